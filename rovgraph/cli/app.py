@@ -1,0 +1,38 @@
+"""The console script: registers the commands and turns bad input into one line.
+
+Exit codes: 0 done, 2 bad input, 130 interrupted.
+"""
+
+import sys
+import warnings
+
+import typer
+
+from rovgraph.errors import DataWarning, InputError
+
+app = typer.Typer(
+    name="rovgraph",
+    help="Where a small underwater vehicle was, and where it is.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+    if issubclass(category, DataWarning):
+        print(f"warning: {message}", file=sys.stderr)
+
+
+def main() -> None:
+    """Entry point of the console script ``rovgraph``."""
+    warnings.simplefilter("always", DataWarning)
+    warnings.showwarning = _show_warning
+    try:
+        app()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted, nothing was written", file=sys.stderr)
+        sys.exit(130)

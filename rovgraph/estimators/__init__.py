@@ -1,0 +1,1 @@
+"""Estimators: each turns a log and a configuration into an `Estimate`."""

@@ -1,0 +1,174 @@
+"""Rotations and angles over a leading axis of epochs.
+
+Everything here takes and returns NumPy arrays. ``(..., 3)`` and ``(..., 3, 3)`` mean
+that any leading axes broadcast.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+def wrap_angle(angle: ArrayLike) -> Array:
+    """Angle wrapped to [-pi, pi) [rad]."""
+    return (np.asarray(angle, dtype=float) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def skew(v: ArrayLike) -> Array:
+    """Cross-product matrix S(v), so that ``skew(a) @ b = a x b`` (2.2).
+
+    Parameters
+    ----------
+    v : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    v = np.asarray(v, dtype=float)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def matrix_from_rpy(rpy: ArrayLike) -> Array:
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll).
+
+    Parameters
+    ----------
+    rpy : array_like, shape (..., 3), roll, pitch, yaw [rad]
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    rpy = np.asarray(rpy, dtype=float)
+    cr, cp, cy = np.moveaxis(np.cos(rpy), -1, 0)
+    sr, sp, sy = np.moveaxis(np.sin(rpy), -1, 0)
+    out = np.empty((*rpy.shape, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = -sp, cp * sr, cp * cr
+    return out
+
+
+def rpy_from_matrix(R: ArrayLike) -> Array:
+    """Roll, pitch, yaw [rad] of rotation matrices: the inverse of `matrix_from_rpy`.
+
+    (2.7) in NED with the usual sign of the pitch, ``pitch = -arcsin(R31)``.
+
+    Parameters
+    ----------
+    R : array_like, shape (..., 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    R = np.asarray(R, dtype=float)
+    return np.stack(
+        [
+            np.arctan2(R[..., 2, 1], R[..., 2, 2]),
+            -np.arcsin(np.clip(R[..., 2, 0], -1.0, 1.0)),
+            np.arctan2(R[..., 1, 0], R[..., 0, 0]),
+        ],
+        axis=-1,
+    )
+
+
+def rpy_jacobian(rpy: ArrayLike) -> Array:
+    """Derivative of roll, pitch, yaw with respect to a rotation vector in n.
+
+    For ``R_nb <- Exp(dtheta_n) R_nb`` the angles change by ``J @ dtheta_n``.
+
+    Parameters
+    ----------
+    rpy : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3); singular at a pitch of 90 degrees
+    """
+    rpy = np.asarray(rpy, dtype=float)
+    cp, tp = np.cos(rpy[..., 1]), np.tan(rpy[..., 1])
+    cy, sy = np.cos(rpy[..., 2]), np.sin(rpy[..., 2])
+    J = np.zeros((*rpy.shape, 3))
+    J[..., 0, 0], J[..., 0, 1] = cy / cp, sy / cp
+    J[..., 1, 0], J[..., 1, 1] = -sy, cy
+    J[..., 2, 0], J[..., 2, 1], J[..., 2, 2] = cy * tp, sy * tp, 1.0
+    return J
+
+
+def exp_rotation(rotvec: ArrayLike) -> Array:
+    """Rotation matrices Exp(rotvec) (2.1).
+
+    Parameters
+    ----------
+    rotvec : array_like, shape (..., 3) [rad]
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    rotvec = np.array(rotvec, dtype=float)  # a copy: scipy refuses read-only views
+    return Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix().reshape(*rotvec.shape, 3)
+
+
+def right_jacobian(rotvec: Array) -> Array:
+    """Jr with Exp(r + d) ~ Exp(r) Exp(Jr d) to first order in d (Forster et al. 2017, eq. 8).
+
+    Parameters
+    ----------
+    rotvec : ndarray, shape (..., 3) [rad]
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    angle2 = np.sum(rotvec**2, axis=-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    small = angle < 1e-4  # below it the closed forms lose digits, the series does not
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    S = skew(rotvec)
+    return np.eye(3) - a * S + b * (S @ S)
+
+
+def log_rotation(R: ArrayLike) -> Array:
+    """Rotation vectors Log(R) [rad], the inverse of `exp_rotation`.
+
+    Parameters
+    ----------
+    R : array_like, shape (..., 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    R = np.array(R, dtype=float)
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+
+
+def transpose(R: Array) -> Array:
+    """Transpose of the last two axes."""
+    return np.swapaxes(R, -1, -2)
+
+
+def rotate(R: ArrayLike, v: ArrayLike) -> Array:
+    """``R @ v`` over leading axes.
+
+    Parameters
+    ----------
+    R : array_like, shape (..., m, 3)
+    v : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., m)
+    """
+    return np.einsum("...ij,...j->...i", R, v)

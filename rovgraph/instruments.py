@@ -1,0 +1,106 @@
+"""The sensors of a configuration: measurement models with the noise that is believed.
+
+`instruments` is the one place where a configuration becomes measurement models.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rovgraph.config import Config, mount_matrix
+from rovgraph.geometry import Array
+from rovgraph.sensors import CompassHeading, DvlVelocity, MagneticField, Position, SensorModel
+
+DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """A measurement model and the belief about its noise.
+
+    Attributes
+    ----------
+    model : the measurement model
+    sd : ndarray, shape (dim,), standard deviation of a measurement
+    loss : "none", "huber" or "cauchy"
+    gate_sd : normalised innovation beyond which a measurement is left out, or None
+    components : names of the components, dim of them
+    """
+
+    model: SensorModel
+    sd: Array
+    loss: str
+    gate_sd: float | None
+    components: tuple[str, ...]
+
+
+def heading_sources(config: Config, available: set[str]) -> list[str]:
+    """Log streams that give heading, in order: "mag", "ahrs", "dvl_heading".
+
+    Where the configuration names no sources, the magnetometer goes before the IMU's own
+    heading, which is made from it and would count it twice.
+    """
+    stream = {"mag": "mag", "ahrs": "ahrs", "dvl": "dvl_heading"}
+    if config.heading.sources is not None:
+        wanted = [stream[s] for s in config.heading.sources]
+    else:
+        wanted = ["mag" if "mag" in available else "ahrs", "dvl_heading"]
+    return [s for s in ("mag", "ahrs", "dvl_heading") if s in wanted and s in available]
+
+
+def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[str, Instrument]:
+    """Every sensor of a configuration, by the name of its log stream.
+
+    Parameters
+    ----------
+    config : Config
+    origin_b : array_like, shape (3,), the point of the body that the state's position and
+        velocity belong to [m]; lever arms are taken relative to it
+
+    Returns
+    -------
+    dict : "dvl", "dvl_heading", "ahrs", "mag", "depth", "fix" -> Instrument
+    """
+    env, origin = config.environment, np.asarray(origin_b, float)
+    declination = float(np.deg2rad(env.declination_deg))
+    R_imu = mount_matrix(config.imu.mount_rpy_deg)
+    dip = DEFAULT_DIP if env.dip_deg is None else float(np.deg2rad(env.dip_deg))
+    magnitude = 1.0 if env.field_norm is None else env.field_norm
+    heading = config.heading
+
+    def arm(lever_arm_m: tuple[float, float, float]) -> Array:
+        return np.asarray(lever_arm_m, float) - origin
+
+    def make(section: object, model: SensorModel, sd: ArrayLike, components: tuple[str, ...]) -> Instrument:
+        spread = np.broadcast_to(np.asarray(sd, float), (model.dim,))
+        return Instrument(model, spread, section.loss, section.gate_sd, components)  # type: ignore[attr-defined]
+
+    return {
+        "dvl": make(config.dvl, DvlVelocity(arm(config.dvl.lever_arm_m)), config.dvl.velocity_sd_mps, ("x", "y", "z")),
+        "dvl_heading": make(
+            heading,
+            CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination),
+            np.deg2rad(heading.dvl_sd_deg),
+            ("heading",),
+        ),
+        "ahrs": make(
+            heading,
+            CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, R_imu),
+            np.deg2rad(heading.ahrs_sd_deg),
+            ("heading",),
+        ),
+        "mag": make(
+            heading,
+            MagneticField(declination, dip, magnitude, R_imu),
+            # a heading error of mag_sd turns the horizontal part of the field
+            np.deg2rad(heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1),
+            ("x", "y", "z"),
+        ),
+        "depth": make(
+            config.depth, Position("depth", arm(config.depth.lever_arm_m), (2,)), config.depth.sd_m, ("down",)
+        ),
+        "fix": make(
+            config.fix, Position("fix", arm(config.fix.lever_arm_m), (0, 1)), config.fix.sd_m, ("north", "east")
+        ),
+    }
