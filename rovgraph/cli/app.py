@@ -8,6 +8,11 @@ import warnings
 
 import typer
 
+from rovgraph.cli.check import check
+from rovgraph.cli.config import config
+from rovgraph.cli.evaluate import evaluate
+from rovgraph.cli.simulate import simulate
+from rovgraph.cli.smooth import smooth
 from rovgraph.errors import DataWarning, InputError
 
 app = typer.Typer(
@@ -17,6 +22,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+for _command in (smooth, evaluate, check, config, simulate):
+    app.command()(_command)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:

@@ -1,0 +1,6 @@
+"""``rovgraph check``."""
+
+
+def check() -> None:
+    """To be written."""
+    raise NotImplementedError

@@ -1,0 +1,6 @@
+"""``rovgraph config``."""
+
+
+def config() -> None:
+    """To be written."""
+    raise NotImplementedError

@@ -1,0 +1,6 @@
+"""``rovgraph evaluate``."""
+
+
+def evaluate() -> None:
+    """To be written."""
+    raise NotImplementedError

@@ -1,0 +1,6 @@
+"""``rovgraph simulate``."""
+
+
+def simulate() -> None:
+    """To be written."""
+    raise NotImplementedError

@@ -1,0 +1,6 @@
+"""``rovgraph smooth``."""
+
+
+def smooth() -> None:
+    """To be written."""
+    raise NotImplementedError
