@@ -1,0 +1,159 @@
+"""A results folder appears complete or not at all.
+
+It is written under a temporary name beside its final place and renamed at the end, so
+that an error, a full disk or Ctrl-C leaves neither half a result nor a lost old one.
+"""
+
+import contextlib
+import errno
+import json
+import os
+import secrets
+import shutil
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+from rovgraph import __version__
+from rovgraph.errors import DataWarning, InputError
+
+SUMMARY = "summary.json"
+STAMP = {"program": "rovgraph", "version": __version__}  # in every summary: the folder is ours
+
+
+def check_writable(path: Path, force: bool) -> None:
+    """Refuse early what `results_folder` would refuse after the work.
+
+    Raises
+    ------
+    InputError : ``path`` holds something that must not be replaced, or cannot be made
+    """
+    with _one_line(path):
+        path = _resolved(path)
+        _check_target(path, force)
+        parent = _nearest_existing(path.parent)
+        if not parent.is_dir():
+            raise InputError(f"{path}: {parent} is a file, not a folder; choose another --out")
+        probe = _hidden(parent, "probe")
+        probe.mkdir()
+        probe.rmdir()
+
+
+@contextlib.contextmanager
+def results_folder(path: Path, force: bool = False) -> Iterator[Path]:
+    """A temporary folder that becomes ``path`` when the block ends without an error.
+
+    Parameters
+    ----------
+    path : the folder to make, its parents too
+    force : replace an older results folder; nothing else is ever replaced
+
+    Yields
+    ------
+    Path : the folder to write into
+
+    Raises
+    ------
+    InputError : as `check_writable`; or writing failed (a full disk), and nothing is kept
+    """
+    check_writable(path, force)
+    final = _resolved(path)
+    temporary = _hidden(_nearest_existing(final.parent), "partial")
+    made = [p for p in final.parents if not p.exists()]
+    try:
+        with _one_line(path):
+            temporary.mkdir()
+        with _one_line(path, inside=temporary):
+            yield temporary
+        with _one_line(path):
+            final.parent.mkdir(parents=True, exist_ok=True)
+            _install(temporary, final, force)
+    except BaseException:
+        _remove(temporary)
+        for parent in made:
+            with contextlib.suppress(OSError):
+                parent.rmdir()  # only where empty
+        raise
+
+
+def _resolved(path: Path) -> Path:
+    return Path(os.path.realpath(path))  # Path.resolve raises on a loop of links
+
+
+def _check_target(path: Path, force: bool) -> None:
+    """Refuse a file, a foreign folder, and without ``force`` any that is not empty."""
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise InputError(f"{path} is a file, not a folder; choose another --out")
+    if not any(path.iterdir()):
+        return
+    if not force:
+        raise InputError(f"{path} exists; choose another --out or give --force")
+    if not _is_ours(path):
+        raise InputError(f"{path} is no results folder of rovgraph, --force does not replace it; choose another --out")
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether the folder holds a summary that rovgraph wrote."""
+    try:
+        summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(summary, dict) and summary.get("program") == STAMP["program"]
+
+
+def _nearest_existing(path: Path) -> Path:
+    while not path.exists() and path != path.parent:
+        path = path.parent
+    return path
+
+
+def _hidden(parent: Path, kind: str) -> Path:
+    return parent / f".rovgraph-{secrets.token_hex(4)}.{kind}"
+
+
+def _install(new: Path, final: Path, force: bool) -> None:
+    """Rename ``new`` to ``final``; the old one is removed only after that."""
+    _check_target(final, force)  # again: the work may have taken an hour
+    if not final.exists():
+        new.rename(final)
+        return
+    old = _hidden(final.parent, "old")
+    try:
+        final.rename(old)
+        new.rename(final)
+    except BaseException:
+        if old.exists() and not final.exists():
+            old.rename(final)
+        raise
+    _remove(old)
+    if old.exists():
+        warnings.warn(f"{old} holds the replaced results and could not be removed", DataWarning, stacklevel=2)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder as far as possible, also when interrupted while doing so."""
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+@contextlib.contextmanager
+def _one_line(path: Path, inside: Path | None = None) -> Iterator[None]:
+    """Turn an error of the file system into an `InputError` about ``path``.
+
+    With ``inside``, errors about files elsewhere (a log that cannot be read) pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        about = error.filename if isinstance(error.filename, str) else None
+        if inside is not None and about is not None and not Path(about).is_relative_to(inside):
+            raise
+        reason = (error.strerror or str(error) or type(error).__name__).splitlines()[0]
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        remedy = "free space or choose another --out" if full else "choose another --out"
+        raise InputError(f"{path}: cannot be written ({reason}), nothing was kept; {remedy}") from error

@@ -1,0 +1,248 @@
+"""The files of a results folder other than the figures; docs/results.md describes them.
+
+Files for programs (trajectories, residuals, history) keep the units of the program, with
+a column ``unit`` where rows differ; what a person reads (calibration, summary) is in
+degrees, and says so.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.config import Config
+from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
+from rovgraph.geometry import Array
+from rovgraph.log import Log
+from rovgraph.report.folder import STAMP, SUMMARY
+from rovgraph.report.units import key_suffix, shown
+from rovgraph.trajectory import Trajectory
+
+CHI2_99 = 9.21  # of two degrees of freedom, so sqrt(9.21) semi-axes hold 99 %
+_ORDER = ("smoothed", "filtered", "dead_reckoning")
+
+
+def main_first(estimates: Sequence[Estimate]) -> list[Estimate]:
+    """Smoothed, filtered, dead reckoning, others; the first is what figures are about."""
+    if not estimates:
+        raise ValueError("no estimates to report")
+    return sorted(estimates, key=lambda e: _ORDER.index(e.kind) if e.kind in _ORDER else len(_ORDER))
+
+
+def write_results(
+    folder: Path,
+    estimates: Sequence[Estimate],
+    log: Log,
+    config: Config,
+    assumptions: list[str],
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """Write every file of a results folder but the figures.
+
+    Parameters
+    ----------
+    folder : an existing folder, such as `results_folder` yields
+    estimates : of one log; the smoothed one leads where there is one
+    log, config : what they were made from
+    assumptions : what was taken for granted, a sentence each
+    seconds : stage of the work -> wall time [s]
+
+    Returns
+    -------
+    dict : what summary.json holds
+    """
+    estimates = main_first(estimates)
+    for estimate in estimates:
+        estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv")
+        estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}.tum")
+    calibration_frame(estimates).to_csv(folder / "calibration.csv", index=False, float_format="%.7g")
+    _residual_frame(estimates[0]).to_csv(folder / "residuals.csv", index=False, float_format="%.7g")
+    _history_frame(estimates).to_csv(folder / "history.csv", index=False, float_format="%.7g")
+    (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
+    summary = summarise(estimates, log, config, assumptions, seconds)
+    (folder / SUMMARY).write_text(
+        json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
+    return summary
+
+
+def summarise(
+    estimates: Sequence[Estimate], log: Log, config: Config, assumptions: list[str], seconds: Mapping[str, float]
+) -> dict[str, Any]:
+    """What summary.json holds: plain values, units in the key names, null for unknown."""
+    estimates = main_first(estimates)
+    main = estimates[0]
+    summary = {
+        **STAMP,
+        "name": config.name,
+        "log": log.source,
+        "start_time_s": main.trajectory.time[0],
+        "main_estimate": main.kind,
+        **_trajectory_numbers(main.trajectory),
+        "sensors": _sensors(main, log),
+        "calibration": {c.label: _calibration_numbers(c) for c in main.calibration},
+        "assumptions": list(assumptions),
+        "seconds": dict(seconds),
+        "estimates": {
+            e.kind: {**_trajectory_numbers(e.trajectory), "sensors": sensor_counts(e.residuals), **e.summary}
+            for e in estimates
+        },
+    }
+    plain: dict[str, Any] = to_plain(summary)
+    return plain
+
+
+def to_plain(value: Any) -> Any:
+    """Only what JSON knows: NumPy becomes Python, keys become text, NaN and infinity None.
+
+    Raises
+    ------
+    TypeError : an object of another kind; it is not printed, it might be a whole graph
+    """
+    if isinstance(value, Mapping):
+        return {str(k): to_plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return to_plain(value.tolist())
+    if isinstance(value, list | tuple | set):
+        return [to_plain(v) for v in value]
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    raise TypeError(f"a summary cannot hold a {type(value).__name__}")
+
+
+def ellipse_axes(covariance: Array) -> tuple[Array, Array, Array]:
+    """99 % ellipses of north and east.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, 3, 3) or (n, 2, 2), north and east first [m^2]
+
+    Returns
+    -------
+    major, minor : ndarray, shape (n,), semi-axes [m]
+    bearing : ndarray, shape (n,), of the major axis, clockwise from north [rad]
+    """
+    values, vectors = np.linalg.eigh(covariance[:, :2, :2])
+    axes = np.sqrt(CHI2_99 * np.clip(values, 0.0, None))
+    return axes[:, 1], axes[:, 0], np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+
+
+def calibration_frame(estimates: Sequence[Estimate]) -> pd.DataFrame:
+    """Rows of calibration.csv: one per estimate and scalar component, angles in degrees."""
+    columns = [
+        "estimate", "label", "unit", "estimated", "value", "sd", "prior_mean", "prior_sd",
+        "moved", "moved_in_prior_sd", "narrowing", "about",
+    ]  # fmt: skip
+    rows = []
+    for estimate in estimates:
+        for c in estimate.calibration:
+            factor, unit = shown(c.unit)
+            value, sd, mean, prior_sd = (factor * x for x in (c.value, c.sd, c.prior_mean, c.prior_sd))
+            moved = value - mean
+            believed = prior_sd if prior_sd > 0 else np.nan
+            relative = (moved / believed, narrowing(c))
+            row = (estimate.kind, c.label, unit, c.estimated, value, sd, mean, prior_sd, moved, *relative, c.about)
+            rows.append(row)
+    return pd.DataFrame(rows, columns=pd.Index(columns))
+
+
+def narrowing(entry: CalibrationEstimate) -> float:
+    """sd after the dive over sd before; NaN where held."""
+    return entry.sd / entry.prior_sd if entry.estimated and entry.prior_sd > 0 else float("nan")
+
+
+def history_labels(variable: str, history: History) -> list[str]:
+    """Names of a history's components that stand alone, such as ``gyr_bias_x``."""
+    if len(history.labels) == 1:
+        return [history.labels[0] or variable]
+    return [s if s.startswith(variable) else f"{variable}_{s.lstrip('_')}" for s in history.labels]
+
+
+def sensor_counts(residuals: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Per sensor: measurements used, weighted down and rejected, and how they fitted.
+
+    A measurement counts as rejected when any of its components has weight 0. The mean
+    square is that of the normalised innovations of the others; about 1 where the
+    believed noise is true.
+    """
+    counts: dict[str, dict[str, Any]] = {}
+    for sensor, rows in residuals.groupby("sensor", sort=False):
+        weight = rows.groupby(["time", "row"], dropna=False)["weight"].transform("min")
+        share = weight[~rows.duplicated(["time", "row"])]
+        fitted = rows.loc[weight > 0, "normalised"].to_numpy(float)
+        fitted = fitted[np.isfinite(fitted)]
+        counts[str(sensor)] = {
+            "used": int((share > 0).sum()),
+            "weighted_down": int(((share > 0) & (share < 1)).sum()),
+            "rejected": int((share <= 0).sum()),
+            "mean_square_normalised": float(np.mean(fitted**2)) if len(fitted) else float("nan"),
+        }
+    return counts
+
+
+def _sensors(estimate: Estimate, log: Log) -> dict[str, dict[str, Any]]:
+    """Counts of every sensor of the log, those the estimate left aside too."""
+    counts = sensor_counts(estimate.residuals)
+    recorded = {name: {"recorded": len(stream)} for name, stream in log.streams.items()}
+    return {name: {**recorded.get(name, {}), **counts.get(name, {})} for name in {**recorded, **counts}}
+
+
+def _trajectory_numbers(track: Trajectory) -> dict[str, Any]:
+    """Duration, distance and where it ended."""
+    major, minor, bearing = _end_ellipse(track)
+    rpy, rpy_sd = np.rad2deg(track.rpy[-1]), np.rad2deg(track.rpy_sd[-1])
+    end: dict[str, Any] = {}
+    for i, name in enumerate(("north", "east", "down")):
+        end[f"{name}_m"], end[f"{name}_sd_m"] = track.p_n[-1, i], track.p_sd[-1, i]
+    end["heading_deg"], end["heading_sd_deg"] = rpy[2] % 360.0, rpy_sd[2]
+    end |= {"ellipse99_major_m": major, "ellipse99_minor_m": minor, "ellipse99_bearing_deg": bearing}
+    return {
+        "duration_s": track.time[-1] - track.time[0],
+        "distance_m": track.distance,
+        "keyframes": len(track),
+        "end": end,
+    }
+
+
+def _end_ellipse(track: Trajectory) -> tuple[float, float, float]:
+    if not np.isfinite(track.cov_p[-1, :2, :2]).all():
+        return float("nan"), float("nan"), float("nan")
+    major, minor, bearing = ellipse_axes(track.cov_p[-1:])
+    return float(major[0]), float(minor[0]), float(np.rad2deg(bearing[0])) % 180.0
+
+
+def _calibration_numbers(entry: CalibrationEstimate) -> dict[str, Any]:
+    factor, unit = shown(entry.unit)
+    tail = key_suffix(unit)
+    numbers = {name + tail: factor * getattr(entry, name) for name in ("value", "sd", "prior_mean", "prior_sd")}
+    return {"estimated": entry.estimated, **numbers, "narrowing": narrowing(entry), "about": entry.about}
+
+
+def _residual_frame(estimate: Estimate) -> pd.DataFrame:
+    frame = estimate.residuals[RESIDUAL_COLUMNS]
+    return frame.assign(time=frame["time"].map("{:.4f}".format))
+
+
+def _history_frame(estimates: Sequence[Estimate]) -> pd.DataFrame:
+    """Rows of history.csv: one per estimate, epoch and scalar component."""
+    frames = []
+    for estimate in estimates:
+        for variable, history in estimate.history.items():
+            stamps = [f"{t:.4f}" for t in history.time]
+            for i, label in enumerate(history_labels(variable, history)):
+                columns = {"time": stamps, "variable": label, "value": history.value[:, i], "sd": history.sd[:, i]}
+                frames.append(pd.DataFrame({"estimate": estimate.kind, **columns, "unit": history.unit}))
+    if not frames:
+        return pd.DataFrame(columns=pd.Index(["estimate", "time", "variable", "value", "sd", "unit"]))
+    return pd.concat(frames, ignore_index=True)

@@ -1,0 +1,100 @@
+"""Tables that a command prints."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
+from rovgraph.report.results import main_first, narrowing
+from rovgraph.report.units import plus_minus, shown
+
+HARDLY = 0.8  # an sd narrowed less than to this part of the prior's is the prior repeated
+
+
+def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> Table:
+    """How long, how far, where it ended and how the sensors fitted; a column per estimate.
+
+    Parameters
+    ----------
+    estimates : as given to `write_results`
+    summary : what `write_results` returned
+    """
+    kinds = [e.kind for e in main_first(estimates)]
+    table = Table(title=f"{summary['name']}: {summary['log']}", title_justify="left")
+    table.add_column("")
+    for kind in kinds:
+        table.add_column(kind.replace("_", " "), justify="right")
+    numbers = [summary["estimates"][kind] for kind in kinds]
+    table.add_row("duration", *(duration(n["duration_s"]) for n in numbers))
+    table.add_row("distance", *(f"{_number(n['distance_m']):.1f} m" for n in numbers))
+    for name in ("north", "east", "down"):
+        table.add_row(f"end {name}", *(_end(n["end"], name, "m") for n in numbers))
+    table.add_row("end heading", *(_end(n["end"], "heading", "deg") for n in numbers))
+    table.add_row("end 99 % ellipse, semi-axes", *(_ellipse(n["end"]) for n in numbers), end_section=True)
+    sensors = list(dict.fromkeys(s for n in numbers for s in n["sensors"]))
+    for sensor in sensors:
+        table.add_row(f"{sensor} used / rejected", *(_counts(n["sensors"].get(sensor)) for n in numbers))
+    for sensor in sensors:
+        table.add_row(f"{sensor} mean square (1 = as believed)", *(_square(n["sensors"].get(sensor)) for n in numbers))
+    return table
+
+
+def calibration_table(estimates: Sequence[Estimate]) -> Table:
+    """Calibration of the leading estimate against what was believed before."""
+    main = main_first(estimates)[0]
+    table = Table(title=f"calibration, {main.kind.replace('_', ' ')}", title_justify="left")
+    for heading in ("variable", "value ± sd", "prior", "moved", "sd narrowed"):
+        table.add_column(heading, justify="left" if heading == "variable" else "right")
+    for entry in sorted(main.calibration, key=lambda e: not e.estimated):
+        table.add_row(entry.label, *_calibration_cells(entry), style="" if entry.estimated else "dim")
+    if any(narrowing(e) > HARDLY for e in main.calibration):
+        table.caption = "hardly: this dive says little about it, the value is mostly the prior"
+    return table
+
+
+def duration(seconds: float | None) -> str:
+    """Time as a person says it, such as ``55 min 43 s``."""
+    if seconds is None:
+        return "unknown"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
+
+
+def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:
+    factor, unit = shown(entry.unit)
+    value, sd, mean, prior_sd = (factor * x for x in (entry.value, entry.sd, entry.prior_mean, entry.prior_sd))
+    if not entry.estimated:
+        return plus_minus(value, 0.0, unit), "held", "", ""
+    ratio = narrowing(entry)
+    moved = f"{(value - mean) / prior_sd:+.1f} sd" if prior_sd > 0 else ""
+    narrowed = "unknown" if not np.isfinite(ratio) else f"to {100 * ratio:.2g} %"
+    if ratio > HARDLY:
+        narrowed = f"hardly (to {100 * min(ratio, 1.0):.0f} %)"
+    return plus_minus(value, sd, unit), plus_minus(mean, prior_sd, unit), moved, narrowed
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def _end(end: Mapping[str, Any], name: str, unit: str) -> str:
+    return plus_minus(_number(end[f"{name}_{unit}"]), _number(end[f"{name}_sd_{unit}"]), unit)
+
+
+def _ellipse(end: Mapping[str, Any]) -> str:
+    major, minor = end["ellipse99_major_m"], end["ellipse99_minor_m"]
+    return "unknown" if major is None or minor is None else f"{major:.3g} × {minor:.3g} m"
+
+
+def _counts(sensor: Mapping[str, Any] | None) -> str:
+    return "–" if sensor is None else f"{sensor['used']} / {sensor['rejected']}"
+
+
+def _square(sensor: Mapping[str, Any] | None) -> str:
+    value = None if sensor is None else sensor["mean_square_normalised"]
+    return "–" if value is None else f"{value:.2f}"

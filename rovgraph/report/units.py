@@ -1,0 +1,37 @@
+"""Units as a person reads them: degrees instead of radians."""
+
+import numpy as np
+
+_DEGREES = float(np.rad2deg(1.0))
+
+
+def shown(unit: str) -> tuple[float, str]:
+    """Factor from a unit inside the program to the one shown, and that one's name.
+
+    >>> shown("m")
+    (1.0, 'm')
+    """
+    if unit.startswith("rad"):
+        return _DEGREES, "deg" + unit[3:]
+    return 1.0, unit
+
+
+def plus_minus(value: float, sd: float, unit: str = "") -> str:
+    """``value ± sd unit`` with two significant digits of the sd.
+
+    >>> plus_minus(-21.5312, 1.912, "deg")
+    '-21.5 ± 1.9 deg'
+    """
+    tail = f" {unit}" if unit not in ("", "1") else ""
+    if not np.isfinite(value):
+        return "unknown"
+    if not np.isfinite(sd) or sd <= 0.0:
+        return f"{value:.4g}{tail}"
+    digits = int(np.clip(1 - np.floor(np.log10(float(f"{sd:.1e}"))), 0, 9))
+    return f"{value:.{digits}f} ± {sd:.{digits}f}{tail}"
+
+
+def key_suffix(unit: str) -> str:
+    """The ending of a JSON key or name for a shown unit: ``_deg``, ``_mps2``; "" for a ratio."""
+    plain = unit.replace("m/s^2", "mps2").replace("m/s", "mps").replace("deg/s", "dps").replace("/", "_per_")
+    return "" if unit in ("", "1") else "_" + plain.replace("^", "")
