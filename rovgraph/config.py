@@ -50,7 +50,9 @@ class Environment(_Section):
     """Gravity, magnetic field and Earth rate."""
 
     gravity_mps2: Positive = Field(9.81, description="gravity")
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)] = Field(0.0, description="latitude, for Earth rotation")
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
+        None, description="latitude, for Earth rotation; null = of the first fix_lat"
+    )
     declination_deg: float = Field(0.0, description="magnetic declination, east positive")
     field_norm: Positive | None = Field(
         None, description="magnitude of the field, log's unit; null = median of the log"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, skew
 from rovgraph.sensors import CompassHeading, DvlVelocity, MagneticField, Position, SensorModel
 
 DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
@@ -26,6 +26,8 @@ class Instrument:
     loss : "none", "huber" or "cauchy"
     gate_sd : normalised innovation beyond which a measurement is left out, or None
     components : names of the components, dim of them
+    rate_gain : ndarray, shape (dim, 3), how an error of the measured rate [rad/s] enters:
+        through the DVL's lever arm, at the nominal mounting
     """
 
     model: SensorModel
@@ -33,6 +35,7 @@ class Instrument:
     loss: str
     gate_sd: float | None
     components: tuple[str, ...]
+    rate_gain: Array
 
 
 def heading_sources(config: Config, available: set[str]) -> list[str]:
@@ -74,33 +77,23 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
 
     def make(section: object, model: SensorModel, sd: ArrayLike, components: tuple[str, ...]) -> Instrument:
         spread = np.broadcast_to(np.asarray(sd, float), (model.dim,))
-        return Instrument(model, spread, section.loss, section.gate_sd, components)  # type: ignore[attr-defined]
+        gain = np.zeros((model.dim, 3))
+        if isinstance(model, DvlVelocity):
+            gain = mount_matrix(config.dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
+        return Instrument(model, spread, section.loss, section.gate_sd, components, gain)  # type: ignore[attr-defined]
 
+    dvl = DvlVelocity(arm(config.dvl.lever_arm_m))
+    compass = CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination)
+    ahrs = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, R_imu)
+    # a heading error of mag_sd turns the horizontal part of the field
+    mag_sd = np.deg2rad(heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
+    depth = Position("depth", arm(config.depth.lever_arm_m), (2,))
+    fix = Position("fix", arm(config.fix.lever_arm_m), (0, 1))
     return {
-        "dvl": make(config.dvl, DvlVelocity(arm(config.dvl.lever_arm_m)), config.dvl.velocity_sd_mps, ("x", "y", "z")),
-        "dvl_heading": make(
-            heading,
-            CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination),
-            np.deg2rad(heading.dvl_sd_deg),
-            ("heading",),
-        ),
-        "ahrs": make(
-            heading,
-            CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, R_imu),
-            np.deg2rad(heading.ahrs_sd_deg),
-            ("heading",),
-        ),
-        "mag": make(
-            heading,
-            MagneticField(declination, dip, magnitude, R_imu),
-            # a heading error of mag_sd turns the horizontal part of the field
-            np.deg2rad(heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1),
-            ("x", "y", "z"),
-        ),
-        "depth": make(
-            config.depth, Position("depth", arm(config.depth.lever_arm_m), (2,)), config.depth.sd_m, ("down",)
-        ),
-        "fix": make(
-            config.fix, Position("fix", arm(config.fix.lever_arm_m), (0, 1)), config.fix.sd_m, ("north", "east")
-        ),
+        "dvl": make(config.dvl, dvl, config.dvl.velocity_sd_mps, ("x", "y", "z")),
+        "dvl_heading": make(heading, compass, np.deg2rad(heading.dvl_sd_deg), ("heading",)),
+        "ahrs": make(heading, ahrs, np.deg2rad(heading.ahrs_sd_deg), ("heading",)),
+        "mag": make(heading, MagneticField(declination, dip, magnitude, R_imu), mag_sd, ("x", "y", "z")),
+        "depth": make(config.depth, depth, config.depth.sd_m, ("down",)),
+        "fix": make(config.fix, fix, config.fix.sd_m, ("north", "east")),
     }

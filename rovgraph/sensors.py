@@ -39,6 +39,7 @@ class SensorModel(Protocol):
     sensor : name of the log stream
     dim : number of components
     angular : components are angles, differences wrap
+    state : state variables it depends on, at its own time or through the motion to it
     calibration : names of the calibration variables it depends on
     """
 
@@ -48,6 +49,8 @@ class SensorModel(Protocol):
     def dim(self) -> int: ...
     @property
     def angular(self) -> bool: ...
+    @property
+    def state(self) -> tuple[str, ...]: ...
     @property
     def calibration(self) -> tuple[str, ...]: ...
 
@@ -107,6 +110,7 @@ class DvlVelocity:
     sensor = "dvl"
     dim = 3
     angular = False
+    state = (POSE, VELOCITY, BIAS)
     calibration = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale")
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
@@ -176,6 +180,7 @@ class CompassHeading:
     R_bs: Array = field(default_factory=lambda: np.eye(3))
     dim = 1
     angular = True
+    state = (POSE, BIAS)
 
     @property
     def calibration(self) -> tuple[str, ...]:
@@ -225,6 +230,7 @@ class MagneticField:
     sensor = "mag"
     dim = 3
     angular = False
+    state = (POSE, BIAS)
     calibration = ("mag_offset", "mag_deviation", "hard_iron")
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
@@ -265,7 +271,8 @@ class Position:
     lever_arm_b: Array
     axes: tuple[int, ...]
     angular = False
-    calibration = ()
+    state = (POSE, VELOCITY, BIAS)
+    calibration: tuple[str, ...] = ()
 
     @property
     def dim(self) -> int:

@@ -121,11 +121,10 @@ def chain(H: Jacobians, state: State, delta: Delta) -> Jacobians:
 
     Returns
     -------
-    Jacobians with respect to ``state``; the variables are those of ``H``, and velocity
-    and bias where the motion brings them in.
+    Jacobians with respect to ``state``: pose, velocity, bias and those of ``H``'s
+    calibration variables.
     """
     n, dt = len(delta.dt), delta.dt[:, None, None]
-    eye = np.broadcast_to(np.eye(3), (n, 3, 3))
     excess = state.bias - delta.bias
     turn = -delta.dt[:, None] * excess[:, 3:]
     dR_t = transpose(delta.dR @ exp_rotation(turn))  # keyframe axes to axes at t
@@ -134,9 +133,8 @@ def chain(H: Jacobians, state: State, delta: Delta) -> Jacobians:
 
     out = {k: v for k, v in H.items() if k not in (POSE, VELOCITY, BIAS)}
     pose = np.zeros((n, next(iter(H.values())).shape[1], 6))
-    velocity, bias = np.zeros_like(pose[..., :3]), np.zeros_like(pose)
-    if BIAS in H:
-        bias += H[BIAS]
+    velocity = np.zeros_like(pose[..., :3])
+    bias = H.get(BIAS, np.zeros_like(pose)).copy()
     if POSE in H:
         H_rotation, H_translation = H[POSE][..., :3], H[POSE][..., 3:]
         pose[..., :3] += H_rotation @ dR_t - H_translation @ dR_t @ skew(dp)
@@ -146,7 +144,7 @@ def chain(H: Jacobians, state: State, delta: Delta) -> Jacobians:
         bias[..., :3] += -0.5 * dt**2 * (H_translation @ dR_t)
     if VELOCITY in H:
         pose[..., :3] += -H[VELOCITY] @ state.R_nb @ skew(dv)
-        velocity += H[VELOCITY] @ eye
+        velocity += H[VELOCITY]
         bias[..., :3] += -dt * (H[VELOCITY] @ state.R_nb)
     out.update({POSE: pose, VELOCITY: velocity, BIAS: bias})
     return out

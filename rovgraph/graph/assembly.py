@@ -1,0 +1,246 @@
+"""Measurements in the order of time become keyframes and what lies between them.
+
+A keyframe stands at every DVL ping, and wherever `graph.max_gap_s` passes without one.
+Any other measurement belongs to the keyframe before it and carries the IMU's motion
+from there to its own time, so nothing is rounded to a keyframe. Batch and incremental
+estimators consume the same `Interval` objects.
+
+Headings and depths are taken once per interval, the first one: their errors last
+longer than that, and counting each sample would make the estimate too sure of itself.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from rovgraph.config import Config, mount_matrix
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.graph.preintegration import BRIDGE_GYR, Snapshot, preintegrate, preintegration_params
+from rovgraph.instruments import Instrument
+from rovgraph.log import Measurement
+
+ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
+GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
+_AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Attached:
+    """A measurement that belongs to a keyframe.
+
+    Attributes
+    ----------
+    sensor : name of the log stream
+    keyframe : index
+    time, row : of the measurement, and its line in the log
+    z : ndarray, shape (dim,)
+    sd : ndarray, shape (dim,), the instrument's, or the measurement's own
+    rate_b, rate_sd : ndarray, shape (3,), float: measured rate, bias still in it [rad/s]
+    motion : Snapshot from the keyframe to the measurement
+    bias : ndarray, shape (6,), that the motion was integrated with
+    """
+
+    sensor: str
+    keyframe: int
+    time: float
+    row: int
+    z: Array
+    sd: Array
+    rate_b: Array
+    rate_sd: float
+    motion: Snapshot
+    bias: Array
+
+
+@dataclass(frozen=True)
+class Interval:
+    """From the keyframe before to keyframe ``index``; the first has no motion.
+
+    Attributes
+    ----------
+    index, time : of the keyframe that ends the interval
+    rate_b : ndarray, shape (3,), measured rate at the keyframe, bias still in it
+    pim : preintegrated motion, None for the first keyframe
+    bridged : there was a gap in the IMU
+    attached : measurements at the keyframe itself, and between the keyframe before and it
+    """
+
+    index: int
+    time: float
+    rate_b: Array
+    pim: gtsam.PreintegratedCombinedMeasurements | None
+    bridged: bool
+    attached: list[Attached]
+
+
+@dataclass
+class Assembler:
+    """Takes measurements one by one, gives back an `Interval` whenever one is complete.
+
+    Attributes
+    ----------
+    config : effective configuration
+    instruments : the sensors in use, by stream
+    bias : ndarray, shape (6,), for preintegration; may be renewed between intervals
+    left_out : (sensor, reason) -> count of measurements that never reach the graph
+    """
+
+    config: Config
+    instruments: dict[str, Instrument]
+    bias: Array
+    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
+        self._params = preintegration_params(self.config)
+        self._bridge = preintegration_params(self.config, bridge=True)
+        self._imu: list[tuple[float, Array]] = []
+        self._waiting: list[Measurement] = []
+        self._index, self._start = -1, 0.0
+        self._between: list[Measurement] = []
+        self._periods: list[float] = []
+
+    def add(self, measurement: Measurement) -> list[Interval]:
+        """Take a measurement; times must not decrease.
+
+        Returns
+        -------
+        list of Interval : those that this measurement completes, usually none or one
+
+        Raises
+        ------
+        InputError : an IMU gap longer than ``imu.max_gap_s``
+        """
+        if measurement.sensor != "imu":
+            if self._admissible(measurement):
+                self._waiting.append(measurement)
+            return []
+        self._take_sample(measurement)
+        done: list[Interval] = []
+        if self._index < 0:
+            self._before_first(measurement.time)
+            done.append(self._close(measurement.time, None))
+        for waiting in self._waiting:
+            done += self._silence(waiting.time)
+            if waiting.sensor == "dvl" and waiting.time - self._start >= self.config.graph.min_gap_s:
+                done.append(self._close(waiting.time, waiting))
+            else:
+                self._between.append(waiting)
+        self._waiting.clear()
+        return done + self._silence(measurement.time)
+
+    def finish(self) -> list[Interval]:
+        """A last keyframe at the last IMU sample."""
+        self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
+        end = self._imu[-1][0] if self._imu else self._start
+        if self._index < 0 or end - self._start < 1e-3:
+            self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
+            return []
+        return [self._close(end, None)]
+
+    def _admissible(self, m: Measurement) -> bool:
+        """Whether a measurement may enter the graph; counts those that may not."""
+        reason = None
+        if m.sensor not in self.instruments:
+            return False
+        if m.sensor == "dvl":
+            if m.values[3] == 0:
+                reason = "no bottom lock"
+            elif np.abs(m.values[:3]).max() > self.config.dvl.max_speed_mps:
+                reason = "faster than dvl.max_speed_mps"
+        if reason:
+            self.left_out[m.sensor, reason] += 1
+        return reason is None
+
+    def _take_sample(self, m: Measurement) -> None:
+        if self._imu:
+            period = m.time - self._imu[-1][0]
+            if period > self.config.imu.max_gap_s:
+                raise InputError(
+                    f"row {m.row}: the IMU is silent for {period:.1f} s before {m.time:.3f} s, longer than "
+                    f"imu.max_gap_s = {self.config.imu.max_gap_s:g}; split the log there or raise that key"
+                )
+            if len(self._periods) < 50:
+                self._periods.append(period)
+        rotated = np.concatenate([self._R_bs @ m.values[:3], self._R_bs @ m.values[3:6]])
+        self._imu.append((m.time, rotated))
+
+    def _before_first(self, time: float) -> None:
+        """Nothing can be placed before the first IMU sample."""
+        early = [m for m in self._waiting if m.time < time]
+        self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
+        self._waiting = [m for m in self._waiting if m.time >= time]
+
+    def _silence(self, time: float) -> list[Interval]:
+        """Keyframes for a time without pings."""
+        done = []
+        gap = self.config.graph.max_gap_s
+        while time - self._start > gap:
+            done.append(self._close(self._start + gap, None))
+        return done
+
+    def _close(self, time: float, ping: Measurement | None) -> Interval:
+        """Make a keyframe at ``time`` and the interval that leads to it."""
+        samples = np.array([[t, *values] for t, values in self._imu])
+        pim, bridged, attached = None, False, []
+        if self._index >= 0:
+            pim, bridged, attached = self._integrate(samples, time)
+        self._index, self._start, self._between = self._index + 1, time, []
+        rate_b, rate_sd = self._rate(samples, time)
+        if ping is not None:
+            attached.append(self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd))
+        keep = max(int(np.searchsorted(samples[:, 0], time, side="right")) - 1, 0)
+        self._imu = self._imu[keep:]
+        return Interval(self._index, time, rate_b, pim, bridged, attached)
+
+    def _integrate(
+        self, samples: Array, time: float
+    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, bool, list[Attached]]:
+        taken, seen = [], set()
+        for m in self._between:
+            if m.sensor not in seen:
+                taken.append(m)
+            if m.sensor in ONCE_PER_INTERVAL:
+                seen.add(m.sensor)
+        stops = np.array([m.time for m in taken])
+        bridged = self._has_gap(samples[:, 0])
+        params = self._bridge if bridged else self._params
+        pim, motions = preintegrate(params, self.bias, samples, self._start, stops, time)
+        attached = [
+            self._attach(m, motion, *self._rate(samples, m.time)) for m, motion in zip(taken, motions, strict=True)
+        ]
+        return pim, bridged, attached
+
+    def _has_gap(self, times: Array) -> bool:
+        if len(self._periods) < 2 or len(times) < 2:
+            return False
+        return bool(np.diff(times).max() > GAP_PERIODS * float(np.median(self._periods)))
+
+    def _rate(self, samples: Array, time: float) -> tuple[Array, float]:
+        """Rate interpolated to a time, and the sd of its noise."""
+        t = samples[:, 0]
+        k = int(np.clip(np.searchsorted(t, time, side="right") - 1, 0, max(len(t) - 2, 0)))
+        if len(t) < 2:
+            return samples[0, 4:], self.config.imu.noise.gyr
+        w = float(np.clip((time - t[k]) / (t[k + 1] - t[k]), 0.0, 1.0))
+        rate = (1.0 - w) * samples[k, 4:] + w * samples[k + 1, 4:]
+        if self._has_gap(t[k : k + 2]):
+            return rate, BRIDGE_GYR
+        density = self.config.imu.noise.gyr
+        return rate, density * float(np.sqrt((w**2 + (1.0 - w) ** 2) / (t[k + 1] - t[k])))
+
+    def _attach(self, m: Measurement, motion: Snapshot, rate_b: Array, rate_sd: float) -> Attached:
+        instrument = self.instruments[m.sensor]
+        dim = instrument.model.dim
+        z, sd = m.values[:dim], instrument.sd
+        if m.sensor == "dvl":
+            if np.isfinite(m.values[4]):
+                sd = np.maximum(sd, m.values[4])
+            if self.config.dvl.scale_sd:
+                sd = np.hypot(sd, self.config.dvl.scale_sd * np.linalg.norm(z))
+        if m.sensor == "fix" and np.isfinite(m.values[2]):
+            sd = np.full(dim, m.values[2])
+        return Attached(m.sensor, self._index, m.time, m.row, z, sd, rate_b, rate_sd, motion, self.bias)

@@ -1,0 +1,233 @@
+"""Batch smoothing: Gauss-Newton over the whole dive, with a step control.
+
+Each iteration linearises the IMU's factors in GTSAM and all measurements at once in
+NumPy, eliminates in GTSAM, and takes the step, halved until the robust cost falls: the
+direction is one of descent for that cost, so the solver cannot diverge. Robust losses
+are applied by reweighting. When it has converged, measurements beyond their gate are
+taken out, and it is solved again until the gates rest.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.calibration import Belief
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.graph.assembly import Attached, Interval
+from rovgraph.graph.factors import Start, estimated_variables, motion, priors
+from rovgraph.graph.keys import key, key_name
+from rovgraph.graph.measurements import Block, loss_and_weight, make_block
+from rovgraph.graph.values import insert_calibration, insert_state, states_from
+from rovgraph.instruments import Instrument
+from rovgraph.state import State
+
+Gates = dict[str, NDArray[np.bool_]]
+
+MAX_ITERATIONS = 50
+MAX_GATINGS = 8
+SMALLEST_STEP = 2.0**-12
+RELATIVE_DECREASE = 1e-9
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The whole dive's graph: native factors, and measurements as blocks.
+
+    Attributes
+    ----------
+    native : priors and IMU factors
+    blocks : sensor -> Block
+    count : number of keyframes
+    fixed : all calibration variables at their means
+    estimated : names of those that are estimated
+    """
+
+    native: gtsam.NonlinearFactorGraph
+    blocks: dict[str, Block]
+    count: int
+    fixed: Mapping[str, Array]
+    estimated: tuple[str, ...]
+
+    def states(self, values: gtsam.Values) -> State:
+        """State of every keyframe."""
+        return states_from(values, self.count, self.fixed, self.estimated)
+
+    def open_gates(self) -> Gates:
+        return {sensor: np.ones(len(block), dtype=bool) for sensor, block in self.blocks.items()}
+
+    def gates(self, values: gtsam.Values) -> Gates:
+        """Which measurements lie within their gate at ``values``."""
+        states, out = self.states(values), {}
+        for sensor, block in self.blocks.items():
+            gate = block.instrument.gate_sd or np.inf
+            out[sensor] = np.linalg.norm(block.normalised(states.at(block.keyframe)), axis=1) <= gate
+        return out
+
+    def weights(self, values: gtsam.Values, gates: Gates) -> dict[str, Array]:
+        """Weight of every measurement, shape (n,) for each sensor."""
+        states, out = self.states(values), {}
+        for sensor, block in self.blocks.items():
+            r = block.normalised(states.at(block.keyframe))
+            out[sensor] = loss_and_weight(r, block.instrument.loss)[1] * gates[sensor]
+        return out
+
+    def cost(self, values: gtsam.Values, gates: Gates) -> float:
+        """The robust cost that is minimised."""
+        states, total = self.states(values), self.native.error(values)
+        for sensor, block in self.blocks.items():
+            r = block.normalised(states.at(block.keyframe))
+            total += float(loss_and_weight(r, block.instrument.loss)[0] @ gates[sensor])
+        return total
+
+    def linearize(self, values: gtsam.Values, gates: Gates) -> gtsam.GaussianFactorGraph:
+        """All factors linearised at ``values``, measurements weighted."""
+        linear, states = self.native.linearize(values), self.states(values)
+        weights = self.weights(values, gates)
+        for sensor, block in self.blocks.items():
+            block.push(linear, states.at(block.keyframe), weights[sensor])
+        return linear
+
+    def nonlinear(self) -> gtsam.NonlinearFactorGraph:
+        """The same graph with one `gtsam.CustomFactor` per measurement."""
+        graph = gtsam.NonlinearFactorGraph(self.native)
+        for block in self.blocks.values():
+            for k in range(len(block)):
+                graph.add(block.custom_factor(k))
+        return graph
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The optimum of a `Problem`.
+
+    Attributes
+    ----------
+    values : gtsam.Values
+    gates, weights : sensor -> which measurements were let in, and their weights
+    cost : robust cost
+    iterations : Gauss-Newton steps in all
+    converged : the last cost no longer fell
+    """
+
+    values: gtsam.Values
+    gates: Gates
+    weights: dict[str, Array]
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def make_problem(
+    intervals: Sequence[Interval],
+    start: Start,
+    config: Config,
+    beliefs: Mapping[str, Belief],
+    instruments: Mapping[str, Instrument],
+) -> Problem:
+    """Assemble the graph of a dive."""
+    attached: dict[str, list[Attached]] = {}
+    for interval in intervals:
+        for a in interval.attached:
+            attached.setdefault(a.sensor, []).append(a)
+    fixed = {name: belief.mean for name, belief in beliefs.items()}
+    estimated = estimated_variables(beliefs, attached)
+    native = gtsam.NonlinearFactorGraph()
+    for factor in priors(start, beliefs, estimated):
+        native.add(factor)
+    for interval in intervals:
+        for factor in motion(interval):
+            native.add(factor)
+    gravity = config.environment.gravity_mps2
+    blocks = {s: make_block(rows, instruments[s], gravity, fixed, estimated) for s, rows in attached.items()}
+    return Problem(native, blocks, len(intervals), fixed, estimated)
+
+
+def make_values(problem: Problem, states: State) -> gtsam.Values:
+    """GTSAM values of the keyframes' states, calibration at its means."""
+    values = gtsam.Values()
+    for i in range(problem.count):
+        insert_state(values, i, states.at([i]))
+    insert_calibration(values, problem.fixed, problem.estimated)
+    return values
+
+
+def solve(problem: Problem, values: gtsam.Values) -> Solution:
+    """Minimise the robust cost from ``values``, then gate and repeat.
+
+    Raises
+    ------
+    InputError : the data do not determine some variable, which is named
+    """
+    gates, iterations, converged = problem.open_gates(), 0, False
+    for _ in range(MAX_GATINGS):
+        values, cost, steps, converged = _minimise(problem, values, gates)
+        iterations += steps
+        renewed = problem.gates(values)
+        if all(np.array_equal(renewed[s], gates[s]) for s in gates):
+            break
+        gates = renewed
+    return Solution(values, gates, problem.weights(values, gates), cost, iterations, converged)
+
+
+def _minimise(problem: Problem, values: gtsam.Values, gates: Gates) -> tuple[gtsam.Values, float, int, bool]:
+    """Gauss-Newton with step halving for fixed gates."""
+    cost, ordering = problem.cost(values, gates), None
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        linear = problem.linearize(values, gates)
+        ordering = ordering or elimination_order(linear)
+        delta = _eliminate(linear, ordering)
+        step, trial = 1.0, values.retract(delta)
+        trial_cost = problem.cost(trial, gates)
+        while not trial_cost <= cost and step > SMALLEST_STEP:
+            step *= 0.5
+            trial = values.retract(delta.scale(step))
+            trial_cost = problem.cost(trial, gates)
+        if not trial_cost <= cost:
+            return values, cost, iteration, True  # no descent left at machine precision
+        decrease = cost - trial_cost
+        values, cost = trial, trial_cost
+        if decrease <= RELATIVE_DECREASE * (1.0 + cost):
+            return values, cost, iteration, True
+    return values, cost, MAX_ITERATIONS, False
+
+
+def elimination_order(linear: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
+    """Nested dissection of the chain of keyframes."""
+    return gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+
+
+def _eliminate(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
+    try:
+        return linear.optimize(ordering)
+    except RuntimeError as error:
+        raise InputError(indeterminate(error)) from None
+
+
+def indeterminate(error: RuntimeError) -> str:
+    """One line on a system that cannot be solved; never the graph that GTSAM prints."""
+    found = re.search(r"variable (\d+)", str(error)[:2000])
+    what = key_name(int(found.group(1))) if found else "some variable"
+    return (
+        f"the data do not determine {what}: check the log (rovgraph check), "
+        "tighten its prior sd, or hold it fixed in the configuration"
+    )
+
+
+def marginals(problem: Problem, solution: Solution) -> gtsam.Marginals:
+    """Marginal covariances at the optimum."""
+    linear = problem.linearize(solution.values, solution.gates)
+    try:
+        return gtsam.Marginals(linear, solution.values)
+    except RuntimeError as error:
+        raise InputError(indeterminate(error)) from None
+
+
+def covariances(of: gtsam.Marginals, variable: str, count: int) -> Array:
+    """Marginal covariance of a state variable at every keyframe, shape (count, d, d)."""
+    return np.array([of.marginalCovariance(key(variable, i)) for i in range(count)])

@@ -1,0 +1,70 @@
+"""The graph as lists of factors: priors, and what an interval adds.
+
+Batch, iSAM2 and fixed lag consume the same lists.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from rovgraph.calibration import Belief
+from rovgraph.geometry import Array, transpose
+from rovgraph.graph.assembly import Interval
+from rovgraph.graph.keys import key
+from rovgraph.state import BIAS, POSE, VELOCITY, State
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is believed at the first keyframe.
+
+    Attributes
+    ----------
+    state : State of one epoch, at the IMU
+    rpy_sd, p_sd, v_sd : ndarray, shape (3,) [rad, m, m/s]; attitude about n's axes, as
+        roll and pitch are small
+    bias_sd : ndarray, shape (6,)
+    """
+
+    state: State
+    rpy_sd: Array
+    p_sd: Array
+    v_sd: Array
+    bias_sd: Array
+
+
+def estimated_variables(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> tuple[str, ...]:
+    """Calibration variables to be estimated: asked for, and their sensor is in use."""
+    present = set(sensors)
+    return tuple(name for name, b in beliefs.items() if b.estimate and b.variable.sensor in present)
+
+
+def priors(start: Start, beliefs: Mapping[str, Belief], estimated: Iterable[str]) -> list[gtsam.NonlinearFactor]:
+    """Priors of the first keyframe and of the calibration variables."""
+    state = start.state
+    R_nb, sigmas = state.R_nb[0], gtsam.noiseModel.Diagonal.Sigmas
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = transpose(R_nb) @ np.diag(start.rpy_sd**2) @ R_nb
+    covariance[3:, 3:] = transpose(R_nb) @ np.diag(start.p_sd**2) @ R_nb
+    pose = gtsam.Pose3(gtsam.Rot3(R_nb), state.p_n[0])
+    bias = gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
+    return [
+        gtsam.PriorFactorPose3(key(POSE, 0), pose, gtsam.noiseModel.Gaussian.Covariance(covariance)),
+        gtsam.PriorFactorVector(key(VELOCITY, 0), state.v_n[0], sigmas(start.v_sd)),
+        gtsam.PriorFactorConstantBias(key(BIAS, 0), bias, sigmas(start.bias_sd)),
+        *(
+            gtsam.PriorFactorVector(key(name), beliefs[name].mean, sigmas(np.full(b.variable.dim, b.sd)))
+            for name, b in ((name, beliefs[name]) for name in estimated)
+        ),
+    ]
+
+
+def motion(interval: Interval) -> list[gtsam.NonlinearFactor]:
+    """The IMU's factor between the keyframe before and the one that ends the interval."""
+    if interval.pim is None:
+        return []
+    i, j = interval.index - 1, interval.index
+    keys = [key(POSE, i), key(VELOCITY, i), key(POSE, j), key(VELOCITY, j), key(BIAS, i), key(BIAS, j)]
+    return [gtsam.CombinedImuFactor(*keys, interval.pim)]

@@ -1,0 +1,203 @@
+"""The measurements of one sensor as factors.
+
+A `Block` holds n measurements as arrays. It is linearised for all of them at once
+(`Block.linearize`), and pushed as Jacobian factors into a linear graph; or one by one, as a
+`gtsam.CustomFactor` whose callback linearises the same block of one, for iSAM2.
+
+Robust losses are applied by reweighting: the weight of a measurement is
+rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero where it is
+gated. The thresholds are where a good measurement of that dimension lies with 95 %.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+
+from rovgraph.geometry import Array
+from rovgraph.graph.assembly import Attached
+from rovgraph.graph.keys import key
+from rovgraph.graph.values import state_at
+from rovgraph.instruments import Instrument
+from rovgraph.sensors import innovation
+from rovgraph.state import DIMENSION, Delta, Jacobians, State, chain, propagate
+
+
+@dataclass(frozen=True)
+class Block:
+    """n measurements of one sensor.
+
+    Attributes
+    ----------
+    instrument : model, noise and loss
+    keyframe : ndarray of int, shape (n,)
+    time, row : ndarray, shape (n,)
+    z : ndarray, shape (n, dim)
+    W : ndarray, shape (n, dim, dim), square-root information, lower triangular
+    rate_b : ndarray, shape (n, 3), measured rate, bias still in it [rad/s]
+    motion : Delta, n, from the keyframe to the measurement
+    gravity : [m/s^2]
+    fixed : values of the calibration variables that are not estimated
+    estimated : names of those that are
+    """
+
+    instrument: Instrument
+    keyframe: Array
+    time: Array
+    row: Array
+    z: Array
+    W: Array
+    rate_b: Array
+    motion: Delta
+    gravity: float
+    fixed: Mapping[str, Array]
+    estimated: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Variables that the factors touch, in the order of their keys."""
+        return (*self.instrument.model.state, *self.estimated)
+
+    def keys(self, k: int) -> list[int]:
+        """Keys of measurement ``k``, in the order of `variables`."""
+        index = int(self.keyframe[k])
+        return [key(v, index if v in DIMENSION else 0) for v in self.variables]
+
+    def innovations(self, state: State) -> Array:
+        """Measured minus predicted, shape (n, dim); ``state`` is at each one's keyframe."""
+        model = self.instrument.model
+        predicted, _ = model.predict(propagate(state, self.motion, self.gravity), self.rate_b)
+        return innovation(model, self.z, predicted)
+
+    def linearize(self, state: State) -> tuple[Array, Jacobians]:
+        """Whitened innovations and Jacobians at ``state`` (that of each keyframe).
+
+        Returns
+        -------
+        r : ndarray, shape (n, dim)
+        H : variable -> ndarray, shape (n, dim, dim of variable)
+        """
+        model, W = self.instrument.model, self.W
+        predicted, H_there = model.predict(propagate(state, self.motion, self.gravity), self.rate_b)
+        H = chain(H_there, state, self.motion)
+        r = np.einsum("nij,nj->ni", W, innovation(model, self.z, predicted))
+        return r, {v: W @ H[v] for v in self.variables}
+
+    def normalised(self, state: State) -> Array:
+        """Whitened innovations alone, shape (n, dim)."""
+        return np.einsum("nij,nj->ni", self.W, self.innovations(state))
+
+    def push(self, graph: gtsam.GaussianFactorGraph, state: State, weight: Array) -> None:
+        """Add the Jacobian factors of all measurements whose weight is not zero."""
+        r, H = self.linearize(state)
+        root = np.sqrt(weight)[:, None]
+        r, H = r * root, {v: h * root[..., None] for v, h in H.items()}
+        unit = gtsam.noiseModel.Unit.Create(r.shape[1])
+        for k in np.flatnonzero(weight):
+            terms = [(j, h[k]) for j, h in zip(self.keys(k), H.values(), strict=True)]
+            # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
+            graph.push_back(gtsam.GaussianConditional(terms, 1, r[k], unit))
+
+    def custom_factor(self, k: int = 0) -> gtsam.CustomFactor:
+        """Measurement ``k`` as a nonlinear factor that calls back into `linearize`."""
+        one, index = self.at(slice(k, k + 1)), int(self.keyframe[k])
+
+        def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+            r, jacobians = one.linearize(state_at(values, index, self.fixed, self.estimated))
+            if H is not None:
+                for place, jacobian in enumerate(jacobians.values()):
+                    H[place] = jacobian[0]
+            return -r[0]  # GTSAM's error is predicted minus measured
+
+        return gtsam.CustomFactor(robust_noise(self.instrument), self.keys(k), error)
+
+    def at(self, index: slice | Array) -> "Block":
+        """Some of the measurements."""
+        arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name in _PER_MEASUREMENT}
+        motion = Delta(*(getattr(self.motion, f.name)[index] for f in fields(Delta)))
+        return replace(self, **arrays, motion=motion)
+
+
+_PER_MEASUREMENT = ("keyframe", "time", "row", "z", "W", "rate_b")
+
+
+def make_block(
+    attached: Sequence[Attached],
+    instrument: Instrument,
+    gravity: float,
+    fixed: Mapping[str, Array],
+    estimated: Iterable[str],
+) -> Block:
+    """Stack measurements of one sensor; ``estimated`` are all calibration variables that are."""
+
+    def stack(name: str) -> Array:
+        return np.array([getattr(a, name) for a in attached])
+
+    delta = Delta(
+        *(np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp")), stack("bias")
+    )
+    own = tuple(v for v in estimated if v in instrument.model.calibration)
+    W = whitening(instrument, stack("sd"), stack("rate_sd"))
+    arrays = (stack("keyframe"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
+    return Block(instrument, *arrays, delta, gravity, fixed, own)
+
+
+def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
+    """Square-root information of measurements, the noise of the rate included.
+
+    Parameters
+    ----------
+    instrument : Instrument
+    sd : ndarray, shape (n, dim)
+    rate_sd : ndarray, shape (n,) [rad/s]
+
+    Returns
+    -------
+    ndarray, shape (n, dim, dim), lower triangular
+    """
+    gain = instrument.rate_gain
+    covariance = np.eye(sd.shape[1]) * sd[:, :, None] ** 2 + (gain @ gain.T) * rate_sd[:, None, None] ** 2
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def loss_threshold(loss: str, dim: int) -> float:
+    """Normalised length at which a loss bends: where 95 % of good measurements lie below."""
+    return float("inf") if loss == "none" else float(np.sqrt(chi2.ppf(0.95, dim)))
+
+
+def loss_and_weight(r: Array, loss: str) -> tuple[Array, Array]:
+    """Robust cost rho and weight rho'(d)/d of whitened innovations.
+
+    Parameters
+    ----------
+    r : ndarray, shape (n, dim)
+    loss : "none", "huber" or "cauchy"
+
+    Returns
+    -------
+    rho, weight : ndarray, shape (n,); for "none" rho = d^2 / 2
+    """
+    d2 = np.sum(r**2, axis=1)
+    k = loss_threshold(loss, r.shape[1])
+    if loss == "none":
+        return 0.5 * d2, np.ones(len(r))
+    if loss == "cauchy":
+        return 0.5 * k**2 * np.log1p(d2 / k**2), 1.0 / (1.0 + d2 / k**2)
+    d = np.sqrt(d2)
+    far = d > k
+    return np.where(far, k * (d - 0.5 * k), 0.5 * d2), np.where(far, k / np.maximum(d, k), 1.0)
+
+
+def robust_noise(instrument: Instrument) -> gtsam.noiseModel.Base:
+    """The same losses as GTSAM's noise models, for factors that are already whitened."""
+    dim, loss = instrument.model.dim, instrument.loss
+    unit, k = gtsam.noiseModel.Unit.Create(dim), loss_threshold(loss, dim)
+    if loss == "none":
+        return unit
+    kinds = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}
+    return gtsam.noiseModel.Robust.Create(kinds[loss].Create(k), unit)
