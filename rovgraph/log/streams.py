@@ -1,8 +1,8 @@
-"""A log: one sparse, wide CSV or Parquet file, read into one stream per sensor."""
+"""What a log is: one stream of measurements per sensor, in the order of time."""
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,15 @@ STREAMS: dict[str, tuple[str, ...]] = {
     "depth": ("depth",),
     "fix": ("fix_north", "fix_east", "fix_sd"),
 }
+OPTIONAL = frozenset({"ahrs_roll", "ahrs_pitch", "dvl_valid", "dvl_sd", "fix_sd"})
+LAT_LON = ("fix_lat", "fix_lon")
+COLUMNS = ("time", *(c for columns in STREAMS.values() for c in columns), *LAT_LON)
+THRUSTER = re.compile(r"thruster_[1-9]\d*")
+
+
+def is_column(name: str) -> bool:
+    """Whether a log may have a column of this name."""
+    return name in COLUMNS or THRUSTER.fullmatch(name) is not None
 
 
 class Measurement(NamedTuple):
@@ -91,10 +100,20 @@ class Log:
         return set(self.streams)
 
     def measurements(self) -> Iterator[Measurement]:
-        """All measurements in the order of time; at equal times the IMU comes first."""
-        raise NotImplementedError
+        """All measurements in the order of time; at equal times the IMU comes first, the DVL last."""
+        streams = sorted(self.streams.values(), key=_priority)
+        if not streams:
+            return
+        time = np.concatenate([s.time for s in streams])
+        which = np.repeat(np.arange(len(streams)), [len(s) for s in streams])
+        index = np.concatenate([np.arange(len(s)) for s in streams])
+        row = np.concatenate([s.row for s in streams])
+        order = np.argsort(time, kind="stable")
+        names, data = [s.sensor for s in streams], [s.data for s in streams]
+        columns = (a[order].tolist() for a in (time, which, index, row))
+        for t, k, i, line in zip(*columns, strict=True):
+            yield Measurement(t, names[k], data[k][i], line)
 
 
-def read_log(path: Path | str, columns: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None) -> Log:
-    """Read a log."""
-    raise NotImplementedError
+def _priority(stream: Stream) -> int:
+    return {"imu": 0, "dvl": 2}.get(stream.sensor, 1)

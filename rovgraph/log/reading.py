@@ -1,0 +1,304 @@
+"""From a file to streams: names, units, the order of time, one stream per sensor.
+
+What can be repaired is repaired and said in a `DataWarning`; what cannot is an `InputError`.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pymap3d
+from numpy.typing import NDArray
+
+from rovgraph.errors import DataWarning, InputError
+from rovgraph.geometry import Array
+from rovgraph.log.streams import COLUMNS, LAT_LON, OPTIONAL, STREAMS, THRUSTER, Log, Stream, is_column
+from rovgraph.log.table import Table, read_table
+from rovgraph.log.units import factors, near_miss, nearest
+
+STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
+ACC_GAP = 0.5  # accelerations further apart are not interpolated [s]
+
+Bools = NDArray[np.bool_]
+Lines = NDArray[np.int64]
+
+
+def read_log(path: Path | str, columns: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None) -> Log:
+    """Read a log.
+
+    Parameters
+    ----------
+    path : CSV, gzipped CSV or Parquet
+    columns : rovgraph's name -> the log's name, where they differ
+    units : column or group of columns -> unit, where it is not SI
+
+    Returns
+    -------
+    Log
+
+    Raises
+    ------
+    InputError : a file that cannot be worked with
+
+    Warns
+    -----
+    DataWarning : what was left out or put in order
+    """
+    table = read_table(path)
+    scale = factors(units or {}, table.source)
+    names = _names(table, columns or {})
+    cells = {name: _finite(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
+    cells, line = _in_order(cells, table.line, table.source)
+    origin = _add_local_fixes(cells, line, table.source)
+    streams = [_imu(cells, line, table.source)]
+    streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
+    streams += [_thruster(cells, line, table.source)]
+    found = {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}
+    if not found:
+        raise InputError(f"{table.source}: no measurement of any sensor in it; {_found(table.names)}")
+    return Log(table.source, found, origin)
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, DataWarning, stacklevel=3)
+
+
+def _found(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+    return f"columns found: {shown[:200]}"
+
+
+def _names(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
+    """rovgraph's name of each column in use -> its name in the file.
+
+    Raises
+    ------
+    InputError : unknown target, missing source, no time
+    """
+    for target, source in columns.items():
+        if not is_column(target):
+            raise InputError(f"{table.source}: columns: {target} is unknown, nearest is {nearest(target, COLUMNS)}")
+        if source not in table.names:
+            near = nearest(source, table.names)
+            raise InputError(f"{table.source}: columns: {target}: the log has no {source!r}, nearest is {near!r}")
+    names = {name: name for name in table.names if is_column(name)} | dict(columns)
+    if "time" not in names:
+        near = nearest("time", table.names)
+        raise InputError(
+            f"{table.source}: line 1: no column time; {_found(table.names)}; "
+            f"rename one or map it, as in columns: {{time: {near!r}}}"
+        )
+    taken = {*names, *names.values()}
+    for name in table.names:
+        meant = None if name in taken else near_miss(name, names)
+        if meant:
+            _warn(f"{table.source}: column {name!r} is ignored; if it is {meant}, rename it or map it under columns")
+    return names
+
+
+def _finite(table: Table, name: str, source: str) -> Array:
+    """A column with infinities taken as missing, shape (n,)."""
+    values = table.numbers(source)
+    infinite = np.flatnonzero(np.isinf(values))
+    if infinite.size:
+        _warn(
+            f"{table.source}: column {name}: {infinite.size} infinite, taken as missing; "
+            f"first in line {table.line[infinite[0]]}"
+        )
+        values = np.where(np.isinf(values), np.nan, values)
+    return values
+
+
+def _in_order(cells: dict[str, Array], line: Lines, source: str) -> tuple[dict[str, Array], Lines]:
+    """Rows in the order of time, those without a time left out.
+
+    Raises
+    ------
+    InputError : time goes back further than `STEP_BACK`, or no row has a time
+    """
+    timeless = np.isnan(cells["time"])
+    if timeless.any():
+        if timeless.all():
+            raise InputError(f"{source}: column time is empty, expected seconds in every row")
+        _warn(f"{source}: {timeless.sum()} rows without time left out, first in line {line[np.argmax(timeless)]}")
+        cells, line = {name: values[~timeless] for name, values in cells.items()}, line[~timeless]
+    time = cells["time"]
+    latest = np.maximum.accumulate(time)
+    late = np.flatnonzero(time < latest)
+    if not late.size:
+        return cells, line
+    worst = late[np.argmax(latest[late] - time[late] > STEP_BACK)]
+    if latest[worst] - time[worst] > STEP_BACK:
+        raise InputError(
+            f"{source}: line {line[worst]}: time goes back from {latest[worst]:.3f} to {time[worst]:.3f} s, "
+            f"expected steps back of at most {STEP_BACK:g} s; was the clock set, or are two dives in one file? Split it"
+        )
+    _warn(f"{source}: {late.size} rows behind the time before them, put in order; first in line {line[late[0]]}")
+    order = np.argsort(time, kind="stable")
+    return {name: values[order] for name, values in cells.items()}, line[order]
+
+
+def _add_local_fixes(cells: dict[str, Array], line: Lines, source: str) -> tuple[float, float] | None:
+    """Turn latitude and longitude into ``fix_north, fix_east``; the origin is the first fix.
+
+    Returns
+    -------
+    origin : latitude and longitude [deg], or None
+
+    Raises
+    ------
+    InputError : no angles in degrees
+    """
+    if not all(name in cells for name in LAT_LON):
+        return None
+    if "fix_north" in cells and "fix_east" in cells:
+        _warn(f"{source}: fix_lat and fix_lon are ignored beside fix_north and fix_east")
+        return None
+    lat, lon = (cells.pop(name) for name in LAT_LON)
+    wild = np.flatnonzero((np.abs(lat) > 90.0) | (np.abs(lon) > 360.0))
+    if wild.size:
+        raise InputError(
+            f"{source}: line {line[wild[0]]}: latitude {lat[wild[0]]:g}, longitude {lon[wild[0]]:g}, expected degrees; "
+            "if they are in units of 1e-7 degrees, say units: {fix: degE7}"
+        )
+    unset = (lat == 0.0) & (lon == 0.0)
+    if unset.any():
+        _warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0, no fix; left out")
+        lat[unset] = np.nan
+    valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
+    cells["fix_north"], cells["fix_east"] = lat * np.nan, lon * np.nan
+    if not valid.size:
+        return None
+    origin = float(lat[valid[0]]), float(lon[valid[0]])
+    north, east, _ = pymap3d.geodetic2ned(lat[valid], lon[valid], 0.0, *origin, 0.0)
+    cells["fix_north"][valid], cells["fix_east"][valid] = north, east
+    return origin
+
+
+def _select(
+    sensor: str, columns: Sequence[str], cells: dict[str, Array], line: Lines, source: str
+) -> tuple[Array, Bools] | None:
+    """Columns of a sensor and the rows in which all that are required are filled.
+
+    Returns
+    -------
+    data : ndarray, shape (n, k)
+    complete : ndarray of bool, shape (n,)
+    """
+    required = [c for c in columns if c not in OPTIONAL]
+    absent = [c for c in required if c not in cells]
+    if absent:
+        if len(absent) < len(required):
+            present = [c for c in required if c in cells]
+            _warn(f"{source}: {sensor} is left out: the log has {', '.join(present)} and no {', '.join(absent)}")
+        return None
+    data = np.column_stack([cells.get(c, np.full(len(line), np.nan)) for c in columns])
+    filled = ~np.isnan(data[:, [columns.index(c) for c in required]])
+    complete, partly = filled.all(axis=1), filled.any(axis=1)
+    if sensor == "dvl":
+        complete, partly = _pings(data, complete, partly, line, source)
+    partly &= ~complete
+    if partly.any():
+        _warn(
+            f"{source}: {sensor}: {partly.sum()} rows partly empty and left out, expected "
+            f"{', '.join(required)} together; first in line {line[np.argmax(partly)]}"
+        )
+    return data, complete
+
+
+def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str) -> tuple[Bools, Bools]:
+    """Rows that are pings, and rows with anything of a ping; validity becomes 0 or 1.
+
+    A ping without bottom lock needs no velocities.
+    """
+    valid = data[:, 3]
+    odd = np.flatnonzero(~np.isnan(valid) & (valid != 0.0) & (valid != 1.0))
+    if odd.size:
+        raise InputError(f"{source}: line {line[odd[0]]}, column dvl_valid: {valid[odd[0]]:g}, expected 0 or 1")
+    lost = valid == 0.0
+    partly = partly | (valid == 1.0)
+    valid[np.isnan(valid)] = 1.0
+    return complete | lost, partly
+
+
+def _stream(sensor: str, cells: dict[str, Array], line: Lines, source: str) -> Stream | None:
+    """The stream of any sensor but the IMU and the thrusters."""
+    columns = STREAMS[sensor]
+    selected = _select(sensor, columns, cells, line, source)
+    if selected is None:
+        return None
+    data, rows = selected
+    return Stream(sensor, columns, cells["time"][rows], data[rows], line[rows])
+
+
+def _thruster(cells: dict[str, Array], line: Lines, source: str) -> Stream | None:
+    """Drive signals, as many columns as the log has."""
+    columns = tuple(sorted((c for c in cells if THRUSTER.fullmatch(c)), key=lambda c: int(c.split("_")[1])))
+    selected = _select("thruster", columns, cells, line, source) if columns else None
+    if selected is None:
+        return None
+    data, rows = selected
+    return Stream("thruster", columns, cells["time"][rows], data[rows], line[rows])
+
+
+def _imu(cells: dict[str, Array], line: Lines, source: str) -> Stream | None:
+    """Samples at the gyro's times; where acceleration is on other rows, it is interpolated."""
+    columns, time = STREAMS["imu"], cells["time"]
+    present = [c for c in columns if c in cells]
+    if len(present) < 6:
+        if present:
+            absent = [c for c in columns if c not in cells]
+            _warn(f"{source}: imu is left out: the log has {', '.join(present)} and no {', '.join(absent)}")
+        return None
+    acc_gyr = (_select(name, part, cells, line, source) for name, part in (("acc", columns[:3]), ("gyr", columns[3:])))
+    (acc, with_acc), (gyr, with_gyr) = (part for part in acc_gyr if part is not None)
+    rows = np.flatnonzero(with_gyr)
+    data = np.hstack([acc, gyr])[rows]
+    alone = ~with_acc[rows]
+    if alone.any() and with_acc.any():
+        data[alone, :3], near = _interpolated(time[rows[alone]], time[with_acc], acc[with_acc])
+        lost = np.flatnonzero(alone)[~near]
+    else:
+        lost = np.flatnonzero(alone)
+    if lost.size:
+        _warn(
+            f"{source}: imu: {lost.size} rows with a rate and no acceleration near, left out; "
+            f"first in line {line[rows[lost[0]]]}"
+        )
+        rows, data = np.delete(rows, lost), np.delete(data, lost, axis=0)
+    return Stream("imu", columns, time[rows], data, line[rows])
+
+
+def _interpolated(at: Array, time: Array, values: Array) -> tuple[Array, Bools]:
+    """Linear interpolation, and whether there are values on both sides, close together.
+
+    Parameters
+    ----------
+    at : ndarray, shape (m,)
+    time, values : ndarray, shape (n,), (n, k)
+
+    Returns
+    -------
+    ndarray, shape (m, k); ndarray of bool, shape (m,)
+    """
+    out = np.column_stack([np.interp(at, time, column) for column in values.T])
+    after = np.searchsorted(time, at, side="left").clip(0, len(time) - 1)
+    before = (np.searchsorted(time, at, side="right") - 1).clip(0, len(time) - 1)
+    inside = (time[before] <= at) & (at <= time[after])
+    return out, inside & (time[after] - time[before] <= ACC_GAP)
+
+
+def _distinct_times(stream: Stream, source: str) -> Stream:
+    """A stream with one measurement at a time, the first."""
+    again = np.concatenate([[False], np.diff(stream.time) == 0.0])
+    if not again.any():
+        return stream
+    first = np.flatnonzero(~again)[np.cumsum(~again) - 1]
+    same = again & ((stream.data == stream.data[first]) | (np.isnan(stream.data) & np.isnan(stream.data[first]))).all(1)
+    for which, what in ((same, "repeated exactly, left out"), (again & ~same, "at the time of another, first kept")):
+        if which.any():
+            line = stream.row[np.argmax(which)]
+            _warn(f"{source}: {stream.sensor}: {which.sum()} measurements {what}; first in line {line}")
+    keep = ~again
+    return Stream(stream.sensor, stream.columns, stream.time[keep], stream.data[keep], stream.row[keep])

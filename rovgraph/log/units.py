@@ -1,0 +1,106 @@
+"""Units that a file may use, and names that may be misspelled.
+
+A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns
+(``gyr: deg/s``); everything becomes SI and radians.
+"""
+
+import difflib
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.log.streams import COLUMNS, STREAMS
+
+_DEG = float(np.deg2rad(1.0))
+_G = 9.80665  # standard gravity [m/s2]
+_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_ANGLE = {"rad": 1.0, "deg": _DEG}
+
+# kind of quantity -> unit -> factor to the unit used inside
+UNITS: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "acceleration": {"m/s2": 1.0, "m/s^2": 1.0, "g": _G, "mg": 1e-3 * _G},
+    "rate": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEG},
+    "field": {"uT": 1.0, "nT": 1e-3, "mG": 0.1, "gauss": 100.0},
+    "angle": _ANGLE,
+    "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "length": _LENGTH,
+    "latitude": {"deg": 1.0, "degE7": 1e-7, "rad": 1.0 / _DEG},
+}
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "time": ("time",),
+    "acc": STREAMS["imu"][:3],
+    "gyr": STREAMS["imu"][3:],
+    "mag": STREAMS["mag"],
+    "ahrs": STREAMS["ahrs"],
+    "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_sd"),
+    "dvl_heading": ("dvl_heading",),
+    "dvl_altitude": ("dvl_altitude",),
+    "depth": ("depth",),
+    "fix": ("fix_north", "fix_east", "fix_sd", "fix_lat", "fix_lon"),
+}
+
+_KIND_OF_GROUP = {
+    "time": "time",
+    "acc": "acceleration",
+    "gyr": "rate",
+    "mag": "field",
+    "ahrs": "angle",
+    "dvl": "speed",
+    "dvl_heading": "angle",
+    "dvl_altitude": "length",
+    "depth": "length",
+    "fix": "length",
+}
+KINDS: dict[str, str] = {c: _KIND_OF_GROUP[group] for group, columns in GROUPS.items() for c in columns}
+KINDS |= {"fix_lat": "latitude", "fix_lon": "latitude"}
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The known name most like ``name``, capitals and blanks aside; "" where nothing is known."""
+    plain = {k.strip().lower(): k for k in known}
+    near = difflib.get_close_matches(name.strip().lower(), plain, 1, cutoff=0.0)
+    return plain[near[0]] if near else ""
+
+
+def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
+    """Factor to SI and radians of each column that a unit was declared for.
+
+    Parameters
+    ----------
+    units : column or group -> unit; a column goes before its group
+    source : name of the log, for messages
+
+    Raises
+    ------
+    InputError : unknown column, group or unit, with the nearest known one
+    """
+    out: dict[str, float] = {}
+    for key, unit in sorted(units.items(), key=lambda item: item[0] in KINDS and item[0] not in GROUPS):
+        columns = GROUPS.get(key, (key,) if key in KINDS else ())
+        if not columns:
+            near = nearest(key, [*GROUPS, *KINDS])
+            raise InputError(f"{source}: units: {key} is no column or group that has a unit, nearest is {near}")
+        known = [unit for c in columns for unit in UNITS[KINDS[c]]]
+        if unit not in known:
+            raise InputError(
+                f"{source}: units: {key}: unknown unit {unit!r}, nearest is {nearest(unit, known)!r}; "
+                f"known are {', '.join(dict.fromkeys(known))}"
+            )
+        out |= {c: UNITS[KINDS[c]][unit] for c in columns if unit in UNITS[KINDS[c]]}
+    return out
+
+
+def near_miss(name: str, present: Iterable[str]) -> str | None:
+    """The known column that an unknown one was probably meant to be.
+
+    Parameters
+    ----------
+    name : unknown column
+    present : columns that the log has; one that is there was not misspelled
+    """
+    missing = set(COLUMNS) - set(present)
+    near = difflib.get_close_matches(name.strip().lower(), sorted(missing), 1, cutoff=0.79)
+    return near[0] if near else None
