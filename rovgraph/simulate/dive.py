@@ -1,0 +1,164 @@
+"""A simulated dive: a path, sampled by the same measurement models that estimators use.
+
+Each sensor is sampled at its own epochs by ``model.predict`` with the true state and the
+true calibration; noise and faults come on top. All randomness comes from one generator.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.config import mount_matrix
+from rovgraph.geometry import Array, rpy_from_matrix, wrap_angle
+from rovgraph.instruments import instruments
+from rovgraph.simulate.imu import specific_force_and_rate, to_imu_axes, walk, white
+from rovgraph.simulate.path import Motion, Path
+from rovgraph.simulate.truth import Truth
+from rovgraph.state import State
+from rovgraph.trajectory import Trajectory
+
+IMU_COLUMNS = ["acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z"]
+MAG_COLUMNS = ["mag_x", "mag_y", "mag_z"]
+DVL_COLUMNS = ["dvl_vx", "dvl_vy", "dvl_vz"]
+TIME_STEP = 1e-4  # resolution of the log's clock [s]
+AHRS_TILT_SD = float(np.deg2rad(0.5))  # noise of the unit's own roll and pitch [rad]
+
+
+@dataclass(frozen=True)
+class Dive:
+    """A simulated dive and its hidden truth.
+
+    Attributes
+    ----------
+    log_frame : the log, sparse and wide, columns of the log's contract, sorted by time
+    truth : Trajectory at the IMU's epochs, without uncertainty
+    hidden : "calibration": name -> ndarray, shape (dim,); "bias": ndarray, shape (n, 6), at
+        the epochs of ``truth``; "start_offset": ndarray, shape (3,) [m]
+    path : the path that was followed
+    """
+
+    log_frame: pd.DataFrame
+    truth: Trajectory
+    hidden: dict[str, Any]
+    path: Path
+
+
+def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
+    """Sample every sensor along a path.
+
+    Parameters
+    ----------
+    path : Path
+    truth : Truth
+    rng : numpy Generator; the same seed gives the same dive
+    """
+    calibration = truth.draw_calibration(rng)
+    bias_start, offset = truth.draw_bias(rng), truth.draw_start(rng)
+    path = path.shifted(offset)
+    time = np.round(np.arange(int(path.duration * truth.imu_rate + 1e-6) + 1) / truth.imu_rate, 4)
+    motion = path.motion(time)
+    bias = np.broadcast_to(bias_start, (len(time), 6))
+    if truth.noise:
+        bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
+    sample = _Sampler(truth, calibration, rng)
+    frames = [_inertial(sample, motion, bias), _pings(sample, path)]
+    frames += [make(sample, path) for make in (_depths, _attitudes, _fixes)]
+    log = pd.concat([f for f in frames if f is not None], ignore_index=True)
+    log = log.sort_values("time", kind="stable", ignore_index=True)
+    hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset}
+    return Dive(log, Trajectory.certain(time, motion.p_n, motion.R_nb, motion.v_n), hidden, path)
+
+
+class _Sampler:
+    """Samples the measurement models at the true state."""
+
+    def __init__(self, truth: Truth, calibration: Mapping[str, Array], rng: np.random.Generator) -> None:
+        self.truth, self.calibration, self.rng = truth, calibration, rng
+        self.instruments = instruments(truth.config)
+
+    def exact(self, sensor: str, motion: Motion) -> Array:
+        """The measurement without noise, shape (n, dim)."""
+        zero = np.zeros((len(motion), 6))
+        state = State(motion.R_nb, motion.p_n, motion.v_n, zero, self.calibration)
+        return self.instruments[sensor].model.predict(state, motion.w_b)[0]
+
+    def noisy(self, sensor: str, motion: Motion) -> Array:
+        """The measurement with the noise of the configuration, shape (n, dim)."""
+        z = self.exact(sensor, motion)
+        z = z + self.noise(self.instruments[sensor].sd, z.shape)
+        return wrap_angle(z) if self.instruments[sensor].model.angular else z
+
+    def noise(self, sd: Array | float, shape: tuple[int, ...]) -> Array:
+        """White noise, zero where the truth has none."""
+        draw = self.rng.standard_normal(shape)
+        return draw * sd if self.truth.noise else np.zeros(shape)
+
+    def epochs(self, path: Path, interval: float, jitter: float = 0.0) -> Array:
+        """Epochs of a sensor with its own clock: a random first one, then at intervals."""
+        count = int(path.duration / (interval * (1.0 - jitter))) + 2
+        steps = interval * (1.0 + jitter * self.rng.uniform(-1.0, 1.0, count))
+        steps[0] *= self.rng.uniform()
+        time = np.round(np.cumsum(steps) / TIME_STEP) * TIME_STEP
+        return np.round(time[time <= path.duration], 4)
+
+
+def _frame(time: Array, columns: list[str], values: Array) -> pd.DataFrame:
+    frame = pd.DataFrame(values, columns=pd.Index(columns))
+    frame.insert(0, "time", time)
+    return frame
+
+
+def _inertial(sample: _Sampler, motion: Motion, bias: Array) -> pd.DataFrame:
+    """Accelerometer, gyro and magnetometer, one row per sample."""
+    truth = sample.truth
+    values = to_imu_axes(specific_force_and_rate(motion, truth.config) + bias, truth.config)
+    if truth.noise:
+        values = values + white(truth.config.imu.noise, truth.imu_rate, len(motion), sample.rng)
+    return _frame(motion.time, IMU_COLUMNS + MAG_COLUMNS, np.hstack([values, sample.noisy("mag", motion)]))
+
+
+def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
+    """DVL velocity, its validity and its compass, one row per ping."""
+    truth, rng = sample.truth, sample.rng
+    motion = path.motion(sample.epochs(path, 1.0 / truth.dvl_rate, truth.dvl_jitter))
+    velocity = sample.exact("dvl", motion)
+    speed = np.linalg.norm(velocity, axis=1)[:, None]
+    sd = np.hypot(sample.instruments["dvl"].sd, truth.config.dvl.scale_sd * speed)
+    velocity = velocity + sample.noise(sd, velocity.shape)
+    wrong = (rng.uniform(size=len(motion)) < truth.outlier_share) & truth.noise
+    velocity[wrong] += truth.outlier_size * rng.standard_normal((int(wrong.sum()), 3))
+    frame = _frame(motion.time, DVL_COLUMNS, velocity)
+    lost = np.zeros(len(motion), bool)
+    for begin, end in truth.dropouts:
+        lost |= (motion.time >= begin) & (motion.time <= end)
+    frame.loc[lost, DVL_COLUMNS] = np.nan
+    frame["dvl_valid"] = pd.array(np.where(lost, 0, 1), dtype="Int64")
+    frame["dvl_heading"] = sample.noisy("dvl_heading", motion)[:, 0]
+    return frame
+
+
+def _depths(sample: _Sampler, path: Path) -> pd.DataFrame | None:
+    if sample.truth.depth_rate is None:
+        return None
+    motion = path.motion(sample.epochs(path, 1.0 / sample.truth.depth_rate))
+    return _frame(motion.time, ["depth"], sample.noisy("depth", motion))
+
+
+def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
+    """The inertial unit's own fused attitude: roll and pitch of its axes, a compass heading."""
+    if sample.truth.ahrs_rate is None:
+        return None
+    motion = path.motion(sample.epochs(path, 1.0 / sample.truth.ahrs_rate))
+    tilt = rpy_from_matrix(motion.R_nb @ mount_matrix(sample.truth.config.imu.mount_rpy_deg))[:, :2]
+    tilt = wrap_angle(tilt + sample.noise(AHRS_TILT_SD, tilt.shape))
+    return _frame(motion.time, ["ahrs_roll", "ahrs_pitch", "ahrs_yaw"], np.hstack([tilt, sample.noisy("ahrs", motion)]))
+
+
+def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
+    if sample.truth.fix_interval is None:
+        return None
+    motion = path.motion(sample.epochs(path, sample.truth.fix_interval))
+    return _frame(motion.time, ["fix_north", "fix_east"], sample.noisy("fix", motion))

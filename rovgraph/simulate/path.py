@@ -1,0 +1,216 @@
+"""A path: the smooth motion of the body's origin that a simulated dive follows.
+
+Position and roll, pitch, yaw are quintic splines in time, so that velocity, acceleration,
+angular rate and angular acceleration are their exact derivatives. With the Euler angles
+(r, p, y) of ``R_nb = Rz(y) Ry(p) Rx(r)`` the angular rate in body axes is
+
+    w_x = r' - y' sin p
+    w_y = p' cos r + y' cos p sin r
+    w_z = y' cos p cos r - p' sin r
+
+and the angular acceleration its derivative.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.ndimage import gaussian_filter1d
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, matrix_from_rpy
+from rovgraph.simulate.route import Route, timetable
+
+GRID_S = 0.1  # spacing of the splines' nodes
+TRUNCATE = 5.0  # reach of the smoothing, in its sd
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The body's motion at n epochs.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,) [s]
+    R_nb : ndarray, shape (n, 3, 3)
+    p_n, v_n, a_n : ndarray, shape (n, 3), of the body's origin [m, m/s, m/s^2]
+    w_b : ndarray, shape (n, 3), angular rate [rad/s], body axes
+    alpha_b : ndarray, shape (n, 3), angular acceleration [rad/s^2], body axes
+    """
+
+    time: Array
+    R_nb: Array
+    p_n: Array
+    v_n: Array
+    a_n: Array
+    w_b: Array
+    alpha_b: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Oscillation that waves add to a path.
+
+    Attributes
+    ----------
+    heave : amplitude [m]
+    roll, pitch : amplitude [rad]
+    frequency : [Hz]; 0.34 is what the thesis saw in the lake (3.1.4)
+    """
+
+    heave: float = 0.015
+    roll: float = float(np.deg2rad(0.6))
+    pitch: float = float(np.deg2rad(0.4))
+    frequency: float = 0.34
+
+    def at(self, time: Array, envelope: Array) -> Array:
+        """Heave, roll and pitch, shape (n, 3), under an envelope of shape (n,)."""
+        phase = 2.0 * np.pi * self.frequency * time[:, None] + np.array([0.0, 1.0, 2.5])
+        return envelope[:, None] * np.sin(phase) * np.array([self.heave, self.roll, self.pitch])
+
+
+CALM = Waves(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Path:
+    """Smooth motion of the body's origin from time 0 to ``duration``.
+
+    Attributes
+    ----------
+    spline : quintic spline of (north, east, down, roll, pitch, yaw) over time
+    duration : [s]
+    """
+
+    spline: BSpline
+    duration: float
+
+    @staticmethod
+    def through(time: Array, p_n: Array, rpy: Array) -> "Path":
+        """The path through given positions and attitudes, at rest at both ends.
+
+        Parameters
+        ----------
+        time : ndarray, shape (n,) [s], increasing from 0, n >= 6
+        p_n : ndarray, shape (n, 3) [m]
+        rpy : ndarray, shape (n, 3) [rad], yaw unwrapped
+        """
+        rest = [(1, np.zeros(6)), (2, np.zeros(6))]
+        spline = make_interp_spline(time, np.hstack([p_n, rpy]), k=5, bc_type=(rest, rest))
+        return Path(spline, float(time[-1]))
+
+    @cached_property
+    def _derivatives(self) -> tuple[BSpline, BSpline]:
+        return self.spline.derivative(1), self.spline.derivative(2)
+
+    def shifted(self, offset_n: ArrayLike) -> "Path":
+        """The same path begun elsewhere; ``offset_n`` has shape (3,) [m]."""
+        c = self.spline.c + np.concatenate([np.asarray(offset_n, float), np.zeros(3)])
+        return Path(BSpline(self.spline.t, c, self.spline.k), self.duration)
+
+    def motion(self, time: ArrayLike) -> Motion:
+        """The motion at ``time``, shape (n,), within 0 and ``duration`` [s]."""
+        t = np.asarray(time, float)
+        x, (first, second) = self.spline(t), (d(t) for d in self._derivatives)
+        rpy = x[:, 3:]
+        w_b, alpha_b = body_rates(rpy, first[:, 3:], second[:, 3:])
+        return Motion(t, matrix_from_rpy(rpy), x[:, :3], first[:, :3], second[:, :3], w_b, alpha_b)
+
+
+def body_rates(rpy: Array, first: Array, second: Array) -> tuple[Array, Array]:
+    """Angular rate and acceleration in body axes from the derivatives of the Euler angles.
+
+    Parameters
+    ----------
+    rpy, first, second : ndarray, shape (n, 3), roll, pitch, yaw and their derivatives
+
+    Returns
+    -------
+    w_b, alpha_b : ndarray, shape (n, 3) [rad/s, rad/s^2]
+    """
+    (sr, sp, _), (cr, cp, _) = np.sin(rpy).T, np.cos(rpy).T
+    dr, dp, dy = first.T
+    ddr, ddp, ddy = second.T
+    w_b = [dr - dy * sp, dp * cr + dy * cp * sr, dy * cp * cr - dp * sr]
+    turn = ddy * cp - dy * dp * sp  # derivative of y' cos p
+    alpha_b = [
+        ddr - ddy * sp - dy * dp * cp,
+        ddp * cr - dp * dr * sr + turn * sr + dy * dr * cp * cr,
+        turn * cr - dy * dr * cp * sr - ddp * sr - dp * dr * cr,
+    ]
+    return np.stack(w_b, axis=-1), np.stack(alpha_b, axis=-1)
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a vehicle follows a route.
+
+    Attributes
+    ----------
+    rest : time at rest before it sets off [s]
+    smoothing : sd of the Gaussian that rounds corners and ramps the speed [s]
+    turning : the same for yaw [s]
+    waves : Waves
+    """
+
+    rest: float = 10.0
+    smoothing: float = 1.2
+    turning: float = 2.0
+    waves: Waves = Waves()
+
+    @property
+    def lead(self) -> float:
+        """Time that smoothing needs before and after the motion [s]."""
+        return TRUNCATE * max(self.smoothing, self.turning)
+
+
+def path_along(route: Route, speed: float, duration: float, style: Style | None = None) -> Path:
+    """The path that follows a route at a speed, begins and ends at rest and lasts ``duration``.
+
+    A route that is not finished in time is cut short; one finished earlier ends in waiting.
+
+    Parameters
+    ----------
+    route : Route
+    speed : [m/s]
+    duration : [s]
+
+    Raises
+    ------
+    InputError : speed or duration not positive, or too short a duration to move at all
+    """
+    style = style or Style()
+    moving = moving_time(duration, style)
+    if not (np.isfinite(speed) and speed > 0):
+        raise InputError(f"speed of {speed} m/s: a positive number is expected")
+    nodes, p_n, yaw = timetable(route, speed)
+    time = np.linspace(0.0, duration, int(np.ceil(duration / GRID_S)) + 1)
+    on_route = np.clip(time - style.rest - style.lead, 0.0, moving)
+
+    def follow(column: Array, sd: float) -> Array:
+        raw = np.interp(on_route, nodes, column)
+        return np.asarray(gaussian_filter1d(raw, sd / (time[1] - time[0]), mode="nearest", truncate=TRUNCATE))
+
+    p_n = np.column_stack([follow(c, style.smoothing) for c in p_n.T])
+    heave, roll, pitch = style.waves.at(time, _envelope(time, duration, style)).T
+    p_n[:, 2] += heave
+    return Path.through(time, p_n, np.column_stack([roll, pitch, follow(yaw, style.turning)]))
+
+
+def moving_time(duration: float, style: Style) -> float:
+    """Time under way in a dive of ``duration``: without the rest and the ramps [s]."""
+    still = style.rest + 2.0 * style.lead
+    if not (np.isfinite(duration) and duration > still):
+        raise InputError(f"duration of {duration} s: at least {still + 1.0:.0f} s are needed, {still:.0f} s go to rest")
+    return duration - still
+
+
+def _envelope(time: Array, duration: float, style: Style) -> Array:
+    """0 at rest, 1 under way, a smooth step of ``lead`` seconds between."""
+    x = np.clip(np.minimum(time - style.rest, duration - time) / style.lead, 0.0, 1.0)
+    return np.asarray(x**3 * (10.0 - 15.0 * x + 6.0 * x**2))

@@ -1,0 +1,137 @@
+"""Dives to simulate, by name.
+
+A scenario is a function of duration and speed (either may be None for its default) and a
+`Style`; it returns a `Path` that begins at north = east = 0.
+"""
+
+import difflib
+from collections.abc import Callable
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.simulate.path import Path, Style, moving_time, path_along
+from rovgraph.simulate.route import Route
+
+Scenario = Callable[[float | None, float | None, Style], Path]
+VATTERN_END = (39.9, -33.7)  # north, east [m]: end of the thesis's reference path (4.3)
+
+
+def scenario(name: str, duration: float | None = None, speed: float | None = None, style: Style | None = None) -> Path:
+    """The path of a scenario.
+
+    Parameters
+    ----------
+    name : key of `SCENARIOS`
+    duration : [s], None = the scenario's own
+    speed : [m/s], None = the scenario's own
+
+    Raises
+    ------
+    InputError : no such scenario; a duration or speed that cannot be
+    """
+    if name not in SCENARIOS:
+        near = difflib.get_close_matches(name, SCENARIOS, 1)
+        hint = f", did you mean {near[0]}?" if near else ""
+        raise InputError(f"unknown scenario {name}{hint} Known: {', '.join(sorted(SCENARIOS))}")
+    return SCENARIOS[name](duration, speed, style or Style())
+
+
+def _endless(route: Route, default_speed: float, default_duration: float = 480.0) -> Scenario:
+    """A closed route, repeated until the time is over."""
+
+    def make(duration: float | None, speed: float | None, style: Style) -> Path:
+        duration = default_duration if duration is None else duration
+        speed = default_speed if speed is None else speed
+        moving = moving_time(duration, style)
+        rounds = 1 if not speed > 0 else int(np.ceil(moving / route.time(speed)))
+        return path_along(route.repeated(max(rounds, 1)), speed, duration, style)
+
+    return make
+
+
+def _once(route: Route, default_speed: float) -> Scenario:
+    """A route that is followed to its end; without a speed, at the speed that takes the time given."""
+
+    def make(duration: float | None, speed: float | None, style: Style) -> Path:
+        if speed is not None and not speed > 0:
+            raise InputError(f"speed of {speed} m/s: a positive number is expected")
+        still = style.rest + 2.0 * style.lead
+        if duration is None:
+            duration = float(np.ceil(route.time(speed or default_speed) + still))
+        moving = moving_time(duration, style) - route.pause[1:].sum()
+        fastest = route.time(1.0) - route.pause[1:].sum()  # metres, legs weighted by their pace
+        if moving <= 0 or (speed is not None and fastest / speed > moving + 1e-9):
+            raise InputError(
+                f"duration of {duration} s is too short to reach the end of the route: "
+                f"{np.ceil(route.time(speed or default_speed) + still):.0f} s at {speed or default_speed} m/s"
+            )
+        return path_along(route, speed or fastest / moving, duration, style)
+
+    return make
+
+
+def _straight(duration: float | None, speed: float | None, style: Style) -> Path:
+    """North, at constant speed until the time is over."""
+    duration, speed = 120.0 if duration is None else duration, 0.4 if speed is None else speed
+    length = max(speed, 0.0) * moving_time(duration, style)
+    return path_along(Route.of([(0, 0, 5), (length, 0, 5)]), speed, duration, style)
+
+
+def _ring(radius: float, sign: float) -> np.ndarray:
+    """Points of a circle that leaves the origin northwards, to starboard for sign +1."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 73)
+    return np.column_stack([radius * np.sin(angle), sign * radius * (1.0 - np.cos(angle)), np.full(73, 5.0)])
+
+
+def _lawnmower() -> Route:
+    """Six lanes of 25 m, 4 m apart, and back to the beginning."""
+    lanes = [(n, 4.0 * i, 8.0) for i in range(6) for n in ((0, 25) if i % 2 == 0 else (25, 0))]
+    return Route.of([*lanes, lanes[0]])
+
+
+def _falcon() -> Route:
+    """An inspection: out, round a structure at two depths, sideways along a wall, stops, back."""
+    rows = [
+        # north, east, down, pace and crab [deg] of the leg that ends here, pause [s]
+        (0, 0, 4, 1, 0, 0),
+        (9, 1, 4, 1, 0, 0),
+        (12, 8, 5, 1, 0, 6),
+        (4, 13, 7, 1.1, 0, 0),
+        (-5, 9, 7, 1.1, 0, 0),
+        (-7, 0, 7, 0.9, 0, 5),
+        (-7, 0, 9, 0.4, 0, 0),
+        (0, -6, 9, 1, 0, 0),
+        (8, -7, 9, 1, 90, 8),
+        (8, 0, 9, 0.6, 90, 4),
+        (3, 2, 8, 1, 0, 0),
+        (1, -3, 8, 1, 0, 0),
+        (6, -4, 8, 1, 0, 0),
+        (7, 3, 8, 1, 0, 0),
+        (16, 6, 6, 1.2, 0, 5),
+        (15, -5, 6, 1, -30, 0),
+        (5, -11, 6, 1, -30, 7),
+        (-4, -5, 5, 1.1, 0, 0),
+        (-3, 4, 5, 1, 0, 0),
+        (3, 3, 4, 0.8, 0, 5),
+        (0, 0, 4, 0.8, 0, 6),
+    ]
+    table = np.array(rows, float)
+    return Route.of(table[:, :3], table[1:, 3], table[:, 5], np.deg2rad(table[1:, 4]))
+
+
+def _vattern() -> Route:
+    """From the origin to the thesis's end point with a few bends on the way."""
+    bends = [(0, 0, 5), (8, 2, 5), (17, -6, 6), (18, -17, 7), (28, -21, 7), (34, -31, 6)]
+    return Route.of([*bends, (*VATTERN_END, 6)])
+
+
+SCENARIOS: dict[str, Scenario] = {
+    "falcon": _endless(_falcon(), 0.35),
+    "lawnmower": _endless(_lawnmower(), 0.4),
+    "square": _endless(Route.of([(0, 0, 5), (10, 0, 5), (10, 10, 5), (0, 10, 5), (0, 0, 5)]), 0.4),
+    "circle": _endless(Route.of(_ring(5.0, 1.0)), 0.4),
+    "figure8": _endless(Route.of(np.vstack([_ring(5.0, 1.0), _ring(5.0, -1.0)[1:]])), 0.4),
+    "straight": _straight,
+    "vattern": _once(_vattern(), 0.3),
+}

@@ -1,0 +1,79 @@
+"""What the simulated vehicle does, apart from what an estimator believes of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rovgraph.config import Config, beliefs
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The vehicle, its sensors and their faults.
+
+    Attributes
+    ----------
+    config : mountings, lever arms, noise and environment, taken as exact
+    calibration : true values by name, each of shape (dim,); what is not given is drawn from
+        the configuration's belief where it is estimated, and is the belief's mean elsewhere
+    bias : ndarray, shape (6,), bias at the first sample, accelerometer [m/s^2] and gyro
+        [rad/s], body axes; None = drawn from the configuration's sd
+    noise : False = no noise, no bias, no drawn calibration, no outliers
+    start_error : the dive begins off its planned start by a draw from the start's sd
+    imu_rate : [Hz]; the magnetometer has the same
+    dvl_rate : mean rate of the pings [Hz]
+    dvl_jitter : intervals between pings vary by up to this share
+    depth_rate, ahrs_rate : [Hz], None = no such sensor
+    fix_interval : [s], None = no fixes
+    outlier_share : part of the pings that are wrong
+    outlier_size : sd of the error of a wrong ping, every component [m/s]
+    dropouts : intervals (from, to) [s] without bottom lock
+    """
+
+    config: Config = field(default_factory=Config)
+    calibration: Mapping[str, Array] = field(default_factory=dict)
+    bias: Array | None = None
+    noise: bool = True
+    start_error: bool = False
+    imu_rate: float = 100.0
+    dvl_rate: float = 5.6
+    dvl_jitter: float = 0.1
+    depth_rate: float | None = 5.0
+    ahrs_rate: float | None = None
+    fix_interval: float | None = None
+    outlier_share: float = 0.0
+    outlier_size: float = 0.5
+    dropouts: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.outlier_share <= 1.0:
+            raise InputError(f"share of outliers {self.outlier_share}: between 0 and 1 is expected")
+        unknown = set(self.calibration) - set(beliefs(self.config))
+        if unknown:
+            raise InputError(f"unknown calibration variable {min(unknown)}")
+
+    def draw_calibration(self, rng: np.random.Generator) -> dict[str, Array]:
+        """True value of every calibration variable, shape (dim,) each."""
+        out = {}
+        for name, belief in beliefs(self.config).items():
+            draw = belief.sd * rng.standard_normal(belief.variable.dim)  # always, so that draws do not shift
+            value = belief.mean + draw if belief.estimate and self.noise else belief.mean
+            out[name] = np.array(self.calibration.get(name, value), float).reshape(belief.variable.dim)
+        return out
+
+    def draw_bias(self, rng: np.random.Generator) -> Array:
+        """Bias at the first sample, shape (6,)."""
+        imu = self.config.imu
+        sd = np.repeat([imu.acc_bias_sd_mps2, np.deg2rad(imu.gyr_bias_sd_dps)], 3)
+        draw = sd * rng.standard_normal(6)
+        if self.bias is not None:
+            return np.array(self.bias, float)
+        return draw if self.noise else np.zeros(6)
+
+    def draw_start(self, rng: np.random.Generator) -> Array:
+        """Offset of the true start from the planned one, shape (3,) [m]."""
+        draw = self.config.start.position_sd_m * rng.standard_normal(3)
+        return draw if self.start_error else np.zeros(3)
