@@ -87,7 +87,7 @@ def summarise(
         "assumptions": list(assumptions),
         "seconds": dict(seconds),
         "estimates": {
-            e.kind: {**_trajectory_numbers(e.trajectory), "sensors": sensor_counts(e.residuals), **e.summary}
+            e.kind: {**e.summary, **_trajectory_numbers(e.trajectory), "sensors": sensor_counts(e.residuals)}
             for e in estimates
         },
     }

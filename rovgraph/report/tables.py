@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
 from rich.table import Table
 
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
@@ -22,7 +24,12 @@ def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> 
     summary : what `write_results` returned
     """
     kinds = [e.kind for e in main_first(estimates)]
-    table = Table(title=f"{summary['name']}: {summary['log']}", title_justify="left")
+    table = Table(
+        title=escape(f"{summary['name']}: {summary['log']}"),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+    )
     table.add_column("")
     for kind in kinds:
         table.add_column(kind.replace("_", " "), justify="right")
@@ -35,20 +42,26 @@ def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> 
     table.add_row("end 99 % ellipse, semi-axes", *(_ellipse(n["end"]) for n in numbers), end_section=True)
     sensors = list(dict.fromkeys(s for n in numbers for s in n["sensors"]))
     for sensor in sensors:
-        table.add_row(f"{sensor} used / rejected", *(_counts(n["sensors"].get(sensor)) for n in numbers))
-    for sensor in sensors:
-        table.add_row(f"{sensor} mean square (1 = as believed)", *(_square(n["sensors"].get(sensor)) for n in numbers))
+        table.add_row(sensor, *(_counts(n["sensors"].get(sensor)) for n in numbers))
+    if sensors:
+        table.caption = "sensors: used / rejected / mean square of the innovations, 1 where the noise is as believed"
     return table
 
 
 def calibration_table(estimates: Sequence[Estimate]) -> Table:
     """Calibration of the leading estimate against what was believed before."""
     main = main_first(estimates)[0]
-    table = Table(title=f"calibration, {main.kind.replace('_', ' ')}", title_justify="left")
-    for heading in ("variable", "value ± sd", "prior", "moved", "sd narrowed"):
+    table = Table(
+        title=f"calibration, {main.kind.replace('_', ' ')}",
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+    )
+    for heading in ("variable", "value ± sd", "prior ± sd", "sd narrowed to"):
         table.add_column(heading, justify="left" if heading == "variable" else "right")
     for entry in sorted(main.calibration, key=lambda e: not e.estimated):
-        table.add_row(entry.label, *_calibration_cells(entry), style="" if entry.estimated else "dim")
+        tail = f" [{shown(entry.unit)[1]}]" if entry.unit != "1" else ""
+        table.add_row(escape(entry.label + tail), *_calibration_cells(entry), style="" if entry.estimated else "dim")
     if any(narrowing(e) > HARDLY for e in main.calibration):
         table.caption = "hardly: this dive says little about it, the value is mostly the prior"
     return table
@@ -65,17 +78,16 @@ def duration(seconds: float | None) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
 
-def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:
-    factor, unit = shown(entry.unit)
+def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str]:
+    factor = shown(entry.unit)[0]
     value, sd, mean, prior_sd = (factor * x for x in (entry.value, entry.sd, entry.prior_mean, entry.prior_sd))
     if not entry.estimated:
-        return plus_minus(value, 0.0, unit), "held", "", ""
+        return plus_minus(value, 0.0), "", "held"
     ratio = narrowing(entry)
-    moved = f"{(value - mean) / prior_sd:+.1f} sd" if prior_sd > 0 else ""
-    narrowed = "unknown" if not np.isfinite(ratio) else f"to {100 * ratio:.2g} %"
+    narrowed = "unknown" if not np.isfinite(ratio) else f"{100 * ratio:.2g} %"
     if ratio > HARDLY:
-        narrowed = f"hardly (to {100 * min(ratio, 1.0):.0f} %)"
-    return plus_minus(value, sd, unit), plus_minus(mean, prior_sd, unit), moved, narrowed
+        narrowed = f"hardly, {100 * ratio:.0f} %"
+    return plus_minus(value, sd), plus_minus(mean, prior_sd), narrowed
 
 
 def _number(value: float | None) -> float:
@@ -92,9 +104,7 @@ def _ellipse(end: Mapping[str, Any]) -> str:
 
 
 def _counts(sensor: Mapping[str, Any] | None) -> str:
-    return "–" if sensor is None else f"{sensor['used']} / {sensor['rejected']}"
-
-
-def _square(sensor: Mapping[str, Any] | None) -> str:
-    value = None if sensor is None else sensor["mean_square_normalised"]
-    return "–" if value is None else f"{value:.2f}"
+    if sensor is None:
+        return "–"
+    fit = sensor["mean_square_normalised"]
+    return f"{sensor['used']} / {sensor['rejected']} / {'–' if fit is None else f'{fit:.2f}'}"

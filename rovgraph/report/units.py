@@ -33,5 +33,17 @@ def plus_minus(value: float, sd: float, unit: str = "") -> str:
 
 def key_suffix(unit: str) -> str:
     """The ending of a JSON key or name for a shown unit: ``_deg``, ``_mps2``; "" for a ratio."""
-    plain = unit.replace("m/s^2", "mps2").replace("m/s", "mps").replace("deg/s", "dps").replace("/", "_per_")
-    return "" if unit in ("", "1") else "_" + plain.replace("^", "")
+    plain = (
+        unit.replace("^", "")
+        .replace("m/s2", "mps2")
+        .replace("m/s", "mps")
+        .replace("deg/s", "dps")
+        .replace("/", "_per_")
+    )
+    return "" if unit in ("", "1") else "_" + plain
+
+
+def nice_step(seconds: float) -> float:
+    """The round time step at or above ``seconds``, such as 15 s, 2 min, 1 h."""
+    steps = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600)
+    return next((float(s) for s in steps if s >= seconds), float(3600 * np.ceil(seconds / 3600)))

@@ -1,0 +1,142 @@
+"""Velocity and attitude against time."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rovgraph.config import Config, beliefs, mount_matrix
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.geometry import Array, matrix_from_rpy, rotate
+from rovgraph.log import Log
+from rovgraph.report.style import Clock, broken, legend_below, line_of, name_of, new_figure, thin
+from rovgraph.trajectory import Trajectory
+
+SOURCES: dict[str, tuple[str, dict[str, Any]]] = {
+    "ahrs": ("AHRS heading", {"marker": ".", "color": "#999999"}),
+    "dvl_heading": ("DVL compass", {"marker": "x", "color": "#009E73", "mew": 0.5}),
+    "mag": ("magnetometer", {"marker": "+", "color": "#E69F00", "mew": 0.5}),
+}
+MOST_SAMPLES = 1500  # of a heading source
+
+
+def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
+    """Velocity north, east, down and speed over ground, with ±2 sd."""
+    figure = new_figure(7.2)
+    panels: list[Axes] = list(figure.subplots(4, 1, sharex=True))
+    clock = Clock.of(estimates[0])
+    for estimate in estimates:
+        track = estimate.trajectory
+        speed, speed_sd = _speed(track)
+        values, sds = np.column_stack([track.v_n, speed]), np.column_stack([track.v_sd, speed_sd])
+        some = thin(len(track))
+        for axes, value, sd in zip(panels, values[some].T, sds[some].T, strict=True):
+            _line_and_band(axes, clock(track.time[some]), value, sd, estimate.kind)
+    for axes, name in zip(panels, ("north", "east", "down", "speed"), strict=True):
+        axes.set_ylabel(f"{name} [m/s]")
+    panels[3].set_ylim(bottom=0.0)
+    panels[0].set_title("velocity over ground, bands ±2 sd", loc="left")
+    clock.name_axis(panels[3])
+    figure.align_ylabels()
+    legend_below(figure, panels)
+    return figure
+
+
+def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
+    """Roll, pitch and heading with ±2 sd, and what the compasses said."""
+    figure = new_figure(6.6)
+    panels: list[Axes] = list(figure.subplots(3, 1, sharex=True, height_ratios=(1, 1, 1.7)))
+    main, clock = estimates[0], Clock.of(estimates[0])
+    low = _lower_end(main.trajectory)
+    for sensor, (time, heading) in heading_samples(main.trajectory, log, config).items():
+        label, look = SOURCES[sensor]
+        panels[2].plot(clock(time), _within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
+    for estimate in estimates:
+        track, some = estimate.trajectory, thin(len(estimate.trajectory))
+        time, rpy, sd = clock(track.time[some]), np.rad2deg(track.rpy[some]), np.rad2deg(track.rpy_sd[some])
+        for i in (0, 1):
+            _line_and_band(panels[i], time, rpy[:, i], sd[:, i], estimate.kind)
+        turned, heading, spread = broken(time, _within(track.rpy[some, 2], low), sd[:, 2])
+        _line_and_band(panels[2], turned, heading, spread, estimate.kind)
+    for axes, name in zip(panels, ("roll", "pitch", "heading"), strict=True):
+        axes.set_ylabel(f"{name} [deg]")
+    _limit_heading(panels[2], low)
+    panels[0].set_title("attitude, bands ±2 sd; compasses without their deviation", loc="left")
+    clock.name_axis(panels[2])
+    figure.align_ylabels()
+    legend_below(figure, panels, 5, 2.0)
+    return figure
+
+
+def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tuple[Array, Array]]:
+    """True heading of the body as each compass has it, before any deviation is taken off.
+
+    Instruments are taken as level: their mounting turns the heading by the azimuth of
+    their x axis. The magnetometer is levelled with the estimate's roll and pitch.
+
+    Returns
+    -------
+    sensor -> (time [s], heading [rad]), each ndarray, shape (m,)
+    """
+    prior = beliefs(config)
+    R_dvl = matrix_from_rpy([float(prior[f"dvl_{angle}"].mean[0]) for angle in ("roll", "pitch", "yaw")])
+    R_imu = mount_matrix(config.imu.mount_rpy_deg)
+    declination = np.deg2rad(config.environment.declination_deg)
+    out = {}
+    for sensor, column, R_bs in (("ahrs", "ahrs_yaw", R_imu), ("dvl_heading", "dvl_heading", R_dvl)):
+        if sensor in log:
+            some = thin(len(log[sensor]), MOST_SAMPLES)
+            azimuth = np.arctan2(R_bs[1, 0], R_bs[0, 0])
+            out[sensor] = (log[sensor].time[some], log[sensor][column][some] + declination - azimuth)
+    if "mag" in log:
+        some = thin(len(log["mag"]), MOST_SAMPLES)
+        time = log["mag"].time[some]
+        out["mag"] = (time, _levelled(track.at(time), rotate(R_imu, log["mag"].data[some])) + declination)
+    return out
+
+
+def _levelled(track: Trajectory, field_b: Array) -> Array:
+    """Magnetic heading from a field in body axes at the attitudes of a track [rad]."""
+    rpy = track.rpy
+    level = rotate(matrix_from_rpy(np.column_stack([rpy[:, :2], np.zeros(len(rpy))])), field_b)
+    return np.arctan2(-level[:, 1], level[:, 0])
+
+
+def _speed(track: Trajectory) -> tuple[Array, Array]:
+    """Horizontal speed and its sd [m/s]."""
+    v = track.v_n[:, :2]
+    speed = np.linalg.norm(v, axis=1)
+    along = v / np.maximum(speed, 1e-6)[:, None]
+    variance = np.einsum("ni,nij,nj->n", along, track.cov_v[:, :2, :2], along)
+    return speed, np.sqrt(np.clip(variance, 0.0, None))
+
+
+def _line_and_band(axes: Axes, time: Array, value: Array, sd: Array, kind: str) -> None:
+    look = line_of(kind)
+    axes.plot(time, value, label=name_of(kind), **look)
+    if np.isfinite(sd).any():
+        band = {"color": look["color"], "alpha": 0.18, "linewidth": 0, "zorder": look["zorder"] - 2}
+        axes.fill_between(time, value - 2 * sd, value + 2 * sd, **band)
+
+
+def _lower_end(track: Trajectory) -> float:
+    """Lower end of the heading axis [deg], 0 or -180, whichever breaks the line less often."""
+    jumps = {low: np.sum(np.abs(np.diff(_within(track.rpy[:, 2], low))) > 180.0) for low in (0.0, -180.0)}
+    return min(jumps, key=lambda low: jumps[low])
+
+
+def _within(heading: Array, low: float) -> Array:
+    """Heading [rad] in degrees from ``low`` to ``low + 360``."""
+    degrees: Array = (np.rad2deg(heading) - low) % 360.0 + low
+    return degrees
+
+
+def _limit_heading(axes: Axes, low: float) -> None:
+    """No axis beyond one turn; over most of a turn, all of it with ticks at the quarters."""
+    bottom, top = np.clip(axes.get_ylim(), low, low + 360.0)
+    if top - bottom > 220.0:
+        bottom, top = low, low + 360.0
+        axes.set_yticks(np.arange(low, low + 361.0, 90.0))
+    axes.set_ylim(bottom, top)

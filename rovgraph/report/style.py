@@ -1,0 +1,172 @@
+"""How all figures look: sizes, colours that the colour-blind and a grey print keep apart, time axes."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.geometry import Array
+
+DPI = 150
+WIDTH = 7.2  # [in], the text width of a page
+MOST_POINTS = 5000  # of a line; more cannot be seen
+
+# Okabe and Ito's colours, and a line style for each, so that grey prints can be read
+LINES: dict[str, dict[str, Any]] = {
+    "smoothed": {"color": "#0072B2", "linestyle": "-", "linewidth": 1.2, "zorder": 4},
+    "filtered": {"color": "#D55E00", "linestyle": (0, (4, 1.5)), "linewidth": 1.0, "zorder": 3},
+    "dead_reckoning": {"color": "#888888", "linestyle": (0, (1, 1.2)), "linewidth": 1.0, "zorder": 2},
+    "reference": {"color": "black", "linestyle": (0, (6, 1.5, 1, 1.5)), "linewidth": 0.9, "zorder": 5},
+}
+OTHER: dict[str, Any] = {"color": "#CC79A7", "linestyle": "-.", "linewidth": 1.0, "zorder": 2}
+USED, REJECTED, UNUSED = "#009E73", "#A3206B", "#AAAAAA"
+PRIOR = "#ECE7DA"
+
+_RC: dict[str, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "lines.solid_capstyle": "round",
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-3, 5),
+    "axes.formatter.use_mathtext": True,
+}
+
+
+@contextlib.contextmanager
+def style() -> Iterator[None]:
+    """The look of our figures, whatever the user's matplotlibrc says; restored afterwards."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_RC)  # type: ignore[arg-type]
+        yield
+
+
+def new_figure(height: float, width: float = WIDTH) -> Figure:
+    """An empty figure without pyplot's global state; sizes in inches."""
+    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a PNG."""
+    figure.savefig(path, dpi=DPI, metadata={"Software": "rovgraph"})
+    return path
+
+
+def line_of(kind: str) -> dict[str, Any]:
+    """Colour, style and width of an estimate's lines."""
+    return LINES.get(kind, OTHER)
+
+
+def name_of(kind: str) -> str:
+    """An estimate's name in a legend."""
+    return kind.replace("_", " ")
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Time since the start, in seconds or, for long dives, minutes.
+
+    Attributes
+    ----------
+    start, end : [s], in the log's epoch
+    """
+
+    start: float
+    end: float
+
+    @staticmethod
+    def of(estimate: Estimate) -> "Clock":
+        """The clock of an estimate's trajectory."""
+        return Clock(float(estimate.trajectory.time[0]), float(estimate.trajectory.time[-1]))
+
+    @property
+    def minutes(self) -> bool:
+        return self.end - self.start > 1200.0
+
+    @property
+    def label(self) -> str:
+        return "time since start [min]" if self.minutes else "time since start [s]"
+
+    def __call__(self, time: Array) -> Array:
+        return (np.asarray(time, float) - self.start) / (60.0 if self.minutes else 1.0)
+
+    def name_axis(self, axes: Axes) -> None:
+        """Name and limit a time axis."""
+        low, high = self(np.array([self.start, self.end]))
+        axes.set_xlabel(self.label)
+        if high > low:
+            axes.set_xlim(low, high)
+
+
+def thin(n: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
+    """At most ``most`` indices spread over n, both ends kept."""
+    if n <= most:
+        return np.arange(n)
+    return np.linspace(0, n - 1, most).round().astype(np.int64)
+
+
+def broken(time: Array, angle_deg: Array, *others: Array) -> tuple[Array, ...]:
+    """Lines of a wrapped angle with NaN put in where it jumps, so that no line crosses.
+
+    Parameters
+    ----------
+    time, angle_deg, others : ndarray, shape (n,)
+
+    Returns
+    -------
+    the same arrays, longer by the number of jumps
+    """
+    at = np.flatnonzero(np.abs(np.diff(angle_deg)) > 180.0) + 1
+    return tuple(np.insert(np.asarray(x, float), at, np.nan) for x in (time, angle_deg, *others))
+
+
+def panel_grid(figure: Figure, count: int, columns: int) -> list[Axes]:
+    """``count`` panels, row by row, with one common time axis."""
+    lines = -(-count // columns)
+    grid = figure.subplots(lines, columns, sharex=True, squeeze=False)
+    panels: list[Axes] = list(grid.flat)
+    for axes in panels[count:]:
+        axes.remove()
+    return panels[:count]
+
+
+def name_lowest(panels: Sequence[Axes], columns: int, clock: Clock) -> None:
+    """Name the time axis under the lowest panel of every column."""
+    for axes in panels[-columns:]:
+        clock.name_axis(axes)
+        axes.tick_params(labelbottom=True)
+
+
+def legend_below(figure: Figure, panels: Sequence[Axes], ncols: int = 4, scale: float = 1.0) -> None:
+    """One legend under all panels: everything that occurs in any of them, once."""
+    found: dict[str, Artist] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    if found:
+        look = {"ncols": ncols, "markerscale": scale, "handlelength": 2.6, "columnspacing": 1.6}
+        figure.legend(found.values(), found.keys(), loc="outside lower center", **look)
