@@ -5,7 +5,7 @@ v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``. TUM files
 ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +77,11 @@ class Trajectory:
         """Length of the track over ground [m]."""
         return float(np.linalg.norm(np.diff(self.p_n, axis=0), axis=1).sum())
 
+    def every(self, step: int) -> "Trajectory":
+        """Every ``step``-th epoch and the last one."""
+        index = np.unique(np.append(np.arange(0, len(self), step), len(self) - 1))
+        return Trajectory(*(getattr(self, f.name)[index] for f in fields(self)))
+
     def at(self, time: Array) -> "Trajectory":
         """Interpolated to ``time`` (linear; rotations along the shortest arc).
 
@@ -105,8 +110,8 @@ class Trajectory:
         return frame
 
     def write_csv(self, path: Path) -> None:
-        """Write the columns of the contract; time to the millisecond's tenth."""
-        frame = self.to_frame()
+        """Write the columns of the contract that are known; time to the millisecond's tenth."""
+        frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
         frame["time"] = frame["time"].map("{:.4f}".format)
         frame.to_csv(path, index=False, float_format="%.7g")
 

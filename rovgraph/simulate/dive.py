@@ -65,8 +65,8 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
     sample = _Sampler(truth, calibration, rng)
     frames = [_inertial(sample, motion, bias), _pings(sample, path)]
-    frames += [make(sample, path) for make in (_depths, _attitudes, _fixes)]
-    log = pd.concat([f for f in frames if f is not None], ignore_index=True)
+    frames += [f for make in (_depths, _attitudes, _fixes) if (f := make(sample, path)) is not None]
+    log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
     hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset}
     return Dive(log, Trajectory.certain(time, motion.p_n, motion.R_nb, motion.v_n), hidden, path)

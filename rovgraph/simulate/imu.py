@@ -67,7 +67,8 @@ def walk(start: Array, noise: ImuNoise, rate: float, n: int, rng: np.random.Gene
 
 def white(noise: ImuNoise, rate: float, n: int, rng: np.random.Generator) -> Array:
     """White noise of n samples at ``rate`` [Hz]: density times root rate; shape (n, 6)."""
-    return np.repeat([noise.acc, noise.gyr], 3) * np.sqrt(rate) * rng.standard_normal((n, 6))
+    sd = np.repeat([noise.acc, noise.gyr], 3) * np.sqrt(rate)
+    return np.asarray(sd * rng.standard_normal((n, 6)))
 
 
 def to_imu_axes(values_b: Array, config: Config) -> Array:

@@ -11,13 +11,11 @@ angular rate and angular acceleration are their exact derivatives. With the Eule
 and the angular acceleration its derivative.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
-from scipy.ndimage import gaussian_filter1d
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
@@ -71,7 +69,8 @@ class Waves:
     def at(self, time: Array, envelope: Array) -> Array:
         """Heave, roll and pitch, shape (n, 3), under an envelope of shape (n,)."""
         phase = 2.0 * np.pi * self.frequency * time[:, None] + np.array([0.0, 1.0, 2.5])
-        return envelope[:, None] * np.sin(phase) * np.array([self.heave, self.roll, self.pitch])
+        amplitude = np.array([self.heave, self.roll, self.pitch])
+        return np.asarray(envelope[:, None] * np.sin(phase) * amplitude)
 
 
 CALM = Waves(0.0, 0.0, 0.0)
@@ -85,10 +84,12 @@ class Path:
     ----------
     spline : quintic spline of (north, east, down, roll, pitch, yaw) over time
     duration : [s]
+    offset_n : ndarray, shape (3,), added to the spline's positions [m]
     """
 
     spline: BSpline
     duration: float
+    offset_n: Array = field(default_factory=lambda: np.zeros(3))
 
     @staticmethod
     def through(time: Array, p_n: Array, rpy: Array) -> "Path":
@@ -104,22 +105,18 @@ class Path:
         spline = make_interp_spline(time, np.hstack([p_n, rpy]), k=5, bc_type=(rest, rest))
         return Path(spline, float(time[-1]))
 
-    @cached_property
-    def _derivatives(self) -> tuple[BSpline, BSpline]:
-        return self.spline.derivative(1), self.spline.derivative(2)
-
     def shifted(self, offset_n: ArrayLike) -> "Path":
         """The same path begun elsewhere; ``offset_n`` has shape (3,) [m]."""
-        c = self.spline.c + np.concatenate([np.asarray(offset_n, float), np.zeros(3)])
-        return Path(BSpline(self.spline.t, c, self.spline.k), self.duration)
+        return replace(self, offset_n=self.offset_n + np.asarray(offset_n, float))
 
     def motion(self, time: ArrayLike) -> Motion:
         """The motion at ``time``, shape (n,), within 0 and ``duration`` [s]."""
         t = np.asarray(time, float)
-        x, (first, second) = self.spline(t), (d(t) for d in self._derivatives)
+        x, first, second = (self.spline(t, nu) for nu in range(3))
         rpy = x[:, 3:]
         w_b, alpha_b = body_rates(rpy, first[:, 3:], second[:, 3:])
-        return Motion(t, matrix_from_rpy(rpy), x[:, :3], first[:, :3], second[:, :3], w_b, alpha_b)
+        p_n = x[:, :3] + self.offset_n
+        return Motion(t, matrix_from_rpy(rpy), p_n, first[:, :3], second[:, :3], w_b, alpha_b)
 
 
 def body_rates(rpy: Array, first: Array, second: Array) -> tuple[Array, Array]:
@@ -193,13 +190,24 @@ def path_along(route: Route, speed: float, duration: float, style: Style | None 
     on_route = np.clip(time - style.rest - style.lead, 0.0, moving)
 
     def follow(column: Array, sd: float) -> Array:
-        raw = np.interp(on_route, nodes, column)
-        return np.asarray(gaussian_filter1d(raw, sd / (time[1] - time[0]), mode="nearest", truncate=TRUNCATE))
+        return smoothed(np.interp(on_route, nodes, column), sd / (time[1] - time[0]))
 
     p_n = np.column_stack([follow(c, style.smoothing) for c in p_n.T])
     heave, roll, pitch = style.waves.at(time, _envelope(time, duration, style)).T
     p_n[:, 2] += heave
     return Path.through(time, p_n, np.column_stack([roll, pitch, follow(yaw, style.turning)]))
+
+
+def smoothed(x: Array, sd: float) -> Array:
+    """Convolution with a Gaussian of ``sd`` samples; beyond its ends ``x`` stays constant.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+    """
+    reach = int(np.ceil(TRUNCATE * sd))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sd) ** 2)
+    return np.convolve(np.pad(x, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
 
 
 def moving_time(duration: float, style: Style) -> float:

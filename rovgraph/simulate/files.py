@@ -1,0 +1,81 @@
+"""A simulated dive as files.
+
+``log.csv`` what the vehicle recorded, ``config.yaml`` what an estimator may know,
+``truth.csv`` and ``truth.json`` what it may not, ``summary.json`` what was made.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.config import Config
+from rovgraph.simulate.dive import Dive
+
+TRUTH_RATE = 10.0  # rows per second of truth.csv
+DECIMALS = {"time": 4, "acc": 4, "gyr": 5, "mag": 4, "ahrs": 5, "dvl": 4, "dvl_heading": 5, "depth": 3, "fix": 3}
+
+
+def write_dive(folder: Path, dive: Dive, config: Config, summary: dict[str, Any]) -> None:
+    """Write all files of a dive into an existing folder.
+
+    Parameters
+    ----------
+    folder : Path
+    dive : Dive
+    config : the configuration that the dive was simulated with; the start that is written
+        is the planned one
+    summary : what ``summary.json`` says beside the figures of the dive
+    """
+    write_log(dive.log_frame, folder / "log.csv")
+    step = max(round(1.0 / (TRUTH_RATE * float(np.median(np.diff(dive.truth.time))))), 1)
+    dive.truth.every(step).write_csv(folder / "truth.csv")
+    (folder / "config.yaml").write_text(known(dive, config).to_yaml(), encoding="utf-8")
+    _write_json(folder / "truth.json", secrets(dive))
+    _write_json(folder / "summary.json", {**summary, **figures(dive)})
+
+
+def write_log(log_frame: pd.DataFrame, path: Path) -> None:
+    """Write a log as CSV (compressed where the name ends in .gz), rounded below its noise."""
+    decimals = {c: DECIMALS.get(c, DECIMALS.get(c.split("_")[0], 6)) for c in log_frame.columns}
+    decimals.pop("dvl_valid", None)
+    log_frame.round(decimals).to_csv(path, index=False)
+
+
+def known(dive: Dive, config: Config) -> Config:
+    """The configuration with the planned start of the dive, as an estimator knows it."""
+    north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
+    start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
+    return config.model_copy(update={"start": start})
+
+
+def secrets(dive: Dive) -> dict[str, Any]:
+    """What an estimator must not know: calibration, biases and the start's error."""
+    return {
+        "units": "radians and SI; bias: accelerometer x y z, gyro x y z, body axes",
+        "calibration": {name: value.tolist() for name, value in dive.hidden["calibration"].items()},
+        "bias_first": dive.hidden["bias"][0].tolist(),
+        "bias_last": dive.hidden["bias"][-1].tolist(),
+        "start_offset_m": dive.hidden["start_offset"].tolist(),
+    }
+
+
+def figures(dive: Dive) -> dict[str, Any]:
+    """Length of the dive and number of measurements of each sensor."""
+    log = dive.log_frame
+    first = {"imu": "acc_x", "dvl": "dvl_vx", "dvl_heading": "dvl_heading", "mag": "mag_x", "depth": "depth"}
+    first |= {"ahrs": "ahrs_yaw", "fix": "fix_north"}
+    counts = {sensor: int(log[c].notna().sum()) for sensor, c in first.items() if c in log}
+    moved = dive.truth.p_n.max(axis=0) - dive.truth.p_n.min(axis=0)
+    return {
+        "duration_s": float(dive.truth.time[-1] - dive.truth.time[0]),
+        "distance_m": round(dive.truth.distance, 3),
+        "extent_m": np.round(moved, 3).tolist(),
+        "measurements": counts,
+    }
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
