@@ -66,6 +66,7 @@ def _gather(estimates: Sequence[Estimate]) -> dict[str, tuple[str, list[_Curve]]
     for estimate in estimates:
         for variable, history in estimate.history.items():
             factor, unit = shown(history.unit)
+            unit = unit.replace("s2", "s²")
             some = thin(len(history.time))
             for i, label in enumerate(history_labels(variable, history)):
                 value, sd = factor * history.value[some, i], factor * history.sd[some, i]

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.geometry import Array, matrix_from_rpy, rotate
+from rovgraph.geometry import Array, matrix_from_rpy, rotate, wrap_angle
 from rovgraph.log import Log
 from rovgraph.report.style import Clock, broken, legend_below, line_of, name_of, new_figure, thin
 from rovgraph.trajectory import Trajectory
@@ -46,28 +46,38 @@ def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
 
 def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Figure:
     """Roll, pitch and heading with ±2 sd, and what the compasses said."""
-    figure = new_figure(6.6)
-    panels: list[Axes] = list(figure.subplots(3, 1, sharex=True, height_ratios=(1, 1, 1.7)))
     main, clock = estimates[0], Clock.of(estimates[0])
+    samples = heading_samples(main.trajectory, log, config)
+    heights = (1.0, 1.0, 1.6, 1.1) if samples else (1.0, 1.0, 1.6)
+    figure = new_figure(1.0 + 1.6 * sum(heights))
+    panels: list[Axes] = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
     low = _lower_end(main.trajectory)
-    for sensor, (time, heading) in heading_samples(main.trajectory, log, config).items():
+    for estimate in estimates:
+        _draw_attitude(panels, estimate, clock, low)
+    for sensor, (time, heading) in samples.items():
         label, look = SOURCES[sensor]
         panels[2].plot(clock(time), _within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
-    for estimate in estimates:
-        track, some = estimate.trajectory, thin(len(estimate.trajectory))
-        time, rpy, sd = clock(track.time[some]), np.rad2deg(track.rpy[some]), np.rad2deg(track.rpy_sd[some])
-        for i in (0, 1):
-            _line_and_band(panels[i], time, rpy[:, i], sd[:, i], estimate.kind)
-        turned, heading, spread = broken(time, _within(track.rpy[some, 2], low), sd[:, 2])
-        _line_and_band(panels[2], turned, heading, spread, estimate.kind)
-    for axes, name in zip(panels, ("roll", "pitch", "heading"), strict=True):
+        difference = np.rad2deg(wrap_angle(heading - main.trajectory.at(time).rpy[:, 2]))
+        panels[3].plot(clock(time), difference, ls="none", ms=2.5, alpha=0.6, **look)
+    names = ("roll", "pitch", "heading", f"compass − {name_of(main.kind)}")
+    for axes, name in zip(panels, names, strict=False):
         axes.set_ylabel(f"{name} [deg]")
     _limit_heading(panels[2], low)
-    panels[0].set_title("attitude, bands ±2 sd; compasses without their deviation", loc="left")
-    clock.name_axis(panels[2])
+    title = "attitude, bands ±2 sd" + ("; compasses before their calibration" if samples else "")
+    panels[0].set_title(title, loc="left")
+    clock.name_axis(panels[-1])
     figure.align_ylabels()
     legend_below(figure, panels, 5, 2.0)
     return figure
+
+
+def _draw_attitude(panels: Sequence[Axes], estimate: Estimate, clock: Clock, low: float) -> None:
+    track, some = estimate.trajectory, thin(len(estimate.trajectory))
+    time, rpy, sd = clock(track.time[some]), track.rpy[some], np.rad2deg(track.rpy_sd[some])
+    for i in (0, 1):
+        _line_and_band(panels[i], time, np.rad2deg(rpy[:, i]), sd[:, i], estimate.kind)
+    time, heading, spread = broken(time, _within(rpy[:, 2], low), sd[:, 2])
+    _line_and_band(panels[2], time, heading, spread, estimate.kind)
 
 
 def heading_samples(track: Trajectory, log: Log, config: Config) -> dict[str, tuple[Array, Array]]:

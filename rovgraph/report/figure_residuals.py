@@ -86,5 +86,6 @@ def _points(axes: Axes, time: Array, value: Array, label: str, look: dict[str, A
     axes.plot(time[inside], value[inside], ls="none", zorder=2, label=label, **look)
     for side, marker in ((1.0, "^"), (-1.0, "v")):
         beyond = time[value * side > LIMIT]
-        edge = np.full(len(beyond), side * LIMIT)
-        axes.plot(beyond, edge, ls="none", marker=marker, ms=3.2, mew=0, color=look["color"], zorder=4, clip_on=False)
+        if len(beyond):
+            edge = np.full(len(beyond), side * LIMIT)
+            axes.plot(beyond, edge, ls="none", marker=marker, ms=3.2, mew=0, color=look["color"], zorder=4)
