@@ -25,7 +25,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rovgraph.geometry import Array, matrix_from_rpy, rotate, skew, transpose, wrap_angle
+from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose, wrap_angle
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
 _EX, _EY, _EZ = np.eye(3)
@@ -117,7 +117,7 @@ class DvlVelocity:
         R_bs, axes = dvl_mount(state)
         R_bn = transpose(state.R_nb)
         body = rotate(R_bn, state.v_n)
-        v_b = body + np.cross(rate_b - state.bias[:, 3:], self.lever_arm_b)
+        v_b = body + cross(rate_b - state.bias[:, 3:], self.lever_arm_b)
         gain = (1.0 + _scalar(state, "dvl_scale"))[:, None]
         R_sb = transpose(R_bs) * gain[..., None]
 
@@ -126,7 +126,7 @@ class DvlVelocity:
         bias[..., 3:] = R_sb @ skew(self.lever_arm_b)
         H = {POSE: pose, VELOCITY: R_sb @ R_bn, BIAS: bias}
         for name, axis in axes.items():
-            H[name] = -rotate(R_sb, np.cross(axis, v_b))[..., None]
+            H[name] = -rotate(R_sb, cross(axis, v_b))[..., None]
         z = rotate(R_sb, v_b)
         H["dvl_scale"] = (z / gain)[..., None]
         return z, H
@@ -148,7 +148,7 @@ def _heading(R_nb: Array, axis_b: Array) -> tuple[Array, Array]:
     u = rotate(R_nb, axis_b)
     across = np.stack([-u[:, 1], u[:, 0], np.zeros(len(u))], axis=-1) / (u[:, :1] ** 2 + u[:, 1:2] ** 2)
     # du = R_nb (dtheta x axis), dh = across . du
-    gradient = np.cross(axis_b, rotate(transpose(R_nb), across))
+    gradient = cross(axis_b, rotate(transpose(R_nb), across))
     return np.arctan2(u[:, 1], u[:, 0]), gradient
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.estimators.initialise import Beginning, trusted_first, yaw_correction
-from rovgraph.geometry import Array, exp_rotation, wrap_angle
+from rovgraph.geometry import Array, cross, exp_rotation, wrap_angle
 from rovgraph.graph.assembly import Interval
 from rovgraph.sensors import dvl_mount
 from rovgraph.state import State
@@ -80,7 +80,7 @@ def _turn(
     up_measured = turn.T @ (pim.deltaVij() / dt)
     up_measured = up_measured / max(float(np.linalg.norm(up_measured)), 1e-9)
     R = R @ turn
-    correction = np.cross(up_measured, -R[2]) * min(dt / LEVEL_S, 1.0) + R.T @ correction_n
+    correction = cross(up_measured, -R[2]) * min(dt / LEVEL_S, 1.0) + R.T @ correction_n
     bias = bias.copy()
     bias[3:] -= correction / (4.0 * LEVEL_S)
     return R @ exp_rotation(correction), bias
@@ -98,7 +98,7 @@ def _velocities(
     z = np.array([a.z for _, a in pings]) / (1.0 + calibration["dvl_scale"])
     rate_b = np.array([a.rate_b for _, a in pings]) - biases[index, 3:]
     arm = beginning.instruments["dvl"].model.lever_arm_b  # type: ignore[attr-defined]
-    v_b = np.einsum("nij,nj->ni", dvl_mount(here)[0], z) - np.cross(rate_b, arm)
+    v_b = np.einsum("nij,nj->ni", dvl_mount(here)[0], z) - cross(rate_b, arm)
     v_n = np.einsum("nij,nj->ni", R_nb[index], v_b)
     time = np.array([i.time for i in intervals])
     return np.column_stack([np.interp(time, time[index], column) for column in v_n.T])

@@ -9,6 +9,7 @@ Headings and depths are taken once per interval, the first one: their errors las
 longer than that, and counting each sample would make the estimate too sure of itself.
 """
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -62,7 +63,8 @@ class Interval:
     Attributes
     ----------
     index, time : of the keyframe that ends the interval
-    rate_b : ndarray, shape (3,), measured rate at the keyframe, bias still in it
+    rate_b, rate_sd : ndarray, shape (3,), float: measured rate at the keyframe, bias still
+        in it, and its noise [rad/s]
     pim : preintegrated motion, None for the first keyframe
     bridged : there was a gap in the IMU
     attached : measurements at the keyframe itself, and between the keyframe before and it
@@ -71,6 +73,7 @@ class Interval:
     index: int
     time: float
     rate_b: Array
+    rate_sd: float
     pim: gtsam.PreintegratedCombinedMeasurements | None
     bridged: bool
     attached: list[Attached]
@@ -102,6 +105,7 @@ class Assembler:
         self._index, self._start = -1, 0.0
         self._between: list[Measurement] = []
         self._periods: list[float] = []
+        self._longest_step = np.inf
 
     def add(self, measurement: Measurement) -> list[Interval]:
         """Take a measurement; times must not decrease.
@@ -165,6 +169,7 @@ class Assembler:
                 )
             if len(self._periods) < 50:
                 self._periods.append(period)
+                self._longest_step = GAP_PERIODS * float(np.median(self._periods))
         rotated = np.concatenate([self._R_bs @ m.values[:3], self._R_bs @ m.values[3:6]])
         self._imu.append((m.time, rotated))
 
@@ -194,7 +199,7 @@ class Assembler:
             attached.append(self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd))
         keep = max(int(np.searchsorted(samples[:, 0], time, side="right")) - 1, 0)
         self._imu = self._imu[keep:]
-        return Interval(self._index, time, rate_b, pim, bridged, attached)
+        return Interval(self._index, time, rate_b, rate_sd, pim, bridged, attached)
 
     def _integrate(
         self, samples: Array, time: float
@@ -206,7 +211,7 @@ class Assembler:
             if m.sensor in ONCE_PER_INTERVAL:
                 seen.add(m.sensor)
         stops = np.array([m.time for m in taken])
-        bridged = self._has_gap(samples[:, 0])
+        bridged = bool(np.diff(samples[:, 0]).max() > self._longest_step)
         params = self._bridge if bridged else self._params
         pim, motions = preintegrate(params, self.bias, samples, self._start, stops, time)
         attached = [
@@ -214,23 +219,18 @@ class Assembler:
         ]
         return pim, bridged, attached
 
-    def _has_gap(self, times: Array) -> bool:
-        if len(self._periods) < 2 or len(times) < 2:
-            return False
-        return bool(np.diff(times).max() > GAP_PERIODS * float(np.median(self._periods)))
-
     def _rate(self, samples: Array, time: float) -> tuple[Array, float]:
         """Rate interpolated to a time, and the sd of its noise."""
-        t = samples[:, 0]
-        k = int(np.clip(np.searchsorted(t, time, side="right") - 1, 0, max(len(t) - 2, 0)))
-        if len(t) < 2:
+        if len(samples) < 2:
             return samples[0, 4:], self.config.imu.noise.gyr
-        w = float(np.clip((time - t[k]) / (t[k + 1] - t[k]), 0.0, 1.0))
+        k = min(max(int(samples[:, 0].searchsorted(time, side="right")) - 1, 0), len(samples) - 2)
+        before, after = float(samples[k, 0]), float(samples[k + 1, 0])
+        step = after - before
+        w = min(max((time - before) / step, 0.0), 1.0)
         rate = (1.0 - w) * samples[k, 4:] + w * samples[k + 1, 4:]
-        if self._has_gap(t[k : k + 2]):
+        if step > self._longest_step:
             return rate, BRIDGE_GYR
-        density = self.config.imu.noise.gyr
-        return rate, density * float(np.sqrt((w**2 + (1.0 - w) ** 2) / (t[k + 1] - t[k])))
+        return rate, self.config.imu.noise.gyr * math.sqrt((w**2 + (1.0 - w) ** 2) / step)
 
     def _attach(self, m: Measurement, motion: Snapshot, rate_b: Array, rate_sd: float) -> Attached:
         instrument = self.instruments[m.sensor]

@@ -180,16 +180,9 @@ def _minimise(problem: Problem, values: gtsam.Values, gates: Gates) -> tuple[gts
     cost, ordering = problem.cost(values, gates), None
     for iteration in range(1, MAX_ITERATIONS + 1):
         linear = problem.linearize(values, gates)
-        ordering = ordering or elimination_order(linear)
+        ordering = ordering or gtsam.Ordering.MetisGaussianFactorGraph(linear)
         delta = _eliminate(linear, ordering)
-        step, trial = 1.0, values.retract(delta)
-        trial_cost = problem.cost(trial, gates)
-        while not trial_cost <= cost and step > SMALLEST_STEP:
-            step *= 0.5
-            trial = values.retract(delta.scale(step))
-            trial_cost = problem.cost(trial, gates)
-        if not trial_cost <= cost:
-            return values, cost, iteration, True  # no descent left at machine precision
+        trial, trial_cost = _search(problem, values, gates, delta, cost)
         decrease = cost - trial_cost
         values, cost = trial, trial_cost
         if decrease <= RELATIVE_DECREASE * (1.0 + cost):
@@ -197,14 +190,38 @@ def _minimise(problem: Problem, values: gtsam.Values, gates: Gates) -> tuple[gts
     return values, cost, MAX_ITERATIONS, False
 
 
-def elimination_order(linear: gtsam.GaussianFactorGraph) -> gtsam.Ordering:
-    """Nested dissection of the chain of keyframes."""
-    return gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+def _search(
+    problem: Problem, values: gtsam.Values, gates: Gates, delta: gtsam.VectorValues, cost: float
+) -> tuple[gtsam.Values, float]:
+    """The best of the steps 1, 2, 4... along ``delta``, or the first of 1/2, 1/4... that lowers the cost.
+
+    Reweighting takes steps that are too short where many measurements lie beyond their
+    loss's bend; lengthening them saves most of the iterations.
+    """
+
+    def at(step: float) -> tuple[gtsam.Values, float]:
+        moved = values.retract(delta.scale(step))
+        return moved, problem.cost(moved, gates)
+
+    step, best = 1.0, at(1.0)
+    if best[1] < cost:
+        while (longer := at(2.0 * step))[1] < best[1]:
+            step, best = 2.0 * step, longer
+        return best
+    while not best[1] < cost and step > SMALLEST_STEP:
+        step *= 0.5
+        best = at(step)
+    return best if best[1] < cost else (values, cost)
 
 
 def _eliminate(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
+    """The Gauss-Newton step: Cholesky, and QR where rounding makes that indefinite."""
     try:
         return linear.optimize(ordering)
+    except RuntimeError:
+        pass
+    try:
+        return linear.optimize(ordering, gtsam.EliminateQR)
     except RuntimeError as error:
         raise InputError(indeterminate(error)) from None
 
@@ -219,15 +236,30 @@ def indeterminate(error: RuntimeError) -> str:
     )
 
 
-def marginals(problem: Problem, solution: Solution) -> gtsam.Marginals:
-    """Marginal covariances at the optimum."""
+def marginals(problem: Problem, solution: Solution) -> gtsam.GaussianBayesTree:
+    """The optimum's Bayes tree, which gives marginal covariances.
+
+    By QR, since small covariances come of large and nearly dependent rows; calibration
+    is eliminated last, since all keyframes share it.
+    """
     linear = problem.linearize(solution.values, solution.gates)
+    last = [key(name) for name in problem.estimated]
+    ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last)
     try:
-        return gtsam.Marginals(linear, solution.values)
+        return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
     except RuntimeError as error:
         raise InputError(indeterminate(error)) from None
 
 
-def covariances(of: gtsam.Marginals, variable: str, count: int) -> Array:
+def covariance(tree: gtsam.GaussianBayesTree, of: int) -> Array:
+    """Marginal covariance of a key, from the square root that QR leaves."""
+    A = tree.marginalFactor(of, gtsam.EliminateQR).jacobian()[0]
+    root = np.linalg.inv(np.linalg.qr(A, mode="r"))
+    return np.asarray(root @ root.T)
+
+
+def covariances(tree: gtsam.GaussianBayesTree, variable: str, count: int) -> Array:
     """Marginal covariance of a state variable at every keyframe, shape (count, d, d)."""
-    return np.array([of.marginalCovariance(key(variable, i)) for i in range(count)])
+    roots = [tree.marginalFactor(key(variable, i), gtsam.EliminateQR).jacobian()[0] for i in range(count)]
+    inverse = np.linalg.inv(np.linalg.qr(np.array(roots), mode="r"))
+    return np.asarray(inverse @ np.swapaxes(inverse, 1, 2))

@@ -3,9 +3,10 @@
 import gtsam
 
 from rovgraph.calibration import TABLE
-from rovgraph.state import BIAS, POSE, VELOCITY
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY
 
-_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b"}
+_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b"} | {v.name: v.letter for v in TABLE.values()}
+_FIRST = {variable: int(gtsam.symbol(letter, 0)) for variable, letter in _LETTER.items()}
 
 
 def key(variable: str, index: int = 0) -> int:
@@ -16,16 +17,12 @@ def key(variable: str, index: int = 0) -> int:
     variable : "pose", "velocity", "bias" or a name of the calibration table
     index : keyframe; 0 for a calibration variable
     """
-    if variable in _LETTER:
-        return int(gtsam.symbol(_LETTER[variable], index))
-    return int(gtsam.symbol(TABLE[variable].letter, 0))
+    return _FIRST[variable] + index  # consecutive, as gtsam.symbol makes them
 
 
 def key_name(key: int) -> str:
     """What a key stands for, in words: for messages."""
     symbol = gtsam.Symbol(key)
     letter = chr(symbol.chr())
-    for variable, own in _LETTER.items():
-        if own == letter:
-            return f"{variable} of keyframe {symbol.index()}"
-    return next(v.name for v in TABLE.values() if v.letter == letter)
+    variable = next(name for name, own in _LETTER.items() if own == letter)
+    return f"{variable} of keyframe {symbol.index()}" if variable in DIMENSION else variable

@@ -11,6 +11,7 @@ gated. The thresholds are where a good measurement of that dimension lies with 9
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -63,10 +64,12 @@ class Block:
         """Variables that the factors touch, in the order of their keys."""
         return (*self.instrument.model.state, *self.estimated)
 
-    def keys(self, k: int) -> list[int]:
-        """Keys of measurement ``k``, in the order of `variables`."""
-        index = int(self.keyframe[k])
-        return [key(v, index if v in DIMENSION else 0) for v in self.variables]
+    @cached_property
+    def keys(self) -> list[list[int]]:
+        """Keys of every measurement, in the order of `variables`."""
+        columns = [key(v) + (self.keyframe if v in DIMENSION else 0 * self.keyframe) for v in self.variables]
+        rows: list[list[int]] = np.column_stack(columns).tolist()
+        return rows
 
     def innovations(self, state: State) -> Array:
         """Measured minus predicted, shape (n, dim); ``state`` is at each one's keyframe."""
@@ -97,9 +100,9 @@ class Block:
         r, H = self.linearize(state)
         root = np.sqrt(weight)[:, None]
         r, H = r * root, {v: h * root[..., None] for v, h in H.items()}
-        unit = gtsam.noiseModel.Unit.Create(r.shape[1])
+        jacobians, unit = list(H.values()), gtsam.noiseModel.Unit.Create(r.shape[1])
         for k in np.flatnonzero(weight):
-            terms = [(j, h[k]) for j, h in zip(self.keys(k), H.values(), strict=True)]
+            terms = [(j, h[k]) for j, h in zip(self.keys[k], jacobians, strict=True)]
             # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
             graph.push_back(gtsam.GaussianConditional(terms, 1, r[k], unit))
 
@@ -114,7 +117,7 @@ class Block:
                     H[place] = jacobian[0]
             return -r[0]  # GTSAM's error is predicted minus measured
 
-        return gtsam.CustomFactor(robust_noise(self.instrument), self.keys(k), error)
+        return gtsam.CustomFactor(robust_noise(self.instrument), self.keys[k], error)
 
     def at(self, index: slice | Array) -> "Block":
         """Some of the measurements."""

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, cross
 
 EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
 INTEGRATION_SD = 1e-3  # per root second; smaller makes the covariance nearly singular
@@ -83,7 +83,7 @@ def preintegrate(
     middle, dt = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
     signal = np.column_stack([np.interp(middle, t, column) for column in imu[:, 1:].T])
     acc, gyr = signal[:, :3], signal[:, 3:]
-    acc = acc + 0.5 * dt[:, None] * np.cross(gyr - bias[3:], acc - bias[:3])
+    acc = acc + 0.5 * dt[:, None] * cross(gyr - bias[3:], acc - bias[:3])
 
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
     wanted = set(np.searchsorted(grid, stops).tolist())

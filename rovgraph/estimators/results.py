@@ -1,0 +1,134 @@
+"""From GTSAM values and covariances to an `Estimate` of the body's origin."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from rovgraph.calibration import TABLE, Belief
+from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
+from rovgraph.geometry import Array, cross, rotate, skew, transpose
+from rovgraph.graph.assembly import Interval
+from rovgraph.graph.measurements import Block
+from rovgraph.sensors import innovation
+from rovgraph.state import State, propagate
+from rovgraph.trajectory import Trajectory
+
+_XYZ = ("_x", "_y", "_z")
+
+
+def body_trajectory(
+    intervals: Sequence[Interval],
+    states: State,
+    lever_arm_b: ArrayLike,
+    cov_pose: Array | None = None,
+    cov_velocity: Array | None = None,
+) -> Trajectory:
+    """Trajectory of the body's origin from states at the IMU.
+
+    Parameters
+    ----------
+    intervals : n, the keyframes
+    states : State of n epochs, at the IMU
+    lever_arm_b : array_like, shape (3,), of the IMU [m]
+    cov_pose : ndarray, shape (n, 6, 6), in GTSAM's tangent space, or None
+    cov_velocity : ndarray, shape (n, 3, 3), in n, or None
+    """
+    R, lever_arm_b = states.R_nb, np.asarray(lever_arm_b, dtype=float)
+    time = np.array([i.time for i in intervals])
+    rate_b = np.array([i.rate_b for i in intervals])
+    rate_sd = np.array([i.rate_sd for i in intervals])[:, None, None]
+    p_n = states.p_n - rotate(R, lever_arm_b)
+    v_n = states.v_n - rotate(R, cross(rate_b - states.bias[:, 3:], lever_arm_b))
+    if cov_pose is None or cov_velocity is None:
+        return Trajectory.certain(time, p_n, R, v_n)
+    J = R @ np.concatenate([skew(lever_arm_b), np.eye(3)], axis=-1)  # p - R l, right perturbation
+    arm = R @ skew(lever_arm_b)
+    return Trajectory(
+        time,
+        p_n,
+        R,
+        v_n,
+        cov_p=J @ cov_pose @ transpose(J),
+        cov_theta=R @ cov_pose[:, :3, :3] @ transpose(R),
+        cov_v=cov_velocity + rate_sd**2 * arm @ transpose(arm),
+    )
+
+
+def calibration_estimates(
+    beliefs: Mapping[str, Belief],
+    sensors: Sequence[str],
+    values: Mapping[str, Array],
+    covariance: Mapping[str, Array],
+) -> list[CalibrationEstimate]:
+    """One entry per component of every variable whose sensor is used.
+
+    Parameters
+    ----------
+    beliefs : all calibration variables
+    sensors : in use
+    values : name -> ndarray, shape (dim,)
+    covariance : name -> ndarray, shape (dim, dim), of those that were estimated
+    """
+    out = []
+    for name, belief in beliefs.items():
+        if belief.variable.sensor not in sensors:
+            continue
+        estimated = name in covariance
+        sd = np.sqrt(np.diag(covariance[name])) if estimated else np.zeros(belief.variable.dim)
+        for k, label in enumerate(belief.variable.labels):
+            v = belief.variable
+            numbers = (float(values[name][k]), float(sd[k]), float(belief.mean[k]), belief.sd if estimated else 0.0)
+            out.append(CalibrationEstimate(label, v.unit, v.about, estimated, *numbers))
+    return out
+
+
+def bias_histories(time: Array, bias: Array, sd: Array) -> dict[str, History]:
+    """Accelerometer and gyro bias against time; ``bias`` and ``sd`` have shape (n, 6)."""
+    acc, gyr = (tuple(f"{s}_bias{c}" for c in _XYZ) for s in ("acc", "gyr"))
+    return {
+        "acc_bias": History(acc, "m/s2", time, bias[:, :3], sd[:, :3]),
+        "gyr_bias": History(gyr, "rad/s", time, bias[:, 3:], sd[:, 3:]),
+    }
+
+
+def calibration_history(name: str, time: Array, value: Array, sd: Array) -> History:
+    """A calibration variable against time; ``value`` and ``sd`` have shape (n, dim)."""
+    return History(TABLE[name].labels, TABLE[name].unit, time, value, sd)
+
+
+def residual_frame(blocks: Mapping[str, Block], states: State, weights: Mapping[str, Array]) -> pd.DataFrame:
+    """Innovation, normalised innovation and weight of every measurement, in order of time.
+
+    Parameters
+    ----------
+    blocks : sensor -> Block
+    states : State of every keyframe
+    weights : sensor -> ndarray, shape (n,)
+    """
+    frames = []
+    for sensor, block in blocks.items():
+        here = states.at(block.keyframe)
+        model = block.instrument.model
+        predicted, _ = model.predict(propagate(here, block.motion, block.gravity), block.rate_b)
+        nu = innovation(model, block.z, predicted)
+        normalised = np.einsum("nij,nj->ni", block.W, nu)
+        sd = np.sqrt(np.diagonal(np.linalg.inv(transpose(block.W) @ block.W), axis1=1, axis2=2))
+        for k, component in enumerate(block.instrument.components):
+            columns = {
+                "time": block.time,
+                "sensor": sensor,
+                "component": component,
+                "measured": block.z[:, k],
+                "predicted": predicted[:, k],
+                "innovation": nu[:, k],
+                "sd": sd[:, k],
+                "normalised": normalised[:, k],
+                "weight": weights[sensor],
+                "row": block.row,
+            }
+            frames.append(pd.DataFrame(columns))
+    if not frames:
+        return pd.DataFrame(columns=pd.Index(RESIDUAL_COLUMNS))
+    return pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)

@@ -1,0 +1,106 @@
+"""Batch smoothing of a whole dive."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rovgraph.config import beliefs
+from rovgraph.estimators.dead_reckoning import dead_reckon
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.results import (
+    bias_histories,
+    body_trajectory,
+    calibration_estimates,
+    calibration_history,
+    residual_frame,
+)
+from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.graph.batch import Problem, Solution, covariance, covariances, make_problem, make_values, marginals, solve
+from rovgraph.graph.keys import key
+from rovgraph.log import Measurement
+from rovgraph.state import BIAS, POSE, VELOCITY
+
+
+@dataclass
+class BatchSmoother:
+    """Collects a dive and solves it at once.
+
+    Attributes
+    ----------
+    beginning : of `rovgraph.estimators.initialise.initialise`
+    """
+
+    beginning: Beginning
+
+    def __post_init__(self) -> None:
+        b = self.beginning
+        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
+        self.intervals: list[Interval] = []
+
+    def add(self, measurement: Measurement) -> list[Interval]:
+        """Take a measurement; times must not decrease."""
+        done = self.assembler.add(measurement)
+        self.intervals += done
+        return done
+
+    def finish(self) -> list[Interval]:
+        """Close the last interval."""
+        done = self.assembler.finish()
+        self.intervals += done
+        return done
+
+    def solve(self) -> Estimate:
+        """The smoothed trajectory with its uncertainty."""
+        problem, solution = self.optimise()
+        return _estimate(problem, solution, self.beginning, self.intervals)
+
+    def optimise(self) -> tuple[Problem, Solution]:
+        """The graph and its optimum."""
+        b = self.beginning
+        problem = make_problem(self.intervals, b.start, b.config, beliefs(b.config), b.instruments)
+        guess = dead_reckon(self.intervals, b, problem.fixed)
+        return problem, solve(problem, make_values(problem, guess))
+
+    def dead_reckoning(self) -> Estimate:
+        """Dead reckoning over the same intervals: the baseline."""
+        b = self.beginning
+        means = {name: belief.mean for name, belief in beliefs(b.config).items()}
+        states = dead_reckon(self.intervals, b, means)
+        trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)
+        return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, states, {}))
+
+
+def _estimate(problem: Problem, solution: Solution, b: Beginning, intervals: Sequence[Interval]) -> Estimate:
+    """The optimum with its marginal covariances."""
+    tree, n = marginals(problem, solution), problem.count
+    states = problem.states(solution.values)
+    trajectory = body_trajectory(
+        intervals,
+        states,
+        b.config.imu.lever_arm_m,
+        covariances(tree, POSE, n),
+        covariances(tree, VELOCITY, n),
+    )
+    bias_sd = np.sqrt(np.diagonal(covariances(tree, BIAS, n), axis1=1, axis2=2))
+    history = bias_histories(trajectory.time, states.bias, bias_sd)
+    known = {name: covariance(tree, key(name)) for name in problem.estimated}
+    ends = trajectory.time[[0, -1]]
+    for name, matrix in known.items():
+        value, sd = states.calibration[name], np.sqrt(np.diag(matrix))
+        history[name] = calibration_history(name, ends, np.tile(value, (2, 1)), np.tile(sd, (2, 1)))
+    return Estimate(
+        "smoothed",
+        trajectory,
+        calibration_estimates(beliefs(b.config), list(problem.blocks), states.calibration, known),
+        history,
+        residual_frame(problem.blocks, states, solution.weights),
+        {
+            "keyframes": n,
+            "cost": solution.cost,
+            "iterations": solution.iterations,
+            "converged": solution.converged,
+            "bridged_intervals": sum(i.bridged for i in intervals),
+        },
+    )
