@@ -5,6 +5,8 @@ v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``. TUM files
 ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
 """
 
+import warnings
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation, Slerp
 
-from rovgraph.errors import InputError
+from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, rpy_jacobian, transpose
 
 POSITION = ["north", "east", "down"]
@@ -85,7 +87,8 @@ class Trajectory:
     def at(self, time: Array) -> "Trajectory":
         """Interpolated to ``time`` (linear; rotations along the shortest arc).
 
-        Epochs outside the trajectory are clamped to its ends.
+        Epochs outside the trajectory are clamped to its ends. Between epochs of which one
+        is not known the result is NaN.
         """
         t = np.clip(time, self.time[0], self.time[-1])
 
@@ -94,7 +97,7 @@ class Trajectory:
             columns = [np.interp(t, self.time, column) for column in flat.T]
             return np.stack(columns, axis=-1).reshape(len(t), *x.shape[1:])
 
-        R_nb = Slerp(self.time, Rotation.from_matrix(self.R_nb))(t).as_matrix()
+        R_nb = _slerp(self.time, self.R_nb, t)
         covariances = linear(self.cov_p), linear(self.cov_theta), linear(self.cov_v)
         return Trajectory(np.asarray(time, float), linear(self.p_n), R_nb, linear(self.v_n), *covariances)
 
@@ -126,47 +129,112 @@ def _sd(covariance: Array) -> Array:
     return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
+def _slerp(time: Array, R: Array, at: Array) -> Array:
+    """Rotations interpolated along the shortest arc; NaN beside a NaN.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,), increasing
+    R : ndarray, shape (n, 3, 3)
+    at : ndarray, shape (m,), within ``time``
+
+    Returns
+    -------
+    ndarray, shape (m, 3, 3)
+    """
+    known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
+    if known.all() and len(time) > 1:
+        return np.asarray(Slerp(time, Rotation.from_matrix(R))(at).as_matrix())
+    filled = _slerp(time, np.where(known[:, None, None], R, np.eye(3)), at) if len(time) > 1 else R[[0] * len(at)]
+    gap = np.interp(at, time, np.where(known, 0.0, 1.0))
+    filled[gap > 0.0] = np.nan
+    return filled
+
+
 def read_trajectory(path: Path | str) -> Trajectory:
-    """Read a trajectory or reference CSV: ``time, north, east``, the rest optional.
+    """Read a trajectory CSV: ``time, north, east``, the rest optional.
 
     Columns that are missing are NaN in the result (rotations too), so that what a
-    reference does not know cannot be mistaken for a zero.
+    file does not know cannot be mistaken for a zero.
 
     Raises
     ------
     InputError : no such file, no CSV, a required column missing, time not increasing
     """
+    return parse_trajectory(read_table(path), str(path))
+
+
+def read_table(path: Path | str) -> pd.DataFrame:
+    """The columns of a trajectory file as numbers, other columns left out.
+
+    Raises
+    ------
+    InputError : no such file, no CSV, a required column missing, something that is no number
+    """
     try:
-        frame = pd.read_csv(path)
+        table = pd.read_csv(path, index_col=False, skipinitialspace=True, low_memory=False)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({str(error).splitlines()[0]})") from None
-    missing = [c for c in ("time", "north", "east") if c not in frame]
+    except (OSError, ValueError, EOFError, zlib.error) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"{path}: cannot be read as CSV ({reason})") from None
+    table.columns = table.columns.str.strip()
+    missing = [c for c in ("time", "north", "east") if c not in table]
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing, a trajectory has time, north, east")
-    try:
-        frame = frame.astype({c: float for c in frame.columns if c in COLUMNS or c.endswith("_sd")})
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
-    frame = frame.dropna(subset=["time", "north", "east"])
+    wanted = [*COLUMNS, *(c + "_sd" for c in COLUMNS[1:]), "cov_north_east"]
+    return pd.DataFrame({c: _numbers(table[c], path) for c in wanted if c in table})
+
+
+def _numbers(column: pd.Series, path: Path | str) -> Array:
+    """A column as floats, empty and infinite values NaN."""
+    values = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
+    wrong = np.flatnonzero(np.isnan(values) & column.notna().to_numpy())
+    if len(wrong):
+        raise InputError(f"{path} line {wrong[0] + 2}: {column.name} is {column.iloc[wrong[0]]!r}, expected a number")
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def parse_trajectory(table: pd.DataFrame, source: str) -> Trajectory:
+    """A trajectory from a table of its columns; ``source`` names it in messages.
+
+    Rows without time, north or east are left out with a `DataWarning`.
+
+    Raises
+    ------
+    InputError : fewer than two rows, time not increasing
+    """
+    frame = table.dropna(subset=["time", "north", "east"])
     if len(frame) < 2:
-        raise InputError(f"{path}: {len(frame)} rows with time, north and east, at least 2 are needed")
-    time = frame["time"].to_numpy()
-    if (np.diff(time) <= 0).any():
-        row = int(np.argmax(np.diff(time) <= 0))
-        raise InputError(f"{path}: time does not increase at {time[row + 1]:.3f} s (data row {row + 2}); sort the file")
+        raise InputError(f"{source}: {len(frame)} rows with time, north and east, at least 2 are needed")
+    if len(frame) < len(table):
+        count = len(table) - len(frame)
+        warnings.warn(f"{source}: {count} rows without time, north or east were left out", DataWarning, stacklevel=2)
+    time = frame["time"].to_numpy(dtype=float)
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if len(back):
+        line = int(frame.index[back[0] + 1]) + 2
+        raise InputError(f"{source} line {line}: time does not increase at {time[back[0] + 1]:.3f} s; sort the file")
 
     def take(names: list[str]) -> Array:
         return np.column_stack([frame[c] if c in frame else np.full(len(frame), np.nan) for c in names])
 
     def diagonal(names: list[str]) -> Array:
-        return np.eye(3) * take([c + "_sd" for c in names])[:, None, :] ** 2
+        return np.asarray(np.eye(3) * take([c + "_sd" for c in names])[:, None, :] ** 2)
 
-    rpy = take(ATTITUDE)
-    cov_p, R_nb = diagonal(POSITION), matrix_from_rpy(rpy)
+    rpy, cov_p = take(ATTITUDE), diagonal(POSITION)
     if "cov_north_east" in frame:
         cov_p[:, 0, 1] = cov_p[:, 1, 0] = frame["cov_north_east"]
-    J_inv = np.linalg.inv(np.where(np.isfinite(rpy_jacobian(rpy)), rpy_jacobian(rpy), np.eye(3)))
-    cov_theta = J_inv @ diagonal(ATTITUDE) @ transpose(J_inv)
+    axes = _rpy_axes(rpy)
+    cov_theta = axes @ diagonal(ATTITUDE) @ transpose(axes)
+    R_nb = matrix_from_rpy(rpy)
     return Trajectory(time, take(POSITION), R_nb, take(VELOCITY), cov_p, cov_theta, diagonal(VELOCITY))
+
+
+def _rpy_axes(rpy: Array) -> Array:
+    """The inverse of `rpy_jacobian`: axes in n that roll, pitch and yaw turn about, as columns."""
+    cp, sp = np.cos(rpy[:, 1]), np.sin(rpy[:, 1])
+    cy, sy = np.cos(rpy[:, 2]), np.sin(rpy[:, 2])
+    zero, one = np.zeros_like(cy), np.ones_like(cy)
+    axes = [[cp * cy, cp * sy, -sp], [-sy, cy, zero], [zero, zero, one]]
+    return np.moveaxis(np.array(axes), -1, 0).swapaxes(-1, -2)

@@ -1,6 +1,73 @@
-"""``rovgraph evaluate``."""
+"""``rovgraph evaluate``: how far a trajectory is from a reference."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rovgraph.evaluate import Metrics
 
 
-def evaluate() -> None:
-    """To be written."""
-    raise NotImplementedError
+def evaluate(
+    trajectory: Annotated[Path, typer.Argument(help="CSV of an estimate.", show_default=False)],
+    reference: Annotated[Path, typer.Argument(help="CSV with time, north, east and what else it knows.")],
+    start: Annotated[float, typer.Option("--from", help="Leave out the first seconds of the trajectory.")] = 0.0,
+    align: Annotated[bool, typer.Option("--align", help="Turn and shift the trajectory to fit first.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Compare a trajectory with a reference.
+
+    Example: rovgraph evaluate results/smoothed.csv data/falcon/truth.csv.gz
+    """
+    import json
+
+    from rovgraph import evaluate as library
+    from rovgraph.trajectory import read_trajectory
+
+    metrics = library.evaluate(read_trajectory(trajectory), library.read_reference(reference), start, align)
+    if as_json:
+        typer.echo(json.dumps(metrics.as_dict(), indent=2))
+    else:
+        _show(metrics, f"{trajectory} against {reference}")
+
+
+def _show(metrics: "Metrics", title: str) -> None:
+    """The table that the command prints; what is not known has no row."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", "", title=title, show_header=False)
+    for label, value in rows(metrics):
+        table.add_row(label, value)
+    Console().print(table)
+
+
+def rows(metrics: "Metrics") -> list[tuple[str, str]]:
+    """Label and value with its unit of every metric that is known."""
+    m = metrics
+    every = [
+        ("compared", f"{m.epochs} epochs, {m.duration_s:.1f} s, {m.distance_m:.1f} m"),
+        ("reference covered", f"{100 * m.coverage:.1f} %"),
+        ("aligned, taken out", _format("{:.2f}° and {:.2f} m north, {:.2f} m east", *_removed(m))),
+        ("horizontal error, rms", f"{m.rms_m:.3f} m"),
+        ("mean", f"{m.mean_m:.3f} m"),
+        ("max", f"{m.max_m:.3f} m at {m.max_at_s:.1f} s"),
+        ("end", f"{m.end_m:.3f} m"),
+        ("end, of the distance", _format("{:.2f} %", m.drift_percent)),
+        ("3D error, rms", _format("{:.3f} m", m.rms_3d_m)),
+        ("depth error, rms", _format("{:.3f} m", m.rms_down_m)),
+        ("heading error, rms", _format("{:.2f}°", m.heading_rms_deg)),
+        ("heading error, mean", _format("{:+.2f}°", m.heading_mean_deg)),
+        ("normalised error squared (honest: 2)", _format("{:.2f}", m.nees)),
+        ("inside the 99 % ellipse", _format("{:.1f} %", None if m.inside_ellipse is None else 100 * m.inside_ellipse)),
+    ]
+    return [(label, value) for label, value in every if value]
+
+
+def _removed(m: "Metrics") -> tuple[float | None, float | None, float | None]:
+    return m.turned_deg, m.shift_north_m, m.shift_east_m
+
+
+def _format(form: str, *values: float | None) -> str:
+    return "" if None in values else form.format(*values)
