@@ -459,7 +459,7 @@ def test_drawn_ellipse_lies_along_the_covariance(dive):
     covariance = estimates[1].trajectory.cov_p[-1, :2, :2][::-1, ::-1]  # east first
     east_north = outline @ drawn.get_transforms()[-1][:2, :2].T
     squares = np.einsum("ni,ij,nj->n", east_north, np.linalg.inv(covariance), east_north)
-    np.testing.assert_allclose(squares, 9.21, rtol=0.02)
+    assert squares.min() == pytest.approx(9.21) and squares.max() < 9.21 * 1.06  # corners of a polygon around it
     aspect = figure.axes[0].transData.transform([[0, 0], [1, 1]])
     assert np.ptp(aspect[:, 0]) == pytest.approx(np.ptp(aspect[:, 1]))
 

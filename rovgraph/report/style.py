@@ -50,7 +50,6 @@ _RC: dict[str, Any] = {
     "lines.solid_capstyle": "round",
     "axes.formatter.useoffset": False,
     "axes.formatter.limits": (-3, 5),
-    "axes.formatter.use_mathtext": True,
 }
 
 
@@ -66,13 +65,12 @@ def style() -> Iterator[None]:
 def new_figure(height: float, width: float = WIDTH) -> Figure:
     """An empty figure without pyplot's global state; sizes in inches."""
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
     return figure
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG."""
-    figure.savefig(path, dpi=DPI, metadata={"Software": "rovgraph"})
+    """Write a PNG, drawn once (`Figure.savefig` lays everything out twice)."""
+    FigureCanvasAgg(figure).print_png(path, metadata={"Software": "rovgraph"})
     return path
 
 
