@@ -445,6 +445,7 @@ def test_ellipse_holds_99_percent():
 
 
 def test_drawn_ellipse_lies_along_the_covariance(dive):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import EllipseCollection
 
     from rovgraph.report.figure_track import draw_track
@@ -453,7 +454,7 @@ def test_drawn_ellipse_lies_along_the_covariance(dive):
     estimates, log, config, _ = dive
     with style():
         figure = draw_track([estimates[1]], log, config)
-        figure.canvas.draw()
+        FigureCanvasAgg(figure).draw()
     drawn = next(c for c in figure.axes[0].collections if isinstance(c, EllipseCollection))
     outline = drawn.get_paths()[0].to_polygons()[0]
     covariance = estimates[1].trajectory.cov_p[-1, :2, :2][::-1, ::-1]  # east first

@@ -64,13 +64,12 @@ def style() -> Iterator[None]:
 
 def new_figure(height: float, width: float = WIDTH) -> Figure:
     """An empty figure without pyplot's global state; sizes in inches."""
-    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
-    return figure
+    return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
 
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a PNG, drawn once (`Figure.savefig` lays everything out twice)."""
-    FigureCanvasAgg(figure).print_png(path, metadata={"Software": "rovgraph"})
+    FigureCanvasAgg(figure).print_png(path, metadata={"Software": "rovgraph"})  # type: ignore[no-untyped-call]
     return path
 
 
