@@ -1,6 +1,88 @@
-"""``rovgraph check``."""
+"""``rovgraph check``: is this log sane?"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from rovgraph.check import Report
 
 
-def check() -> None:
-    """To be written."""
-    raise NotImplementedError
+def check(
+    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
+) -> None:
+    """Look at a log: sensors, rates, gaps, units, signs, clocks, and what an estimate would make of it."""
+    import json
+    from dataclasses import asdict
+
+    from rich.console import Console
+
+    from rovgraph.check import examine, refuse
+    from rovgraph.config import load_config
+    from rovgraph.log import read_log
+
+    settings = load_config(config)
+    report = examine(read_log(log, settings.columns, settings.units), settings)
+    if as_json:
+        typer.echo(json.dumps(_without_nan(asdict(report)), indent=2, allow_nan=False))
+    else:
+        console = Console()
+        console.print(_timing_table(report))
+        for finding in report.findings:
+            _print_finding(console, finding.level, f"{finding.sensor}: {finding.text}")
+        warnings, errors = len(report.at("warning")), len(report.at("error"))
+        console.print(f"{_plural(errors, 'error')}, {_plural(warnings, 'warning')}", style="bold")
+    refuse(report)
+
+
+def _plural(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n or 'no'} {what}s"
+
+
+def _print_finding(console: "Console", level: str, text: str) -> None:
+    from rich.text import Text
+
+    style = {"ok": "green", "warning": "yellow", "error": "bold red"}[level]
+    console.print(Text.assemble((f"{level:8}", style), text), soft_wrap=True)
+
+
+def _timing_table(report: "Report") -> "Table":
+    """When the measurements of each sensor came; times are seconds from the start of the log."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(report.source), title_justify="left")
+    headings = (
+        "sensor",
+        "count",
+        "rate [Hz]",
+        "from [s]",
+        "to [s]",
+        "largest gap [s]",
+        "at [s]",
+        "jitter [s]",
+        "repeats",
+    )
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "sensor" else "right")
+    start = min(t.first for t in report.timings)
+    for t in report.timings:
+        numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", f"{t.gap:.3g}")
+        table.add_row(t.sensor, str(t.count), *numbers, f"{t.gap_at - start:.1f}", f"{t.jitter:.2g}", str(t.repeats))
+    table.caption = f"0 s is {start:.3f} s of the log's clock"
+    return table
+
+
+def _without_nan(value: object) -> object:
+    """NaN as null, which JSON has."""
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and value != value else value

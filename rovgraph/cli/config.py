@@ -1,6 +1,100 @@
-"""``rovgraph config``."""
+"""``rovgraph config``: the effective configuration, or all keys there are."""
+
+import itertools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+# ending of a key -> unit
+_UNITS = {
+    "_mps2": "m/s²",
+    "_mps": "m/s",
+    "_dps": "deg/s",
+    "_deg": "deg",
+    "_m": "m",
+    "_s": "s",
+}
+_GROUP_TEXT = {
+    "": "General",
+    "start": "start: where the dive begins",
+    "environment": "environment: gravity, magnetic field, Earth rate",
+    "imu": "imu: inertial unit",
+    "dvl": "dvl: Doppler velocity log",
+    "heading": "heading: compasses",
+    "depth": "depth: pressure sensor",
+    "fix": "fix: position fixes",
+    "calibration": "calibration: held at the mean, or estimated",
+    "graph": "graph: how it is built and solved",
+}
 
 
-def config() -> None:
-    """To be written."""
-    raise NotImplementedError
+def config(
+    path: Annotated[
+        Path | None, typer.Argument(help="configuration (YAML); without it all defaults", metavar="[CONFIG]")
+    ] = None,
+    keys: Annotated[bool, typer.Option("--keys", help="list all keys with default, unit and meaning")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="with --keys: as the tables of the manual")] = False,
+) -> None:
+    """Print the effective configuration, every key written out; a wrong key is named."""
+    from rovgraph.config import load_config
+
+    settings = load_config(path)
+    if keys and markdown:
+        typer.echo(key_tables())
+    elif keys:
+        _print_keys()
+    else:
+        typer.echo(settings.to_yaml().rstrip("\n"))
+
+
+def key_tables() -> str:
+    """All keys as Markdown, a table per section: what docs/configuration.md holds."""
+    lines: list[str] = []
+    for section, rows in _sections():
+        lines += [
+            f"### {_GROUP_TEXT.get(section, section)}",
+            "",
+            "| key | unit | default | meaning |",
+            "|---|---|---|---|",
+        ]
+        lines += [f"| `{key}` | {unit} | `{default}` | {meaning} |" for key, unit, default, meaning in rows]
+        lines.append("")
+    return "\n".join(lines).rstrip("\n")
+
+
+def _rows() -> Iterator[tuple[str, str, str, str]]:
+    """Key, unit, default as in YAML and meaning of every key."""
+    from rovgraph.config import describe
+
+    for key, default, meaning in describe():
+        unit = next((unit for ending, unit in _UNITS.items() if key.endswith(ending)), "")
+        bracket = re.search(r" ?\[([^]]+)\]", meaning)
+        if bracket is not None:
+            unit, meaning = bracket.group(1), meaning.replace(bracket.group(0), "")
+        unit = {"degrees": "deg", "1": ""}.get(unit, unit)
+        yield key, unit, {"True": "true", "False": "false"}.get(default, default), meaning
+
+
+def _sections() -> Iterator[tuple[str, list[tuple[str, str, str, str]]]]:
+    """Rows grouped by the first part of their key; keys without a section are "General"."""
+    rows = sorted(_rows(), key=lambda row: "." in row[0])
+    for section, group in itertools.groupby(rows, key=lambda row: row[0].split(".")[0] if "." in row[0] else ""):
+        yield section, list(group)
+
+
+def _print_keys() -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title="configuration keys", title_justify="left")
+    for heading in ("key", "unit", "default", "meaning"):
+        table.add_column(heading, no_wrap=heading in ("key", "unit"), overflow="fold")
+    for _, rows in _sections():
+        for key, unit, default, meaning in rows:
+            table.add_row(key, Text(unit), Text(default), Text(meaning))
+        table.add_section()
+    Console().print(table)

@@ -1,0 +1,75 @@
+"""Is this log sane? And what would an estimate make of it?
+
+`examine` runs every check of `CHECKS` and collects what they find; `warn` is for commands
+that go on to work with the log. A check takes a log and a configuration and yields
+findings; it knows nothing of other checks.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator
+
+from rovgraph.check.agreement import headings, vertical
+from rovgraph.check.findings import Finding, Level, Report, Timing
+from rovgraph.check.fixes import track
+from rovgraph.check.frozen_dvl import dvl_frozen_intervals, standstill
+from rovgraph.check.outlook import plan
+from rovgraph.check.times import overlap, presence, regularity, timing
+from rovgraph.check.values import angles, bottom_lock, depths, frozen, gravity, magnetic_field, turn_rates
+from rovgraph.config import Config
+from rovgraph.errors import DataWarning, InputError
+from rovgraph.log import Log
+
+__all__ = ["Finding", "Level", "Report", "Timing", "dvl_frozen_intervals", "examine", "warn"]
+
+Check = Callable[[Log, Config], Iterator[Finding]]
+CHECKS: tuple[Check, ...] = (
+    presence,
+    overlap,
+    regularity,
+    gravity,
+    turn_rates,
+    angles,
+    headings,
+    magnetic_field,
+    bottom_lock,
+    standstill,
+    frozen,
+    depths,
+    vertical,
+    track,
+    plan,
+)
+
+
+def examine(log: Log, config: Config | None = None) -> Report:
+    """Run every check.
+
+    Parameters
+    ----------
+    log : as read
+    config : what is believed of the vehicle; defaults where it is not given
+    """
+    config = Config() if config is None else config
+    findings = [finding for check in CHECKS for finding in check(log, config)]
+    return Report(log.source, [timing(stream) for stream in log.streams.values()], findings)
+
+
+def warn(log: Log, config: Config | None = None) -> None:
+    """Issue a `DataWarning` for whatever looks wrong.
+
+    Raises
+    ------
+    InputError : what the log cannot be worked with for; the first of these findings
+    """
+    report = examine(log, config)
+    for finding in report.at("warning"):
+        warnings.warn(f"{report.source}: {finding.sensor}: {finding.text}", DataWarning, stacklevel=2)
+    refuse(report)
+
+
+def refuse(report: Report) -> None:
+    """Raise an `InputError` if a report holds an error."""
+    errors = report.at("error")
+    if errors:
+        more = f" (and {len(errors) - 1} more; see rovgraph check)" if len(errors) > 1 else ""
+        raise InputError(f"{report.source}: {errors[0].sensor}: {errors[0].text}{more}")

@@ -1,0 +1,249 @@
+"""Whether sensors that see the same motion agree: sign, scale, and clock.
+
+Each comparison takes what two sensors say of the change within windows of some seconds
+and fits ``change_b = slope * change_a + const``, so biases and constant offsets drop out.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from rovgraph.check.findings import Finding, Level, integral
+from rovgraph.config import Config, mount_matrix
+from rovgraph.geometry import Array, rotate
+from rovgraph.log import Log, Stream
+
+ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
+ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
+MIN_WINDOWS = 15
+FOLLOWS = 0.7  # correlation of sensors that see the same motion
+LAG_WARNING = 0.3  # [s]
+LARGEST_LAG = 3.0  # that is searched for [s]
+NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading"}
+
+
+@dataclass(frozen=True)
+class Signal:
+    """An integrated quantity over time, such as a heading without jumps.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,) [s]
+    value : ndarray, shape (n,)
+    """
+
+    time: Array
+    value: Array
+
+    def changes(self, edges: Array, longest: float) -> Array:
+        """Change from each edge to the next, NaN next to a gap; shape (len(edges) - 1,)."""
+        k = np.searchsorted(self.time, edges).clip(1, len(self.time) - 1)
+        in_gap = self.time[k] - self.time[k - 1] > longest
+        inside = (edges >= self.time[0]) & (edges <= self.time[-1]) & ~in_gap
+        return np.diff(np.where(inside, np.interp(edges, self.time, self.value), np.nan))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Straight line through the changes of two signals.
+
+    Attributes
+    ----------
+    slope, correlation : of b's changes against a's
+    sd_a, sd_b : of the changes
+    windows : how many
+    """
+
+    slope: float
+    correlation: float
+    sd_a: float
+    sd_b: float
+    windows: int
+
+
+def fit(a: Signal, b: Signal, window: float, lag: float = 0.0) -> Fit:
+    """Compare the changes of two signals, b taken ``lag`` seconds later."""
+    first, last = max(a.time[0], b.time[0]) + LARGEST_LAG, min(a.time[-1], b.time[-1]) - LARGEST_LAG
+    edges = np.arange(first, last, window)
+    if len(edges) < 3:
+        return Fit(np.nan, 0.0, 0.0, 0.0, 0)
+    x, y = a.changes(edges, window), b.changes(edges + lag, window)
+    both = np.isfinite(x) & np.isfinite(y)
+    x, y = x[both], y[both]
+    if len(x) < 3 or x.std() == 0.0 or y.std() == 0.0:
+        return Fit(np.nan, 0.0, 0.0, 0.0, len(x))
+    correlation = float(np.corrcoef(x, y)[0, 1])
+    return Fit(correlation * float(y.std() / x.std()), correlation, float(x.std()), float(y.std()), len(x))
+
+
+def lag(a: Signal, b: Signal, window: float) -> float:
+    """How much later b shows the same motion than a [s]; NaN if they do not follow each other."""
+    step = 0.1
+    lags = np.arange(-LARGEST_LAG, LARGEST_LAG + step / 2, step)
+    correlation = np.array([abs(fit(a, b, window, float(x)).correlation) for x in lags])
+    k = int(np.argmax(correlation))
+    if not 0 < k < len(lags) - 1 or correlation[k] < FOLLOWS:
+        return np.nan
+    before, peak, after = correlation[k - 1 : k + 2]
+    bend = before - 2.0 * peak + after
+    return float(lags[k] + (0.5 * step * (before - after) / bend if bend < 0 else 0.0))
+
+
+def headings(log: Log, config: Config) -> Iterator[Finding]:
+    """Every heading turns as the gyro does: direction, unit and clock."""
+    if "imu" not in log or len(log["imu"]) < 3:
+        return
+    gyro = _gyro_yaw(log["imu"], config)
+    for sensor in ("mag", "ahrs", "dvl_heading"):
+        if sensor not in log or len(log[sensor]) < MIN_WINDOWS:
+            continue
+        heading = _heading(log, config, sensor)
+        period = float(np.median(np.diff(heading.time)))
+        f = fit(gyro, heading, max(2.0, 3.0 * period))
+        yield _turning(log, sensor, f)
+        if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
+            # short windows: in long ones a compass's deviation looks like a lag
+            seconds = lag(gyro, heading, max(1.0, 1.5 * period))
+            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", seconds)
+
+
+def _gyro_yaw(imu: Stream, config: Config) -> Signal:
+    """Integrated rate about the body's z axis [rad]."""
+    rate_b = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])
+    return Signal(imu.time, integral(imu, rate_b[:, 2]))
+
+
+def _heading(log: Log, config: Config, sensor: str) -> Signal:
+    """A heading without jumps, of whatever circle its numbers suggest."""
+    stream = log[sensor]
+    if sensor == "mag":
+        field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
+        values = np.arctan2(-field_b[:, 1], field_b[:, 0])
+    else:
+        values = stream.data[:, 0]
+    return Signal(stream.time, np.unwrap(values, period=360.0 if _beyond_circle(values) else 2.0 * np.pi))
+
+
+def _beyond_circle(values: Array) -> bool:
+    return bool(np.abs(values).max() > 2.0 * np.pi + 0.01)
+
+
+def _turning(log: Log, sensor: str, f: Fit) -> Finding:
+    """What a comparison of a heading with the gyro means."""
+    name, beyond = NAMES[sensor], sensor != "mag" and _beyond_circle(log[sensor].data[:, 0])
+    if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b) < ENOUGH_TURNING:
+        if beyond:
+            largest = np.abs(log[sensor].data[:, 0]).max()
+            return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; in degrees? {_say_degrees(sensor)}")
+        return Finding(sensor, "ok", f"too little turning to compare {name} with the gyro")
+    numbers = f"slope {f.slope:.3g}, correlation {f.correlation:.2f} over {f.windows} windows"
+    if abs(f.correlation) < FOLLOWS:
+        hint = "hard iron, or a wrong mounting?" if sensor == "mag" else "wrong unit, mounting or clock?"
+        return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); {hint}")
+    if 40.0 < abs(f.slope) < 80.0 or 1 / 80.0 < abs(f.slope) < 1 / 40.0:
+        return Finding(sensor, "error", f"{_factor_of_57(log, sensor, f.slope)} ({numbers})")
+    if f.slope < 0.0:
+        return Finding(
+            sensor,
+            "warning",
+            f"{name} turns against the gyro ({numbers}): the heading counts anticlockwise, or the IMU's z axis points "
+            "up (imu.mount_rpy_deg)",
+        )
+    level: Level = "ok" if 0.7 < f.slope < 1.4 else "warning"
+    return Finding(sensor, level, f"{name} turns with the gyro ({numbers})")
+
+
+def _factor_of_57(log: Log, sensor: str, slope: float) -> str:
+    """Which of gyro and heading is in the wrong unit."""
+    fast = float(np.percentile(np.abs(log["imu"].data[:, 3:]), 99))
+    name = NAMES[sensor]
+    if abs(slope) < 1.0:
+        if sensor != "mag" and np.ptp(log[sensor].data[:, 0]) < 2 * np.pi / 50 and fast < 3.0:
+            return f"{name} is 57 times too small; was it converted to radians twice, by units: too?"
+        return "the gyro is 57 times too fast; in deg/s? Say units: {gyr: deg/s}"
+    if sensor != "mag" and _beyond_circle(log[sensor].data[:, 0]):
+        return f"{name} is 57 times too large; in degrees? {_say_degrees(sensor)}"
+    return "the gyro is 57 times too slow; was it converted to rad/s twice, by units: too?"
+
+
+def _say_degrees(sensor: str) -> str:
+    return f"Say units: {{{sensor}: deg}}"
+
+
+def _clock(sensor: str, what: str, against: str, seconds: float) -> Iterator[Finding]:
+    """A lag, if there is one."""
+    if np.isnan(seconds):
+        return
+    later = f"{abs(seconds):.2f} s {'later' if seconds > 0 else 'earlier'} than {against}"
+    if abs(seconds) > LAG_WARNING:
+        yield Finding(sensor, "warning", f"{what} comes {later}: do the clocks disagree, or is it filtered slowly?")
+    else:
+        yield Finding(sensor, "ok", f"{what} comes {later}")
+
+
+def vertical(log: Log, config: Config) -> Iterator[Finding]:
+    """The DVL's velocity downwards against the change of depth: sign and clock."""
+    if not {"dvl", "depth", "imu"} <= log.sensors or len(log["depth"]) < MIN_WINDOWS:
+        return
+    pings = _valid_pings(log["dvl"])
+    if len(pings) < MIN_WINDOWS:
+        return
+    down = _downwards(log["imu"], config, pings.time)
+    v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
+    dvl = Signal(pings.time, integral(pings, np.sum(v_b * down, axis=1)))
+    depth = Signal(log["depth"].time, log["depth"]["depth"])
+    window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
+    f = fit(depth, dvl, window)
+    if f.windows < MIN_WINDOWS or f.sd_a < ENOUGH_DIVING:
+        yield Finding("dvl", "ok", "too little diving to compare its vertical velocity with depth")
+        return
+    numbers = f"slope {f.slope:.2g}, correlation {f.correlation:.2f} over {f.windows} windows"
+    if abs(f.correlation) < FOLLOWS:
+        if f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
+            yield Finding("dvl", "warning", f"vertical velocity does not follow depth ({numbers}); mounting or clock?")
+        return
+    if f.slope < 0.0:
+        yield Finding(
+            "dvl",
+            "warning",
+            f"vertical velocity has the sign opposite to the change of depth ({numbers}): {_flip(config)}; "
+            "or does depth count upwards?",
+        )
+    else:
+        level: Level = "ok" if 0.7 < f.slope < 1.4 else "warning"
+        yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
+    yield from _clock("dvl", "vertical velocity", "the change of depth", lag(depth, dvl, window))
+
+
+def _flip(config: Config) -> str:
+    """A hint at a DVL that is mounted the other way up."""
+    roll, pitch, yaw = config.dvl.mount_rpy_deg
+    turned, points = (180, "up") if abs(roll) < 90 else (0, "down")
+    return f"does the DVL's z axis point {points}? Then dvl.mount_rpy_deg is [{turned}, {pitch:g}, {yaw:g}]"
+
+
+def _valid_pings(stream: Stream) -> Stream:
+    valid = stream["dvl_valid"] == 1.0
+    return Stream(stream.sensor, stream.columns, stream.time[valid], stream.data[valid], stream.row[valid])
+
+
+def _downwards(imu: Stream, config: Config, time: Array, span: float = 2.0) -> Array:
+    """Unit vector of gravity in body axes from the mean specific force around each time.
+
+    Parameters
+    ----------
+    time : ndarray, shape (m,)
+    span : averaged over so long [s]
+
+    Returns
+    -------
+    ndarray, shape (m, 3)
+    """
+    R_bs = mount_matrix(config.imu.mount_rpy_deg)
+    total = np.vstack([np.zeros(3), np.cumsum(imu.data[:, :3], axis=0)])
+    low = np.searchsorted(imu.time, time - span / 2).clip(0, len(imu) - 1)
+    high = np.maximum(np.searchsorted(imu.time, time + span / 2), low + 1)
+    f_b = rotate(R_bs, (total[high] - total[low]) / (high - low)[:, None])
+    out: Array = -f_b / np.maximum(np.linalg.norm(f_b, axis=1, keepdims=True), 1e-9)
+    return out

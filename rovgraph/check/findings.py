@@ -1,0 +1,115 @@
+"""What a check has to say, and helpers that the checks share."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.geometry import Array
+from rovgraph.log import Log, Stream
+
+Level = Literal["ok", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One statement about a log.
+
+    Attributes
+    ----------
+    sensor : name of the stream, or "log", "configuration"
+    level : "error": cannot be worked with as it is
+    text : one sentence, with the numbers it rests on
+    """
+
+    sensor: str
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the measurements of one sensor came.
+
+    Attributes
+    ----------
+    sensor : name of the stream
+    count : measurements
+    rate : one over the median period [Hz], NaN for a single one
+    first, last : times [s]
+    gap, gap_at : largest time between two, and when it begins [s]
+    jitter : half the width of the middle 90 % of the periods [s]
+    repeats : measurements that repeat the one before exactly
+    """
+
+    sensor: str
+    count: int
+    rate: float
+    first: float
+    last: float
+    gap: float
+    gap_at: float
+    jitter: float
+    repeats: int
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that was found in a log.
+
+    Attributes
+    ----------
+    source : file name
+    timings : one per sensor
+    findings : in the order of the checks
+    """
+
+    source: str
+    timings: list[Timing]
+    findings: list[Finding]
+
+    def at(self, level: Level) -> list[Finding]:
+        """Findings of one level."""
+        return [f for f in self.findings if f.level == level]
+
+
+def repeats(values: Array) -> NDArray[np.bool_]:
+    """Whether each row repeats the one before exactly, NaN included; shape (n,)."""
+    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+    return np.concatenate([[False], same.reshape(len(same), -1).all(axis=1)])[: len(values)]
+
+
+def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """First and last index of every stretch of True."""
+    edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
+    yield from zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True)
+
+
+def frozen_runs(values: Array) -> Iterator[tuple[int, int]]:
+    """First and last index of every stretch of identical rows, two or more."""
+    for first, last in runs(repeats(values)):
+        yield first - 1, last
+
+
+def since(log: Log, time: float) -> str:
+    """A time as a person looks for it: seconds from the start of the log.
+
+    >>> from rovgraph.log import Log
+    >>> since(Log("dive.csv", {}), 3.0)
+    '3.0 s'
+    """
+    start = min((float(s.time[0]) for s in log.streams.values()), default=0.0)
+    return f"{time - start:.1f} s"
+
+
+def integral(stream: Stream, values: Array) -> Array:
+    """Trapezoidal integral of values over a stream's time from its start, same shape as values.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+    """
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(stream.time)
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,0 +1,130 @@
+"""Which sensors there are, and when their measurements came."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rovgraph.check.findings import Finding, Timing, repeats, since
+from rovgraph.config import Config
+from rovgraph.instruments import heading_sources
+from rovgraph.log import Log, Stream
+
+GAP_PERIODS = 5.0  # longer than this many periods is a gap
+REPEATED = 0.2  # share of repeated samples that a sensor does not produce by itself
+# slowest and fastest rates that make sense [Hz]
+RATES = {"imu": (5.0, 4000.0), "dvl": (0.1, 100.0), "depth": (0.05, 1000.0), "mag": (0.5, 4000.0)}
+
+
+def timing(stream: Stream) -> Timing:
+    """When the measurements of one sensor came."""
+    periods = np.diff(stream.time)
+    again = int(repeats(stream.data).sum())
+    if not len(periods):
+        time = float(stream.time[0])
+        return Timing(stream.sensor, 1, np.nan, time, time, np.nan, np.nan, np.nan, again)
+    widest = int(np.argmax(periods))
+    low, high = np.percentile(periods, [5, 95])
+    return Timing(
+        stream.sensor,
+        len(stream),
+        float(1.0 / np.median(periods)),
+        float(stream.time[0]),
+        float(stream.time[-1]),
+        float(periods[widest]),
+        float(stream.time[widest]),
+        float(high - low) / 2.0,
+        again,
+    )
+
+
+def presence(log: Log, config: Config) -> Iterator[Finding]:
+    """Sensors that are missing, and what that means."""
+    if "imu" not in log:
+        yield Finding(
+            "imu",
+            "error",
+            "no IMU: nothing carries attitude from ping to ping; give acc_x, acc_y, acc_z, gyr_x, gyr_y, gyr_z",
+        )
+    if "dvl" not in log:
+        yield Finding(
+            "dvl", "warning", "no DVL: position is lost within a minute between fixes; give dvl_vx, dvl_vy, dvl_vz"
+        )
+    if not heading_sources(config, log.sensors):
+        known = (
+            "heading starts at start.heading_deg and drifts with the gyro"
+            if config.start.heading_deg is not None
+            else "give mag, ahrs_yaw or dvl_heading, or at least start.heading_deg"
+        )
+        yield Finding("log", "warning", f"no heading source in use: {known}")
+    if "depth" not in log:
+        yield Finding("depth", "warning", "no depth: the vertical drifts; give depth if there is a pressure sensor")
+    if "fix" not in log:
+        yield Finding("fix", "ok", "no position fixes: the error of position grows with the distance")
+
+
+def overlap(log: Log, config: Config) -> Iterator[Finding]:
+    """Sensors that share no time with the IMU."""
+    if "imu" not in log:
+        return
+    first, last = log["imu"].time[[0, -1]]
+    for sensor, stream in log.streams.items():
+        inside = np.mean((stream.time >= first) & (stream.time <= last))
+        if inside == 0.0:
+            yield Finding(
+                sensor, "error", "no time in common with the IMU; are the clocks of different epochs? Put them on one"
+            )
+        elif inside < 0.8:
+            yield Finding(
+                sensor, "warning", f"{1.0 - inside:.0%} of its measurements lie before or after the IMU's and are lost"
+            )
+
+
+def regularity(log: Log, config: Config) -> Iterator[Finding]:
+    """Rates, gaps, jitter and repeated samples."""
+    for sensor, stream in log.streams.items():
+        t = timing(stream)
+        if np.isnan(t.rate):
+            yield Finding(sensor, "warning", "a single measurement")
+            continue
+        low, high = RATES.get(sensor, (0.0, np.inf))
+        if not low <= t.rate <= high:
+            yield Finding(
+                sensor,
+                "warning",
+                f"{t.rate:.4g} Hz, expected {low:g} to {high:g}; is time in seconds? Otherwise say units: {{time: ms}}",
+            )
+        yield from _gaps(log, config, t)
+        if sensor == "imu" and t.jitter * t.rate > 0.5:
+            yield Finding(
+                sensor,
+                "warning",
+                f"times jitter by {t.jitter:.3g} s about {1 / t.rate:.3g} s; are they times of arrival?",
+            )
+        if sensor in ("imu", "mag", "dvl") and t.repeats > REPEATED * t.count and _moves(stream):
+            yield Finding(
+                sensor,
+                "warning",
+                f"{t.repeats / t.count:.0%} of the measurements repeat the one before exactly; "
+                "written faster than measured? Log each once",
+            )
+
+
+def _moves(stream: Stream) -> bool:
+    return bool((np.nanstd(stream.data[:, :3], axis=0) > 0).any()) if np.isfinite(stream.data[:, :3]).any() else False
+
+
+def _gaps(log: Log, config: Config, t: Timing) -> Iterator[Finding]:
+    """Silences of sensors that sample all the time."""
+    if t.sensor == "fix" or t.count < 3:
+        return
+    limit = GAP_PERIODS / t.rate
+    periods = np.diff(log[t.sensor].time)
+    longer = int((periods > limit).sum())
+    if not longer:
+        return
+    text = f"{longer} gaps longer than {limit:.3g} s, the longest {t.gap:.1f} s from {since(log, t.gap_at)} on"
+    if t.sensor == "imu" and t.gap > config.imu.max_gap_s:
+        text += f"; longer than imu.max_gap_s = {config.imu.max_gap_s:g}: split the log there or raise that key"
+        yield Finding(t.sensor, "error", text)
+    else:
+        yield Finding(t.sensor, "warning", text)

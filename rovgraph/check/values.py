@@ -1,0 +1,182 @@
+"""Whether the values of each sensor are possible: gravity, units, ranges, bottom lock."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rovgraph.check.findings import Finding, Level, frozen_runs, integral, since
+from rovgraph.config import Config, mount_matrix
+from rovgraph.geometry import Array, rotate
+from rovgraph.log import Log
+
+GRAVITY_RANGE = (9.3, 10.3)  # plausible mean specific force [m/s2]
+GRAVITY_ANGLE = np.deg2rad(25.0)  # of mean specific force from upwards
+FAST_TURN = 3.0  # no vehicle of this kind turns faster for long [rad/s]
+FAST_SPIKE = 10.0  # nor for a moment [rad/s]
+# specific force along this IMU axis, at rest -> mounting that turns it upwards
+UPRIGHT = {
+    "+x": (0, 90, 0),
+    "-x": (0, -90, 0),
+    "+y": (-90, 0, 0),
+    "-y": (90, 0, 0),
+    "+z": (180, 0, 0),
+    "-z": (0, 0, 0),
+}
+
+
+def gravity(log: Log, config: Config) -> Iterator[Finding]:
+    """Mean specific force: about 9.8 m/s2, upwards in body axes."""
+    if "imu" not in log:
+        return
+    f_s = log["imu"].data[:, :3].mean(axis=0)
+    size = float(np.linalg.norm(f_s))
+    low, high = GRAVITY_RANGE
+    if not low <= size <= high:
+        level: Level = "warning" if 5.0 < size < 15.0 else "error"
+        yield Finding("imu", level, f"mean specific force is {size:.4g} m/s2, expected about 9.8; {_acc_unit(size)}")
+    if size < 1e-6:
+        return
+    f_b = mount_matrix(config.imu.mount_rpy_deg) @ f_s
+    angle = float(np.arccos(np.clip(-f_b[2] / size, -1.0, 1.0)))
+    k = int(np.argmax(np.abs(f_s)))
+    axis = ("-" if f_s[k] < 0 else "+") + "xyz"[k]
+    if angle > GRAVITY_ANGLE:
+        yield Finding(
+            "imu",
+            "warning",
+            f"mean specific force points {np.rad2deg(angle):.0f} deg away from upwards (-z of the body): it is on the "
+            f"IMU's {axis} axis; is imu.mount_rpy_deg {list(UPRIGHT[axis])} with a yaw of your own?",
+        )
+    elif low <= size <= high:
+        yield Finding("imu", "ok", f"mean specific force {size:.2f} m/s2, {np.rad2deg(angle):.1f} deg from upwards")
+
+
+def _acc_unit(size: float) -> str:
+    for unit, g in (("g", 1.0), ("mg", 1000.0)):
+        if 0.9 < size / g < 1.1:
+            return f"acc in {unit}? Say units: {{acc: {unit}}}"
+    return "is gravity taken out of it? Give specific force" if size < 1.0 else "check the unit of acc"
+
+
+def turn_rates(log: Log, config: Config) -> Iterator[Finding]:
+    """Rates that no small vehicle reaches."""
+    if "imu" not in log:
+        return
+    rate = np.linalg.norm(log["imu"].data[:, 3:], axis=1)
+    usual, fast = float(np.percentile(rate, 90)), int((rate > FAST_SPIKE).sum())
+    if usual > FAST_TURN:
+        yield Finding(
+            "imu",
+            "error",
+            f"a tenth of the rates is above {usual:.3g} rad/s ({np.rad2deg(usual):.0f} deg/s); "
+            "in deg/s? Say units: {gyr: deg/s}",
+        )
+    elif fast:
+        when = since(log, log["imu"].time[np.argmax(rate > FAST_SPIKE)])
+        yield Finding("imu", "warning", f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or deg/s")
+    if not np.ptp(log["imu"].data[:, 3:], axis=0).any():
+        yield Finding("imu", "error", "the gyro never changes; is it connected?")
+
+
+def angles(log: Log, config: Config) -> Iterator[Finding]:
+    """Roll and pitch that are no radians; headings are compared with the gyro elsewhere."""
+    if "ahrs" not in log:
+        return
+    tilt = np.abs(log["ahrs"].data[:, 1:])
+    largest = float(np.max(tilt, initial=0.0, where=np.isfinite(tilt)))
+    if largest > np.pi + 0.01:
+        yield Finding("ahrs", "error", f"roll or pitch reaches {largest:.4g} rad; in degrees? Say units: {{ahrs: deg}}")
+
+
+def bottom_lock(log: Log, config: Config) -> Iterator[Finding]:
+    """Share of valid pings, and their speed."""
+    if "dvl" not in log:
+        return
+    stream = log["dvl"]
+    valid = stream["dvl_valid"] == 1.0
+    share = float(valid.mean())
+    yield Finding("dvl", "ok" if share >= 0.8 else "warning", f"bottom lock {share:.1%} of {len(stream)} pings")
+    if not valid.any():
+        return
+    speed = np.linalg.norm(stream.data[valid, :3], axis=1)
+    usual, limit = float(np.median(speed)), config.dvl.max_speed_mps
+    component = np.abs(stream.data[valid, :3]).max(axis=1)
+    lost = int((component > limit).sum())
+    if usual > max(limit, 10.0):
+        yield Finding("dvl", "error", f"median speed {usual:.3g} m/s; in mm/s or cm/s? Say units: {{dvl: mm/s}}")
+    elif lost > 0.05 * len(speed):
+        yield Finding("dvl", "warning", f"{lost} pings are faster than dvl.max_speed_mps = {limit:g} and are left out")
+    else:
+        tail = f"; {lost} faster than {limit:g} m/s are left out" if lost else ""
+        yield Finding("dvl", "ok", f"median speed {usual:.2f} m/s{tail}")
+
+
+def depths(log: Log, config: Config) -> Iterator[Finding]:
+    """Depth positive down, and in metres."""
+    if "depth" not in log:
+        return
+    depth = log["depth"]["depth"]
+    if np.median(depth) < -0.5:
+        yield Finding("depth", "warning", f"median depth {np.median(depth):.2f} m; depth counts downwards: mirrored?")
+    if np.ptp(depth) > 1000.0:
+        yield Finding("depth", "warning", f"depth spans {np.ptp(depth):.0f} m; in cm or mm? Say units: {{depth: mm}}")
+
+
+def magnetic_field(log: Log, config: Config) -> Iterator[Finding]:
+    """The field's magnitude is constant but for iron near the magnetometer."""
+    if "mag" not in log:
+        return
+    size = np.linalg.norm(log["mag"].data, axis=1)
+    low, middle, high = np.percentile(size, [5, 50, 95])
+    spread = (high - low) / middle if middle > 0 else np.inf
+    level: Level = "warning" if spread > 0.4 else "ok"
+    hint = "; large hard iron, calibrate it (rovgraph calibrate)" if level == "warning" else ""
+    yield Finding("mag", level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}")
+
+
+def frozen(log: Log, config: Config) -> Iterator[Finding]:
+    """Sensors that repeat one value although the vehicle moves; zeros of the DVL have their own check."""
+    seconds = {"acc": 1.0, "gyr": 1.0, "mag": 3.0, "dvl": 5.0}  # a noisy sensor never repeats for so long
+    parts = {"acc": ("imu", 0), "gyr": ("imu", 3), "mag": ("mag", 0), "dvl": ("dvl", 0)}
+    for name, (sensor, first) in parts.items():
+        if sensor not in log:
+            continue
+        values = log[sensor].data[:, first : first + 3]
+        zero_or_empty = ~np.any(values, axis=1) | np.isnan(values).any(axis=1)
+        allowed = [zero_or_empty[a] for a, _ in frozen_runs(values)] if name == "dvl" else []
+        stretches = [r for i, r in enumerate(frozen_runs(values)) if not (allowed and allowed[i])]
+        yield from _longest(log, sensor, name, [r for r in stretches if r[1] - r[0] >= 9], seconds[name])
+    for sensor in ("ahrs", "dvl_heading"):
+        if sensor in log and "imu" in log:
+            yield from _frozen_heading(log, config, sensor)
+
+
+def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]], seconds: float) -> Iterator[Finding]:
+    time = log[sensor].time
+    long = [(time[b] - time[a], time[a]) for a, b in stretches if time[b] - time[a] >= seconds]
+    if long:
+        duration, start = max(long)
+        yield Finding(
+            sensor,
+            "warning",
+            f"{name} repeats one value exactly for {duration:.1f} s from {since(log, start)} on "
+            f"({len(long)} such times); a sensor that noise never moves is not measuring",
+        )
+
+
+def _frozen_heading(log: Log, config: Config, sensor: str) -> Iterator[Finding]:
+    """A heading that stands still while the gyro turns."""
+    imu, stream = log["imu"], log[sensor]
+    rate = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])[:, 2]
+    turned: Array = np.interp(stream.time, imu.time, integral(imu, rate - np.median(rate)))
+    for a, b in frozen_runs(stream.data[:, :1]):
+        duration = stream.time[b] - stream.time[a]
+        turn = float(np.ptp(turned[a : b + 1]))
+        if duration > 3.0 and turn > max(0.3, 0.03 * duration):
+            yield Finding(
+                sensor,
+                "warning",
+                f"heading stands still for {duration:.1f} s from {since(log, stream.time[a])} on "
+                f"while the gyro turns by {np.rad2deg(turn):.0f} deg",
+            )
+            return
