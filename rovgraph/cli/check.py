@@ -54,28 +54,18 @@ def _print_finding(console: "Console", level: str, text: str) -> None:
 
 def _timing_table(report: "Report") -> "Table":
     """When the measurements of each sensor came; times are seconds from the start of the log."""
+    from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(report.source), title_justify="left")
-    headings = (
-        "sensor",
-        "count",
-        "rate [Hz]",
-        "from [s]",
-        "to [s]",
-        "largest gap [s]",
-        "at [s]",
-        "jitter [s]",
-        "repeats",
-    )
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "sensor" else "right")
+    table = Table(title=Text(report.source), title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("sensor", "count", "Hz", "from [s]", "to [s]", "gap [s]", "at [s]", "jitter [s]", "repeats"):
+        table.add_column(heading, justify="left" if heading == "sensor" else "right", no_wrap=True)
     start = min(t.first for t in report.timings)
     for t in report.timings:
         numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", f"{t.gap:.3g}")
         table.add_row(t.sensor, str(t.count), *numbers, f"{t.gap_at - start:.1f}", f"{t.jitter:.2g}", str(t.repeats))
-    table.caption = f"0 s is {start:.3f} s of the log's clock"
+    table.caption = f"0 s is {start:.3f} s of the log's clock; gap: the largest, and when"
     return table
 
 

@@ -86,15 +86,19 @@ def _sections() -> Iterator[tuple[str, list[tuple[str, str, str, str]]]]:
 
 
 def _print_keys() -> None:
+    from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title="configuration keys", title_justify="left")
-    for heading in ("key", "unit", "default", "meaning"):
-        table.add_column(heading, no_wrap=heading in ("key", "unit"), overflow="fold")
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("key", "default", "meaning"):
+        table.add_column(heading, no_wrap=heading == "key", overflow="fold")
     for _, rows in _sections():
         for key, unit, default, meaning in rows:
-            table.add_row(key, Text(unit), Text(default), Text(meaning))
+            table.add_row(key, Text(default), Text(f"{meaning} [{unit}]" if unit else meaning))
         table.add_section()
-    Console().print(table)
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=200)  # a file or a pipe has no width to fold at
+    console.print(table)
