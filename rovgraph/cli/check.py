@@ -58,7 +58,7 @@ def _timing_table(report: "Report") -> "Table":
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(report.source), title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=Text(report.source), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading in ("sensor", "count", "Hz", "from [s]", "to [s]", "gap [s]", "at [s]", "jitter [s]", "repeats"):
         table.add_column(heading, justify="left" if heading == "sensor" else "right", no_wrap=True)
     start = min(t.first for t in report.timings)

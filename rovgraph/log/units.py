@@ -5,7 +5,7 @@ A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns
 """
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
 
@@ -93,7 +93,7 @@ def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
     return out
 
 
-def near_miss(name: str, present: Iterable[str]) -> str | None:
+def near_miss(name: str, present: Container[str]) -> str | None:
     """The known column that an unknown one was probably meant to be.
 
     Parameters
@@ -101,6 +101,5 @@ def near_miss(name: str, present: Iterable[str]) -> str | None:
     name : unknown column
     present : columns that the log has; one that is there was not misspelled
     """
-    missing = set(COLUMNS) - set(present)
-    near = difflib.get_close_matches(name.strip().lower(), sorted(missing), 1, cutoff=0.79)
-    return near[0] if near else None
+    near = difflib.get_close_matches(name.strip().lower(), COLUMNS, 1, cutoff=0.79)
+    return near[0] if near and near[0] not in present else None
