@@ -20,6 +20,7 @@ SOURCES: dict[str, tuple[str, dict[str, Any]]] = {
     "mag": ("magnetometer", {"marker": "+", "color": "#E69F00", "mew": 0.5}),
 }
 MOST_SAMPLES = 1500  # of a heading source
+DENSE = 2000  # epochs from which lines are drawn thinner
 
 
 def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
@@ -125,6 +126,8 @@ def _speed(track: Trajectory) -> tuple[Array, Array]:
 
 def _line_and_band(axes: Axes, time: Array, value: Array, sd: Array, kind: str) -> None:
     look = line_of(kind)
+    if len(time) > DENSE:
+        look = {**look, "linewidth": 0.65 * look["linewidth"]}
     axes.plot(time, value, label=name_of(kind), **look)
     if np.isfinite(sd).any():
         band = {"color": look["color"], "alpha": 0.18, "linewidth": 0, "zorder": look["zorder"] - 2}

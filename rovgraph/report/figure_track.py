@@ -19,6 +19,7 @@ from rovgraph.report.units import nice_step
 from rovgraph.trajectory import Trajectory
 
 ELLIPSES = 20  # along a track, at most
+FIXES = 150  # of a kind that are drawn, at most
 _HALO = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "boxstyle": "square,pad=0.1"}
 
 
@@ -98,7 +99,7 @@ def _draw_ellipses(axes: Axes, track: Trajectory, index: Array, kind: str, label
         return
     major, minor, bearing = ellipse_axes(track.cov_p[index])
     look = line_of(kind)
-    face = look["color"] + "22" if len(index) > 1 else "none"
+    face = look["color"] + "18" if len(index) > 1 else "none"
     ellipses = EllipseCollection(
         2 * major,
         2 * minor,
@@ -134,7 +135,7 @@ def _draw_fixes(axes: Axes, estimate: Estimate, log: Log, limits: Array) -> int:
     for chosen, label, look in groups:
         some = np.flatnonzero(chosen & inside)
         if len(some):
-            some = some[thin(len(some), 2000)]
+            some = some[thin(len(some), FIXES)]
             axes.plot(*point[some].T, linestyle="none", mew=0.8, label=label, **look)
     return int(np.sum(~inside & np.isfinite(point).all(axis=-1)))
 

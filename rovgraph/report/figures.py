@@ -35,12 +35,14 @@ def draw_figures(
     list of Path : the PNG files written
     """
     estimates = main_first(estimates)
+    # dead reckoning differentiates every ping: against time it would hide the others
+    over_time = [e for e in estimates if e.kind != "dead_reckoning"] or estimates
     with style():
         figures = {
             "track.png": draw_track(estimates, log, config, reference),
-            "velocity.png": draw_velocity(estimates),
-            "attitude.png": draw_attitude(estimates, log, config),
+            "velocity.png": draw_velocity(over_time),
+            "attitude.png": draw_attitude(over_time, log, config),
             "residuals.png": draw_residuals(estimates[0]),
-            "calibration.png": draw_calibration(estimates),
+            "calibration.png": draw_calibration(over_time),
         }
         return [save(figure, folder / name) for name, figure in figures.items() if figure is not None]
