@@ -179,12 +179,10 @@ def path_along(route: Route, speed: float, duration: float, style: Style | None 
 
     Raises
     ------
-    InputError : speed or duration not positive, or too short a duration to move at all
+    InputError : too short a duration to move at all
     """
     style = style or Style()
     moving = moving_time(duration, style)
-    if not (np.isfinite(speed) and speed > 0):
-        raise InputError(f"speed of {speed} m/s: a positive number is expected")
     nodes, p_n, yaw = timetable(route, speed)
     time = np.linspace(0.0, duration, int(np.ceil(duration / GRID_S)) + 1)
     on_route = np.clip(time - style.rest - style.lead, 0.0, moving)

@@ -15,6 +15,7 @@ from rovgraph.simulate.path import Path, Style, moving_time, path_along
 from rovgraph.simulate.route import Route
 
 Scenario = Callable[[float | None, float | None, Style], Path]
+FASTEST = 20.0  # [m/s]
 VATTERN_END = (39.9, -33.7)  # north, east [m]: end of the thesis's reference path (4.3)
 
 
@@ -35,6 +36,8 @@ def scenario(name: str, duration: float | None = None, speed: float | None = Non
         near = difflib.get_close_matches(name, SCENARIOS, 1)
         hint = f", did you mean {near[0]}?" if near else ""
         raise InputError(f"unknown scenario {name!r}{hint} (known: {', '.join(sorted(SCENARIOS))})")
+    if speed is not None and not 0.0 < speed <= FASTEST:
+        raise InputError(f"speed of {speed} m/s: more than 0 and at most {FASTEST} is expected")
     return SCENARIOS[name](duration, speed, style or Style())
 
 
@@ -44,9 +47,8 @@ def _endless(route: Route, default_speed: float, default_duration: float = 480.0
     def make(duration: float | None, speed: float | None, style: Style) -> Path:
         duration = default_duration if duration is None else duration
         speed = default_speed if speed is None else speed
-        moving = moving_time(duration, style)
-        rounds = 1 if not speed > 0 else int(np.ceil(moving / route.time(speed)))
-        return path_along(route.repeated(max(rounds, 1)), speed, duration, style)
+        rounds = int(np.ceil(moving_time(duration, style) / route.time(speed)))
+        return path_along(route.repeated(rounds), speed, duration, style)
 
     return make
 
@@ -55,8 +57,6 @@ def _once(route: Route, default_speed: float) -> Scenario:
     """A route that is followed to its end; without a speed, at the speed that takes the time given."""
 
     def make(duration: float | None, speed: float | None, style: Style) -> Path:
-        if speed is not None and not speed > 0:
-            raise InputError(f"speed of {speed} m/s: a positive number is expected")
         still = style.rest + 2.0 * style.lead
         if duration is None:
             duration = float(np.ceil(route.time(speed or default_speed) + still))
@@ -75,7 +75,7 @@ def _once(route: Route, default_speed: float) -> Scenario:
 def _straight(duration: float | None, speed: float | None, style: Style) -> Path:
     """North, at constant speed until the time is over."""
     duration, speed = 120.0 if duration is None else duration, 0.4 if speed is None else speed
-    length = max(speed, 0.0) * moving_time(duration, style)
+    length = speed * moving_time(duration, style)
     return path_along(Route.of([(0, 0, 5), (length, 0, 5)]), speed, duration, style)
 
 

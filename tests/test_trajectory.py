@@ -1,0 +1,146 @@
+"""A trajectory survives its files, its interpolation and its uncertainty."""
+
+import gzip
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rovgraph.errors import DataWarning, InputError
+from rovgraph.geometry import exp_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
+from rovgraph.trajectory import Trajectory, read_trajectory
+
+N = 40
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    rng = np.random.default_rng(1)
+    time = np.cumsum(rng.uniform(0.1, 0.3, N))
+    rpy = np.column_stack([0.1 * np.sin(time), 0.3 * np.cos(time), wrap_angle(2.0 * time)])
+    root = 0.1 * rng.standard_normal((3, N, 3, 3))
+    cov_p, cov_theta, cov_v = root @ root.swapaxes(-1, -2)
+    p_n, v_n = rng.standard_normal((2, N, 3))
+    return Trajectory(time, 10 * p_n, matrix_from_rpy(rpy), v_n, cov_p, cov_theta, cov_v)
+
+
+def test_csv_round_trip_keeps_values_and_sds(trajectory, tmp_path):
+    trajectory.write_csv(tmp_path / "t.csv")
+    back = read_trajectory(tmp_path / "t.csv")
+    np.testing.assert_allclose(back.time, trajectory.time, atol=1e-4)
+    np.testing.assert_allclose(back.p_n, trajectory.p_n, rtol=1e-6)
+    np.testing.assert_allclose(back.v_n, trajectory.v_n, rtol=1e-6)
+    np.testing.assert_allclose(back.R_nb, trajectory.R_nb, atol=1e-6)
+    np.testing.assert_allclose(back.p_sd, trajectory.p_sd, rtol=1e-6)
+    np.testing.assert_allclose(back.rpy_sd, trajectory.rpy_sd, rtol=1e-5)
+    np.testing.assert_allclose(back.v_sd, trajectory.v_sd, rtol=1e-6)
+    np.testing.assert_allclose(back.cov_p[:, 0, 1], trajectory.cov_p[:, 0, 1], rtol=1e-6)
+
+
+def test_csv_has_the_columns_of_the_contract(trajectory, tmp_path):
+    trajectory.write_csv(tmp_path / "t.csv")
+    values = ["north", "east", "down", "roll", "pitch", "yaw", "v_north", "v_east", "v_down"]
+    columns = pd.read_csv(tmp_path / "t.csv").columns.tolist()
+    assert columns == ["time", *values, *(v + "_sd" for v in values), "cov_north_east"]
+
+
+def test_what_is_not_known_is_neither_written_nor_read_as_zero(trajectory, tmp_path):
+    truth = Trajectory.certain(trajectory.time, trajectory.p_n, trajectory.R_nb, trajectory.v_n)
+    truth.write_csv(tmp_path / "t.csv.gz")
+    with gzip.open(tmp_path / "t.csv.gz", "rt") as file:
+        assert file.readline().strip() == "time,north,east,down,roll,pitch,yaw,v_north,v_east,v_down"
+    back = read_trajectory(tmp_path / "t.csv.gz")
+    assert np.isnan(back.p_sd).all() and np.isnan(back.cov_theta).all()
+    (tmp_path / "short.csv").write_text("time,north,east,remark\n0,1,2,a\n1,2,3,b\n")
+    short = read_trajectory(tmp_path / "short.csv")
+    assert np.isnan(short.R_nb).all() and np.isnan(short.p_n[:, 2]).all() and np.isnan(short.rpy).all()
+    assert np.isnan(short.at(np.array([0.5])).R_nb).all()
+    np.testing.assert_allclose(short.at(np.array([0.5])).p_n[0, :2], [1.5, 2.5])
+
+
+def test_tum_file_has_position_and_quaternion_in_n(trajectory, tmp_path):
+    trajectory.write_tum(tmp_path / "t.tum")
+    rows = np.loadtxt(tmp_path / "t.tum")
+    assert rows.shape == (N, 8)
+    np.testing.assert_allclose(rows[:, 1:4], trajectory.p_n, atol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), trajectory.R_nb, atol=1e-8)
+
+
+def test_interpolation_is_exact_at_epochs_and_halves_between(trajectory):
+    same = trajectory.at(trajectory.time)
+    np.testing.assert_allclose(same.p_n, trajectory.p_n, atol=1e-12)
+    np.testing.assert_allclose(same.R_nb, trajectory.R_nb, atol=1e-12)
+    np.testing.assert_allclose(same.cov_p, trajectory.cov_p, atol=1e-12)
+    middle = trajectory.at(0.5 * (trajectory.time[:1] + trajectory.time[1:2]))
+    np.testing.assert_allclose(middle.p_n[0], trajectory.p_n[:2].mean(axis=0))
+    turn = Rotation.from_matrix(trajectory.R_nb[0].T @ trajectory.R_nb[1]).as_rotvec()
+    np.testing.assert_allclose(middle.R_nb[0], trajectory.R_nb[0] @ exp_rotation(turn / 2), atol=1e-12)
+
+
+def test_interpolation_goes_the_short_way_across_south():
+    R = matrix_from_rpy([[0, 0, np.deg2rad(170)], [0, 0, np.deg2rad(-170)]])
+    two = Trajectory.certain(np.array([0.0, 1.0]), np.zeros((2, 3)), R, np.zeros((2, 3)))
+    assert abs(wrap_angle(two.at(np.array([0.5])).rpy[0, 2] - np.pi)) < 1e-12
+
+
+def test_interpolation_clamps_outside_and_is_unknown_beside_the_unknown(trajectory):
+    outside = trajectory.at(np.array([-5.0, 1e6]))
+    np.testing.assert_allclose(outside.p_n, trajectory.p_n[[0, -1]])
+    trajectory.R_nb[3] = np.nan
+    t = trajectory.time
+    R = trajectory.at(np.array([t[1], 0.5 * (t[2] + t[3]), t[3], 0.5 * (t[3] + t[4]), t[4]])).R_nb
+    assert np.isnan(R).all(axis=(1, 2)).tolist() == [False, True, True, True, False]
+
+
+def test_rpy_sd_agrees_with_monte_carlo():
+    rpy, root = np.array([0.3, -0.6, 2.0]), np.array([[2, 0, 0], [1, 3, 0], [-1, 1, 2]]) * 1e-3
+    R = matrix_from_rpy(rpy)
+    draws = exp_rotation(np.random.default_rng(2).standard_normal((40000, 3)) @ root.T) @ R
+    spread = wrap_angle(rpy_from_matrix(draws) - rpy).std(axis=0)
+    one = Trajectory(np.zeros(1), *(np.zeros((1, 3)), R[None], np.zeros((1, 3))), *[(root @ root.T)[None]] * 3)
+    np.testing.assert_allclose(one.rpy_sd[0], spread, rtol=0.02)
+
+
+def test_every_keeps_the_last_epoch(trajectory):
+    thin = trajectory.every(7)
+    assert thin.time.tolist() == [*trajectory.time[:-1:7], trajectory.time[-1]]
+    assert len(trajectory.every(1)) == N
+
+
+def test_distance_is_the_length_of_the_track():
+    p = np.array([[0, 0, 0], [3, 4, 0], [3, 4, 12]], float)
+    track = Trajectory.certain(np.arange(3.0), p, np.broadcast_to(np.eye(3), (3, 3, 3)), p)
+    assert track.distance == pytest.approx(17.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "cannot be read as CSV"),
+        (b"\x1f\x8b\x00garbage", "cannot be read as CSV"),
+        (b"time,north\n0,1\n1,2\n", "column east is missing"),
+        (b"time,north,east\n0,1,2\n", "1 rows"),
+        (b"time,north,east\n0,1,2\n1,x,2\n", "line 3: north is 'x', expected a number"),
+        (b"time,north,east\n0,1,2\n2,1,2\n1,1,2\n", "line 4: time does not increase"),
+        (b"time,north,east\n0,1,2\n0,1,2\n", "line 3: time does not increase"),
+    ],
+)
+def test_bad_files_are_named_with_their_line(tmp_path, content, words):
+    for name in ("t.csv", "t.csv.gz") if words.startswith("cannot") else ("t.csv",):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=words):
+            read_trajectory(tmp_path / name)
+
+
+def test_missing_file_and_folder_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_trajectory(tmp_path / "none.csv")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_trajectory(tmp_path)
+
+
+def test_rows_without_position_are_left_out_with_a_warning(tmp_path):
+    (tmp_path / "t.csv").write_text("time, north, east\n0,1,2\n1,,2\n2,inf,2\n3,1,2\n")
+    with pytest.warns(DataWarning, match="2 rows"):
+        assert read_trajectory(tmp_path / "t.csv").time.tolist() == [0.0, 3.0]
