@@ -80,6 +80,7 @@ def fit(a: Signal, b: Signal, window: float, lag: float = 0.0) -> Fit:
 def lag(a: Signal, b: Signal, window: float) -> float:
     """How much later b shows the same motion than a [s]; NaN if they do not follow each other."""
     step = 0.1
+    window *= 1.0618  # no multiple of a period, so that interpolation smooths the noise alike at every lag
     lags = np.arange(-LARGEST_LAG, LARGEST_LAG + step / 2, step)
     correlation = np.array([abs(fit(a, b, window, float(x)).correlation) for x in lags])
     k = int(np.argmax(correlation))
@@ -122,7 +123,15 @@ def _heading(log: Log, config: Config, sensor: str) -> Signal:
         values = np.arctan2(-field_b[:, 1], field_b[:, 0])
     else:
         values = stream.data[:, 0]
-    return Signal(stream.time, np.unwrap(values, period=360.0 if _beyond_circle(values) else 2.0 * np.pi))
+    return Signal(stream.time, np.unwrap(values, period=_circle(values)))
+
+
+def _circle(values: Array) -> float:
+    """The full circle that the numbers of a heading suggest: degrees, radians, or radians converted twice."""
+    if _beyond_circle(values):
+        return 360.0
+    twice = np.deg2rad(2.0 * np.pi)
+    return float(twice) if 0.96 * twice < np.ptp(values) < 1.01 * twice else 2.0 * np.pi
 
 
 def _beyond_circle(values: Array) -> bool:

@@ -76,9 +76,9 @@ class Report:
 
 
 def repeats(values: Array) -> NDArray[np.bool_]:
-    """Whether each row repeats the one before exactly, NaN included; shape (n,)."""
+    """Whether each row of (n, k) repeats the one before exactly, NaN included; shape (n,)."""
     same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
-    return np.concatenate([[False], same.reshape(len(same), -1).all(axis=1)])[: len(values)]
+    return np.concatenate([[False], same.all(axis=1)])[: len(values)]
 
 
 def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

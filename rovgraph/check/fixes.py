@@ -52,7 +52,7 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
         tail = "; check dvl.mount_rpy_deg and the compass offset" if wrong else ""
         if wrong and unlike > like - 0.05:
             tail += f". As well it may be mirrored: {_other_way_up(config)}"
-        text = f"fits the fixes when turned by {np.rad2deg(angle):+.0f} deg and scaled by {scale:.2f}{tail}"
+        text = f"fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
         yield Finding("dvl", "warning" if wrong else "ok", text)
 
 
@@ -74,9 +74,9 @@ def _other_way_up(config: Config) -> str:
 
 
 def _body_heading(log: Log, config: Config) -> tuple[Array, Array] | None:
-    """Times and headings without jumps of the first source but the magnetometer [rad]."""
-    for sensor in heading_sources(config, log.sensors):
-        if sensor == "mag" or len(log[sensor]) < 2:
+    """Times and headings without jumps of the first source but the magnetometer, in use or not [rad]."""
+    for sensor in (*heading_sources(config, log.sensors), "ahrs", "dvl_heading"):
+        if sensor == "mag" or sensor not in log or len(log[sensor]) < 2:
             continue
         mount = config.imu.mount_rpy_deg if sensor == "ahrs" else config.dvl.mount_rpy_deg
         axis = matrix_from_rpy(np.deg2rad(mount))[:, 0]

@@ -60,7 +60,7 @@ def _timing_table(report: "Report") -> "Table":
 
     table = Table(title=Text(report.source), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading in ("sensor", "count", "Hz", "from [s]", "to [s]", "gap [s]", "at [s]", "jitter [s]", "repeats"):
-        table.add_column(heading, justify="left" if heading == "sensor" else "right", no_wrap=True)
+        table.add_column(Text(heading), justify="left" if heading == "sensor" else "right", no_wrap=True)
     start = min(t.first for t in report.timings)
     for t in report.timings:
         numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", f"{t.gap:.3g}")

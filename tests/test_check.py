@@ -1,0 +1,379 @@
+"""The checks of a log: silent on a sound dive, and each fault is named where it was put in."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rovgraph.check import dvl_frozen_intervals, examine, warn
+from rovgraph.check.outlook import keyframes
+from rovgraph.check.times import timing
+from rovgraph.check.values import UPRIGHT
+from rovgraph.config import Config, load_config, mount_matrix
+from rovgraph.errors import DataWarning, InputError
+from rovgraph.geometry import wrap_angle
+from rovgraph.log import STREAMS, Log, Stream, read_log
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+FLIPPED = {"dvl": {"mount_rpy_deg": [180, 0, 0]}}
+
+
+def stream(sensor: str, time, *columns) -> Stream:
+    data = np.full((len(time), len(STREAMS[sensor])), np.nan)
+    data[:, : len(columns)] = np.column_stack(columns)
+    return Stream(sensor, STREAMS[sensor], np.asarray(time), data, np.arange(len(time)) + 2)
+
+
+def dive(duration: float = 400.0, turning: float = 0.15, sway: float = 0.15) -> Log:
+    """A dive with turns and changes of depth, all sensors sound; DVL and IMU in body axes."""
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, duration, 0.02)
+    rate = turning * (np.sin(2 * np.pi * t / 47) + 0.6 * np.sin(2 * np.pi * t / 13 + 1))
+    heading = 1.0 + np.cumsum(rate) * 0.02
+    surge, across = 0.4 + 0.1 * np.sin(t / 9), sway * np.sin(2 * np.pi * t / 31)
+    down = 5.0 + 2.0 * np.sin(2 * np.pi * t / 60)
+    v_down = np.gradient(down, t)
+    v_n = surge * np.cos(heading) - across * np.sin(heading), surge * np.sin(heading) + across * np.cos(heading)
+    north, east = (np.cumsum(v) * 0.02 for v in v_n)
+
+    def noise(n: int, sd: float):
+        return rng.normal(0, sd, n)
+
+    n, p, d, f = len(t), slice(7, None, 10), slice(3, None, 10), slice(1, None, 50)
+    m = len(t[p])
+    imu = stream(
+        "imu", t, *(noise(n, 0.02) for _ in range(2)), -9.81 + noise(n, 0.02),
+        *(noise(n, 2e-3) for _ in range(2)), rate + 0.01 + noise(n, 2e-3),
+    )  # fmt: skip
+    dvl = stream("dvl", t[p], *(x[p] + noise(m, 0.005) for x in (surge, across, v_down)), np.ones(m))
+    compass = wrap_angle(heading[p] + noise(m, 0.01))
+    streams = (
+        imu,
+        dvl,
+        stream("dvl_heading", t[p], compass),
+        stream("ahrs", t, wrap_angle(heading + noise(n, 0.005)), noise(n, 0.01), noise(n, 0.01)),
+        stream("mag", t, np.cos(heading) + noise(n, 0.01), -np.sin(heading) + noise(n, 0.01), np.full(n, 2.0)),
+        stream("depth", t[d], down[d] + noise(len(t[d]), 0.01)),
+        stream("fix", t[f], north[f] + noise(len(t[f]), 0.3), east[f] + noise(len(t[f]), 0.3)),
+    )
+    return Log("dive.csv", {s.sensor: s for s in streams})
+
+
+def changed(log: Log, sensor: str, change) -> Log:
+    """The log with one stream's data changed in place by ``change(data, time)``."""
+    data = log[sensor].data.copy()
+    change(data, log[sensor].time)
+    return replace(log, streams={**log.streams, sensor: replace(log[sensor], data=data)})
+
+
+def scaled(log: Log, sensor: str, columns: slice, factor: float) -> Log:
+    def change(data, _):
+        data[:, columns] *= factor
+
+    return changed(log, sensor, change)
+
+
+def without(log: Log, *sensors: str) -> Log:
+    return replace(log, streams={k: s for k, s in log.streams.items() if k not in sensors})
+
+
+def complaints(log: Log, config: Config | None = None, level: str = "warning", sensor: str | None = None) -> str:
+    return "\n".join(f.text for f in examine(log, config).at(level) if sensor in (None, f.sensor))
+
+
+@pytest.fixture(scope="module")
+def sound() -> Log:
+    return dive()
+
+
+def test_a_sound_dive_has_no_complaint(sound):
+    report = examine(sound)
+    assert [f for f in report.findings if f.level != "ok"] == []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn(sound)
+
+
+def test_what_sensors_agree_on_is_said_with_numbers(sound):
+    said = complaints(sound, level="ok")
+    for sensor in ("ahrs_yaw", "dvl_heading", "the field's direction"):
+        assert f"{sensor} turns with the gyro (slope 1" in said
+    assert "vertical velocity agrees with the change of depth (slope 1" in said
+    assert "fits the fixes when turned by +0 deg and scaled by 1.0" in said
+
+
+def test_timing_counts_rate_gap_and_repeats():
+    time = np.concatenate([np.arange(0, 10, 0.1), np.arange(15, 20, 0.1)])
+    depth = np.arange(len(time), dtype=float)
+    depth[5:8] = depth[5]
+    t = timing(stream("depth", time, depth))
+    assert (t.count, t.repeats) == (150, 2)
+    assert (t.rate, t.gap, t.gap_at, t.last) == pytest.approx((10.0, 5.1, 9.9, 19.9))
+    assert np.isnan(timing(stream("depth", [1.0], [2.0])).rate)
+
+
+@pytest.mark.parametrize(
+    ("absent", "level", "said"),
+    [
+        (["imu"], "error", "no IMU"),
+        (["dvl"], "warning", "no DVL: position is lost"),
+        (["mag", "ahrs", "dvl_heading"], "warning", "no heading source in use: give mag, ahrs_yaw or dvl_heading"),
+        (["depth"], "warning", "no depth"),
+        (["fix"], "ok", "no position fixes"),
+    ],
+)
+def test_a_missing_sensor_is_named_with_its_consequence(sound, absent, level, said):
+    assert said in complaints(without(sound, *absent), level=level)
+
+
+def test_a_gap_is_found_where_it_is_and_a_long_one_of_the_imu_is_refused(sound):
+    def cut(log, sensor, a, b):
+        s = log[sensor]
+        k = (s.time < a) | (s.time > b)
+        return replace(log, streams={**log.streams, sensor: replace(s, time=s.time[k], data=s.data[k], row=s.row[k])})
+
+    assert "the longest 20.2 s from 99.9 s on" in complaints(cut(sound, "dvl", 100, 120), sensor="dvl")
+    assert "1 gaps" in complaints(cut(sound, "imu", 100, 120), sensor="imu")
+    assert "imu.max_gap_s = 30" in complaints(cut(sound, "imu", 100, 140), level="error")
+
+
+def test_milliseconds_taken_for_seconds_are_noticed(sound):
+    slow = {k: replace(s, time=s.time * 1000) for k, s in sound.streams.items()}
+    assert "units: {time: ms}" in complaints(replace(sound, streams=slow), sensor="imu")
+
+
+def test_clocks_of_different_epochs_are_refused(sound):
+    late = replace(sound["dvl"], time=sound["dvl"].time + 1e6)
+    log = replace(sound, streams={**sound.streams, "dvl": late})
+    assert "no time in common" in complaints(log, level="error", sensor="dvl")
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1 / 9.80665, "g"), (1000 / 9.80665, "mg")])
+def test_acceleration_in_g_is_refused_with_the_unit(sound, factor, unit):
+    log = scaled(sound, "imu", slice(0, 3), factor)
+    assert f"units: {{acc: {unit}}}" in complaints(log, level="error", sensor="imu")
+    with pytest.raises(InputError, match=r"^dive.csv: imu: "):
+        warn(log)
+
+
+@pytest.mark.parametrize("axis", UPRIGHT)
+def test_the_mounting_that_is_suggested_turns_gravity_upright(sound, axis):
+    f = (1 if axis[0] == "+" else -1) * 9.81 * np.eye(3)["xyz".index(axis[1])]
+    np.testing.assert_allclose(mount_matrix(UPRIGHT[axis]) @ f, [0, 0, -9.81], atol=1e-9)
+
+    def turn(data, _):
+        data[:] = data @ np.kron(np.eye(2), mount_matrix(UPRIGHT[axis]))
+
+    turned = complaints(changed(sound, "imu", turn), sensor="imu")
+    assert (f"IMU's {axis} axis" in turned) == (axis != "-z")
+    mounted = Config.model_validate({"imu": {"mount_rpy_deg": UPRIGHT[axis]}})
+    assert complaints(without(changed(sound, "imu", turn), "mag"), mounted) == ""
+
+
+@pytest.mark.parametrize("with_heading", [True, False])
+def test_a_gyro_in_degrees_is_refused(sound, with_heading):
+    log = scaled(sound, "imu", slice(3, 6), np.rad2deg(1.0))
+    log = log if with_heading else without(log, "mag", "ahrs", "dvl_heading")
+    assert "units: {gyr: deg/s}" in complaints(log, level="error")
+
+
+def test_a_slow_gyro_in_degrees_is_refused_by_its_heading():
+    log = scaled(dive(turning=0.03), "imu", slice(3, 6), np.rad2deg(1.0))
+    assert "the gyro is 57 times too fast" in complaints(log, level="error", sensor="ahrs")
+
+
+def test_a_gyro_converted_twice_is_refused(sound):
+    log = scaled(sound, "imu", slice(3, 6), np.deg2rad(1.0))
+    assert "the gyro is 57 times too slow" in complaints(log, level="error", sensor="dvl_heading")
+
+
+@pytest.mark.parametrize("sensor", ["ahrs", "dvl_heading"])
+def test_a_heading_in_degrees_is_refused(sound, sensor):
+    log = scaled(sound, sensor, slice(0, 1), np.rad2deg(1.0))
+    assert f"units: {{{sensor}: deg}}" in complaints(log, level="error", sensor=sensor)
+
+
+def test_a_heading_converted_twice_is_refused(sound):
+    log = scaled(sound, "dvl_heading", slice(0, 1), np.deg2rad(1.0))
+    assert "dvl_heading is 57 times too small" in complaints(log, level="error", sensor="dvl_heading")
+
+
+def test_a_heading_that_counts_on_past_a_circle_is_fine(sound):
+    def unwrap(data, _):
+        data[:, 0] = np.unwrap(data[:, 0]) + 20.0
+
+    assert complaints(changed(sound, "ahrs", unwrap)) == complaints(changed(sound, "ahrs", unwrap), level="error") == ""
+
+
+def test_tilt_in_degrees_is_refused(sound):
+    def tilt(data, time):
+        data[:, 1] = 8.0 * np.sin(time)
+
+    assert "roll or pitch reaches 8 rad" in complaints(changed(sound, "ahrs", tilt), level="error")
+
+
+def test_a_heading_that_counts_anticlockwise_is_named(sound):
+    log = scaled(sound, "dvl_heading", slice(0, 1), -1.0)
+    assert "dvl_heading turns against the gyro (slope -1" in complaints(log, sensor="dvl_heading")
+    assert complaints(log, sensor="ahrs") == ""
+
+
+def test_a_late_compass_is_measured(sound):
+    late = replace(sound["dvl_heading"], time=sound["dvl_heading"].time + 0.8)
+    said = complaints(replace(sound, streams={**sound.streams, "dvl_heading": late}), sensor="dvl_heading")
+    assert any(f"comes {x} s later than the gyro's" in said for x in ("0.79", "0.80", "0.81"))
+
+
+def test_a_late_dvl_is_measured_against_depth(sound):
+    late = replace(sound["dvl"], time=sound["dvl"].time + 1.5)
+    said = complaints(replace(sound, streams={**sound.streams, "dvl": late}), sensor="dvl")
+    assert any(f"vertical velocity comes {x} s later" in said for x in ("1.48", "1.49", "1.50", "1.51", "1.52"))
+
+
+def test_a_dvl_that_looks_up_is_named_by_depth_and_by_fixes(sound):
+    log = scaled(sound, "dvl", slice(1, 3), -1.0)
+    assert "Then dvl.mount_rpy_deg is [180, 0, 0]" in complaints(without(log, "fix"), sensor="dvl")
+    assert "better with y mirrored" in complaints(without(log, "depth"), sensor="dvl")
+    assert complaints(log, Config.model_validate(FLIPPED)) == ""
+    assert "Then dvl.mount_rpy_deg is [0, 0, 0]" in complaints(sound, Config.model_validate(FLIPPED), sensor="dvl")
+
+
+def test_a_dvl_turned_by_40_degrees_is_measured_against_fixes(sound):
+    turned = Config.model_validate({"dvl": {"mount_rpy_deg": [0, 0, 40]}})
+    said = complaints(without(sound, "dvl_heading"), turned, sensor="dvl")
+    assert "turned by -40 deg and scaled by 1.0" in said
+
+
+def test_velocities_in_millimetres_are_refused(sound):
+    assert "units: {dvl: mm/s}" in complaints(scaled(sound, "dvl", slice(0, 3), 1e3), level="error", sensor="dvl")
+
+
+def test_little_bottom_lock_is_counted(sound):
+    def lose(data, time):
+        data[time < 100, 3] = 0.0
+
+    assert "bottom lock 75.0%" in complaints(changed(sound, "dvl", lose), sensor="dvl")
+
+
+def test_depth_upwards_is_named(sound):
+    assert "depth counts downwards" in complaints(scaled(sound, "depth", slice(0, 1), -1.0), sensor="depth")
+
+
+def test_hard_iron_larger_than_the_field_is_named(sound):
+    def magnetise(data, _):
+        data[:, 0] += 3.0
+
+    assert "hard iron" in complaints(changed(sound, "mag", magnetise), sensor="mag")
+
+
+def test_an_imu_that_repeats_itself_is_named(sound):
+    def hold(data, time):
+        data[(time > 50) & (time < 70)] = data[0]
+
+    said = complaints(changed(sound, "imu", hold), sensor="imu")
+    assert "acc repeats one value exactly for 20.0 s from 50.0 s on" in said
+    assert "gyr repeats" in said
+
+
+def test_samples_written_twice_are_named(sound):
+    def twice(data, _):
+        data[1::2] = data[::2]
+
+    assert "50% of the measurements repeat" in complaints(changed(sound, "imu", twice), sensor="imu")
+
+
+def test_a_heading_that_stands_still_in_a_turn_is_named(sound):
+    def hold(data, time):
+        data[(time > 50) & (time < 70), 0] = 1.0
+
+    assert "while the gyro turns by" in complaints(changed(sound, "dvl_heading", hold), sensor="dvl_heading")
+
+
+def zeroed(log: Log, first: float, last: float) -> Log:
+    def stop(data, time):
+        data[(time >= first) & (time <= last), :3] = 0.0
+
+    return changed(log, "dvl", stop)
+
+
+def test_zeros_that_begin_at_speed_are_a_frozen_dvl(sound):
+    ((first, last),) = dvl_frozen_intervals(zeroed(sound, 100.0, 120.0))
+    assert (first, last) == pytest.approx((100.14, 119.94))
+    assert "exactly zero for 19.8 s from 100.1 s on although it moves at" in complaints(zeroed(sound, 100.0, 120.0))
+
+
+def test_zeros_all_along_are_frozen_when_others_see_motion(sound):
+    assert len(dvl_frozen_intervals(zeroed(sound, -1, 1e9))) == 1
+    still = changed(zeroed(sound, -1, 1e9), "imu", lambda data, _: data.__setitem__((slice(None), 5), 1e-3))
+    assert "fixes move" in complaints(still, sensor="dvl")
+    assert dvl_frozen_intervals(without(still, "fix")) == []
+
+
+def test_short_or_slow_zeros_are_a_standstill(sound):
+    assert dvl_frozen_intervals(sound) == []
+    assert dvl_frozen_intervals(zeroed(sound, 100.0, 102.0)) == []
+
+    def ease(data, time):  # comes to rest, stays, and sets off again
+        speed = np.clip((np.abs(time - 100.0) - 20.0) / 60.0, 0.0, 0.4)
+        data[:, :3] = np.column_stack([speed, 0 * speed, 0 * speed])
+
+    resting = changed(without(sound, "fix"), "dvl", ease)
+    resting = changed(resting, "imu", lambda data, _: data.__setitem__((slice(None), 5), 1e-3))
+    assert dvl_frozen_intervals(resting) == []
+
+
+def test_invalid_zeros_are_not_frozen(sound):
+    def lose(data, time):
+        data[(time >= 100) & (time <= 120), :4] = 0.0
+
+    assert dvl_frozen_intervals(changed(sound, "dvl", lose)) == []
+
+
+def test_keyframes_are_pings_and_what_fills_gaps():
+    imu = stream("imu", np.arange(0, 10.001, 0.01), *np.zeros((6, 1001)))
+    dvl = stream("dvl", [1.0, 1.5, 1.51, 4.0, 9.0], *np.ones((4, 5)))
+    log = Log("x", {"imu": imu, "dvl": dvl})
+    # start; 1.0; 1.5; (1.51 is attached); 2.5 or so, 3.5 or so, 4.0; 5, 6, 7, 8, 9; 10
+    assert keyframes(log, Config()) == 1 + 2 + 3 + 5 + 1
+
+
+def test_assumptions_and_absent_heading_sources_are_said(sound):
+    said = complaints(sound, level="ok", sensor="configuration")
+    assert "heading from mag, dvl_heading" in said
+    assert "start.heading_deg is not given: taken from the first samples of mag" in said
+    assert "dvl.mount_rpy_deg is not given" in said
+    given = Config.model_validate({"heading": {"sources": ["dvl", "mag"]}, "dvl": {"mount_rpy_deg": [0, 0, 0]}})
+    assert "dvl.mount_rpy_deg" not in complaints(sound, given, level="ok")
+    assert "heading.sources names dvl" in complaints(without(sound, "dvl_heading"), given)
+
+
+def test_warn_issues_what_examine_finds(sound):
+    with pytest.warns(DataWarning, match=r"^dive.csv: depth: median depth -"):
+        warn(scaled(sound, "depth", slice(0, 1), -1.0))
+
+
+def test_sparse_streams_do_not_break_any_check(sound):
+    for sensor in sound.sensors:
+        for n in (1, 2, 20):
+            s = sound[sensor]
+            few = replace(s, time=s.time[:n], data=s.data[:n], row=s.row[:n])
+            examine(replace(sound, streams={**sound.streams, sensor: few}))
+            examine(Log("x", {sensor: few}))
+
+
+def test_the_real_dive_raises_no_false_alarm():
+    folder = DATA / "ictineu"
+    if not (folder / "log.csv.gz").exists():
+        pytest.skip(f"no real data in {folder}")
+    log = read_log(folder / "log.csv.gz")
+    report = examine(log, load_config(folder / "ictineu.yaml"))
+    assert report.at("error") == []
+    # its DVL's compass does come late: at the same lag for windows of 1 to 8 s
+    (only,) = report.at("warning")
+    assert only.sensor == "dvl_heading"
+    assert "s later than the gyro's" in only.text
+    assert "bottom lock 98.3% of 5045 pings" in complaints(log, level="ok")
+    assert dvl_frozen_intervals(log) == []
+    assert "y to port? Then dvl.mount_rpy_deg is [180, 0, 0]" in complaints(log, sensor="dvl")
