@@ -3,6 +3,10 @@
 The configuration's ``calibration`` section, the graph's keys and priors, the
 simulator's hidden truth and the rows of a report all come from `TABLE`.
 A variable is added by adding a row here and using its name in a measurement model.
+
+The offset and the deviation of every compass are estimated by default: no compass in a
+vehicle is free of them, and holding them at zero pushes them into the DVL's misalignment
+and makes the track look far more certain than it is.
 """
 
 from dataclasses import dataclass
@@ -25,6 +29,7 @@ class Variable:
     sd : default standard deviation of the prior, every component [unit]
     sensor : log sensor without which the variable has no meaning
     estimate : estimated unless the configuration says otherwise
+    linear : enters its measurement linearly, so that iSAM2 need never relinearise it
     about : one line for people
     """
 
@@ -36,6 +41,7 @@ class Variable:
     sensor: str
     about: str
     estimate: bool = False
+    linear: bool = True
 
     @property
     def dim(self) -> int:
@@ -59,12 +65,27 @@ _CURVE = ("_sin", "_cos")
 TABLE: dict[str, Variable] = {
     v.name: v
     for v in (
-        Variable("dvl_roll", "r", ("",), "rad", 2 * _DEG, "dvl", "roll of the DVL's mounting (third of mount_rpy)"),
+        Variable("dvl_roll", "r", ("",), "rad", 2 * _DEG, "dvl", "roll of the DVL's mounting", linear=False),
         Variable("dvl_pitch", "p", ("",), "rad", 2 * _DEG, "dvl", "pitch of the DVL's mounting"),
-        Variable("dvl_yaw", "y", ("",), "rad", 5 * _DEG, "dvl", "yaw of the DVL's mounting (misalignment)"),
+        Variable(
+            "dvl_yaw",
+            "y",
+            ("",),
+            "rad",
+            5 * _DEG,
+            "dvl",
+            "yaw of the DVL's mounting: misalignment",
+        ),
         Variable("dvl_scale", "s", ("",), "1", 0.01, "dvl", "scale error of the DVL (sound speed)"),
         Variable(
-            "dvl_compass_offset", "d", ("",), "rad", 5 * _DEG, "dvl_heading", "offset of the DVL's compass, deviation A"
+            "dvl_compass_offset",
+            "d",
+            ("",),
+            "rad",
+            5 * _DEG,
+            "dvl_heading",
+            "offset of the DVL's compass (deviation A)",
+            estimate=True,
         ),
         Variable(
             "dvl_compass_deviation",
@@ -76,7 +97,16 @@ TABLE: dict[str, Variable] = {
             "deviation curve of the DVL's compass: sine and cosine of heading (B, C)",
             estimate=True,
         ),
-        Variable("ahrs_offset", "a", ("",), "rad", 5 * _DEG, "ahrs", "offset of the IMU's own heading, deviation A"),
+        Variable(
+            "ahrs_offset",
+            "a",
+            ("",),
+            "rad",
+            5 * _DEG,
+            "ahrs",
+            "offset of the IMU's own heading (deviation A)",
+            estimate=True,
+        ),
         Variable(
             "ahrs_deviation",
             "f",
@@ -87,7 +117,16 @@ TABLE: dict[str, Variable] = {
             "deviation curve of the IMU's own heading: sine and cosine of heading (B, C)",
             estimate=True,
         ),
-        Variable("mag_offset", "m", ("",), "rad", 5 * _DEG, "mag", "offset of the magnetometer's heading, deviation A"),
+        Variable(
+            "mag_offset",
+            "m",
+            ("",),
+            "rad",
+            5 * _DEG,
+            "mag",
+            "offset of the magnetometer's heading (deviation A)",
+            estimate=True,
+        ),
         Variable(
             "mag_deviation",
             "g",
@@ -102,9 +141,10 @@ TABLE: dict[str, Variable] = {
             "h",
             _XYZ,
             "field",
-            0.05,
+            0.02,
             "mag",
             "hard iron in IMU axes, as a fraction of the field's magnitude",
+            estimate=True,
         ),
     )
 }

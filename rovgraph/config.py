@@ -135,7 +135,10 @@ class Graph(_Section):
     solver: Literal["batch", "isam2", "fixed_lag"] = Field(
         "batch", description="of the smoothed estimate; isam2 is incremental, fixed_lag forgets"
     )
-    lag_s: Positive = Field(30.0, description="lag of the fixed-lag smoother")
+    lag_s: Positive = Field(5.0, description="lag of the fixed-lag smoother, which gives the filtered estimate")
+
+
+_MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 
 
 def _calibration_entry(variable: Variable) -> type[BaseModel]:
@@ -143,11 +146,12 @@ def _calibration_entry(variable: Variable) -> type[BaseModel]:
     tail = "_deg" if variable.angular else ""
     scale = float(np.rad2deg(1.0)) if variable.angular else 1.0
     unit = "degrees" if variable.angular else variable.unit
+    mounted = variable.name in _MOUNT
     fields: dict[str, Any] = {
         "estimate": (bool, Field(variable.estimate, description=f"estimate it: {variable.about}")),
         "mean" + tail: (
             float | tuple[float, ...] | None,
-            Field(None, description=f"prior mean [{unit}]; null = the mounting, else 0"),
+            Field(None, description=f"prior mean [{unit}]; null = " + ("the mounting" if mounted else "0")),
         ),
         "sd" + tail: (Positive, Field(round(variable.sd * scale, 12), description=f"prior sd [{unit}]")),
     }
@@ -183,7 +187,7 @@ class Config(_Section):
         """The effective configuration, every key written out."""
         stream = io.StringIO()
         yaml = YAML(typ="safe", pure=True)
-        yaml.default_flow_style = None
+        yaml.default_flow_style, yaml.width = None, 4096
         yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
         yaml.dump(self.model_dump(mode="json"), stream)
         return stream.getvalue()
@@ -203,7 +207,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
     ------
     InputError : a mean with the wrong number of components
     """
-    mount = dict(zip(("dvl_roll", "dvl_pitch", "dvl_yaw"), config.dvl.mount_rpy_deg, strict=True))
+    mount = dict(zip(_MOUNT, config.dvl.mount_rpy_deg, strict=True))
     out = {}
     for name, variable in TABLE.items():
         entry, tail = getattr(config.calibration, name), "_deg" if variable.angular else ""

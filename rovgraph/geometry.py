@@ -28,11 +28,13 @@ def skew(v: ArrayLike) -> Array:
     ndarray, shape (..., 3, 3)
     """
     v = np.asarray(v, dtype=float)
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
-    return out
+    out = np.zeros((*v.shape[:-1], 9))
+    out[..., _SKEW_PLUS] = v
+    out[..., _SKEW_MINUS] = -v
+    return out.reshape(*v.shape, 3)
+
+
+_SKEW_PLUS, _SKEW_MINUS = [7, 2, 3], [5, 6, 1]  # where x, y, z stand in the flattened matrix
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -110,19 +112,20 @@ def rpy_jacobian(rpy: ArrayLike) -> Array:
     return J
 
 
-def exp_rotation(rotvec: ArrayLike) -> Array:
-    """Rotation matrices Exp(rotvec) (2.1).
+def exp_rotation(rotvec: Array) -> Array:
+    """Rotation matrices Exp(rotvec), Rodrigues' formula (2.1).
 
     Parameters
     ----------
-    rotvec : array_like, shape (..., 3) [rad]
+    rotvec : ndarray, shape (..., 3) [rad]
 
     Returns
     -------
     ndarray, shape (..., 3, 3)
     """
-    rotvec = np.array(rotvec, dtype=float)  # a copy: scipy refuses read-only views
-    return Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix().reshape(*rotvec.shape, 3)
+    sine, cosine, _ = _rodrigues(rotvec)
+    S = skew(rotvec)
+    return _EYE + sine * S + cosine * (S @ S)
 
 
 def right_jacobian(rotvec: Array) -> Array:
@@ -136,14 +139,25 @@ def right_jacobian(rotvec: Array) -> Array:
     -------
     ndarray, shape (..., 3, 3)
     """
-    angle2 = np.sum(rotvec**2, axis=-1)[..., None, None]
-    angle = np.sqrt(angle2)
-    small = angle < 1e-4  # below it the closed forms lose digits, the series does not
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    _, cosine, cubic = _rodrigues(rotvec)
     S = skew(rotvec)
-    return np.eye(3) - a * S + b * (S @ S)
+    return _EYE - cosine * S + cubic * (S @ S)
+
+
+_EYE = np.eye(3)
+
+
+def _rodrigues(rotvec: Array) -> tuple[Array, Array, Array]:
+    """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3 of the angle a, shapes (..., 1, 1)."""
+    square = (rotvec * rotvec).sum(axis=-1)[..., None, None]
+    if square.size and square.max() < 1e-8:  # the series are exact to rounding, the closed forms are not
+        return 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    small = square < 1e-8
+    angle = np.sqrt(np.where(small, 1.0, square))
+    sine = np.where(small, 1.0 - square / 6.0, np.sin(angle) / angle)
+    cosine = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(angle)) / angle**2)
+    cubic = np.where(small, 1.0 / 6.0 - square / 120.0, (angle - np.sin(angle)) / angle**3)
+    return sine, cosine, cubic
 
 
 def log_rotation(R: ArrayLike) -> Array:
@@ -166,16 +180,16 @@ def transpose(R: Array) -> Array:
     return np.swapaxes(R, -1, -2)
 
 
-def rotate(R: ArrayLike, v: ArrayLike) -> Array:
+def rotate(R: Array, v: ArrayLike) -> Array:
     """``R @ v`` over leading axes.
 
     Parameters
     ----------
-    R : array_like, shape (..., m, 3)
+    R : ndarray, shape (..., m, 3)
     v : array_like, shape (..., 3)
 
     Returns
     -------
     ndarray, shape (..., m)
     """
-    return np.einsum("...ij,...j->...i", R, v)
+    return np.asarray((R @ np.asarray(v)[..., None])[..., 0])

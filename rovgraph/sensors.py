@@ -28,7 +28,7 @@ import numpy as np
 from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose, wrap_angle
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
-_EX, _EY, _EZ = np.eye(3)
+_EZ = np.array([0.0, 0.0, 1.0])
 
 
 class SensorModel(Protocol):
@@ -41,6 +41,8 @@ class SensorModel(Protocol):
     angular : components are angles, differences wrap
     state : state variables it depends on, at its own time or through the motion to it
     calibration : names of the calibration variables it depends on
+    relinearise : an incremental estimator must relinearise it as the estimate settles;
+        false where it is all but linear in what still changes after its first use
     """
 
     @property
@@ -53,6 +55,8 @@ class SensorModel(Protocol):
     def state(self) -> tuple[str, ...]: ...
     @property
     def calibration(self) -> tuple[str, ...]: ...
+    @property
+    def relinearise(self) -> bool: ...
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         """The measurement that the state predicts, and its derivatives.
@@ -78,7 +82,7 @@ def innovation(model: SensorModel, z: Array, predicted: Array) -> Array:
 
 def _scalar(state: State, name: str) -> Array:
     """A scalar calibration variable for each epoch, shape (n,)."""
-    return np.broadcast_to(state.calibration[name][..., 0], (len(state),))
+    return np.zeros(len(state)) + state.calibration[name][..., 0]
 
 
 def dvl_mount(state: State) -> tuple[Array, Jacobians]:
@@ -93,7 +97,7 @@ def dvl_mount(state: State) -> tuple[Array, Jacobians]:
     zero = np.zeros_like(yaw)
     R_bs = matrix_from_rpy(np.stack([roll, pitch, yaw], axis=-1))
     pitch_axis = np.stack([-np.sin(yaw), np.cos(yaw), zero], axis=-1)
-    axes = {"dvl_roll": R_bs[..., 0], "dvl_pitch": pitch_axis, "dvl_yaw": np.broadcast_to(_EZ, pitch_axis.shape)}
+    axes = {"dvl_roll": R_bs[..., 0], "dvl_pitch": pitch_axis, "dvl_yaw": np.zeros_like(pitch_axis) + _EZ}
     return R_bs, axes
 
 
@@ -112,6 +116,7 @@ class DvlVelocity:
     angular = False
     state = (POSE, VELOCITY, BIAS)
     calibration = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale")
+    relinearise = True  # the misalignment multiplies the velocity
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         R_bs, axes = dvl_mount(state)
@@ -155,7 +160,7 @@ def _heading(R_nb: Array, axis_b: Array) -> tuple[Array, Array]:
 def _deviation(state: State, offset: str, curve: str, heading: Array) -> tuple[Array, Array, Array]:
     """Compass deviation A + B sin h + C cos h, its slope over h, and (sin h, cos h)."""
     A = _scalar(state, offset)
-    B, C = np.broadcast_to(state.calibration[curve], (len(state), 2)).T
+    B, C = state.calibration[curve][..., 0], state.calibration[curve][..., 1]
     sine, cosine = np.sin(heading), np.cos(heading)
     return A + B * sine + C * cosine, B * cosine - C * sine, np.stack([sine, cosine], axis=-1)
 
@@ -181,6 +186,7 @@ class CompassHeading:
     dim = 1
     angular = True
     state = (POSE, BIAS)
+    relinearise = False
 
     @property
     def calibration(self) -> tuple[str, ...]:
@@ -192,7 +198,7 @@ class CompassHeading:
         if self.sensor == "dvl_heading":
             R_bs, axes = dvl_mount(state)
         else:
-            R_bs, axes = np.broadcast_to(self.R_bs, (n, 3, 3)), {}
+            R_bs, axes = np.tile(self.R_bs, (n, 1, 1)), {}
         heading, gradient = _heading(state.R_nb, R_bs[..., 0])
         heading = heading - self.declination
         deviation, slope, sine_cosine = _deviation(state, self.offset, self.curve, heading)
@@ -232,10 +238,11 @@ class MagneticField:
     angular = False
     state = (POSE, BIAS)
     calibration = ("mag_offset", "mag_deviation", "hard_iron")
+    relinearise = False
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         n = len(state)
-        heading, gradient = _heading(state.R_nb, np.broadcast_to(self.R_bs[:, 0], (n, 3)))
+        heading, gradient = _heading(state.R_nb, np.tile(self.R_bs[:, 0], (n, 1)))
         heading = heading - self.declination
         deviation, slope, sine_cosine = _deviation(state, "mag_offset", "mag_deviation", heading)
         u_n = field_direction(self.declination - deviation, self.dip)
@@ -246,12 +253,12 @@ class MagneticField:
 
         pose = np.zeros((n, 3, 6))
         pose[..., :3] = R_sb @ skew(u_b) + by_deviation[..., None] * (slope[:, None] * gradient)[:, None, :]
-        iron = np.broadcast_to(state.calibration["hard_iron"], (n, 3))
+        iron = state.calibration["hard_iron"]
         H = {
             POSE: pose,
             "mag_offset": by_deviation[..., None],
             "mag_deviation": by_deviation[..., None] * sine_cosine[:, None, :],
-            "hard_iron": np.broadcast_to(self.magnitude * np.eye(3), (n, 3, 3)),
+            "hard_iron": np.tile(self.magnitude * np.eye(3), (n, 1, 1)),
         }
         return rotate(R_sb, u_b) + self.magnitude * iron, H
 
@@ -273,6 +280,7 @@ class Position:
     angular = False
     state = (POSE, VELOCITY, BIAS)
     calibration: tuple[str, ...] = ()
+    relinearise = False
 
     @property
     def dim(self) -> int:

@@ -16,7 +16,7 @@ with b' the bias beyond the one the preintegration assumed (Forster et al. 2017,
 preintegration on manifold, first order in the bias over a fraction of a second).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -70,6 +70,18 @@ class State:
         return replace(self, calibration={**self.calibration, variable: self.calibration[variable] + delta})
 
 
+def stack_states(states: Sequence[State]) -> State:
+    """Many states of one epoch as one `State`; calibration becomes per epoch, shape (n, dim)."""
+    names = states[0].calibration
+    return State(
+        np.concatenate([s.R_nb for s in states]),
+        np.concatenate([s.p_n for s in states]),
+        np.concatenate([s.v_n for s in states]),
+        np.concatenate([s.bias for s in states]),
+        {name: np.array([s.calibration[name] for s in states]) for name in names},
+    )
+
+
 @dataclass(frozen=True)
 class Delta:
     """Preintegrated motion from a keyframe to a measurement's own time, n of them.
@@ -97,54 +109,51 @@ class Delta:
 
 def propagate(state: State, delta: Delta, gravity: float) -> State:
     """The state at the measurements' times (equations in the module's docstring)."""
-    dt = delta.dt[:, None]
-    excess = state.bias - delta.bias
-    g_n = np.array([0.0, 0.0, gravity])
-    dv = delta.dv - dt * excess[:, :3]
-    dp = delta.dp - 0.5 * dt**2 * excess[:, :3]
-    return replace(
-        state,
-        R_nb=state.R_nb @ delta.dR @ exp_rotation(-dt * excess[:, 3:]),
-        v_n=state.v_n + g_n * dt + rotate(state.R_nb, dv),
-        p_n=state.p_n + state.v_n * dt + 0.5 * g_n * dt**2 + rotate(state.R_nb, dp),
-    )
+    return _propagate(state, delta, gravity)[0]
 
 
-def chain(H: Jacobians, state: State, delta: Delta) -> Jacobians:
-    """Derivatives with respect to the keyframe from those at the measurement's time.
+def propagate_with_jacobian(state: State, delta: Delta, gravity: float) -> tuple[State, Array]:
+    """The state at the measurements' times, and its derivative by the keyframes' state.
 
     Parameters
     ----------
-    H : Jacobians of a model evaluated at ``propagate(state, delta, g)``
     state : State of the keyframes, n epochs
     delta : Delta, n
+    gravity : [m/s^2]
 
     Returns
     -------
-    Jacobians with respect to ``state``: pose, velocity, bias and those of ``H``'s
-    calibration variables.
+    state : State, n epochs
+    F : ndarray, shape (n, 15, 15), pose, velocity, bias by pose, velocity, bias
     """
+    there, dv, dp, turn = _propagate(state, delta, gravity)
     n, dt = len(delta.dt), delta.dt[:, None, None]
-    excess = state.bias - delta.bias
-    turn = -delta.dt[:, None] * excess[:, 3:]
-    dR_t = transpose(delta.dR @ exp_rotation(turn))  # keyframe axes to axes at t
-    dv = delta.dv - delta.dt[:, None] * excess[:, :3]
-    dp = delta.dp - 0.5 * delta.dt[:, None] ** 2 * excess[:, :3]
+    to_there = transpose(delta.dR @ exp_rotation(turn))
+    F = np.zeros((n, 15, 15))
+    F[:, _DIAGONAL, _DIAGONAL] = 1.0
+    F[:, 0:3, 0:3] = F[:, 3:6, 3:6] = to_there
+    F[:, 0:3, 12:15] = -dt * right_jacobian(turn)
+    F[:, 3:6, 0:3] = -to_there @ skew(dp)
+    F[:, 3:6, 6:9] = dt * (to_there @ transpose(state.R_nb))
+    F[:, 3:6, 9:12] = -0.5 * dt**2 * to_there
+    F[:, 6:9, 0:3] = -state.R_nb @ skew(dv)
+    F[:, 6:9, 9:12] = -dt * state.R_nb
+    return there, F
 
-    out = {k: v for k, v in H.items() if k not in (POSE, VELOCITY, BIAS)}
-    pose = np.zeros((n, next(iter(H.values())).shape[1], 6))
-    velocity = np.zeros_like(pose[..., :3])
-    bias = H.get(BIAS, np.zeros_like(pose)).copy()
-    if POSE in H:
-        H_rotation, H_translation = H[POSE][..., :3], H[POSE][..., 3:]
-        pose[..., :3] += H_rotation @ dR_t - H_translation @ dR_t @ skew(dp)
-        pose[..., 3:] += H_translation @ dR_t
-        velocity += dt * (H_translation @ dR_t @ transpose(state.R_nb))
-        bias[..., 3:] += -dt * (H_rotation @ right_jacobian(turn))
-        bias[..., :3] += -0.5 * dt**2 * (H_translation @ dR_t)
-    if VELOCITY in H:
-        pose[..., :3] += -H[VELOCITY] @ state.R_nb @ skew(dv)
-        velocity += H[VELOCITY]
-        bias[..., :3] += -dt * (H[VELOCITY] @ state.R_nb)
-    out.update({POSE: pose, VELOCITY: velocity, BIAS: bias})
-    return out
+
+_DIAGONAL = np.arange(15)
+
+
+def _propagate(state: State, delta: Delta, gravity: float) -> tuple[State, Array, Array, Array]:
+    """The state, and the motion corrected for the bias: velocity, position, turn."""
+    dt = delta.dt[:, None]
+    excess = state.bias - delta.bias
+    dv = delta.dv - dt * excess[:, :3]
+    dp = delta.dp - 0.5 * dt**2 * excess[:, :3]
+    turn = -dt * excess[:, 3:]
+    v_n = state.v_n + rotate(state.R_nb, dv)
+    p_n = state.p_n + state.v_n * dt + rotate(state.R_nb, dp)
+    v_n[:, 2] += gravity * delta.dt
+    p_n[:, 2] += 0.5 * gravity * delta.dt**2
+    there = State(state.R_nb @ delta.dR @ exp_rotation(turn), p_n, v_n, state.bias, state.calibration)
+    return there, dv, dp, turn

@@ -5,7 +5,7 @@ and heading from whatever the log has; the gyro's bias from standing still, wher
 stands still. An explicit ``start`` goes before all of it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +25,8 @@ MOVING_TILT_SD = np.deg2rad(5.0)
 UNKNOWN_HEADING_SD = np.deg2rad(20.0)  # the samples themselves enter as factors
 START_VELOCITY_SD = 1.0
 HEADING_WITHIN_S = 30.0
+ENOUGH_SAMPLES = 100
+NOISIER = 1.25  # times the believed density, before the log's own is taken
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ def initialise(log: Log, config: Config) -> Beginning:
         )
     assumptions: list[str] = []
     config = _resolve_environment(log, config, assumptions)
+    config = _resolve_noise(log, config, assumptions)
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
     used = [s for s in ("dvl", "depth", "fix") if s in log] + sources
@@ -110,6 +113,39 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:
         raise InputError("environment.earth_rotation needs environment.latitude_deg, as the log has no fix_lat")
     return config.model_copy(update={"environment": env.model_copy(update=changes)}) if changes else config
+
+
+def sample_density(time: Array, samples: Array) -> float:
+    """Noise density that samples show by themselves [unit/rtHz].
+
+    Each sample is compared with the mean of its neighbours: white noise of sd s scatters
+    by sqrt(1.5) s. Vibration that the sampling does not resolve scatters likewise, and
+    harms the integration likewise. The median makes it blind to knocks.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+    samples : ndarray, shape (n, 3)
+    """
+    odd = samples[1:-1] - 0.5 * (samples[:-2] + samples[2:])
+    sd = 1.4826 * np.median(np.abs(odd), axis=0) / np.sqrt(1.5)
+    return float(np.mean(sd) * np.sqrt(np.median(np.diff(time))))
+
+
+def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """Raise the IMU's noise densities to what its samples scatter in this dive."""
+    imu, noise, changes = log["imu"], config.imu.noise, {}
+    if len(imu) < ENOUGH_SAMPLES:
+        return config
+    for name, columns in (("acc", slice(0, 3)), ("gyr", slice(3, 6))):
+        seen, believed = sample_density(imu.time, imu.data[:, columns]), getattr(noise, name)
+        if seen > NOISIER * believed:
+            changes[name] = seen
+            assumptions.append(f"imu.noise.{name} {seen:.2g} instead of {believed:.2g}: the samples scatter that much")
+    if not changes:
+        return config
+    imu_section = config.imu.model_copy(update={"noise": noise.model_copy(update=changes)})
+    return config.model_copy(update={"imu": imu_section})
 
 
 def _first_seconds(log: Log, config: Config) -> tuple[Array, Array, bool, float]:
@@ -248,8 +284,3 @@ def _position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> 
     if start.down_m is None and "depth" in log:
         p_n[2] = log["depth"].data[0, 0] - float(rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2])
     return p_n, sd
-
-
-def with_calibration(state: State, calibration: dict[str, Array]) -> State:
-    """A state with calibration variables set."""
-    return replace(state, calibration=calibration)

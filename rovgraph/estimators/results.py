@@ -98,18 +98,20 @@ def calibration_history(name: str, time: Array, value: Array, sd: Array) -> Hist
     return History(TABLE[name].labels, TABLE[name].unit, time, value, sd)
 
 
-def residual_frame(blocks: Mapping[str, Block], states: State, weights: Mapping[str, Array]) -> pd.DataFrame:
+def residual_frame(
+    blocks: Mapping[str, Block], keyframes: Mapping[str, State], weights: Mapping[str, Array]
+) -> pd.DataFrame:
     """Innovation, normalised innovation and weight of every measurement, in order of time.
 
     Parameters
     ----------
     blocks : sensor -> Block
-    states : State of every keyframe
+    keyframes : sensor -> State of each measurement's keyframe
     weights : sensor -> ndarray, shape (n,)
     """
     frames = []
     for sensor, block in blocks.items():
-        here = states.at(block.keyframe)
+        here = keyframes[sensor]
         model = block.instrument.model
         predicted, _ = model.predict(propagate(here, block.motion, block.gravity), block.rate_b)
         nu = innovation(model, block.z, predicted)

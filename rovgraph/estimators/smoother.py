@@ -69,7 +69,7 @@ class BatchSmoother:
         means = {name: belief.mean for name, belief in beliefs(b.config).items()}
         states = dead_reckon(self.intervals, b, means)
         trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)
-        return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, states, {}))
+        return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
 
 
 def _estimate(problem: Problem, solution: Solution, b: Beginning, intervals: Sequence[Interval]) -> Estimate:
@@ -90,12 +90,13 @@ def _estimate(problem: Problem, solution: Solution, b: Beginning, intervals: Seq
     for name, matrix in known.items():
         value, sd = states.calibration[name], np.sqrt(np.diag(matrix))
         history[name] = calibration_history(name, ends, np.tile(value, (2, 1)), np.tile(sd, (2, 1)))
+    here = {sensor: states.at(block.keyframe) for sensor, block in problem.blocks.items()}
     return Estimate(
         "smoothed",
         trajectory,
         calibration_estimates(beliefs(b.config), list(problem.blocks), states.calibration, known),
         history,
-        residual_frame(problem.blocks, states, solution.weights),
+        residual_frame(problem.blocks, here, solution.weights),
         {
             "keyframes": n,
             "cost": solution.cost,

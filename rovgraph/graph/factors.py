@@ -4,7 +4,7 @@ Batch, iSAM2 and fixed lag consume the same lists.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -13,7 +13,10 @@ from rovgraph.calibration import Belief
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.keys import key
+from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.state import BIAS, POSE, VELOCITY, State
+
+Factor = gtsam.NonlinearFactor
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ def estimated_variables(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -
     return tuple(name for name, b in beliefs.items() if b.estimate and b.variable.sensor in present)
 
 
-def priors(start: Start, beliefs: Mapping[str, Belief], estimated: Iterable[str]) -> list[gtsam.NonlinearFactor]:
+def priors(start: Start, beliefs: Mapping[str, Belief], estimated: Iterable[str]) -> list[Factor]:
     """Priors of the first keyframe and of the calibration variables."""
     state = start.state
     R_nb, sigmas = state.R_nb[0], gtsam.noiseModel.Diagonal.Sigmas
@@ -61,10 +64,39 @@ def priors(start: Start, beliefs: Mapping[str, Belief], estimated: Iterable[str]
     ]
 
 
-def motion(interval: Interval) -> list[gtsam.NonlinearFactor]:
+def motion(interval: Interval) -> list[Factor]:
     """The IMU's factor between the keyframe before and the one that ends the interval."""
     if interval.pim is None:
         return []
     i, j = interval.index - 1, interval.index
     keys = [key(POSE, i), key(VELOCITY, i), key(POSE, j), key(VELOCITY, j), key(BIAS, i), key(BIAS, j)]
     return [gtsam.CombinedImuFactor(*keys, interval.pim)]
+
+
+def predict(interval: Interval, state: State) -> State:
+    """The state at the end of an interval, from the IMU alone.
+
+    Parameters
+    ----------
+    interval : with motion
+    state : State of one epoch, of the keyframe before
+    """
+    assert interval.pim is not None
+    bias = gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
+    before = gtsam.NavState(gtsam.Rot3(state.R_nb[0]), state.p_n[0], state.v_n[0])
+    after = interval.pim.predict(before, bias)
+    return replace(state, R_nb=after.attitude().matrix()[None], p_n=after.position()[None], v_n=after.velocity()[None])
+
+
+def first_values(state: State, fixed: Mapping[str, Array], estimated: Iterable[str]) -> gtsam.Values:
+    """Initial values of the first keyframe and of the calibration."""
+    values = next_values(0, state)
+    insert_calibration(values, fixed, estimated)
+    return values
+
+
+def next_values(index: int, state: State) -> gtsam.Values:
+    """Initial values of a keyframe."""
+    values = gtsam.Values()
+    insert_state(values, index, state)
+    return values

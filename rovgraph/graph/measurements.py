@@ -11,19 +11,21 @@ gated. The thresholds are where a good measurement of that dimension lies with 9
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import gtsam
 import numpy as np
 from scipy.stats import chi2
 
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import Attached
 from rovgraph.graph.keys import key
-from rovgraph.graph.values import state_at
+from rovgraph.graph.values import insert_calibration, insert_state, state_at
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
-from rovgraph.state import DIMENSION, Delta, Jacobians, State, chain, propagate
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Delta, Jacobians, State, propagate, propagate_with_jacobian
+
+_COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
 
 
 @dataclass(frozen=True)
@@ -71,11 +73,30 @@ class Block:
         rows: list[list[int]] = np.column_stack(columns).tolist()
         return rows
 
+    @cached_property
+    def at_keyframes(self) -> bool:
+        """All measurements are at their keyframes: there is no motion to reckon with."""
+        return not self.motion.dt.any()
+
+    def predict(self, state: State) -> tuple[Array, Jacobians]:
+        """Predicted measurements, shape (n, dim), and Jacobians by the keyframes' variables."""
+        model = self.instrument.model
+        if self.at_keyframes:
+            return model.predict(state, self.rate_b)
+        there, F = propagate_with_jacobian(state, self.motion, self.gravity)
+        predicted, H = model.predict(there, self.rate_b)
+        stacked = np.zeros((len(self), predicted.shape[1], 15))
+        for variable, columns in _COLUMNS.items():
+            if variable in H:
+                stacked[..., columns] = H[variable]
+        stacked = stacked @ F
+        return predicted, H | {variable: stacked[..., columns] for variable, columns in _COLUMNS.items()}
+
     def innovations(self, state: State) -> Array:
         """Measured minus predicted, shape (n, dim); ``state`` is at each one's keyframe."""
-        model = self.instrument.model
-        predicted, _ = model.predict(propagate(state, self.motion, self.gravity), self.rate_b)
-        return innovation(model, self.z, predicted)
+        there = state if self.at_keyframes else propagate(state, self.motion, self.gravity)
+        predicted, _ = self.instrument.model.predict(there, self.rate_b)
+        return innovation(self.instrument.model, self.z, predicted)
 
     def linearize(self, state: State) -> tuple[Array, Jacobians]:
         """Whitened innovations and Jacobians at ``state`` (that of each keyframe).
@@ -85,15 +106,16 @@ class Block:
         r : ndarray, shape (n, dim)
         H : variable -> ndarray, shape (n, dim, dim of variable)
         """
-        model, W = self.instrument.model, self.W
-        predicted, H_there = model.predict(propagate(state, self.motion, self.gravity), self.rate_b)
-        H = chain(H_there, state, self.motion)
-        r = np.einsum("nij,nj->ni", W, innovation(model, self.z, predicted))
-        return r, {v: W @ H[v] for v in self.variables}
+        predicted, H = self.predict(state)
+        r = rotate(self.W, innovation(self.instrument.model, self.z, predicted))
+        return r, {v: self.W @ H[v] if v in H else self._zeros(v) for v in self.variables}
+
+    def _zeros(self, variable: str) -> Array:
+        return np.zeros((*self.z.shape, DIMENSION[variable]))
 
     def normalised(self, state: State) -> Array:
         """Whitened innovations alone, shape (n, dim)."""
-        return np.einsum("nij,nj->ni", self.W, self.innovations(state))
+        return rotate(self.W, self.innovations(state))
 
     def push(self, graph: gtsam.GaussianFactorGraph, state: State, weight: Array) -> None:
         """Add the Jacobian factors of all measurements whose weight is not zero."""
@@ -118,6 +140,20 @@ class Block:
             return -r[0]  # GTSAM's error is predicted minus measured
 
         return gtsam.CustomFactor(robust_noise(self.instrument), self.keys[k], error)
+
+    def linear_factor(self, state: State, r: Array, H: Jacobians) -> gtsam.LinearContainerFactor:
+        """A block of one, already linearised at ``state``, as a factor that never calls back.
+
+        For models that need not be relinearised; the loss's weight is that of ``r``.
+        """
+        root = np.sqrt(loss_and_weight(r, self.instrument.loss)[1][0])
+        terms = [(j, root * h[0]) for j, h in zip(self.keys[0], H.values(), strict=True)]
+        unit = gtsam.noiseModel.Unit.Create(r.shape[1])
+        factor = gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, root * r[0], unit))
+        values = gtsam.Values()
+        insert_state(values, int(self.keyframe[0]), state)
+        insert_calibration(values, state.calibration, self.estimated)
+        return gtsam.LinearContainerFactor(factor, values)
 
     def at(self, index: slice | Array) -> "Block":
         """Some of the measurements."""
@@ -168,6 +204,7 @@ def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
+@cache
 def loss_threshold(loss: str, dim: int) -> float:
     """Normalised length at which a loss bends: where 95 % of good measurements lie below."""
     return float("inf") if loss == "none" else float(np.sqrt(chi2.ppf(0.95, dim)))

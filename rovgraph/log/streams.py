@@ -100,7 +100,10 @@ class Log:
         return set(self.streams)
 
     def measurements(self) -> Iterator[Measurement]:
-        """All measurements in the order of time; at equal times the IMU comes first, the DVL last."""
+        """All measurements in the order of time; at equal times the IMU comes first, then the DVL.
+
+        So a ping makes its keyframe before what was measured together with it is attached.
+        """
         streams = sorted(self.streams.values(), key=_priority)
         if not streams:
             return
@@ -116,4 +119,4 @@ class Log:
 
 
 def _priority(stream: Stream) -> int:
-    return {"imu": 0, "dvl": 2}.get(stream.sensor, 1)
+    return {"imu": 0, "dvl": 1}.get(stream.sensor, 2)

@@ -1,0 +1,172 @@
+"""The filtering estimate: what is known at each keyframe from the data up to then.
+
+Feeds the graph interval by interval to an incremental engine and keeps the newest
+keyframe's estimate after each. A measurement is gated by its normalised innovation
+before it enters; a sensor that is rejected many times running is let in again, so that
+none is locked out for ever.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.config import beliefs
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.results import (
+    bias_histories,
+    body_trajectory,
+    calibration_estimates,
+    calibration_history,
+    residual_frame,
+)
+from rovgraph.geometry import Array
+from rovgraph.graph.assembly import Assembler, Attached, Interval
+from rovgraph.graph.factors import Factor, estimated_variables, first_values, motion, next_values, predict, priors
+from rovgraph.graph.incremental import Incremental
+from rovgraph.graph.measurements import Block, make_block
+from rovgraph.log import Measurement
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, stack_states
+
+CALIBRATION_EVERY = 5  # keyframes between new marginals of the calibration
+READMIT_AFTER = 10  # rejections running, after which a sensor is believed again
+
+
+@dataclass
+class IncrementalEstimator:
+    """iSAM2 over the whole dive or a fixed lag, fed measurement by measurement.
+
+    Attributes
+    ----------
+    beginning : of `rovgraph.estimators.initialise.initialise`
+    lag : length of the window [s], None = whole dive
+    """
+
+    beginning: Beginning
+    lag: float | None = None
+
+    def __post_init__(self) -> None:
+        b = self.beginning
+        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
+        self.intervals: list[Interval] = []
+        self.beliefs = beliefs(b.config)
+        self.fixed = {name: belief.mean for name, belief in self.beliefs.items()}
+        self.estimated = estimated_variables(self.beliefs, b.instruments)
+        self.engine = Incremental(self.lag, self.fixed, self.estimated)
+        self._states: list[State] = []
+        self._covariances: list[dict[str, Array]] = []
+        self._used: dict[str, list[tuple[Attached, State, float]]] = {}
+        self._rejected: Counter[str] = Counter()
+
+    def add(self, measurement: Measurement) -> list[Interval]:
+        """Take a measurement; times must not decrease."""
+        return self._take(self.assembler.add(measurement))
+
+    def finish(self) -> list[Interval]:
+        """Close the last interval."""
+        return self._take(self.assembler.finish())
+
+    def latest(self) -> State:
+        """The newest keyframe's state, at the IMU, calibration included."""
+        return self._states[-1]
+
+    @property
+    def calibration(self) -> Mapping[str, Array]:
+        """Calibration variables as they are known now."""
+        return self._states[-1].calibration if self._states else self.fixed
+
+    def step(self, interval: Interval) -> None:
+        """Add one interval to the graph and keep the newest keyframe's estimate."""
+        start = self.beginning.start
+        if interval.pim is None:
+            state, factors = start.state, priors(start, self.beliefs, self.estimated)
+            values = first_values(state, self.fixed, self.estimated)
+        else:
+            state, factors = predict(interval, self.latest()), motion(interval)
+            values = next_values(interval.index, state)
+        for attached in interval.attached:
+            here = state if attached.keyframe == interval.index else self.latest()
+            factor = self._factor(attached, replace(here, calibration=self.calibration))
+            factors += [factor] if factor is not None else []
+        self.engine.update(factors, values, interval.time)
+        self.intervals.append(interval)
+        self._states.append(self.engine.state(interval.index))
+        self._covariances.append(self._newest_covariances(interval.index))
+
+    def solve(self) -> Estimate:
+        """The filtering estimate of every keyframe so far."""
+        states = stack_states(self._states)
+        P = {v: np.array([c[v] for c in self._covariances]) for v in (*DIMENSION, *self.estimated)}
+        sd = {v: np.sqrt(np.diagonal(p, axis1=1, axis2=2)) for v, p in P.items()}
+        arm = self.beginning.config.imu.lever_arm_m
+        trajectory = body_trajectory(self.intervals, states, arm, P[POSE], P[VELOCITY])
+        history = bias_histories(trajectory.time, states.bias, sd[BIAS])
+        for name in self.estimated:
+            history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[name])
+        final = {name: P[name][-1] for name in self.estimated}
+        sensors = [s for s in self.beginning.instruments if s in self._used]
+        calibration = calibration_estimates(self.beliefs, sensors, self.latest().calibration, final)
+        return Estimate("filtered", trajectory, calibration, history, self._residuals(), {"lag_s": self.lag})
+
+    def _newest_covariances(self, index: int) -> dict[str, Array]:
+        """Marginals of the newest keyframe; those of the slow calibration only now and then."""
+        if index % CALIBRATION_EVERY == 0:
+            return self.engine.covariances(index)
+        before = {name: self._covariances[-1][name] for name in self.estimated}
+        return before | self.engine.covariances(index, calibration=False)
+
+    def _take(self, intervals: list[Interval]) -> list[Interval]:
+        for interval in intervals:
+            self.step(interval)
+        return intervals
+
+    def _block(self, attached: list[Attached]) -> Block:
+        b = self.beginning
+        instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
+        return make_block(attached, instrument, gravity, self.fixed, self.estimated)
+
+    def _factor(self, attached: Attached, here: State) -> Factor | None:
+        """The factor of a measurement, or None where its gate keeps it out.
+
+        Parameters
+        ----------
+        attached : the measurement
+        here : State of its keyframe, one epoch, as far as it is known
+        """
+        one = self._block([attached])
+        r, H = one.linearize(here)
+        admitted = self._admit(one, r, H)
+        self._used.setdefault(attached.sensor, []).append((attached, here, float(admitted)))
+        if not admitted:
+            return None
+        if self.lag is None or one.instrument.model.relinearise:
+            return one.custom_factor()
+        return one.linear_factor(here, r, H)
+
+    def _admit(self, one: Block, r: Array, H: Jacobians) -> bool:
+        """Whether a measurement's normalised innovation lies within its gate."""
+        gate, sensor = one.instrument.gate_sd, one.instrument.model.sensor
+        if gate is None or not self._covariances or np.linalg.norm(r) <= gate:
+            self._rejected[sensor] = 0
+            return True
+        S = np.eye(r.shape[1])
+        for variable, jacobian in H.items():
+            # the blocks' correlations are left out, which only widens the gate
+            S = S + jacobian[0] @ self._covariances[-1][variable] @ jacobian[0].T
+        consistent = float(r[0] @ np.linalg.solve(S, r[0])) <= gate**2
+        self._rejected[sensor] = 0 if consistent else self._rejected[sensor] + 1
+        if self._rejected[sensor] > READMIT_AFTER:
+            self._rejected[sensor] = 0
+        return self._rejected[sensor] == 0
+
+    def _residuals(self) -> pd.DataFrame:
+        """Innovations against the prediction, before the measurement entered."""
+        blocks, here, weights = {}, {}, {}
+        for sensor, rows in self._used.items():
+            blocks[sensor] = self._block([attached for attached, _, _ in rows])
+            here[sensor] = stack_states([state for _, state, _ in rows])
+            weights[sensor] = np.array([weight for _, _, weight in rows])
+        return residual_frame(blocks, here, weights)

@@ -1,0 +1,104 @@
+"""Incremental smoothing: iSAM2 over the whole dive, or over a fixed lag.
+
+iSAM2 (Kaess et al. 2012) with QR, as Cholesky finds preintegrated IMU factors indefinite
+now and then, and thresholds of relinearisation per kind of variable: positions and
+velocities enter linearly. The measurements' factors call back into Python; the reference
+to the linearisation point that is kept here lets the bindings hand them that object
+instead of a copy, without which the cost of a callback grows with the dive.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import gtsam
+import numpy as np
+
+from rovgraph.calibration import TABLE
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.graph.batch import indeterminate
+from rovgraph.graph.keys import key
+from rovgraph.graph.values import states_from
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, State
+
+ROTATION_THRESHOLD = 0.02  # [rad]
+CALIBRATION_THRESHOLD = 0.01  # [rad, 1]
+NEVER = 1e9  # for what enters linearly
+WILDFIRE = 1e-3
+
+
+def isam2_params() -> gtsam.ISAM2Params:
+    """Parameters shared by both engines."""
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")
+    params.relinearizeSkip = 1
+    params.findUnusedFactorSlots = True
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
+    thresholds = gtsam.ISAM2ThresholdMap()
+    thresholds.insert(("x", np.r_[np.full(3, ROTATION_THRESHOLD), np.full(3, NEVER)]))
+    thresholds.insert(("v", np.full(3, NEVER)))
+    thresholds.insert(("b", np.full(6, NEVER)))
+    for variable in TABLE.values():
+        threshold = NEVER if variable.linear else CALIBRATION_THRESHOLD
+        thresholds.insert((variable.letter, np.full(variable.dim, threshold)))
+    params.setRelinearizeThreshold(thresholds)
+    return params
+
+
+class Incremental:
+    """One interface to iSAM2 and to the fixed-lag smoother.
+
+    Parameters
+    ----------
+    lag : length of the window [s], or None for the whole dive
+    fixed : values of the calibration variables that are not estimated
+    estimated : names of those that are
+    """
+
+    def __init__(self, lag: float | None, fixed: Mapping[str, Array], estimated: tuple[str, ...]) -> None:
+        self.lag, self._fixed, self._estimated = lag, fixed, estimated
+        params = isam2_params()
+        self._engine = gtsam.ISAM2(params) if lag is None else gtsam.IncrementalFixedLagSmoother(lag, params)
+        self._theta = self._engine.getLinearizationPoint()
+
+    def update(self, factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values, time: float) -> None:
+        """Add a step's factors and the initial values of its new variables.
+
+        Raises
+        ------
+        InputError : the data do not determine some variable, which is named
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in factors:
+            graph.add(factor)
+        try:
+            if self.lag is None:
+                self._engine.update(graph, values)
+            else:
+                calibration = [key(name) for name in self._estimated]
+                self._engine.update(graph, values, dict.fromkeys([*values.keys(), *calibration], time))
+        except RuntimeError as error:
+            raise InputError(indeterminate(error)) from None
+
+    def state(self, index: int) -> State:
+        """Estimate of a keyframe within the lag, as a `State` of one epoch, calibration included."""
+        engine = self._engine
+        pose = engine.calculateEstimatePose3(key(POSE, index))
+        calibration = {name: engine.calculateEstimateVector(key(name)) for name in self._estimated}
+        return State(
+            pose.rotation().matrix()[None],
+            pose.translation()[None],
+            engine.calculateEstimateVector(key(VELOCITY, index))[None],
+            engine.calculateEstimateConstantBias(key(BIAS, index)).vector()[None],
+            {**self._fixed, **calibration},
+        )
+
+    def covariances(self, index: int, calibration: bool = True) -> dict[str, Array]:
+        """Marginal covariances of a keyframe's state variables, and of the calibration."""
+        keys = {v: key(v, index) for v in DIMENSION}
+        if calibration:
+            keys |= {name: key(name) for name in self._estimated}
+        return {v: np.asarray(self._engine.marginalCovariance(k)) for v, k in keys.items()}
+
+    def all_states(self, count: int) -> State:
+        """Estimates of keyframes 0 to count - 1; only without a lag."""
+        return states_from(self._engine.calculateBestEstimate(), count, self._fixed, self._estimated)
