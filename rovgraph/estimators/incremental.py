@@ -32,7 +32,7 @@ from rovgraph.log import Measurement
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, stack_states
 
 CALIBRATION_EVERY = 5  # keyframes between new marginals of the calibration
-READMIT_AFTER = 10  # rejections running, after which a sensor is believed again
+READMIT_AFTER = 5  # rejections running, after which a sensor is believed until it is consistent again
 
 
 @dataclass
@@ -158,9 +158,7 @@ class IncrementalEstimator:
             S = S + jacobian[0] @ self._covariances[-1][variable] @ jacobian[0].T
         consistent = float(r[0] @ np.linalg.solve(S, r[0])) <= gate**2
         self._rejected[sensor] = 0 if consistent else self._rejected[sensor] + 1
-        if self._rejected[sensor] > READMIT_AFTER:
-            self._rejected[sensor] = 0
-        return self._rejected[sensor] == 0
+        return consistent or self._rejected[sensor] > READMIT_AFTER
 
     def _residuals(self) -> pd.DataFrame:
         """Innovations against the prediction, before the measurement entered."""

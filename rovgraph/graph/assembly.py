@@ -19,7 +19,15 @@ import numpy as np
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.preintegration import BRIDGE_GYR, Snapshot, preintegrate, preintegration_params
+from rovgraph.graph.preintegration import (
+    BRIDGE_ACC,
+    BRIDGE_GYR,
+    KNOCK,
+    Snapshot,
+    preintegrate,
+    preintegration_params,
+    scatter_density,
+)
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
 
@@ -98,8 +106,9 @@ class Assembler:
 
     def __post_init__(self) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
-        self._params = preintegration_params(self.config)
-        self._bridge = preintegration_params(self.config, bridge=True)
+        noise = self.config.imu.noise
+        self._params = preintegration_params(self.config, noise.acc, noise.gyr)
+        self._bridge = preintegration_params(self.config, BRIDGE_ACC, BRIDGE_GYR)
         self._imu: list[tuple[float, Array]] = []
         self._waiting: list[Measurement] = []
         self._index, self._start = -1, 0.0
@@ -212,12 +221,19 @@ class Assembler:
                 seen.add(m.sensor)
         stops = np.array([m.time for m in taken])
         bridged = bool(np.diff(samples[:, 0]).max() > self._longest_step)
-        params = self._bridge if bridged else self._params
+        params = self._bridge if bridged else self._params_for(samples)
         pim, motions = preintegrate(params, self.bias, samples, self._start, stops, time)
         attached = [
             self._attach(m, motion, *self._rate(samples, m.time)) for m, motion in zip(taken, motions, strict=True)
         ]
         return pim, bridged, attached
+
+    def _params_for(self, samples: Array) -> gtsam.PreintegrationCombinedParams:
+        """The believed noise, or where a knock shakes the samples far more, what they show."""
+        noise, (acc, gyr) = self.config.imu.noise, scatter_density(samples)
+        if acc < KNOCK * noise.acc and gyr < KNOCK * noise.gyr:
+            return self._params
+        return preintegration_params(self.config, max(acc, noise.acc), max(gyr, noise.gyr))
 
     def _rate(self, samples: Array, time: float) -> tuple[Array, float]:
         """Rate interpolated to a time, and the sd of its noise."""

@@ -27,17 +27,19 @@ def earth_rate_n(latitude: float) -> Array:
     return EARTH_RATE * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
 
 
-def preintegration_params(config: Config, bridge: bool = False) -> gtsam.PreintegrationCombinedParams:
-    """GTSAM's parameters for a configuration.
+KNOCK = 3.0  # times the believed noise, before an interval's own scatter is taken
+
+
+def preintegration_params(config: Config, acc: float, gyr: float) -> gtsam.PreintegrationCombinedParams:
+    """GTSAM's parameters for a configuration and noise densities.
 
     Parameters
     ----------
     config : Config
-    bridge : for an interval with a gap in the IMU, where motion is only interpolated
+    acc, gyr : noise densities [m/s^2/rtHz, rad/s/rtHz]
     """
     noise, env = config.imu.noise, config.environment
     params = gtsam.PreintegrationCombinedParams.MakeSharedD(env.gravity_mps2)
-    acc, gyr = (BRIDGE_ACC, BRIDGE_GYR) if bridge else (noise.acc, noise.gyr)
     params.setAccelerometerCovariance(np.eye(3) * acc**2)
     params.setGyroscopeCovariance(np.eye(3) * gyr**2)
     params.setBiasAccCovariance(np.eye(3) * noise.acc_walk**2)
@@ -46,6 +48,29 @@ def preintegration_params(config: Config, bridge: bool = False) -> gtsam.Preinte
     if env.earth_rotation:
         params.setOmegaCoriolis(earth_rate_n(np.deg2rad(env.latitude_deg or 0.0)))
     return params
+
+
+def scatter_density(imu: Array) -> tuple[float, float]:
+    """Noise densities that accelerometer and gyro samples show by themselves.
+
+    Each sample is compared with the mean of its neighbours: white noise of sd s scatters
+    by sqrt(1.5) s. Vibration and knocks that the sampling does not resolve scatter
+    likewise, and harm the integration likewise.
+
+    Parameters
+    ----------
+    imu : ndarray, shape (m, 7), as in `preintegrate`
+
+    Returns
+    -------
+    acc, gyr : float; root mean square over samples and axes, 0 for fewer than 3 samples
+    """
+    if len(imu) < 3:
+        return 0.0, 0.0
+    odd = imu[1:-1, 1:] - 0.5 * (imu[:-2, 1:] + imu[2:, 1:])
+    scale = float(np.sqrt((imu[-1, 0] - imu[0, 0]) / (len(imu) - 1) / 1.5))
+    rms = np.sqrt((odd * odd).mean(axis=0).reshape(2, 3).mean(axis=1))
+    return scale * float(rms[0]), scale * float(rms[1])
 
 
 @dataclass(frozen=True)
