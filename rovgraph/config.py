@@ -178,7 +178,7 @@ class Config(_Section):
     heading: Heading = Heading()
     depth: Depth = Depth()
     fix: Fix = Fix()
-    calibration: Calibration = Calibration()  # type: ignore[valid-type]
+    calibration: Calibration = Calibration()
     graph: Graph = Graph()
     columns: dict[str, str] = Field(default_factory=dict, description="rovgraph's column: the log's own name for it")
     units: dict[str, str] = Field(default_factory=dict, description="column or sensor: unit it is in, e.g. gyr: deg/s")

@@ -112,17 +112,18 @@ def rpy_jacobian(rpy: ArrayLike) -> Array:
     return J
 
 
-def exp_rotation(rotvec: Array) -> Array:
+def exp_rotation(rotvec: ArrayLike) -> Array:
     """Rotation matrices Exp(rotvec), Rodrigues' formula (2.1).
 
     Parameters
     ----------
-    rotvec : ndarray, shape (..., 3) [rad]
+    rotvec : array_like, shape (..., 3) [rad]
 
     Returns
     -------
     ndarray, shape (..., 3, 3)
     """
+    rotvec = np.asarray(rotvec, dtype=float)
     sine, cosine, _ = _rodrigues(rotvec)
     S = skew(rotvec)
     return _EYE + sine * S + cosine * (S @ S)
@@ -172,7 +173,8 @@ def log_rotation(R: ArrayLike) -> Array:
     ndarray, shape (..., 3)
     """
     R = np.array(R, dtype=float)
-    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+    rotvec = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(rotvec.reshape(R.shape[:-1]), dtype=float)
 
 
 def transpose(R: Array) -> Array:

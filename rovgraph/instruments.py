@@ -65,7 +65,8 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
     -------
     dict : "dvl", "dvl_heading", "ahrs", "mag", "depth", "fix" -> Instrument
     """
-    env, origin = config.environment, np.asarray(origin_b, float)
+    env = config.environment
+    origin: Array = np.asarray(origin_b, float)
     declination = float(np.deg2rad(env.declination_deg))
     R_imu = mount_matrix(config.imu.mount_rpy_deg)
     dip = DEFAULT_DIP if env.dip_deg is None else float(np.deg2rad(env.dip_deg))
@@ -73,7 +74,7 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
     heading = config.heading
 
     def arm(lever_arm_m: tuple[float, float, float]) -> Array:
-        return np.asarray(lever_arm_m, float) - origin
+        return np.array(lever_arm_m) - origin
 
     def make(section: object, model: SensorModel, sd: ArrayLike, components: tuple[str, ...]) -> Instrument:
         spread = np.broadcast_to(np.asarray(sd, float), (model.dim,))
