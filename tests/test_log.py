@@ -274,12 +274,12 @@ def stream(sensor: str, times: list[float]) -> Stream:
     )
 
 
-def test_measurements_come_in_order_imu_first_and_dvl_last():
+def test_measurements_come_in_order_imu_first_then_the_ping():
     streams = [stream("dvl", [1, 2]), stream("depth", [1, 2.5]), stream("imu", [0, 1, 2, 3])]
     log = Log("x", {s.sensor: s for s in streams})
     got = list(log.measurements())
     assert [(m.time, m.sensor) for m in got] == [
-        (0, "imu"), (1, "imu"), (1, "depth"), (1, "dvl"), (2, "imu"), (2, "dvl"), (2.5, "depth"), (3, "imu"),
+        (0, "imu"), (1, "imu"), (1, "dvl"), (1, "depth"), (2, "imu"), (2, "dvl"), (2.5, "depth"), (3, "imu"),
     ]  # fmt: skip
     np.testing.assert_array_equal(got[5].values, log["dvl"].data[1])
     assert got[5].row == 1
