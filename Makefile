@@ -1,0 +1,50 @@
+# make demo   a track from the dive in data/falcon, and how far it is from the truth
+# make test   linters, types and tests
+# Each makes the environment that it needs in .venv.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+DEMO   ?= results/falcon
+
+.PHONY: help venv demo test lint bench clean
+.DELETE_ON_ERROR:
+
+help:
+	@sed -n 's/^# //p' Makefile | head -3
+
+venv: $(VENV)/dev.stamp
+
+$(VENV)/venv.stamp:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 || { \
+	  echo "Python 3.11 or newer is needed, and $(PYTHON) is none; name one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; \
+	  exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/run.stamp: $(VENV)/venv.stamp pyproject.toml
+	$(PIP) --editable .
+	@touch $@
+
+$(VENV)/dev.stamp: $(VENV)/venv.stamp pyproject.toml
+	$(PIP) --editable '.[dev]'
+	@touch $@ $(VENV)/run.stamp
+
+demo: $(VENV)/run.stamp
+	$(BIN)/rovgraph smooth data/falcon/log.csv.gz --config data/falcon/config.yaml --out $(DEMO) --force
+	$(BIN)/rovgraph evaluate $(DEMO)/trajectory_smoothed.csv data/falcon/truth.csv.gz
+
+lint: $(VENV)/dev.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/pytest -n 2 -m 'not slow'
+
+bench: $(VENV)/dev.stamp
+	$(BIN)/python benchmarks/batch.py
+
+clean:
+	rm -rf $(VENV) build dist rovgraph.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis $(DEMO)
