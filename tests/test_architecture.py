@@ -1,0 +1,173 @@
+"""Imports go downwards only, heavy libraries stay where they belong, and help is instant."""
+
+import ast
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "rovgraph"
+
+# Bottom first. Members of one layer are independent: they may not import each other.
+LAYERS = (
+    {"errors"},
+    {"geometry"},
+    {"state", "calibration"},
+    {"sensors"},
+    {"config", "log", "trajectory"},
+    {"instruments"},
+    {"graph"},
+    {"estimators", "simulate", "evaluate", "check"},
+    {"report"},
+    {"cli"},
+)
+LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
+
+# library -> the only member that may import it
+CONFINED = {"gtsam": "graph", "matplotlib": "report", "typer": "cli"}
+HEAVY = {"numpy", "scipy", "pandas", "gtsam", "matplotlib"}
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def for_types_only(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test) in {"TYPE_CHECKING", "typing.TYPE_CHECKING"}
+
+
+def imported(tree: ast.AST, package: str, types_too: bool) -> set[str]:
+    """Names of all modules that a syntax tree imports, inside functions too.
+
+    For ``from a import b`` this is ``a.b`` where that is a module of ours, and ``a`` otherwise.
+    """
+    found: set[str] = set()
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            base = ".".join([*parents, *([node.module] if node.module else [])])
+            for alias in node.names:
+                inner = f"{base}.{alias.name}"
+                found.add(inner if inner in MODULES else base)
+        elif types_too or not for_types_only(node):
+            found |= imported(node, package, types_too)
+        else:
+            found |= set().union(*(imported(branch, package, types_too) for branch in node.orelse))
+    return found
+
+
+def imports_of(name: str, types_too: bool = True) -> set[str]:
+    path = MODULES[name]
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    return imported(ast.parse(path.read_text(encoding="utf-8")), package, types_too)
+
+
+GRAPH = {name: imports_of(name) for name in MODULES}
+
+
+def member(name: str) -> str:
+    """The part of a name that has a layer: ``log`` of ``rovgraph.log.table``."""
+    return name.split(".")[1]
+
+
+def first_party(names: set[str]) -> set[str]:
+    """Our own modules among imported names, the package itself aside, which holds the version only."""
+    return {n for n in names if n.startswith("rovgraph.")}
+
+
+def test_every_module_has_a_layer():
+    assert {member(name) for name in MODULES if "." in name} == set(LEVEL)
+
+
+@pytest.mark.parametrize("name", [n for n in MODULES if "." in n])
+def test_imports_go_downwards_only(name):
+    own = member(name)
+    wrong = {other for other in first_party(GRAPH[name]) if member(other) != own and LEVEL[member(other)] >= LEVEL[own]}
+    assert not wrong, f"{name} ({own}) imports {sorted(wrong)}, which do not stand below it"
+
+
+def test_the_package_itself_imports_nothing():
+    assert GRAPH["rovgraph"] == set()
+
+
+def test_no_cycles():
+    """Within a package too; a package's ``__init__`` counts as what it imports."""
+    done: set[str] = set()
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        assert name not in path, "cycle: " + " -> ".join([*path[path.index(name) :], name])
+        if name not in done:
+            for other in sorted(first_party(GRAPH[name])):
+                visit(other, (*path, name))
+            done.add(name)
+
+    for name in MODULES:
+        visit(name, ())
+
+
+@pytest.mark.parametrize(("library", "owner"), CONFINED.items())
+def test_a_library_stays_with_its_owner(library, owner):
+    users = {name for name, names in GRAPH.items() if any(n.split(".")[0] == library for n in names)}
+    strangers = {name for name in users if "." not in name or member(name) != owner}
+    assert users, f"nothing imports {library}"
+    assert not strangers, f"only rovgraph/{owner} imports {library}"
+
+
+def test_no_drawers():
+    """A module is named after what it is about."""
+    vague = {"utils", "util", "common", "helpers", "misc", "tools"}
+    assert not vague & {part for name in MODULES for part in name.split(".")}
+
+
+def test_the_documents_name_every_layer_and_every_module():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    missing = [n for n in MODULES if "." in n and f"`{n.split('.', 1)[1].replace('.', '/')}`" not in text]
+    assert not missing, "docs/architecture.md does not name them"
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+
+
+HELP = """
+import sys
+from rovgraph.cli import app
+sys.argv = ["rovgraph", *{arguments!r}]
+try:
+    app.main()
+except SystemExit as stop:
+    assert not stop.code
+print("MODULES", *sys.modules)
+"""
+
+
+@pytest.mark.parametrize("command", [[], ["smooth"], ["evaluate"], ["check"], ["config"], ["simulate"]])
+def test_help_loads_nothing_heavy(command):
+    done = run(HELP.format(arguments=[*command, "--help"]))
+    assert done.returncode == 0, done.stderr
+    assert "Usage: rovgraph" in done.stdout
+    loaded = set(done.stdout.rpartition("MODULES ")[2].split())
+    assert sorted(loaded & HEAVY) == []
+
+
+def test_help_is_instant():
+    """Best of five, over the interpreter's own start, so that a busy machine is forgiven."""
+
+    def best(code: str) -> float:
+        spent = []
+        for _ in range(5):
+            begin = time.perf_counter()
+            run(code)
+            spent.append(time.perf_counter() - begin)
+        return min(spent)
+
+    assert best(HELP.format(arguments=["--help"])) - best("pass") < 0.4
