@@ -1,0 +1,171 @@
+"""Small simulated dives for the tests, as `Log` objects that never touch a file."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.config import Config, load_config
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.estimators.initialise import Beginning, initialise
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.geometry import Array, log_rotation, rotate, transpose
+from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.log.streams import OPTIONAL
+from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
+from rovgraph.trajectory import Trajectory
+
+FALCON = FilePath(__file__).parents[1] / "configs" / "falcon.yaml"
+LIVELY = Style(waves=Waves(heave=0.05, roll=0.1, pitch=0.08))
+
+
+def falcon(**sections: Mapping[str, Any]) -> Config:
+    """The Falcon's configuration with some keys changed, as ``falcon(dvl={"loss": "none"})``."""
+    return changed(load_config(FALCON), **sections)
+
+
+def changed(config: Config, **sections: Mapping[str, Any]) -> Config:
+    """A configuration with some keys changed, ``start={"heading_deg": 3}``."""
+    data = config.model_dump(exclude_unset=True)
+    merge(data, sections)
+    return Config.model_validate(data)
+
+
+def merge(into: dict[str, Any], new: Mapping[str, Any]) -> None:
+    for key, value in new.items():
+        if isinstance(value, Mapping):
+            merge(into.setdefault(key, {}), value)
+        else:
+            into[key] = value
+
+
+def as_log(frame: pd.DataFrame, source: str = "dive.csv") -> Log:
+    """The streams of a simulated log."""
+    streams = {}
+    for sensor, columns in STREAMS.items():
+        required = [c for c in columns if c not in OPTIONAL]
+        if not set(required) <= set(frame.columns):
+            continue
+        kept = frame.dropna(subset=required)
+        data = kept.reindex(columns=list(columns)).to_numpy(float)
+        if sensor == "dvl":
+            data[:, 3] = np.nan_to_num(data[:, 3], nan=1.0)
+        if len(kept):
+            rows = kept.index.to_numpy(dtype=np.int64) + 2
+            streams[sensor] = Stream(sensor, columns, kept["time"].to_numpy(float), data, rows)
+    return Log(source, streams)
+
+
+def without(log: Log, *sensors: str) -> Log:
+    """A log that lacks some sensors."""
+    return Log(log.source, {s: stream for s, stream in log.streams.items() if s not in sensors}, log.origin)
+
+
+def altered(log: Log, sensor: str, data: Array) -> Log:
+    """A log with other data for one sensor."""
+    old = log[sensor]
+    return Log(log.source, {**log.streams, sensor: Stream(sensor, old.columns, old.time, data, old.row)}, log.origin)
+
+
+def kept(log: Log, sensor: str, keep: Array) -> Log:
+    """A log with some measurements of one sensor."""
+    s = log[sensor]
+    stream = Stream(sensor, s.columns, s.time[keep], s.data[keep], s.row[keep])
+    return Log(log.source, {**log.streams, sensor: stream}, log.origin)
+
+
+def level_log(seconds: float, acc: Array, gyr: Array, rate: float = 100.0, **sensors: tuple[Array, Array]) -> Log:
+    """A log of an IMU with constant signals, and other sensors as ``name=(time, data)``."""
+    time = np.round(np.arange(int(seconds * rate) + 1) / rate, 4)
+    data = np.tile(np.concatenate([acc, gyr]), (len(time), 1))
+    streams = {"imu": Stream("imu", STREAMS["imu"], time, data, np.arange(len(time)) + 2)}
+    for name, (at, values) in sensors.items():
+        rows = np.arange(len(at)) + 10_000
+        streams[name] = Stream(name, STREAMS[name], np.asarray(at, float), np.asarray(values, float), rows)
+    return Log("dive.csv", streams)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulated dive with the configuration that an estimator is given."""
+
+    config: Config
+    dive: Dive
+    log: Log
+
+    @property
+    def truth(self) -> Trajectory:
+        return self.dive.truth
+
+
+def simulated(
+    config: Config,
+    seconds: float = 120.0,
+    seed: int = 1,
+    path: Path | str = "falcon",
+    style: Style = LIVELY,
+    **truth: Any,
+) -> Simulated:
+    """A dive, simulated by the configuration that is returned with it."""
+    path = scenario(path, seconds, None, style) if isinstance(path, str) else path
+    dive = simulate(path, Truth(config, **truth), np.random.default_rng(seed))
+    return Simulated(config, dive, as_log(dive.log_frame))
+
+
+def started(case: Simulated, **sections: Mapping[str, Any]) -> Config:
+    """The configuration with the dive's exact start, and other changes."""
+    rpy = np.rad2deg(case.truth.rpy[0])
+    north, east, down = case.truth.p_n[0]
+    start = {"north_m": north, "east_m": east, "down_m": down}
+    start |= {"roll_deg": rpy[0], "pitch_deg": rpy[1], "heading_deg": rpy[2]}
+    return changed(changed(case.config, start=start), **sections)
+
+
+def batch(log: Log, config: Config) -> BatchSmoother:
+    """A batch smoother that has taken a whole log."""
+    return fed(BatchSmoother(initialise(log, config)), log)
+
+
+def incremental(log: Log, config: Config, lag: float | None = None) -> IncrementalEstimator:
+    """An incremental estimator that has taken a whole log."""
+    return fed(IncrementalEstimator(initialise(log, config), lag), log)
+
+
+def fed(estimator: Any, log: Log) -> Any:
+    for measurement in log.measurements():
+        estimator.add(measurement)
+    estimator.finish()
+    return estimator
+
+
+def smoothed(log: Log, config: Config) -> Estimate:
+    return batch(log, config).solve()
+
+
+def beginning(log: Log, config: Config) -> Beginning:
+    return initialise(log, config)
+
+
+def true_at(case: Simulated, time: Array) -> Trajectory:
+    """The truth, from the path itself, at any epochs."""
+    motion = case.dive.path.motion(np.minimum(time, case.dive.path.duration))
+    return Trajectory.certain(time, motion.p_n, motion.R_nb, motion.v_n)
+
+
+def position_errors(trajectory: Trajectory, case: Simulated) -> Array:
+    """Length of the position's error at every epoch, shape (n,) [m]."""
+    return np.asarray(np.linalg.norm(trajectory.p_n - true_at(case, trajectory.time).p_n, axis=1))
+
+
+def attitude_errors(trajectory: Trajectory, case: Simulated) -> Array:
+    """Rotation vector of the attitude's error in n, shape (n, 3) [rad]."""
+    R = true_at(case, trajectory.time).R_nb
+    return rotate(R, log_rotation(transpose(R) @ trajectory.R_nb))
+
+
+def rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))

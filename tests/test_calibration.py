@@ -1,0 +1,69 @@
+"""One table of calibration variables serves configuration, models, keys and simulator."""
+
+import re
+
+import numpy as np
+import pytest
+
+from rovgraph.calibration import TABLE
+from rovgraph.config import Config, beliefs, parse_config
+from rovgraph.errors import InputError
+from rovgraph.graph.keys import key, key_name
+from rovgraph.instruments import instruments
+from rovgraph.state import DIMENSION
+
+
+def test_every_variable_is_named_by_a_measurement_model():
+    named = {name for i in instruments(Config()).values() for name in i.model.calibration}
+    assert named == set(TABLE)
+
+
+def test_every_variable_belongs_to_a_sensor_that_names_it():
+    sensors = instruments(Config())
+    for name, variable in TABLE.items():
+        assert name in sensors[variable.sensor].model.calibration
+
+
+def test_letters_are_unique_and_none_is_a_state_variables():
+    letters = [v.letter for v in TABLE.values()]
+    assert len(set(letters)) == len(letters)
+    assert not {"x", "v", "b"} & set(letters)
+    assert all(len(letter) == 1 for letter in letters)
+
+
+def test_labels_of_all_components_are_unique():
+    labels = [label for v in TABLE.values() for label in v.labels]
+    assert len(set(labels)) == len(labels) == sum(v.dim for v in TABLE.values())
+
+
+@pytest.mark.parametrize("variable", [*DIMENSION, *TABLE])
+def test_keys_are_told_apart_in_words(variable):
+    index = 12 if variable in DIMENSION else 0
+    said = key_name(key(variable, index))
+    assert said == (f"{variable} of keyframe 12" if variable in DIMENSION else variable)
+
+
+def test_defaults_of_the_table_are_the_beliefs_of_an_empty_configuration():
+    for name, belief in beliefs(Config()).items():
+        assert belief.variable is TABLE[name]
+        assert belief.estimate == TABLE[name].estimate
+        np.testing.assert_allclose(belief.sd, TABLE[name].sd, rtol=1e-9)
+        np.testing.assert_array_equal(belief.mean, np.zeros(TABLE[name].dim))
+
+
+def test_mean_of_the_mounting_angles_is_the_mounting_unless_it_is_given():
+    config = parse_config(
+        "dvl: {mount_rpy_deg: [180, -2, 45]}\n"
+        "calibration: {dvl_pitch: {mean_deg: 3}, hard_iron: {mean: [0.1, 0.2, 0.3]}, ahrs_deviation: {mean_deg: 2}}"
+    )
+    b = beliefs(config)
+    means = [float(np.rad2deg(b[name].mean[0])) for name in ("dvl_roll", "dvl_pitch", "dvl_yaw")]
+    np.testing.assert_allclose(means, [180, 3, 45])
+    np.testing.assert_allclose(b["hard_iron"].mean, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(b["ahrs_deviation"].mean, np.deg2rad([2, 2]))
+
+
+def test_a_mean_with_the_wrong_number_of_components_names_its_key():
+    config = parse_config("calibration: {hard_iron: {mean: [0.1, 0.2]}}")
+    with pytest.raises(InputError, match=re.escape("calibration.hard_iron.mean: 2 numbers, expected 3")):
+        beliefs(config)
