@@ -18,7 +18,7 @@ venv: $(VENV)/dev.stamp
 
 $(VENV)/venv.stamp:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 || { \
-	  echo "Python 3.11 or newer is needed, and $(PYTHON) is none; name one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; \
+	  echo "Python 3.11 or newer is needed, and $(PYTHON) is none; name one: make PYTHON=/path/to/python3 $(MAKECMDGOALS)" >&2; \
 	  exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
