@@ -132,9 +132,7 @@ class Graph(_Section):
     keyframe: Literal["dvl"] = Field("dvl", description="what makes a keyframe")
     max_gap_s: Positive = Field(1.0, description="longest time between keyframes")
     min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
-    solver: Literal["batch", "isam2", "fixed_lag"] = Field(
-        "batch", description="of the smoothed estimate; isam2 is incremental, fixed_lag forgets"
-    )
+    solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
     lag_s: Positive = Field(5.0, description="lag of the fixed-lag smoother, which gives the filtered estimate")
 
 

@@ -41,8 +41,6 @@ class SensorModel(Protocol):
     angular : components are angles, differences wrap
     state : state variables it depends on, at its own time or through the motion to it
     calibration : names of the calibration variables it depends on
-    relinearise : an incremental estimator must relinearise it as the estimate settles;
-        false where it is all but linear in what still changes after its first use
     """
 
     @property
@@ -55,8 +53,6 @@ class SensorModel(Protocol):
     def state(self) -> tuple[str, ...]: ...
     @property
     def calibration(self) -> tuple[str, ...]: ...
-    @property
-    def relinearise(self) -> bool: ...
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         """The measurement that the state predicts, and its derivatives.
@@ -116,7 +112,6 @@ class DvlVelocity:
     angular = False
     state = (POSE, VELOCITY, BIAS)
     calibration = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale")
-    relinearise = True  # the misalignment multiplies the velocity
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         R_bs, axes = dvl_mount(state)
@@ -186,7 +181,6 @@ class CompassHeading:
     dim = 1
     angular = True
     state = (POSE, BIAS)
-    relinearise = False
 
     @property
     def calibration(self) -> tuple[str, ...]:
@@ -238,7 +232,6 @@ class MagneticField:
     angular = False
     state = (POSE, BIAS)
     calibration = ("mag_offset", "mag_deviation", "hard_iron")
-    relinearise = False
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         n = len(state)
@@ -280,7 +273,6 @@ class Position:
     angular = False
     state = (POSE, VELOCITY, BIAS)
     calibration: tuple[str, ...] = ()
-    relinearise = False
 
     @property
     def dim(self) -> int:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from rovgraph.check.agreement import headings, vertical
 from rovgraph.check.findings import Finding, Level, Report, Timing
 from rovgraph.check.fixes import track
-from rovgraph.check.frozen_dvl import dvl_frozen_intervals, standstill
+from rovgraph.check.frozen_dvl import dvl_frozen_intervals, standstill, without_frozen_pings
 from rovgraph.check.outlook import plan
 from rovgraph.check.times import overlap, presence, regularity, timing
 from rovgraph.check.values import angles, bottom_lock, depths, frozen, gravity, magnetic_field, turn_rates
@@ -19,7 +19,7 @@ from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.log import Log
 
-__all__ = ["Finding", "Level", "Report", "Timing", "dvl_frozen_intervals", "examine", "warn"]
+__all__ = ["Finding", "Level", "Report", "Timing", "dvl_frozen_intervals", "examine", "warn", "without_frozen_pings"]
 
 Check = Callable[[Log, Config], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (

@@ -5,6 +5,7 @@ DVL that measures a standstill shows its noise.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,6 +31,17 @@ def dvl_frozen_intervals(log: Log) -> list[tuple[float, float]]:
     list of (first, last) : times of the first and last zero ping, both included [s]
     """
     return [(first, last) for first, last, _ in _frozen(log)]
+
+
+def without_frozen_pings(log: Log) -> Log:
+    """The log without the DVL's zeros that are no measurement."""
+    intervals = dvl_frozen_intervals(log)
+    if not intervals:
+        return log
+    dvl = log["dvl"]
+    keep = ~np.any([(dvl.time >= first) & (dvl.time <= last) for first, last in intervals], axis=0)
+    kept = replace(dvl, time=dvl.time[keep], data=dvl.data[keep], row=dvl.row[keep])
+    return replace(log, streams={**log.streams, "dvl": kept})
 
 
 def standstill(log: Log, config: Config) -> Iterator[Finding]:

@@ -1,6 +1,67 @@
-"""``rovgraph smooth``."""
+"""``rovgraph smooth``: the best track of a dive."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
 
 
-def smooth() -> None:
-    """To be written."""
-    raise NotImplementedError
+class Which(StrEnum):
+    """Which estimate to make."""
+
+    smoothed = "smoothed"
+    filtered = "filtered"
+    both = "both"
+
+
+def smooth(
+    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
+    estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
+    force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
+) -> None:
+    """Estimate the track of a dive and everything that was calibrated on the way.
+
+    Example: rovgraph smooth log.csv --config vehicle.yaml --out results
+    """
+    import time
+
+    from rich.console import Console
+
+    from rovgraph import check
+    from rovgraph.cli.progress import progress_bar
+    from rovgraph.config import load_config
+    from rovgraph.estimators.dive import smooth as smooth_dive
+    from rovgraph.log import read_log
+    from rovgraph.report.folder import check_writable, results_folder
+    from rovgraph.report.results import write_results
+    from rovgraph.report.tables import calibration_table, summary_table
+
+    out = Path("results-" + log.name.split(".")[0]) if out is None else out
+    settings = load_config(config)
+    check_writable(out, force)
+    began = time.perf_counter()
+    dive_log = read_log(log, settings.columns, settings.units)
+    check.warn(dive_log, settings)
+    dive_log = check.without_frozen_pings(dive_log)
+    seconds = {"reading": time.perf_counter() - began}
+    with progress_bar() as progress:
+        dive = smooth_dive(dive_log, settings, estimate.value, progress)
+    seconds["estimating"] = time.perf_counter() - began - seconds["reading"]
+    assumptions = dive.assumptions
+    with results_folder(out, force) as folder:
+        if figures:
+            from rovgraph.report.figures import draw_figures
+
+            draw_figures(folder, dive.estimates, dive_log, dive.beginning.config)
+        seconds["total"] = time.perf_counter() - began
+        summary = write_results(folder, dive.estimates, dive_log, dive.beginning.config, assumptions, seconds)
+    console = Console()
+    console.print(summary_table(dive.estimates, summary))
+    console.print(calibration_table(dive.estimates))
+    for line in assumptions:
+        console.print(f"assumed: {line}", highlight=False, markup=False)
+    console.print(f"results in {out}", highlight=False, markup=False)

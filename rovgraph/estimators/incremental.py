@@ -1,5 +1,11 @@
 """The filtering estimate: what is known at each keyframe from the data up to then.
 
+Over a fixed lag every factor is linearised once, and the attitude of a keyframe always
+at its first estimate (first-estimates Jacobians: Huang, Mourikis and Roumeliotis 2010).
+Linearised anew after each correction, a filter learns heading and misalignment from its
+own corrections, and becomes far too sure of both. Without a lag, factors stay nonlinear
+and iSAM2 relinearises them.
+
 Feeds the graph interval by interval to an incremental engine and keeps the newest
 keyframe's estimate after each. A measurement is gated by its normalised innovation
 before it enters; a sensor that is rejected many times running is let in again, so that
@@ -25,7 +31,16 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Attached, Interval
-from rovgraph.graph.factors import Factor, estimated_variables, first_values, motion, next_values, predict, priors
+from rovgraph.graph.factors import (
+    Factor,
+    estimated_variables,
+    first_values,
+    linear_motion,
+    motion,
+    next_values,
+    predict,
+    priors,
+)
 from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.measurements import Block, make_block
 from rovgraph.log import Measurement
@@ -82,15 +97,19 @@ class IncrementalEstimator:
         """Add one interval to the graph and keep the newest keyframe's estimate."""
         start = self.beginning.start
         if interval.pim is None:
-            state, factors = start.state, priors(start, self.beliefs, self.estimated)
+            before = state = replace(start.state, calibration=self.fixed)
+            factors = priors(start, self.beliefs, self.estimated)
             values = first_values(state, self.fixed, self.estimated)
         else:
-            state, factors = predict(interval, self.latest()), motion(interval)
+            state = predict(interval, self.latest())
+            before = replace(self.latest(), R_nb=self._first_R_nb)
+            factors = motion(interval) if self.lag is None else linear_motion(interval, before, state)
             values = next_values(interval.index, state)
         for attached in interval.attached:
-            here = state if attached.keyframe == interval.index else self.latest()
+            here = state if attached.keyframe == interval.index else before
             factor = self._factor(attached, replace(here, calibration=self.calibration))
             factors += [factor] if factor is not None else []
+        self._first_R_nb = state.R_nb
         self.engine.update(factors, values, interval.time)
         self.intervals.append(interval)
         self._states.append(self.engine.state(interval.index))
@@ -142,9 +161,7 @@ class IncrementalEstimator:
         self._used.setdefault(attached.sensor, []).append((attached, here, float(admitted)))
         if not admitted:
             return None
-        if self.lag is None or one.instrument.model.relinearise:
-            return one.custom_factor()
-        return one.linear_factor(here, r, H)
+        return one.custom_factor() if self.lag is None else one.linear_factor(here, r, H)
 
     def _admit(self, one: Block, r: Array, H: Jacobians) -> bool:
         """Whether a measurement's normalised innovation lies within its gate."""

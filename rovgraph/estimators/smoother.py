@@ -8,6 +8,7 @@ import numpy as np
 from rovgraph.config import beliefs
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.results import (
     bias_histories,
@@ -17,7 +18,17 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.graph.assembly import Assembler, Interval
-from rovgraph.graph.batch import Problem, Solution, covariance, covariances, make_problem, make_values, marginals, solve
+from rovgraph.graph.batch import (
+    Problem,
+    Solution,
+    covariance,
+    covariances,
+    make_problem,
+    make_values,
+    marginals,
+    solution_at,
+    solve,
+)
 from rovgraph.graph.keys import key
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY
@@ -51,17 +62,21 @@ class BatchSmoother:
         self.intervals += done
         return done
 
-    def solve(self) -> Estimate:
-        """The smoothed trajectory with its uncertainty."""
-        problem, solution = self.optimise()
-        return _estimate(problem, solution, self.beginning, self.intervals)
+    def solve(self, incremental: IncrementalEstimator | None = None) -> Estimate:
+        """The smoothed trajectory with its uncertainty.
 
-    def optimise(self) -> tuple[Problem, Solution]:
-        """The graph and its optimum."""
+        Parameters
+        ----------
+        incremental : has the same dive, without a lag; its optimum is taken instead of
+            the batch solver's
+        """
         b = self.beginning
         problem = make_problem(self.intervals, b.start, b.config, beliefs(b.config), b.instruments)
-        guess = dead_reckon(self.intervals, b, problem.fixed)
-        return problem, solve(problem, make_values(problem, guess))
+        if incremental is None:
+            solution = solve(problem, make_values(problem, dead_reckon(self.intervals, b, problem.fixed)))
+        else:
+            solution = solution_at(problem, incremental.engine.values())
+        return _estimate(problem, solution, b, self.intervals)
 
     def dead_reckoning(self) -> Estimate:
         """Dead reckoning over the same intervals: the baseline."""

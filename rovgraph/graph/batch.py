@@ -32,7 +32,8 @@ Gates = dict[str, NDArray[np.bool_]]
 MAX_ITERATIONS = 50
 MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
-RELATIVE_DECREASE = 1e-9
+RELATIVE_DECREASE = 1e-8  # of the cost, at which the last round stops
+COARSE_DECREASE = 1e-5  # and the rounds before the gates rest
 
 
 @dataclass(frozen=True)
@@ -164,18 +165,28 @@ def solve(problem: Problem, values: gtsam.Values) -> Solution:
     ------
     InputError : the data do not determine some variable, which is named
     """
-    gates, iterations, converged = problem.open_gates(), 0, False
+    gates, iterations = problem.open_gates(), 0
     for _ in range(MAX_GATINGS):
-        values, cost, steps, converged = _minimise(problem, values, gates)
+        values, _, steps, _ = _minimise(problem, values, gates, COARSE_DECREASE)
         iterations += steps
         renewed = problem.gates(values)
         if all(np.array_equal(renewed[s], gates[s]) for s in gates):
             break
         gates = renewed
+    values, cost, steps, converged = _minimise(problem, values, gates, RELATIVE_DECREASE)
+    iterations += steps
     return Solution(values, gates, problem.weights(values, gates), cost, iterations, converged)
 
 
-def _minimise(problem: Problem, values: gtsam.Values, gates: Gates) -> tuple[gtsam.Values, float, int, bool]:
+def solution_at(problem: Problem, values: gtsam.Values) -> Solution:
+    """The optimum that another solver found, as a `Solution`."""
+    gates = problem.gates(values)
+    return Solution(values, gates, problem.weights(values, gates), problem.cost(values, gates), 0, True)
+
+
+def _minimise(
+    problem: Problem, values: gtsam.Values, gates: Gates, tolerance: float
+) -> tuple[gtsam.Values, float, int, bool]:
     """Gauss-Newton with step halving for fixed gates."""
     cost, ordering = problem.cost(values, gates), None
     for iteration in range(1, MAX_ITERATIONS + 1):
@@ -185,7 +196,7 @@ def _minimise(problem: Problem, values: gtsam.Values, gates: Gates) -> tuple[gts
         trial, trial_cost = _search(problem, values, gates, delta, cost)
         decrease = cost - trial_cost
         values, cost = trial, trial_cost
-        if decrease <= RELATIVE_DECREASE * (1.0 + cost):
+        if decrease <= tolerance * (1.0 + cost):
             return values, cost, iteration, True
     return values, cost, MAX_ITERATIONS, False
 

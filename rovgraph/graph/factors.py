@@ -73,6 +73,26 @@ def motion(interval: Interval) -> list[Factor]:
     return [gtsam.CombinedImuFactor(*keys, interval.pim)]
 
 
+def linear_motion(interval: Interval, before: State, after: State) -> list[Factor]:
+    """`motion`, linearised for good.
+
+    The factor multiplies the change of velocity with the attitude, so the velocities must
+    belong together: the one after is predicted from the one before with ``before``'s own
+    attitude. A correction between them would pass for an acceleration.
+
+    Parameters
+    ----------
+    interval : with motion
+    before, after : State of one epoch each, at which to linearise; of ``after`` only the
+        attitude is taken
+    """
+    after = replace(predict(interval, before), R_nb=after.R_nb)
+    values = gtsam.Values()
+    insert_state(values, interval.index - 1, before)
+    insert_state(values, interval.index, after)
+    return [gtsam.LinearContainerFactor(factor.linearize(values), values) for factor in motion(interval)]
+
+
 def predict(interval: Interval, state: State) -> State:
     """The state at the end of an interval, from the IMU alone.
 

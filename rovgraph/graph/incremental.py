@@ -1,8 +1,8 @@
 """Incremental smoothing: iSAM2 over the whole dive, or over a fixed lag.
 
 iSAM2 (Kaess et al. 2012) with QR, as Cholesky finds preintegrated IMU factors indefinite
-now and then, and thresholds of relinearisation per kind of variable: positions and
-velocities enter linearly. The measurements' factors call back into Python; the reference
+now and then, and thresholds of relinearisation per kind of variable: positions and most
+calibration variables enter linearly. The measurements' factors call back into Python; the reference
 to the linearisation point that is kept here lets the bindings hand them that object
 instead of a copy, without which the cost of a callback grows with the dive.
 """
@@ -17,10 +17,10 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import indeterminate
 from rovgraph.graph.keys import key
-from rovgraph.graph.values import states_from
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, State
 
 ROTATION_THRESHOLD = 0.02  # [rad]
+VELOCITY_THRESHOLD = 0.05  # [m/s], as the IMU's factor multiplies it with the attitude
 CALIBRATION_THRESHOLD = 0.01  # [rad, 1]
 NEVER = 1e9  # for what enters linearly
 WILDFIRE = 1e-3
@@ -35,7 +35,7 @@ def isam2_params() -> gtsam.ISAM2Params:
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
     thresholds = gtsam.ISAM2ThresholdMap()
     thresholds.insert(("x", np.r_[np.full(3, ROTATION_THRESHOLD), np.full(3, NEVER)]))
-    thresholds.insert(("v", np.full(3, NEVER)))
+    thresholds.insert(("v", np.full(3, VELOCITY_THRESHOLD)))
     thresholds.insert(("b", np.full(6, NEVER)))
     for variable in TABLE.values():
         threshold = NEVER if variable.linear else CALIBRATION_THRESHOLD
@@ -99,6 +99,6 @@ class Incremental:
             keys |= {name: key(name) for name in self._estimated}
         return {v: np.asarray(self._engine.marginalCovariance(k)) for v, k in keys.items()}
 
-    def all_states(self, count: int) -> State:
-        """Estimates of keyframes 0 to count - 1; only without a lag."""
-        return states_from(self._engine.calculateBestEstimate(), count, self._fixed, self._estimated)
+    def values(self) -> gtsam.Values:
+        """Estimates of all variables that are still in the graph."""
+        return self._engine.calculateEstimate()

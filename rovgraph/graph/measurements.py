@@ -144,7 +144,7 @@ class Block:
     def linear_factor(self, state: State, r: Array, H: Jacobians) -> gtsam.LinearContainerFactor:
         """A block of one, already linearised at ``state``, as a factor that never calls back.
 
-        For models that need not be relinearised; the loss's weight is that of ``r``.
+        The loss's weight is that of ``r``.
         """
         root = np.sqrt(loss_and_weight(r, self.instrument.loss)[1][0])
         terms = [(j, root * h[0]) for j, h in zip(self.keys[0], H.values(), strict=True)]
