@@ -53,7 +53,7 @@ def dead_reckon(intervals: Sequence[Interval], beginning: Beginning, calibration
 
 
 def _compass(beginning: Beginning) -> str | None:
-    sources = [s for s in ("mag", "ahrs", "dvl_heading") if s in beginning.instruments]
+    sources: list[str] = [s for s in ("mag", "ahrs", "dvl_heading") if s in beginning.instruments]
     return next(iter(trusted_first(beginning.config, sources)), None)
 
 
@@ -110,4 +110,4 @@ def _depths(intervals: Sequence[Interval], integrated: Array, config: Config) ->
     if not found:
         return integrated
     time, depth = np.array(found).T
-    return np.interp([i.time for i in intervals], time, depth)
+    return np.asarray(np.interp([i.time for i in intervals], time, depth))

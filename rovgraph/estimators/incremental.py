@@ -72,6 +72,7 @@ class IncrementalEstimator:
         self.estimated = estimated_variables(self.beliefs, b.instruments)
         self.engine = Incremental(self.lag, self.fixed, self.estimated)
         self._states: list[State] = []
+        self._first_R_nb = self.beginning.start.state.R_nb
         self._covariances: list[dict[str, Array]] = []
         self._used: dict[str, list[tuple[Attached, State, float]]] = {}
         self._rejected: Counter[str] = Counter()

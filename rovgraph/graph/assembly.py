@@ -199,7 +199,8 @@ class Assembler:
     def _close(self, time: float, ping: Measurement | None) -> Interval:
         """Make a keyframe at ``time`` and the interval that leads to it."""
         samples = np.array([[t, *values] for t, values in self._imu])
-        pim, bridged, attached = None, False, []
+        pim, bridged = None, False
+        attached: list[Attached] = []
         if self._index >= 0:
             pim, bridged, attached = self._integrate(samples, time)
         self._index, self._start, self._between = self._index + 1, time, []

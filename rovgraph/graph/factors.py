@@ -69,8 +69,8 @@ def motion(interval: Interval) -> list[Factor]:
     if interval.pim is None:
         return []
     i, j = interval.index - 1, interval.index
-    keys = [key(POSE, i), key(VELOCITY, i), key(POSE, j), key(VELOCITY, j), key(BIAS, i), key(BIAS, j)]
-    return [gtsam.CombinedImuFactor(*keys, interval.pim)]
+    before, after = (key(POSE, i), key(VELOCITY, i)), (key(POSE, j), key(VELOCITY, j))
+    return [gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)]
 
 
 def linear_motion(interval: Interval, before: State, after: State) -> list[Factor]:

@@ -8,6 +8,7 @@ instead of a copy, without which the cost of a callback grows with the dive.
 """
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -57,7 +58,7 @@ class Incremental:
     def __init__(self, lag: float | None, fixed: Mapping[str, Array], estimated: tuple[str, ...]) -> None:
         self.lag, self._fixed, self._estimated = lag, fixed, estimated
         params = isam2_params()
-        self._engine = gtsam.ISAM2(params) if lag is None else gtsam.IncrementalFixedLagSmoother(lag, params)
+        self._engine: Any = gtsam.ISAM2(params) if lag is None else gtsam.IncrementalFixedLagSmoother(lag, params)
         self._theta = self._engine.getLinearizationPoint()
 
     def update(self, factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values, time: float) -> None:
@@ -70,12 +71,12 @@ class Incremental:
         graph = gtsam.NonlinearFactorGraph()
         for factor in factors:
             graph.add(factor)
+        stamps: tuple[dict[int, float], ...] = ()
+        if self.lag is not None:
+            calibration = [key(name) for name in self._estimated]
+            stamps = (dict.fromkeys([*values.keys(), *calibration], time),)
         try:
-            if self.lag is None:
-                self._engine.update(graph, values)
-            else:
-                calibration = [key(name) for name in self._estimated]
-                self._engine.update(graph, values, dict.fromkeys([*values.keys(), *calibration], time))
+            self._engine.update(graph, values, *stamps)
         except RuntimeError as error:
             raise InputError(indeterminate(error)) from None
 
@@ -101,4 +102,5 @@ class Incremental:
 
     def values(self) -> gtsam.Values:
         """Estimates of all variables that are still in the graph."""
-        return self._engine.calculateEstimate()
+        values: gtsam.Values = self._engine.calculateEstimate()
+        return values

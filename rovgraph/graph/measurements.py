@@ -15,7 +15,7 @@ from functools import cache, cached_property
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import Attached
@@ -137,7 +137,7 @@ class Block:
             if H is not None:
                 for place, jacobian in enumerate(jacobians.values()):
                     H[place] = jacobian[0]
-            return -r[0]  # GTSAM's error is predicted minus measured
+            return np.negative(r[0])  # GTSAM's error is predicted minus measured
 
         return gtsam.CustomFactor(robust_noise(self.instrument), self.keys[k], error)
 
@@ -177,9 +177,8 @@ def make_block(
     def stack(name: str) -> Array:
         return np.array([getattr(a, name) for a in attached])
 
-    delta = Delta(
-        *(np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp")), stack("bias")
-    )
+    dt, dR, dv, dp = (np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp"))
+    delta = Delta(dt, dR, dv, dp, stack("bias"))
     own = tuple(v for v in estimated if v in instrument.model.calibration)
     W = whitening(instrument, stack("sd"), stack("rate_sd"))
     arrays = (stack("keyframe"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
@@ -207,7 +206,7 @@ def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
 @cache
 def loss_threshold(loss: str, dim: int) -> float:
     """Normalised length at which a loss bends: where 95 % of good measurements lie below."""
-    return float("inf") if loss == "none" else float(np.sqrt(chi2.ppf(0.95, dim)))
+    return float("inf") if loss == "none" else float(np.sqrt(chdtri(dim, 0.05)))
 
 
 def loss_and_weight(r: Array, loss: str) -> tuple[Array, Array]:
@@ -239,5 +238,6 @@ def robust_noise(instrument: Instrument) -> gtsam.noiseModel.Base:
     unit, k = gtsam.noiseModel.Unit.Create(dim), loss_threshold(loss, dim)
     if loss == "none":
         return unit
-    kinds = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}
-    return gtsam.noiseModel.Robust.Create(kinds[loss].Create(k), unit)
+    kinds = gtsam.noiseModel.mEstimator
+    robust = kinds.Huber.Create(k) if loss == "huber" else kinds.Cauchy.Create(k)
+    return gtsam.noiseModel.Robust.Create(robust, unit)
