@@ -1,0 +1,202 @@
+"""Blocks of measurements: their factors are the finite differences of their innovations."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from dives import fed, simulated
+from scipy.stats import chi2
+from test_sensors import CONFIG, SENSORS, random_state
+
+from rovgraph.calibration import TABLE
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.geometry import exp_rotation
+from rovgraph.graph.assembly import Attached
+from rovgraph.graph.keys import key
+from rovgraph.graph.measurements import (
+    Block,
+    loss_and_weight,
+    loss_threshold,
+    make_block,
+    robust_noise,
+    whitening,
+)
+from rovgraph.graph.preintegration import Snapshot
+from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.state import DIMENSION, State, propagate
+
+N, STEP = 4, 1e-6
+ALL = tuple(TABLE)
+
+
+def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Block, State]:
+    """A block with motion to each measurement, and the state of its keyframes."""
+    rng, instrument = np.random.default_rng(3), replace(SENSORS[sensor], loss=loss)
+    state = random_state(5, N)
+    attached = []
+    for k in range(N):
+        bias = state.bias[k] + 0.05 * rng.standard_normal(6)
+        turn = exp_rotation(0.2 * rng.standard_normal(3))
+        motion = Snapshot(0.1 + 0.05 * k, turn, 0.3 * rng.standard_normal(3), 0.1 * rng.standard_normal(3))
+        motion = motion if moving else Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
+        rate, z = rng.standard_normal(3), rng.standard_normal(instrument.model.dim)
+        sd = instrument.sd * rng.uniform(0.5, 2.0, instrument.model.dim)
+        attached.append(Attached(sensor, k, 0.2 * k, 10 + k, z, sd, rate, 0.01, motion, bias))
+    return make_block(attached, instrument, 9.81, state.calibration, ALL), state
+
+
+def values_of(state: State, estimated) -> gtsam.Values:
+    values = gtsam.Values()
+    for k in range(len(state)):
+        insert_state(values, k, state.at([k]))
+    insert_calibration(values, state.calibration, estimated)
+    return values
+
+
+@pytest.mark.parametrize("moving", [True, False], ids=["between keyframes", "at the keyframe"])
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_linearised_block_is_the_finite_difference_of_its_innovations(sensor, moving):
+    block, state = block_of(sensor, moving)
+    r, H = block.linearize(state)
+    np.testing.assert_allclose(r, block.normalised(state), atol=1e-9)
+    assert set(H) == set(block.variables)
+    for variable, J in H.items():
+        numeric = np.empty_like(J)
+        for k in range(J.shape[2]):
+            d = STEP * np.eye(J.shape[2])[k]
+            ahead, behind = (block.normalised(state.retract(variable, s * d)) for s in (1, -1))
+            numeric[..., k] = -(ahead - behind) / (2 * STEP)  # innovations fall where predictions rise
+        scale = max(np.abs(J).max(), 1.0)
+        np.testing.assert_allclose(J / scale, numeric / scale, atol=1e-6, err_msg=variable)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_custom_factor_is_linearised_by_gtsam_as_its_own_error_moves(sensor):
+    block, state = block_of(sensor)
+    values, k = values_of(state, block.estimated), 2
+    factor = block.custom_factor(k)
+    linear = factor.linearize(values)
+    A, b = linear.jacobian()
+    np.testing.assert_allclose(b, -factor.unwhitenedError(values), atol=1e-9)
+    names = {key(v) + (k if v in DIMENSION else 0): v for v in block.variables}
+    column = 0
+    for j in list(linear.keys()):
+        dim = DIMENSION.get(names[j]) or TABLE[names[j]].dim
+        for c in range(dim):
+            moved = []
+            for sign in (1, -1):
+                delta = gtsam.VectorValues()
+                delta.insert(j, sign * STEP * np.eye(dim)[c])
+                moved.append(factor.unwhitenedError(values.retract(delta)))
+            numeric = (moved[0] - moved[1]) / (2 * STEP)
+            scale = max(np.abs(A).max(), 1.0)
+            np.testing.assert_allclose(A[:, column] / scale, numeric / scale, atol=1e-6, err_msg=names[j])
+            column += 1
+
+
+@pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_bulk_custom_and_linear_factors_are_the_same_system(sensor, loss):
+    block, state = block_of(sensor, loss=loss)
+    values = values_of(state, block.estimated)
+    pushed, custom, held = (gtsam.GaussianFactorGraph() for _ in range(3))
+    r, H = block.linearize(state)
+    block.push(pushed, state, loss_and_weight(r, loss)[1])
+    for k in range(N):
+        custom.push_back(block.custom_factor(k).linearize(values))
+        one = {v: h[[k]] for v, h in H.items()}
+        here = state.at([k])
+        held.push_back(block.at(slice(k, k + 1)).linear_factor(here, r[[k]], one).linearize(values))
+    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(pushed)
+    expected = custom.hessian(ordering)
+    for graph in (pushed, held):
+        for mine, gtsams in zip(graph.hessian(ordering), expected, strict=True):
+            scale = np.abs(gtsams).max()
+            np.testing.assert_allclose(mine / scale, gtsams / scale, atol=1e-9)
+
+
+@pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
+def test_losses_are_gtsams(loss):
+    block, _ = block_of("dvl", loss=loss)
+    noise = robust_noise(block.instrument)
+    for length in (0.0, 0.5, 2.0, 2.7, 2.9, 10.0, 100.0):
+        r = np.array([[0.6, 0.0, -0.8]]) * length
+        rho, weight = loss_and_weight(r, loss)
+        if loss == "none":
+            np.testing.assert_allclose([rho[0], weight[0]], [0.5 * length**2, 1.0], atol=1e-12)
+        else:
+            np.testing.assert_allclose(weight[0], noise.robust().weight(length), atol=1e-12)
+            np.testing.assert_allclose(rho[0], noise.robust().loss(length), atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_losses_leave_nineteen_of_twenty_good_measurements_alone(dim):
+    r = np.random.default_rng(0).standard_normal((40_000, dim))
+    inside = np.linalg.norm(r, axis=1) <= loss_threshold("huber", dim)
+    assert abs(inside.mean() - 0.95) < 0.005
+    assert loss_threshold("huber", dim) == pytest.approx(np.sqrt(chi2.ppf(0.95, dim)))
+    np.testing.assert_array_equal(loss_and_weight(r, "huber")[1][inside], 1.0)
+
+
+def test_weight_is_the_slope_of_the_loss_over_the_length():
+    for loss in ("huber", "cauchy"):
+        for length in (0.5, 2.0, 4.0, 20.0):
+            rho = [loss_and_weight(np.array([[d, 0.0, 0.0]]), loss)[0][0] for d in (length - 1e-5, length + 1e-5)]
+            weight = loss_and_weight(np.array([[length, 0.0, 0.0]]), loss)[1][0]
+            assert weight * length == pytest.approx((rho[1] - rho[0]) / 2e-5, rel=1e-6)
+
+
+def test_whitening_takes_in_the_noise_of_the_rate_at_the_lever_arm():
+    instrument = SENSORS["dvl"]
+    sd, rate_sd = np.array([[0.004, 0.005, 0.002]]), np.array([0.02])
+    W = whitening(instrument, sd, rate_sd)[0]
+    expected = np.diag(sd[0] ** 2) + instrument.rate_gain @ instrument.rate_gain.T * rate_sd[0] ** 2
+    np.testing.assert_allclose(np.linalg.inv(W.T @ W), expected, rtol=1e-9)
+    rng = np.random.default_rng(1)
+    noise = rng.standard_normal((50_000, 3)) * sd + rng.standard_normal((50_000, 3)) * rate_sd @ instrument.rate_gain.T
+    np.testing.assert_allclose(np.cov((noise @ W.T).T), np.eye(3), atol=0.03)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_block_predicts_at_the_measurements_own_time(sensor):
+    block, state = block_of(sensor)
+    there = propagate(state, block.motion, block.gravity)
+    expected = block.instrument.model.predict(there, block.rate_b)[0]
+    np.testing.assert_allclose(block.predict(state)[0], expected, atol=1e-12)
+    resting = replace(block, motion=replace(block.motion, dt=0 * block.motion.dt))
+    assert resting.at_keyframes and not block.at_keyframes
+
+
+def test_some_of_a_block_are_its_own_measurements():
+    block, state = block_of("dvl")
+    some = block.at(np.array([2, 0]))
+    np.testing.assert_allclose(some.normalised(state.at([2, 0])), block.normalised(state)[[2, 0]])
+    assert [row[0] for row in some.keys] == [key("pose", 2), key("pose", 0)]
+
+
+def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
+    """The simulator and the blocks agree about time, motion, lever arms and noise."""
+    case = simulated(CONFIG, 40.0, seed=4, ahrs_rate=5.0, fix_interval=1.0, bias=np.zeros(6))
+    config = case.config.model_copy(
+        update={"heading": case.config.heading.model_copy(update={"sources": ("mag", "dvl", "ahrs")})}
+    )
+    smoother: BatchSmoother = fed(BatchSmoother(initialise(case.log, config)), case.log)
+    motion = case.dive.path.motion(np.minimum([i.time for i in smoother.intervals], case.dive.path.duration))
+    arm = np.array(config.imu.lever_arm_m)
+    swing = np.einsum("nij,nj->ni", motion.R_nb, np.cross(motion.w_b, arm))
+    p_n, zero = motion.p_n + motion.R_nb @ arm, np.zeros((len(motion), 6))
+    truth = State(motion.R_nb, p_n, motion.v_n + swing, zero, case.dive.hidden["calibration"])
+    by_sensor: dict[str, list[Attached]] = {}
+    for interval in smoother.intervals:
+        for a in interval.attached:
+            by_sensor.setdefault(a.sensor, []).append(a)
+    assert set(by_sensor) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
+    for sensor, attached in by_sensor.items():
+        instrument = smoother.beginning.instruments[sensor]
+        block = make_block(attached, instrument, config.environment.gravity_mps2, truth.calibration, ())
+        r = block.normalised(truth.at(block.keyframe))
+        # motion from the keyframe is integrated from noisy samples, which adds little
+        low, high = chi2.ppf([0.0005, 0.9995], r.size) / r.size
+        assert low < np.mean(r**2) < 1.1 * high, sensor
