@@ -13,8 +13,8 @@ none is locked out for ever.
 """
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,12 +34,11 @@ from rovgraph.graph.assembly import Assembler, Attached, Interval
 from rovgraph.graph.factors import (
     Factor,
     estimated_variables,
-    first_values,
     linear_motion,
     motion,
-    next_values,
     predict,
     priors,
+    values_of,
 )
 from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.measurements import Block, make_block
@@ -89,27 +88,23 @@ class IncrementalEstimator:
         """The newest keyframe's state, at the IMU, calibration included."""
         return self._states[-1]
 
-    @property
-    def calibration(self) -> Mapping[str, Array]:
-        """Calibration variables as they are known now."""
-        return self._states[-1].calibration if self._states else self.fixed
-
     def step(self, interval: Interval) -> None:
         """Add one interval to the graph and keep the newest keyframe's estimate."""
-        start = self.beginning.start
         if interval.pim is None:
-            before = state = replace(start.state, calibration=self.fixed)
-            factors = priors(start, self.beliefs, self.estimated)
-            values = first_values(state, self.fixed, self.estimated)
+            before = state = replace(self.beginning.start.state, calibration=self.fixed)
+            factors = priors(self.beginning.start, self.beliefs, self.estimated)
+            values = values_of(0, state, self.estimated)
         else:
             state = predict(interval, self.latest())
             before = replace(self.latest(), R_nb=self._first_R_nb)
             factors = motion(interval) if self.lag is None else linear_motion(interval, before, state)
-            values = next_values(interval.index, state)
+            values = values_of(interval.index, state)
+        points: dict[int, Any] = {}
         for attached in interval.attached:
             here = state if attached.keyframe == interval.index else before
-            factor = self._factor(attached, replace(here, calibration=self.calibration))
-            factors += [factor] if factor is not None else []
+            if attached.keyframe not in points:
+                points[attached.keyframe] = values_of(attached.keyframe, here, self.estimated)
+            factors += self._factor(attached, here, points[attached.keyframe])
         self._first_R_nb = state.R_nb
         self.engine.update(factors, values, interval.time)
         self.intervals.append(interval)
@@ -148,21 +143,22 @@ class IncrementalEstimator:
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
         return make_block(attached, instrument, gravity, self.fixed, self.estimated)
 
-    def _factor(self, attached: Attached, here: State) -> Factor | None:
-        """The factor of a measurement, or None where its gate keeps it out.
+    def _factor(self, attached: Attached, here: State, point: Any) -> list[Factor]:
+        """The factor of a measurement, or none where its gate keeps it out.
 
         Parameters
         ----------
         attached : the measurement
         here : State of its keyframe, one epoch, as far as it is known
+        point : the same as GTSAM's values
         """
         one = self._block([attached])
         r, H = one.linearize(here)
         admitted = self._admit(one, r, H)
         self._used.setdefault(attached.sensor, []).append((attached, here, float(admitted)))
         if not admitted:
-            return None
-        return one.custom_factor() if self.lag is None else one.linear_factor(here, r, H)
+            return []
+        return [one.custom_factor() if self.lag is None else one.linear_factor(point, r, H)]
 
     def _admit(self, one: Block, r: Array, H: Jacobians) -> bool:
         """Whether a measurement's normalised innovation lies within its gate."""

@@ -32,7 +32,7 @@ Gates = dict[str, NDArray[np.bool_]]
 MAX_ITERATIONS = 50
 MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
-RELATIVE_DECREASE = 1e-8  # of the cost, at which the last round stops
+RELATIVE_DECREASE = 1e-7  # of the cost, at which the last round stops
 COARSE_DECREASE = 1e-5  # and the rounds before the gates rest
 
 
@@ -89,9 +89,8 @@ class Problem:
     def linearize(self, values: gtsam.Values, gates: Gates) -> gtsam.GaussianFactorGraph:
         """All factors linearised at ``values``, measurements weighted."""
         linear, states = self.native.linearize(values), self.states(values)
-        weights = self.weights(values, gates)
         for sensor, block in self.blocks.items():
-            block.push(linear, states.at(block.keyframe), weights[sensor])
+            block.push(linear, states.at(block.keyframe), gates[sensor])
         return linear
 
     def nonlinear(self) -> gtsam.NonlinearFactorGraph:

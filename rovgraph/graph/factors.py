@@ -108,15 +108,9 @@ def predict(interval: Interval, state: State) -> State:
     return replace(state, R_nb=after.attitude().matrix()[None], p_n=after.position()[None], v_n=after.velocity()[None])
 
 
-def first_values(state: State, fixed: Mapping[str, Array], estimated: Iterable[str]) -> gtsam.Values:
-    """Initial values of the first keyframe and of the calibration."""
-    values = next_values(0, state)
-    insert_calibration(values, fixed, estimated)
-    return values
-
-
-def next_values(index: int, state: State) -> gtsam.Values:
-    """Initial values of a keyframe."""
+def values_of(index: int, state: State, estimated: Iterable[str] = ()) -> gtsam.Values:
+    """Values of a keyframe's state, and of the calibration variables named."""
     values = gtsam.Values()
     insert_state(values, index, state)
+    insert_calibration(values, state.calibration, estimated)
     return values

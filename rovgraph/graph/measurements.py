@@ -12,15 +12,17 @@ gated. The thresholds are where a good measurement of that dimension lies with 9
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import Attached
 from rovgraph.graph.keys import key
-from rovgraph.graph.values import insert_calibration, insert_state, state_at
+from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Delta, Jacobians, State, propagate, propagate_with_jacobian
@@ -117,13 +119,14 @@ class Block:
         """Whitened innovations alone, shape (n, dim)."""
         return rotate(self.W, self.innovations(state))
 
-    def push(self, graph: gtsam.GaussianFactorGraph, state: State, weight: Array) -> None:
-        """Add the Jacobian factors of all measurements whose weight is not zero."""
+    def push(self, graph: gtsam.GaussianFactorGraph, state: State, gate: NDArray[np.bool_]) -> None:
+        """Add the Jacobian factors of all measurements within their gate, weighted by the loss."""
         r, H = self.linearize(state)
+        weight = loss_and_weight(r, self.instrument.loss)[1]
         root = np.sqrt(weight)[:, None]
         r, H = r * root, {v: h * root[..., None] for v, h in H.items()}
         jacobians, unit = list(H.values()), gtsam.noiseModel.Unit.Create(r.shape[1])
-        for k in np.flatnonzero(weight):
+        for k in np.flatnonzero(gate).tolist():
             terms = [(j, h[k]) for j, h in zip(self.keys[k], jacobians, strict=True)]
             # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
             graph.push_back(gtsam.GaussianConditional(terms, 1, r[k], unit))
@@ -132,17 +135,17 @@ class Block:
         """Measurement ``k`` as a nonlinear factor that calls back into `linearize`."""
         one, index = self.at(slice(k, k + 1)), int(self.keyframe[k])
 
-        def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+        def error(_: gtsam.CustomFactor, values: gtsam.Values, H: Any) -> Array:
             r, jacobians = one.linearize(state_at(values, index, self.fixed, self.estimated))
             if H is not None:
                 for place, jacobian in enumerate(jacobians.values()):
                     H[place] = jacobian[0]
-            return np.negative(r[0])  # GTSAM's error is predicted minus measured
+            return np.asarray(-r[0])  # GTSAM's error is predicted minus measured
 
         return gtsam.CustomFactor(robust_noise(self.instrument), self.keys[k], error)
 
-    def linear_factor(self, state: State, r: Array, H: Jacobians) -> gtsam.LinearContainerFactor:
-        """A block of one, already linearised at ``state``, as a factor that never calls back.
+    def linear_factor(self, point: gtsam.Values, r: Array, H: Jacobians) -> gtsam.LinearContainerFactor:
+        """A block of one, already linearised at ``point``, as a factor that never calls back.
 
         The loss's weight is that of ``r``.
         """
@@ -150,10 +153,7 @@ class Block:
         terms = [(j, root * h[0]) for j, h in zip(self.keys[0], H.values(), strict=True)]
         unit = gtsam.noiseModel.Unit.Create(r.shape[1])
         factor = gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, root * r[0], unit))
-        values = gtsam.Values()
-        insert_state(values, int(self.keyframe[0]), state)
-        insert_calibration(values, state.calibration, self.estimated)
-        return gtsam.LinearContainerFactor(factor, values)
+        return gtsam.LinearContainerFactor(factor, point)
 
     def at(self, index: slice | Array) -> "Block":
         """Some of the measurements."""
