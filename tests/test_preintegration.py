@@ -1,0 +1,211 @@
+"""Integrated IMU samples reproduce the motion they were made of."""
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+from dives import LIVELY, altered, as_log, batch, changed, falcon, fed, kept, level_log, simulated
+
+from rovgraph.config import Config, parse_config
+from rovgraph.errors import InputError
+from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.estimators.initialise import initialise
+from rovgraph.geometry import log_rotation, rpy_from_matrix
+from rovgraph.graph.preintegration import BRIDGE_GYR, EARTH_RATE, earth_rate_n, preintegrate, preintegration_params
+from rovgraph.simulate import Path, scenario
+from rovgraph.simulate.imu import specific_force_and_rate
+
+START, END = 31.0, 36.0
+ARM = (-0.4, 0.3, 0.2)
+
+
+@pytest.fixture(scope="module")
+def path() -> Path:
+    return scenario("falcon", 60.0, 0.5, LIVELY)
+
+
+def params_of(config: Config) -> gtsam.PreintegrationCombinedParams:
+    return preintegration_params(config, config.imu.noise.acc, config.imu.noise.gyr)
+
+
+def moved(pim: gtsam.PreintegratedCombinedMeasurements) -> np.ndarray:
+    """Rotation vector, change of position and of velocity, shape (9,)."""
+    return np.concatenate([log_rotation(pim.deltaRij().matrix()), pim.deltaPij(), pim.deltaVij()])
+
+
+def samples(path: Path, config: Config, rate: float) -> np.ndarray:
+    """Perfect samples in body axes at the IMU's place, shape (m, 7)."""
+    motion = path.motion(np.arange(int(path.duration * rate)) / rate)
+    return np.column_stack([motion.time, specific_force_and_rate(motion, config)])
+
+
+def at_imu(path: Path, config: Config, time: float) -> gtsam.NavState:
+    m, arm = path.motion([time]), np.asarray(config.imu.lever_arm_m)
+    R = m.R_nb[0]
+    return gtsam.NavState(gtsam.Rot3(R), m.p_n[0] + R @ arm, m.v_n[0] + R @ np.cross(m.w_b[0], arm))
+
+
+def error(path: Path, config: Config, rate: float) -> np.ndarray:
+    """Length of the error in attitude, velocity and position after the motion from START to END."""
+    nothing = np.zeros(6)
+    imu, stops = samples(path, config, rate), np.array([])
+    pim, _ = preintegrate(params_of(config), nothing, imu, START, stops, END)
+    got = pim.predict(at_imu(path, config, START), gtsam.imuBias.ConstantBias())
+    true = at_imu(path, config, END)
+    turn = log_rotation(true.attitude().matrix().T @ got.attitude().matrix())
+    parts = (turn, got.velocity() - true.velocity(), got.position() - true.position())
+    return np.array([np.linalg.norm(p) for p in parts])
+
+
+@pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), ARM], ids=["at the origin", "off the origin"])
+def test_motion_is_reproduced_to_second_order(path, arm):
+    config = Config.model_validate({"imu": {"lever_arm_m": arm}})
+    coarse, fine = error(path, config, 25.0), error(path, config, 50.0)
+    assert (fine < [2e-3, 5e-3, 2e-2]).all()
+    assert (fine < coarse / 3.0).all()  # a quarter, as far as the samples' phase allows
+    assert (error(path, config, 100.0) < coarse / 9.0).all()
+
+
+def test_snapshots_are_what_separate_integrations_give(path):
+    config = Config()
+    imu, bias = samples(path, config, 100.0), np.array([0.1, -0.1, 0.05, 0.01, -0.02, 0.03])
+    params = params_of(config)
+    stops = np.array([START, START + 0.333, START + 0.333, START + 0.34, END])
+    _, snapshots = preintegrate(params, bias, imu, START, stops, END)
+    assert len(snapshots) == len(stops)
+    assert snapshots[0].dt == 0.0
+    for stop, snapshot in zip(stops[1:], snapshots[1:], strict=True):
+        alone, _ = preintegrate(params, bias, imu, START, np.array([]), float(stop))
+        assert snapshot.dt == pytest.approx(stop - START)
+        # the last step of one is cut in the other
+        np.testing.assert_allclose(snapshot.dR, alone.deltaRij().matrix(), atol=1e-7)
+        np.testing.assert_allclose(snapshot.dv, alone.deltaVij(), atol=1e-6)
+        np.testing.assert_allclose(snapshot.dp, alone.deltaPij(), atol=1e-6)
+
+
+def test_intervals_that_meet_between_samples_lose_nothing(path):
+    config, params = Config(), params_of(Config())
+    imu, none = samples(path, config, 50.0), np.array([])
+    whole, _ = preintegrate(params, np.zeros(6), imu, START, none, END)
+    state, bias = at_imu(path, config, START), gtsam.imuBias.ConstantBias()
+    cuts = np.array([START, START + 0.0071, START + 1.2345, START + 3.3333, END])
+    there = state
+    for a, b in pairwise(cuts):
+        there = preintegrate(params, np.zeros(6), imu, a, none, b)[0].predict(there, bias)
+    together = whole.predict(state, bias)
+    # a step that is cut is integrated in two, which is as exact as the samples are dense
+    assert np.linalg.norm(there.position() - together.position()) < 0.5 * error(path, config, 50.0)[2] + 1e-3
+    assert log_rotation(there.attitude().matrix().T @ together.attitude().matrix()) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_bias_is_taken_off_the_samples(path):
+    config, bias = Config(), np.array([0.1, -0.2, 0.05, 0.01, -0.02, 0.03])
+    imu = samples(path, config, 100.0)
+    wrong = imu + np.append(0.0, bias)
+    none, params = np.array([]), params_of(config)
+    clean, _ = preintegrate(params, np.zeros(6), imu, START, none, END)
+    known, _ = preintegrate(params, bias, wrong, START, none, END)
+    np.testing.assert_allclose(moved(known), moved(clean), atol=1e-9)
+
+
+@pytest.mark.parametrize("mount", [(0, 0, 0), (176.6, 1.2, 30), (-90, 0, 45)])
+def test_mounting_of_the_imu_does_not_matter_once_it_is_known(mount):
+    config = parse_config("environment: {dip_deg: 70, field_norm: 1}")
+    same = changed(config, imu={"mount_rpy_deg": mount})
+    straight, turned = (simulated(c, 40.0, noise=False, seed=2) for c in (config, same))
+    a, b = (batch(s.log, s.config).intervals for s in (straight, turned))
+    assert len(a) == len(b) > 100
+    for one, other in zip(a[1:], b[1:], strict=True):
+        np.testing.assert_allclose(moved(one.pim), moved(other.pim), atol=1e-8)
+        np.testing.assert_allclose(one.rate_b, other.rate_b, atol=1e-9)
+
+
+def test_earths_rate_points_north_and_up_in_the_north():
+    np.testing.assert_allclose(earth_rate_n(0.0), [EARTH_RATE, 0, 0])
+    np.testing.assert_allclose(earth_rate_n(np.pi / 2), [0, 0, -EARTH_RATE], atol=1e-12)
+    np.testing.assert_allclose(earth_rate_n(-np.pi / 2), [0, 0, EARTH_RATE], atol=1e-12)
+
+
+LATITUDE, STILL_S = 58.3, 400.0
+
+
+def still_heading(on: bool) -> float:
+    """Heading after `STILL_S` at rest on a turning Earth, gyro alone [rad]; it begins at 0."""
+    lat = np.deg2rad(LATITUDE)
+    config = Config.model_validate({"environment": {"earth_rotation": on, "latitude_deg": LATITUDE}})
+    time = np.arange(0.0, STILL_S + 0.1, 0.1)
+    signal = np.concatenate([[0, 0, -config.environment.gravity_mps2], earth_rate_n(lat)])
+    imu = np.column_stack([time, np.tile(signal, (len(time), 1))])
+    state, bias = gtsam.NavState(), gtsam.imuBias.ConstantBias()
+    params = params_of(config)
+    for begin in np.arange(0.0, STILL_S, 1.0):
+        part = imu[(imu[:, 0] > begin - 0.2) & (imu[:, 0] < begin + 1.2)]
+        pim, _ = preintegrate(params, np.zeros(6), part, begin, np.array([]), begin + 1.0)
+        state = pim.predict(state, bias)
+    return float(rpy_from_matrix(state.attitude().matrix())[2])
+
+
+def test_a_turning_earth_turns_the_heading_of_who_does_not_know_it():
+    # sin(58.3 deg) of 15.04 deg/h in 400 s is 1.42 deg; the level is lost as well, which changes it a little
+    expected = -EARTH_RATE * np.sin(np.deg2rad(LATITUDE)) * STILL_S
+    assert np.rad2deg(expected) == pytest.approx(-1.42, abs=0.01)
+    assert still_heading(False) == pytest.approx(expected, rel=0.02)
+    assert abs(still_heading(True)) < np.deg2rad(0.01)
+
+
+def silent(seconds: float, **imu: float):
+    """A log whose IMU says nothing for a while from 20 s on, and its configuration."""
+    case = simulated(changed(falcon(), imu=imu), 40.0, seed=5)
+    time = case.log["imu"].time
+    return case, kept(case.log, "imu", (time < 20.0) | (time > 20.0 + seconds))
+
+
+def test_a_gap_in_the_imu_is_bridged_with_an_inflated_covariance():
+    case, log = silent(3.0)
+    intervals = batch(log, case.config).intervals
+    bridged = [i for i in intervals if i.bridged]
+    assert bridged
+    assert all(19.9 < i.time < 23.3 for i in bridged)
+    whole = [i for i in intervals[1:] if not i.bridged]
+
+    def rotation_density(interval):
+        return np.sqrt(interval.pim.preintMeasCov()[0, 0] / interval.pim.deltaTij())
+
+    assert rotation_density(bridged[1]) == pytest.approx(BRIDGE_GYR, rel=0.1)
+    assert rotation_density(bridged[1]) > 50 * np.median([rotation_density(i) for i in whole])
+    # and a ping in the gap knows that its rate is a guess
+    inside = [a for i in bridged for a in i.attached if a.sensor == "dvl" and 20.2 < a.time < 22.9]
+    assert inside and all(a.rate_sd == BRIDGE_GYR for a in inside)
+
+
+def test_keyframes_stand_at_the_pings_within_a_gap_of_the_imu():
+    case, log = silent(3.0)
+    times = np.array([i.time for i in batch(log, case.config).intervals])
+    pings = log["dvl"].time
+    assert np.isin(pings[(pings > 20.1) & (pings < 22.9)], times).all()
+
+
+def test_a_gap_longer_than_allowed_is_refused_with_row_and_remedy():
+    case, log = silent(3.0, max_gap_s=2.0)
+    after = int(np.searchsorted(log["imu"].time, 21.0))
+    row = log["imu"].row[after]
+    with pytest.raises(InputError, match=rf"row {row}: the IMU is silent for 3\.0 s .* imu\.max_gap_s = 2"):
+        fed(IncrementalEstimator(initialise(log, case.config), 5.0), log)
+
+
+def test_a_single_lost_sample_is_no_gap():
+    case = simulated(falcon(), 40.0, seed=5)
+    keep = np.ones(len(case.log["imu"]), bool)
+    keep[[1500, 1700, 1701]] = False
+    assert not any(i.bridged for i in batch(kept(case.log, "imu", keep), case.config).intervals)
+
+
+def test_helpers_of_these_tests_make_logs_in_the_logs_contract():
+    case = simulated(falcon(), 32.0, seed=1)
+    again = as_log(case.dive.log_frame)
+    assert again.sensors == {"imu", "mag", "dvl", "dvl_heading", "depth"}
+    assert [m.sensor for m in again.measurements()].count("imu") == len(again["imu"]) == 3201
+    zeroed = altered(again, "depth", 0 * again["depth"].data)
+    assert not zeroed["depth"].data.any()
+    assert level_log(1.0, np.zeros(3), np.zeros(3))["imu"].data.shape == (101, 6)
