@@ -146,6 +146,26 @@ TABLE: dict[str, Variable] = {
             "hard iron in IMU axes, as a fraction of the field's magnitude",
             estimate=True,
         ),
+        Variable(
+            "field_dip",
+            "i",
+            ("",),
+            "rad",
+            3 * _DEG,
+            "mag",
+            "difference of the field's dip from environment.dip_deg",
+            True,
+        ),
+        Variable(
+            "field_scale",
+            "q",
+            ("",),
+            "1",
+            0.05,
+            "mag",
+            "difference of the field's magnitude from environment.field_norm, as a fraction of it",
+            True,
+        ),
     )
 }
 

@@ -11,7 +11,8 @@ sensor       equation                                                   source
 dvl          z = (1 + k) R_sb (R_bn v_n + (w - b_g) x l)                (3.16), (3.17)
 dvl_heading  z = h + A + B sin h + C cos h, h = heading - declination   (3.17); deviation
 ahrs         the same with the IMU's x axis                             curve: Bowditch
-mag          z = |H| (R_sb R_bn u(declination - A - ..., dip) + iron)   (3.11), (3.14)
+mag          z = |H| ((1 + s) R_sb R_bn u(declination - A - ..., dip + d) + iron)
+                                                                        (3.11), (3.14)
 depth        z = p_d + (R_nb l)_d
 fix          z = (p + R_nb l)_north,east
 ===========  =========================================================  ==================
@@ -231,27 +232,31 @@ class MagneticField:
     dim = 3
     angular = False
     state = (POSE, BIAS)
-    calibration = ("mag_offset", "mag_deviation", "hard_iron")
+    calibration = ("mag_offset", "mag_deviation", "hard_iron", "field_dip", "field_scale")
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         n = len(state)
         heading, gradient = _heading(state.R_nb, np.tile(self.R_bs[:, 0], (n, 1)))
         heading = heading - self.declination
         deviation, slope, sine_cosine = _deviation(state, "mag_offset", "mag_deviation", heading)
-        u_n = field_direction(self.declination - deviation, self.dip)
+        declination, dip = self.declination - deviation, self.dip + _scalar(state, "field_dip")
+        u_n, dipped = field_direction(declination, dip), field_direction(declination, dip + 0.5 * np.pi)
         u_b = rotate(transpose(state.R_nb), u_n)
         turned = np.stack([-u_n[:, 1], u_n[:, 0], np.zeros(n)], axis=-1)  # du/d(declination)
-        R_sb = self.magnitude * self.R_bs.T
+        R_sb = self.magnitude * (1.0 + _scalar(state, "field_scale"))[:, None, None] * self.R_bs.T
         by_deviation = -rotate(R_sb, rotate(transpose(state.R_nb), turned))
 
         pose = np.zeros((n, 3, 6))
         pose[..., :3] = R_sb @ skew(u_b) + by_deviation[..., None] * (slope[:, None] * gradient)[:, None, :]
         iron = state.calibration["hard_iron"]
+        field = rotate(self.magnitude * self.R_bs.T, u_b)
         H = {
             POSE: pose,
             "mag_offset": by_deviation[..., None],
             "mag_deviation": by_deviation[..., None] * sine_cosine[:, None, :],
             "hard_iron": np.tile(self.magnitude * np.eye(3), (n, 1, 1)),
+            "field_dip": rotate(R_sb, rotate(transpose(state.R_nb), dipped))[..., None],
+            "field_scale": field[..., None],
         }
         return rotate(R_sb, u_b) + self.magnitude * iron, H
 

@@ -32,6 +32,8 @@ from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
 
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
+HALF_WINDOW_S = 0.05  # around a ping, over which the rate is averaged; measurements wait that long
+ENOUGH_FOR_A_LINE = 4  # samples in that window; a slower IMU is interpolated between two
 GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
@@ -136,23 +138,32 @@ class Assembler:
         if self._index < 0:
             self._before_first(measurement.time)
             done.append(self._close(measurement.time, None))
-        for waiting in self._waiting:
-            done += self._silence(waiting.time)
-            if waiting.sensor == "dvl" and waiting.time - self._start >= self.config.graph.min_gap_s:
-                done.append(self._close(waiting.time, waiting))
+        return done + self._take_until(measurement.time - HALF_WINDOW_S)
+
+    def _take_until(self, time: float) -> list[Interval]:
+        """Place what has waited for the IMU up to a time."""
+        done: list[Interval] = []
+        ready = [m for m in self._waiting if m.time <= time]
+        self._waiting = self._waiting[len(ready) :]
+        for m in ready:
+            done += self._silence(m.time)
+            if m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
+                done.append(self._close(m.time, m))
             else:
-                self._between.append(waiting)
-        self._waiting.clear()
-        return done + self._silence(measurement.time)
+                self._between.append(m)
+        return done + self._silence(time)
 
     def finish(self) -> list[Interval]:
-        """A last keyframe at the last IMU sample."""
-        self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
-        end = self._imu[-1][0] if self._imu else self._start
-        if self._index < 0 or end - self._start < 1e-3:
-            self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
+        """Place the rest, and a last keyframe at the last IMU sample."""
+        if not self._imu:
             return []
-        return [self._close(end, None)]
+        end = self._imu[-1][0]
+        done = self._take_until(end)
+        self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
+        if end - self._start < 1e-3:
+            self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
+            return done
+        return [*done, self._close(end, None)]
 
     def _admissible(self, m: Measurement) -> bool:
         """Whether a measurement may enter the graph; counts those that may not."""
@@ -207,7 +218,7 @@ class Assembler:
         rate_b, rate_sd = self._rate(samples, time)
         if ping is not None:
             attached.append(self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd))
-        keep = max(int(np.searchsorted(samples[:, 0], time, side="right")) - 1, 0)
+        keep = max(int(np.searchsorted(samples[:, 0], time - HALF_WINDOW_S, side="right")) - 1, 0)
         self._imu = self._imu[keep:]
         return Interval(self._index, time, rate_b, rate_sd, pim, bridged, attached)
 
@@ -237,17 +248,26 @@ class Assembler:
         return preintegration_params(self.config, max(acc, noise.acc), max(gyr, noise.gyr))
 
     def _rate(self, samples: Array, time: float) -> tuple[Array, float]:
-        """Rate interpolated to a time, and the sd of its noise."""
-        if len(samples) < 2:
-            return samples[0, 4:], self.config.imu.noise.gyr
-        k = min(max(int(samples[:, 0].searchsorted(time, side="right")) - 1, 0), len(samples) - 2)
-        before, after = float(samples[k, 0]), float(samples[k + 1, 0])
-        step = after - before
-        w = min(max((time - before) / step, 0.0), 1.0)
-        rate = (1.0 - w) * samples[k, 4:] + w * samples[k + 1, 4:]
+        """Rate at a time, shape (3,), and the sd of its noise.
+
+        A straight line through the samples around it. The lever arm turns the noise of
+        the rate into velocity, and the derivative by the misalignment into knowledge
+        that is not there, so a single sample would not do.
+        """
+        t = samples[:, 0]
+        first, last = t.searchsorted([time - HALF_WINDOW_S, time + HALF_WINDOW_S + 1e-9])
+        if last - first < ENOUGH_FOR_A_LINE:
+            first = min(max(int(t.searchsorted(time, side="right")) - 1, 0), max(len(t) - 2, 0))
+            last = first + 2
+        t, rate = t[first:last] - time, samples[first:last, 4:]
+        step = float(t[-1] - t[0]) / max(len(t) - 1, 1)
+        if len(t) < 2:
+            return rate[0], self.config.imu.noise.gyr
+        off = t - t.mean()
+        weights = 1.0 / len(t) - off * (t.mean() / float(off @ off))
         if step > self._longest_step:
-            return rate, BRIDGE_GYR
-        return rate, self.config.imu.noise.gyr * math.sqrt((w**2 + (1.0 - w) ** 2) / step)
+            return weights @ rate, BRIDGE_GYR
+        return weights @ rate, self.config.imu.noise.gyr * math.sqrt(float(weights @ weights) / step)
 
     def _attach(self, m: Measurement, motion: Snapshot, rate_b: Array, rate_sd: float) -> Attached:
         instrument = self.instruments[m.sensor]

@@ -45,10 +45,10 @@ def write_log(log_frame: pd.DataFrame, path: Path) -> None:
 
 
 def known(dive: Dive, config: Config) -> Config:
-    """The configuration with the planned start of the dive, as an estimator knows it."""
+    """What an estimator knows: the configuration with the planned start, for a log in rovgraph's own columns."""
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
     start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
-    return config.model_copy(update={"start": start})
+    return config.model_copy(update={"start": start, "columns": {}, "units": {}})
 
 
 def secrets(dive: Dive) -> dict[str, Any]:
