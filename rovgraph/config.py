@@ -153,13 +153,17 @@ def _calibration_entry(variable: Variable) -> type[BaseModel]:
         ),
         "sd" + tail: (Positive, Field(round(variable.sd * scale, 12), description=f"prior sd [{unit}]")),
     }
-    return create_model(f"Calibration_{variable.name}", __base__=_Section, __doc__=variable.about, **fields)
+    return create_model(
+        f"Calibration_{variable.name}", __base__=_Section, __module__=__name__, __doc__=variable.about, **fields
+    )
 
 
 _ENTRIES = {name: _calibration_entry(v) for name, v in TABLE.items()}
+globals().update({entry.__name__: entry for entry in _ENTRIES.values()})  # where pickle looks for them
 Calibration: type[BaseModel] = create_model(
     "Calibration",
     __base__=_Section,
+    __module__=__name__,
     __doc__="Calibration variables: fixed at their mean, or estimated.",
     **{name: (entry, entry()) for name, entry in _ENTRIES.items()},  # type: ignore[call-overload]
 )

@@ -1,7 +1,9 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from multiprocessing import Pool
 
 from rovgraph.config import Config
 from rovgraph.estimators.estimate import Estimate
@@ -41,7 +43,9 @@ class Dive:
         return self.beginning.assumptions + [f"left out {n} of {sensor}: {why}" for (sensor, why), n in counts]
 
 
-def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress = no_progress) -> Dive:
+def smooth(
+    log: Log, config: Config, estimate: str = "both", progress: Progress = no_progress, parallel: bool = False
+) -> Dive:
     """Estimate a dive: what ``rovgraph smooth`` does.
 
     Parameters
@@ -49,27 +53,51 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     log, config : the dive, and what is believed of vehicle and sensors
     estimate : "smoothed", "filtered" or "both"
     progress : called now and then
+    parallel : filter in a second process while this one smooths
 
     Raises
     ------
     InputError : the log lacks what is needed, or does not determine some variable
     """
     beginning = initialise(log, config)
+    if estimate == "both" and parallel:
+        with Pool(1, initializer=_leave_interrupts_to_the_parent) as pool:
+            filtering = pool.apply_async(_filtered, (log, beginning))
+            batch = assemble(log, beginning)
+            estimates = [_solve(batch, progress)]
+            progress("filtering", 0.9)
+            estimates.append(filtering.get())
+    else:
+        batch, estimates = assemble(log, beginning), []
+        if estimate != "filtered":
+            estimates.append(_solve(batch, progress))
+        if estimate != "smoothed":
+            estimates.append(run(batch.intervals, beginning, config.graph.lag_s, progress).solve())
+    return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
+
+
+def assemble(log: Log, beginning: Beginning) -> BatchSmoother:
+    """All keyframes of a log and what lies between them."""
     batch = BatchSmoother(beginning)
-    progress("reading the log's motion", 0.0)
     for measurement in log.measurements():
         batch.add(measurement)
     batch.finish()
-    estimates: list[Estimate] = []
-    if estimate in ("smoothed", "both"):
-        progress("smoothing", 0.0)
-        isam2 = config.graph.solver == "isam2"
-        estimates.append(batch.solve(run(batch.intervals, beginning, None, progress) if isam2 else None))
-    if estimate in ("filtered", "both"):
-        estimates.append(run(batch.intervals, beginning, config.graph.lag_s, progress).solve())
-    progress("dead reckoning", 1.0)
-    estimates.append(batch.dead_reckoning())
-    return Dive(estimates, beginning, dict(batch.assembler.left_out))
+    return batch
+
+
+def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
+    progress("smoothing", 0.1)
+    if batch.beginning.config.graph.solver == "isam2":
+        return batch.solve(run(batch.intervals, batch.beginning, None, progress))
+    return batch.solve()
+
+
+def _filtered(log: Log, beginning: Beginning) -> Estimate:
+    return run(assemble(log, beginning).intervals, beginning, beginning.config.graph.lag_s).solve()
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def run(
