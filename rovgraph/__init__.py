@@ -34,8 +34,8 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / report / studies / estimators, simulate, evaluate, check / graph /
-config, log, trajectory / sensors / calibration, state, geometry, errors.
+cli / report / estimators, simulate, evaluate, check / graph / instruments /
+config, log, trajectory / sensors / calibration, state / geometry / errors.
 """
 
 __version__ = "0.1.0"
