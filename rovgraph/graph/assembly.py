@@ -33,7 +33,7 @@ from rovgraph.log import Measurement
 
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 HALF_WINDOW_S = 0.05  # around a ping, over which the rate is averaged; measurements wait that long
-ENOUGH_FOR_A_LINE = 4  # samples in that window; a slower IMU is interpolated between two
+ENOUGH_FOR_A_CURVE = 5  # samples in that window; a slower IMU is interpolated between two
 GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
@@ -236,7 +236,7 @@ class Assembler:
         params = self._bridge if bridged else self._params_for(samples)
         pim, motions = preintegrate(params, self.bias, samples, self._start, stops, time)
         attached = [
-            self._attach(m, motion, *self._rate(samples, m.time)) for m, motion in zip(taken, motions, strict=True)
+            self._attach(m, motion, *self._rate_for(m, samples)) for m, motion in zip(taken, motions, strict=True)
         ]
         return pim, bridged, attached
 
@@ -247,24 +247,30 @@ class Assembler:
             return self._params
         return preintegration_params(self.config, max(acc, noise.acc), max(gyr, noise.gyr))
 
+    def _rate_for(self, m: Measurement, samples: Array) -> tuple[Array, float]:
+        """The rate, for those instruments that it reaches."""
+        reached = self.instruments[m.sensor].rate_gain.any()
+        return self._rate(samples, m.time) if reached else (np.zeros(3), 0.0)
+
     def _rate(self, samples: Array, time: float) -> tuple[Array, float]:
         """Rate at a time, shape (3,), and the sd of its noise.
 
-        A straight line through the samples around it. The lever arm turns the noise of
+        A parabola through the samples around it. The lever arm turns the noise of
         the rate into velocity, and the derivative by the misalignment into knowledge
         that is not there, so a single sample would not do.
         """
         t = samples[:, 0]
         first, last = t.searchsorted([time - HALF_WINDOW_S, time + HALF_WINDOW_S + 1e-9])
-        if last - first < ENOUGH_FOR_A_LINE:
+        degree = 2
+        if last - first < ENOUGH_FOR_A_CURVE:
+            degree = 1
             first = min(max(int(t.searchsorted(time, side="right")) - 1, 0), max(len(t) - 2, 0))
             last = first + 2
         t, rate = t[first:last] - time, samples[first:last, 4:]
         step = float(t[-1] - t[0]) / max(len(t) - 1, 1)
         if len(t) < 2:
             return rate[0], self.config.imu.noise.gyr
-        off = t - t.mean()
-        weights = 1.0 / len(t) - off * (t.mean() / float(off @ off))
+        weights = np.linalg.pinv(np.vander(t / HALF_WINDOW_S, degree + 1))[-1]
         if step > self._longest_step:
             return weights @ rate, BRIDGE_GYR
         return weights @ rate, self.config.imu.noise.gyr * math.sqrt(float(weights @ weights) / step)

@@ -238,7 +238,7 @@ def _eliminate(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> g
 
 def indeterminate(error: RuntimeError) -> str:
     """One line on a system that cannot be solved; never the graph that GTSAM prints."""
-    found = re.search(r"variable (\d+)", str(error)[:2000])
+    found = re.search(r"variable\s+(\d+)", str(error)[:2000])
     what = key_name(int(found.group(1))) if found else "some variable"
     return (
         f"the data do not determine {what}: check the log (rovgraph check), "
