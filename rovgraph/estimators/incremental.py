@@ -31,6 +31,7 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Attached, Interval
+from rovgraph.graph.batch import make_problem, make_values, solve
 from rovgraph.graph.factors import (
     Factor,
     estimated_variables,
@@ -46,6 +47,7 @@ from rovgraph.log import Measurement
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, stack_states
 
 CALIBRATION_EVERY = 5  # keyframes between new marginals of the calibration
+RELINEARISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # since the start, while calibration settles
 READMIT_AFTER = 5  # rejections running, after which a sensor is believed until it is consistent again
 
 
@@ -72,6 +74,7 @@ class IncrementalEstimator:
         self.engine = Incremental(self.lag, self.fixed, self.estimated)
         self._states: list[State] = []
         self._first_R_nb = self.beginning.start.state.R_nb
+        self._settling = list(RELINEARISE_AT_S)
         self._covariances: list[dict[str, Array]] = []
         self._used: dict[str, list[tuple[Attached, State, float]]] = {}
         self._rejected: Counter[str] = Counter()
@@ -110,6 +113,9 @@ class IncrementalEstimator:
         self.intervals.append(interval)
         self._states.append(self.engine.state(interval.index))
         self._covariances.append(self._newest_covariances(interval.index))
+        if self.lag is not None and self._settling and interval.time - self.intervals[0].time >= self._settling[0]:
+            self._settling.pop(0)
+            self._relinearise()
 
     def solve(self) -> Estimate:
         """The filtering estimate of every keyframe so far."""
@@ -125,6 +131,22 @@ class IncrementalEstimator:
         sensors = [s for s in self.beginning.instruments if s in self._used]
         calibration = calibration_estimates(self.beliefs, sensors, self.latest().calibration, final)
         return Estimate("filtered", trajectory, calibration, history, self._residuals(), {"lag_s": self.lag})
+
+    def _relinearise(self) -> None:
+        """Solve the dive so far as a whole, and go on from there.
+
+        While heading and calibration are known only to several degrees, factors that were
+        linearised once misstate what they know by the square of that.
+        """
+        b, newest = self.beginning, self.intervals[-1].index
+        problem = make_problem(self.intervals, b.start, b.config, self.beliefs, b.instruments)
+        values = make_values(problem, stack_states(self._states), self.latest().calibration)
+        solution = solve(problem, values)
+        linear = problem.linearize(solution.values, solution.gates)
+        self.engine.restart(linear, solution.values, {i.index: i.time for i in self.intervals})
+        self._states[-1] = self.engine.state(newest)
+        self._covariances[-1] = self.engine.covariances(newest)
+        self._first_R_nb = self.latest().R_nb
 
     def _newest_covariances(self, index: int) -> dict[str, Array]:
         """Marginals of the newest keyframe; those of the slow calibration only now and then."""

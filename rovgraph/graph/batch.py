@@ -148,12 +148,12 @@ def make_problem(
     return Problem(native, blocks, len(intervals), fixed, estimated)
 
 
-def make_values(problem: Problem, states: State) -> gtsam.Values:
-    """GTSAM values of the keyframes' states, calibration at its means."""
+def make_values(problem: Problem, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:
+    """GTSAM values of the keyframes' states, calibration at its means unless given."""
     values = gtsam.Values()
     for i in range(problem.count):
         insert_state(values, i, states.at([i]))
-    insert_calibration(values, problem.fixed, problem.estimated)
+    insert_calibration(values, problem.fixed if calibration is None else calibration, problem.estimated)
     return values
 
 

@@ -80,6 +80,21 @@ class Incremental:
         except RuntimeError as error:
             raise InputError(indeterminate(error)) from None
 
+    def restart(self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, times: Mapping[int, float]) -> None:
+        """Begin anew with a dive so far, linearised at its optimum; only with a lag.
+
+        Parameters
+        ----------
+        linear : all factors, linearised at ``values``
+        values : of all variables
+        times : keyframe -> time [s]
+        """
+        self._engine = gtsam.IncrementalFixedLagSmoother(self.lag or 0.0, isam2_params())
+        stamps = {key(v, index): time for index, time in times.items() for v in DIMENSION}
+        stamps |= dict.fromkeys([key(name) for name in self._estimated], max(times.values()))
+        self._engine.update(gtsam.LinearContainerFactor.ConvertLinearGraph(linear, values), values, stamps)
+        self._theta = self._engine.getLinearizationPoint()
+
     def state(self, index: int) -> State:
         """Estimate of a keyframe within the lag, as a `State` of one epoch, calibration included."""
         engine = self._engine
