@@ -1,0 +1,118 @@
+"""The batch solver against GTSAM's Levenberg-Marquardt, on the same graph from the same start.
+
+    python benchmarks/batch.py                         500 s, both solvers; 4000 s, ours
+    python benchmarks/batch.py --seconds 20 --long 40  a smoke test
+
+The reference solves `Problem.nonlinear()`: the same native factors, and one Python
+`gtsam.CustomFactor` per measurement. Both costs are evaluated by `Problem.cost` with the
+gates that our solver came to rest with, so gates are left open on both sides.
+Nothing is asserted: it prints a table.
+"""
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import gtsam
+import numpy as np
+
+from rovgraph.config import Config, beliefs, load_config
+from rovgraph.estimators.dead_reckoning import dead_reckon
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.graph.batch import Problem, make_problem, make_values, solve
+from rovgraph.log import read_log
+from rovgraph.simulate import Truth, scenario, simulate
+from rovgraph.simulate.files import write_log
+
+FALCON = Path(__file__).parents[1] / "configs" / "falcon.yaml"
+IMU_RATE, DVL_RATE = 100.0, 5.6
+
+
+@dataclass(frozen=True)
+class Run:
+    """One solver on one graph."""
+
+    solver: str
+    seconds: float
+    keyframes: int
+    measurements: int
+    time: float
+    cost: float
+
+
+def make_graph(seconds: float, config: Config) -> tuple[Problem, gtsam.Values]:
+    """The graph of a simulated dive, and dead reckoning to begin with."""
+    truth = Truth(config, imu_rate=IMU_RATE, dvl_rate=DVL_RATE)
+    dive = simulate(scenario("falcon", seconds), truth, np.random.default_rng(0))
+    with TemporaryDirectory() as folder:
+        write_log(dive.log_frame, Path(folder) / "log.csv")
+        log = read_log(Path(folder) / "log.csv")
+    smoother = BatchSmoother(initialise(log, config))
+    for measurement in log.measurements():
+        smoother.add(measurement)
+    smoother.finish()
+    b = smoother.beginning
+    # gates are open: Levenberg-Marquardt has none
+    sensors = {name: replace(instrument, gate_sd=None) for name, instrument in b.instruments.items()}
+    problem = make_problem(smoother.intervals, b.start, b.config, beliefs(b.config), sensors)
+    return problem, make_values(problem, dead_reckon(smoother.intervals, b, problem.fixed))
+
+
+def ours(problem: Problem, values: gtsam.Values, seconds: float, repeats: int = 3) -> Run:
+    """Our solver; the shortest of some runs."""
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        solution = solve(problem, values)
+        times.append(time.perf_counter() - begin)
+    return _run("rovgraph", problem, seconds, min(times), solution.cost)
+
+
+def reference(problem: Problem, values: gtsam.Values, seconds: float) -> Run:
+    """GTSAM's Levenberg-Marquardt with its default parameters and a tight tolerance."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-7)
+    graph = problem.nonlinear()
+    begin = time.perf_counter()
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    took = time.perf_counter() - begin
+    return _run("Levenberg-Marquardt", problem, seconds, took, problem.cost(result, problem.open_gates()))
+
+
+def _run(solver: str, problem: Problem, seconds: float, took: float, cost: float) -> Run:
+    return Run(solver, seconds, problem.count, sum(len(b) for b in problem.blocks.values()), took, cost)
+
+
+def table(runs: list[Run]) -> str:
+    """The runs as a Markdown table."""
+    lines = ["| solver | dive | keyframes | measurements | time | cost |", "|---|---|---|---|---|---|"]
+    for r in runs:
+        sizes = f"{r.seconds:.0f} s | {r.keyframes} | {r.measurements}"
+        lines.append(f"| {r.solver} | {sizes} | {r.time:.2f} s | {r.cost:.6f} |")
+    return "\n".join(lines)
+
+
+def main(seconds: float, long: float) -> list[Run]:
+    """Run and print; the runs are ours, the reference, ours on the long dive."""
+    config = load_config(FALCON)
+    problem, values = make_graph(seconds, config)
+    mine, gtsams = ours(problem, values, seconds), reference(problem, values, seconds)
+    longer = ours(*make_graph(long, config), long, repeats=2)
+    runs = [mine, gtsams, longer]
+    print(table(runs))
+    print()
+    print(f"cost, ours relative to the reference's: {(mine.cost - gtsams.cost) / gtsams.cost:+.1e}")
+    print(f"speed: {gtsams.time / mine.time:.0f} times that of the reference")
+    print(f"{long:.0f} s take {longer.time / mine.time:.1f} times as long as {seconds:.0f} s")
+    return runs
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=500.0, help="length of the dive that both solve")
+    parser.add_argument("--long", type=float, default=4000.0, help="length of the dive that ours alone solves")
+    arguments = parser.parse_args()
+    main(arguments.seconds, arguments.long)
