@@ -1,133 +1,280 @@
-"""Where a dive begins, and what a configuration leaves to the log."""
+"""Where a dive begins: from the log where the configuration is silent, else from the configuration."""
 
 import numpy as np
 import pytest
-from dives import altered, as_log, changed, falcon, without
-
-from rovgraph.config import Config
-from rovgraph.errors import InputError
-from rovgraph.estimators.initialise import MOVING_TILT_SD, initialise, sample_density
-from rovgraph.geometry import rpy_from_matrix, wrap_angle
-from rovgraph.log import Log
-from rovgraph.simulate import Style, Truth, scenario, simulate
-
-
-def dive(config: Config, noise: bool = True, seed: int = 5, rest: float = 10.0, **truth: object):
-    path = scenario("lawnmower", 60.0, style=Style(rest=rest))
-    return simulate(path, Truth(config, noise=noise, **truth), np.random.default_rng(seed))  # type: ignore[arg-type]
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return falcon()
-
-
-@pytest.fixture(scope="module")
-def perfect(config):
-    return dive(config, noise=False, ahrs_rate=20.0)
-
-
-@pytest.fixture(scope="module")
-def log(perfect) -> Log:
-    return as_log(perfect.log_frame)
-
-
-def begin_rpy(log: Log, config: Config):
-    return rpy_from_matrix(initialise(log, config).start.state.R_nb[0])
-
-
-def test_a_vehicle_at_rest_is_levelled_by_gravity(perfect, log, config):
-    rpy = begin_rpy(log, config)
-    np.testing.assert_allclose(rpy[:2], perfect.truth.rpy[0, :2], atol=np.deg2rad(0.1))
-
-
-@pytest.mark.parametrize("source", ["mag", "ahrs", "dvl"])
-def test_heading_comes_from_any_source_alone(perfect, log, config, source):
-    own = changed(config, heading={"sources": [source]})
-    assert abs(wrap_angle(begin_rpy(log, own)[2] - perfect.truth.rpy[0, 2])) < np.deg2rad(0.2)
-
-
-def test_an_explicit_start_goes_before_the_log(log, config):
-    start = {"heading_deg": 123.0, "roll_deg": 2.0, "pitch_deg": -3.0, "north_m": 7.0, "down_m": 9.0}
-    got = initialise(log, changed(config, start=start))
-    np.testing.assert_allclose(np.rad2deg(rpy_from_matrix(got.start.state.R_nb[0])), [2.0, -3.0, 123.0], atol=1e-9)
-    at_imu = got.start.state.R_nb[0] @ np.array(config.imu.lever_arm_m)
-    np.testing.assert_allclose(got.start.state.p_n[0] - at_imu, [7.0, 0.0, 9.0], atol=1e-9)
-
-
-def test_a_start_in_motion_is_levelled_with_a_larger_sd(config):
-    moving = dive(config, rest=0.0)
-    frame = moving.log_frame[moving.log_frame["time"] > moving.log_frame["time"].iloc[0] + 20.0].copy()
-    rng = np.random.default_rng(0)
-    shaken = as_log(frame)
-    imu = shaken["imu"].data.copy()
-    imu[:, :3] += 0.5 * np.sin(3.0 * shaken["imu"].time)[:, None] + 0.01 * rng.standard_normal((len(imu), 3))
-    got = initialise(altered(shaken, "imu", imu), config)
-    assert got.start.rpy_sd[0] == pytest.approx(MOVING_TILT_SD)
-    assert any("in motion" in line for line in got.assumptions)
-    k = int(np.searchsorted(moving.truth.time, shaken["imu"].time[0]))
-    error = rpy_from_matrix(got.start.state.R_nb[0])[:2] - moving.truth.rpy[k, :2]
-    assert np.abs(error).max() < MOVING_TILT_SD
-
-
-def test_the_gyros_bias_is_taken_from_standing_still(config):
-    bias = np.array([0.0, 0.0, 0.0, 4e-3, -3e-3, 5e-3])
-    got = initialise(as_log(dive(config, bias=bias).log_frame), config)
-    assert (np.abs(got.start.state.bias[0, 3:] - bias[3:]) < 3.0 * got.start.bias_sd[3:]).all()
-    assert (got.start.bias_sd[3:] < np.deg2rad(config.imu.gyr_bias_sd_dps)).all()
-
-
-def test_noise_is_raised_to_what_the_samples_scatter_and_only_then(config):
-    honest = as_log(dive(config).log_frame)
-    assert initialise(honest, config).config.imu.noise == config.imu.noise
-    noisy = honest["imu"].data.copy()
-    density = 4.0 * config.imu.noise.gyr
-    noisy[:, 3:] += density * 10.0 * np.random.default_rng(1).standard_normal((len(noisy), 3))
-    got = initialise(altered(honest, "imu", noisy), config)
-    assert got.config.imu.noise.gyr == pytest.approx(np.hypot(density, config.imu.noise.gyr), rel=0.05)
-    assert got.config.imu.noise.acc == config.imu.noise.acc
-    assert any("imu.noise.gyr" in line for line in got.assumptions)
-
-
-def test_the_scatter_of_white_noise_is_its_density():
-    rng, rate = np.random.default_rng(2), 50.0
-    samples = 0.3 * np.sqrt(rate) * rng.standard_normal((20_000, 3))
-    assert sample_density(np.arange(20_000) / rate, samples) == pytest.approx(0.3, rel=0.02)
-
-
-def test_field_and_dip_come_from_the_log_where_they_are_null(log, config):
-    free = changed(config, environment={"field_norm": None, "dip_deg": None})
-    environment = initialise(log, free).config.environment
-    assert environment.field_norm == pytest.approx(config.environment.field_norm or 1.0, rel=0.01)
-    assert environment.dip_deg == pytest.approx(config.environment.dip_deg, abs=0.5)
-
-
-def test_the_start_is_at_the_first_fix_unless_it_is_given(config):
-    fixed = dive(config, noise=False, fix_interval=1.0)
-    frame = fixed.log_frame.copy()
-    frame["fix_north"] += 50.0
-    free = Config.model_validate({k: v for k, v in config.model_dump(exclude_unset=True).items() if k != "start"})
-    p_n = initialise(as_log(frame), free).start.state.p_n[0]
-    assert p_n[0] == pytest.approx(50.0, abs=1.0)
-    given = changed(free, start={"north_m": 3.0, "east_m": 0.0})
-    assert initialise(as_log(frame), given).start.state.p_n[0, 0] == pytest.approx(3.0, abs=1.0)
-
-
-@pytest.mark.parametrize(
-    ("missing", "says"),
-    [(("imu",), "IMU"), (("dvl",), "DVL"), (("mag", "ahrs", "dvl_heading"), "start.heading_deg")],
+from dives import (
+    LIVELY,
+    altered,
+    attitude_errors,
+    batch,
+    changed,
+    falcon,
+    kept,
+    level_log,
+    simulated,
+    without,
 )
-def test_what_is_missing_is_named(log, config, missing, says):
-    with pytest.raises(InputError, match=says):
-        initialise(without(log, *missing), config)
+
+from rovgraph.config import Config, parse_config
+from rovgraph.errors import InputError
+from rovgraph.estimators.initialise import UNKNOWN_HEADING_SD, initialise, sample_density, trusted_first
+from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix, wrap_angle
+from rovgraph.simulate import Path, Style, scenario
+from rovgraph.simulate.scenario import SCENARIOS
+
+DEG = np.deg2rad(1.0)
+G = 9.81
 
 
-def test_without_a_compass_a_given_heading_is_enough_and_said_to_drift(log, config):
-    bare = without(log, "mag", "ahrs", "dvl_heading")
-    got = initialise(bare, changed(config, start={"heading_deg": 10.0}))
-    assert any("drift" in line for line in got.assumptions)
+def still(rpy_deg, heading_deg=30.0, noise=0.0, seconds=10.0, gyr=(0.0, 0.0, 0.0), seed=0):
+    """A log at rest at some attitude, with pings and a compass that stay still too."""
+    rng = np.random.default_rng(seed)
+    R = matrix_from_rpy(np.deg2rad(rpy_deg))
+    acc = -R.T @ [0.0, 0.0, G]
+    at = np.arange(0.1, seconds, 0.2)
+    pings = np.tile([0.0, 0.0, 0.0, 1.0, np.nan], (len(at), 1))
+    heading = np.full((len(at), 1), np.deg2rad(heading_deg))
+    log = level_log(seconds, acc, np.asarray(gyr, float), dvl=(at, pings), dvl_heading=(at, heading))
+    return altered(log, "imu", log["imu"].data + noise * rng.standard_normal(log["imu"].data.shape))
 
 
-def test_earth_rotation_needs_a_latitude(log):
-    with pytest.raises(InputError, match="latitude_deg"):
-        initialise(log, Config.model_validate({"environment": {"earth_rotation": True}}))
+def start_of(log, config=None):
+    """Roll, pitch, yaw of the start [deg] and the whole beginning."""
+    b = initialise(log, config or Config())
+    return np.rad2deg(rpy_from_matrix(b.start.state.R_nb[0])), b
+
+
+@pytest.mark.parametrize("roll", [-25.0, 0.0, 40.0])
+@pytest.mark.parametrize("pitch", [-35.0, 0.0, 20.0])
+def test_a_tilted_start_is_levelled_by_gravity(roll, pitch):
+    rpy, b = start_of(still((roll, pitch, 0.0)))
+    np.testing.assert_allclose(rpy[:2], [roll, pitch], atol=0.01)
+    np.testing.assert_allclose(b.start.rpy_sd[:2], Config().start.tilt_sd_deg * DEG)
+    assert not any("in motion" in line for line in b.assumptions)
+
+
+def test_gravity_is_read_through_the_mounting_of_the_imu():
+    config = parse_config("imu: {mount_rpy_deg: [180, 0, 0]}")
+    turned = still((0.0, 0.0, 0.0))
+    data = turned["imu"].data * [1, -1, -1, 1, -1, -1]
+    np.testing.assert_allclose(start_of(altered(turned, "imu", data), config)[0][:2], 0.0, atol=0.01)
+    assert abs(start_of(turned, config)[0][0]) > 170.0  # the wrong mounting is upside down
+
+
+def in_motion(seed=4):
+    """A dive that is cut out of another: under way from its first second."""
+    case = simulated(falcon(), 120.0, seed=seed, style=LIVELY)
+    log = case.log
+    for sensor in log.streams:
+        log = kept(log, sensor, log[sensor].time > 40.0)
+    return case, log
+
+
+def test_a_start_in_motion_is_less_sure_of_its_level():
+    _, log = in_motion()
+    b = initialise(log, falcon())
+    assert (b.start.rpy_sd[:2] > 2.0 * falcon().start.tilt_sd_deg * DEG).all()
+    assert any("begins in motion" in line for line in b.assumptions)
+    assert not any("standing still" in line for line in b.assumptions)
+
+
+def test_a_start_in_motion_settles_in_the_graph():
+    case, log = in_motion()
+    smoother = batch(log, case.config)
+    trajectory = smoother.solve().trajectory
+    tilt = np.linalg.norm(attitude_errors(trajectory, case)[:, :2], axis=1)
+    assert tilt.max() < 0.5 * DEG
+    started = rpy_from_matrix(smoother.beginning.start.state.R_nb[0])
+    true = case.dive.path.motion([trajectory.time[0]])
+    assert np.abs(started - rpy_from_matrix(true.R_nb[0]))[:2].max() < 15.0 * DEG
+
+
+def test_an_explicit_start_goes_before_the_log():
+    start = {"roll_deg": 3, "pitch_deg": -4, "heading_deg": 200, "heading_sd_deg": 1, "north_m": 7, "east_m": 8}
+    config = Config.model_validate({"start": {**start, "down_m": 9, "position_sd_m": 0.3}})
+    rpy, b = start_of(still((20.0, 10.0, 0.0)), config)
+    np.testing.assert_allclose(np.mod(rpy, 360.0), [3, 356, 200], atol=1e-6)
+    np.testing.assert_allclose(b.start.state.p_n[0], [7, 8, 9])
+    np.testing.assert_allclose(b.start.p_sd, 0.3)
+    assert b.start.rpy_sd[2] == pytest.approx(1 * DEG)
+
+
+def test_the_state_begins_at_the_imu():
+    config = parse_config("imu: {lever_arm_m: [1, 2, 3]}\nstart: {heading_deg: 90, down_m: 5}")
+    _, b = start_of(still((0.0, 0.0, 0.0)), config)
+    np.testing.assert_allclose(b.start.state.p_n[0], [-2, 1, 8], atol=1e-6)
+
+
+def test_what_was_null_is_filled_in_and_said():
+    rpy, b = start_of(still((5.0, -3.0, 0.0), heading_deg=77.0))
+    start = b.config.start
+    np.testing.assert_allclose([start.roll_deg, start.pitch_deg, start.heading_deg], [5, -3, 77], atol=0.01)
+    assert any(line.startswith("start.heading_deg 77.0, from dvl_heading") for line in b.assumptions)
+    assert rpy[2] == pytest.approx(77.0, abs=0.01)
+
+
+# heading
+
+
+@pytest.fixture(scope="module")
+def every_source():
+    return simulated(falcon(heading={"sources": ["mag", "dvl", "ahrs"]}), 40.0, noise=False, ahrs_rate=10.0, seed=2)
+
+
+@pytest.mark.parametrize(("source", "stream"), [("mag", "mag"), ("dvl", "dvl_heading"), ("ahrs", "ahrs")])
+@pytest.mark.parametrize("path", ["falcon", "south"])
+def test_heading_comes_from_each_source_alone(source, stream, path):
+    route = SCENARIOS["falcon"](40.0, None, Style()) if path == "falcon" else turned(np.deg2rad(190.0))
+    case = simulated(falcon(heading={"sources": [source]}), 40.0, path=route, noise=False, ahrs_rate=10.0, seed=2)
+    b = initialise(case.log, case.config)
+    assert {"mag", "dvl_heading", "ahrs"} & set(b.instruments) == {stream}
+    yaw = rpy_from_matrix(b.start.state.R_nb[0])[2]
+    assert abs(wrap_angle(yaw - case.truth.rpy[0, 2])) < 0.1 * DEG
+    assert b.start.rpy_sd[2] == pytest.approx(UNKNOWN_HEADING_SD)
+
+
+def turned(yaw: float) -> Path:
+    """A path at rest with another heading."""
+    time = np.linspace(0.0, 40.0, 50)
+    return Path.through(time, np.zeros((50, 3)), np.tile([0.05, -0.03, yaw], (50, 1)))
+
+
+def test_without_sources_in_the_configuration_the_magnetometer_goes_before_the_imus_heading(every_source):
+    free = changed(every_source.config, heading={"sources": None})
+    assert {"mag", "dvl_heading"} <= set(initialise(every_source.log, free).instruments)
+    assert "ahrs" not in initialise(every_source.log, free).instruments
+    no_mag = initialise(without(every_source.log, "mag"), free).instruments
+    assert "ahrs" in no_mag and "mag" not in no_mag
+
+
+def test_the_source_that_is_known_best_is_asked_first():
+    config = falcon(calibration={"mag_offset": {"estimate": True, "sd_deg": 9}, "ahrs_offset": {"estimate": False}})
+    assert trusted_first(config, ["mag", "ahrs", "dvl_heading"]) == ["ahrs", "dvl_heading", "mag"]
+
+
+def test_without_any_heading_it_says_what_to_give(every_source):
+    bare = without(every_source.log, "mag", "ahrs", "dvl_heading")
+    with pytest.raises(InputError, match=r"dive\.csv: no heading .* give start\.heading_deg"):
+        initialise(bare, every_source.config)
+    b = initialise(bare, changed(every_source.config, start={"heading_deg": 10.0}))
+    assert any("start.heading_deg alone: it will drift" in line for line in b.assumptions)
+
+
+def test_without_imu_it_says_so(every_source):
+    with pytest.raises(InputError, match=r"dive\.csv: no IMU, columns acc_x\.\.acc_z"):
+        initialise(without(every_source.log, "imu"), every_source.config)
+
+
+def test_with_neither_dvl_nor_fixes_it_says_so(every_source):
+    with pytest.raises(InputError, match=r"dive\.csv: neither DVL .* nor position fixes"):
+        initialise(without(every_source.log, "dvl"), every_source.config)
+
+
+def test_fixes_alone_will_do():
+    case = simulated(falcon(), 40.0, fix_interval=1.0, seed=2)
+    b = initialise(without(case.log, "dvl"), case.config)
+    assert "fix" in b.instruments and "dvl" not in b.instruments
+
+
+# gyro bias
+
+
+def test_the_gyros_bias_is_read_while_it_stands_still():
+    bias = np.array([3e-3, -2e-3, 4e-3])
+    _, b = start_of(still((2.0, 1.0, 0.0), noise=0.005, gyr=bias))
+    np.testing.assert_allclose(b.start.state.bias[0, 3:], bias, atol=1e-3)
+    assert (b.start.bias_sd[3:] < 0.5 * np.deg2rad(Config().imu.gyr_bias_sd_dps)).all()
+    assert any("gyro bias from the first 5 s" in line for line in b.assumptions)
+    np.testing.assert_array_equal(b.start.bias_sd[:3], Config().imu.acc_bias_sd_mps2)
+
+
+def test_a_steady_turn_is_not_taken_for_a_bias():
+    _, b = start_of(still((0.0, 0.0, 0.0), gyr=(0.0, 0.0, 0.1)))
+    np.testing.assert_array_equal(b.start.state.bias[0, 3:], 0.0)
+    np.testing.assert_allclose(b.start.bias_sd[3:], np.deg2rad(Config().imu.gyr_bias_sd_dps))
+
+
+# noise
+
+
+@pytest.mark.parametrize(("scatter", "raised"), [(1.0, False), (3.0, True)])
+def test_noise_is_raised_to_what_the_samples_scatter(scatter, raised):
+    config, rng = Config(), np.random.default_rng(1)
+    log = still((0.0, 0.0, 0.0))
+    n = len(log["imu"])
+    sd = np.repeat([config.imu.noise.acc, config.imu.noise.gyr], 3) * np.sqrt(100.0)
+    b = initialise(altered(log, "imu", log["imu"].data + scatter * sd * rng.standard_normal((n, 6))), config)
+    assert any("imu.noise" in line for line in b.assumptions) == raised
+    expected = scatter if raised else 1.0
+    assert b.config.imu.noise.acc == pytest.approx(expected * config.imu.noise.acc, rel=0.1)
+    assert b.config.imu.noise.gyr == pytest.approx(expected * config.imu.noise.gyr, rel=0.1)
+
+
+def test_a_samples_own_scatter_is_a_density_and_motion_is_not_scatter():
+    rng = np.random.default_rng(0)
+    for rate in (50.0, 200.0):
+        time = np.arange(0.0, 60.0, 1.0 / rate)
+        white = 0.01 * np.sqrt(rate) * rng.standard_normal((len(time), 3))
+        motion = np.sin(2 * np.pi * 0.3 * time)[:, None] * [0.3, 0.2, 0.1]
+        assert sample_density(time, white) == pytest.approx(0.01, rel=0.05)
+        assert sample_density(time, white + motion) == pytest.approx(0.01, rel=0.05)
+        knocked = white.copy()
+        knocked[:: int(rate)] += 5.0
+        assert sample_density(time, knocked) == pytest.approx(0.01, rel=0.1)
+
+
+# the field and the place
+
+
+@pytest.fixture(scope="module")
+def field_from_log():
+    config = falcon(environment={"dip_deg": 65.0, "field_norm": 48.0}, imu={"mount_rpy_deg": [176.6, 1.2, 30]})
+    case = simulated(config, 60.0, noise=False, path=scenario("figure8", 60.0), seed=1)
+    unknown = config.environment.model_copy(update={"dip_deg": None, "field_norm": None})
+    return initialise(case.log, config.model_copy(update={"environment": unknown}))
+
+
+def test_magnitude_and_dip_of_the_field_come_from_the_log(field_from_log):
+    env = field_from_log.config.environment
+    assert env.field_norm == pytest.approx(48.0, rel=1e-3)
+    assert env.dip_deg == pytest.approx(65.0, abs=0.3)
+    assert sum("from the log" in line or "of the log" in line for line in field_from_log.assumptions) >= 2
+
+
+def test_what_the_configuration_says_of_the_field_stands(every_source):
+    env = initialise(every_source.log, every_source.config).config.environment
+    assert (env.field_norm, env.dip_deg) == (1.0, 72.0)
+
+
+def test_the_start_is_the_first_fix_unless_it_is_given():
+    case = simulated(falcon(), 40.0, fix_interval=1.0, seed=2)
+    free = case.config.model_copy(update={"start": Config().start})
+    first = case.log["fix"].data[0, :2]
+    b = initialise(case.log, free)
+    np.testing.assert_allclose([b.config.start.north_m, b.config.start.east_m], first)
+    assert (b.start.p_sd >= free.fix.sd_m).all()
+    assert any("start position from the first fix" in line for line in b.assumptions)
+    given = initialise(case.log, changed(case.config, start={"north_m": 3.0}))
+    assert given.config.start.north_m == 3.0
+
+
+def test_depth_of_the_start_is_the_first_sample_less_the_lever_arm():
+    case = simulated(falcon(depth={"lever_arm_m": [0.0, 0.0, -0.4]}), 40.0, noise=False, seed=2)
+    b = initialise(case.log, case.config)
+    assert b.config.start.down_m == pytest.approx(case.truth.p_n[0, 2], abs=0.01)
+
+
+def test_earths_rotation_needs_a_latitude(every_source):
+    config = changed(every_source.config, environment={"earth_rotation": True, "latitude_deg": None})
+    with pytest.raises(InputError, match=r"environment\.earth_rotation needs environment\.latitude_deg"):
+        initialise(every_source.log, config)
+
+
+def test_noise_of_one_sensor_is_raised_alone_and_that_of_an_honest_dive_is_not():
+    case = simulated(falcon(), 40.0, seed=5)
+    assert initialise(case.log, case.config).config.imu.noise == case.config.imu.noise
+    data, density = case.log["imu"].data.copy(), 4.0 * case.config.imu.noise.gyr
+    data[:, 3:] += density * 10.0 * np.random.default_rng(1).standard_normal((len(data), 3))
+    noise = initialise(altered(case.log, "imu", data), case.config).config.imu.noise
+    assert noise.gyr == pytest.approx(np.hypot(density, case.config.imu.noise.gyr), rel=0.05)
+    assert noise.acc == case.config.imu.noise.acc
