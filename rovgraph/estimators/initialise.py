@@ -13,6 +13,7 @@ from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy, rotate, rpy_from_matrix
 from rovgraph.graph.factors import Start
+from rovgraph.graph.preintegration import scatter
 from rovgraph.instruments import Instrument, heading_sources, instruments
 from rovgraph.log import Log
 from rovgraph.sensors import innovation
@@ -116,20 +117,14 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
 
 
 def sample_density(time: Array, samples: Array) -> float:
-    """Noise density that samples show by themselves [unit/rtHz].
-
-    Each sample is compared with the mean of its neighbours: white noise of sd s scatters
-    by sqrt(1.5) s. Vibration that the sampling does not resolve scatters likewise, and
-    harms the integration likewise. The median makes it blind to knocks.
+    """Noise density that samples show by themselves, blind to knocks [unit/rtHz].
 
     Parameters
     ----------
     time : ndarray, shape (n,)
     samples : ndarray, shape (n, 3)
     """
-    odd = samples[1:-1] - 0.5 * (samples[:-2] + samples[2:])
-    sd = 1.4826 * np.median(np.abs(odd), axis=0) / np.sqrt(1.5)
-    return float(np.mean(sd) * np.sqrt(np.median(np.diff(time))))
+    return float(np.mean(1.4826 * np.median(np.abs(scatter(time, samples)), axis=0)))
 
 
 def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:

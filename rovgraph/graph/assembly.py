@@ -26,7 +26,7 @@ from rovgraph.graph.preintegration import (
     Snapshot,
     preintegrate,
     preintegration_params,
-    scatter_density,
+    scatter,
 )
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
@@ -242,7 +242,10 @@ class Assembler:
 
     def _params_for(self, samples: Array) -> gtsam.PreintegrationCombinedParams:
         """The believed noise, or where a knock shakes the samples far more, what they show."""
-        noise, (acc, gyr) = self.config.imu.noise, scatter_density(samples)
+        noise = self.config.imu.noise
+        if len(samples) < 3:
+            return self._params
+        acc, gyr = np.sqrt((scatter(samples[:, 0], samples[:, 1:]) ** 2).reshape(-1, 2, 3).mean(axis=(0, 2)))
         if acc < KNOCK * noise.acc and gyr < KNOCK * noise.gyr:
             return self._params
         return preintegration_params(self.config, max(acc, noise.acc), max(gyr, noise.gyr))

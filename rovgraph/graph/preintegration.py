@@ -50,27 +50,23 @@ def preintegration_params(config: Config, acc: float, gyr: float) -> gtsam.Prein
     return params
 
 
-def scatter_density(imu: Array) -> tuple[float, float]:
-    """Noise densities that accelerometer and gyro samples show by themselves.
+def scatter(time: Array, samples: Array) -> Array:
+    """How much samples differ from the mean of their neighbours, as noise densities.
 
-    Each sample is compared with the mean of its neighbours: white noise of sd s scatters
-    by sqrt(1.5) s. Vibration and knocks that the sampling does not resolve scatter
-    likewise, and harm the integration likewise.
+    White noise of density d gives values of standard deviation d. Vibration and knocks
+    that the sampling does not resolve scatter likewise, and harm the integration likewise.
 
     Parameters
     ----------
-    imu : ndarray, shape (m, 7), as in `preintegrate`
+    time : ndarray, shape (m,)
+    samples : ndarray, shape (m, k)
 
     Returns
     -------
-    acc, gyr : float; root mean square over samples and axes, 0 for fewer than 3 samples
+    ndarray, shape (m - 2, k) [unit/rtHz]
     """
-    if len(imu) < 3:
-        return 0.0, 0.0
-    odd = imu[1:-1, 1:] - 0.5 * (imu[:-2, 1:] + imu[2:, 1:])
-    scale = float(np.sqrt((imu[-1, 0] - imu[0, 0]) / (len(imu) - 1) / 1.5))
-    rms = np.sqrt((odd * odd).mean(axis=0).reshape(2, 3).mean(axis=1))
-    return scale * float(rms[0]), scale * float(rms[1])
+    odd = samples[1:-1] - 0.5 * (samples[:-2] + samples[2:])
+    return np.asarray(odd * np.sqrt((time[-1] - time[0]) / (len(time) - 1) / 1.5))
 
 
 @dataclass(frozen=True)
