@@ -29,7 +29,6 @@ class Variable:
     sd : default standard deviation of the prior, every component [unit]
     sensor : log sensor without which the variable has no meaning
     estimate : estimated unless the configuration says otherwise
-    linear : enters its measurement linearly, so that iSAM2 need never relinearise it
     about : one line for people
     """
 
@@ -41,7 +40,6 @@ class Variable:
     sensor: str
     about: str
     estimate: bool = False
-    linear: bool = True
 
     @property
     def dim(self) -> int:
@@ -65,7 +63,7 @@ _CURVE = ("_sin", "_cos")
 TABLE: dict[str, Variable] = {
     v.name: v
     for v in (
-        Variable("dvl_roll", "r", ("",), "rad", 2 * _DEG, "dvl", "roll of the DVL's mounting", linear=False),
+        Variable("dvl_roll", "r", ("",), "rad", 2 * _DEG, "dvl", "roll of the DVL's mounting"),
         Variable("dvl_pitch", "p", ("",), "rad", 2 * _DEG, "dvl", "pitch of the DVL's mounting"),
         Variable(
             "dvl_yaw",

@@ -1,10 +1,10 @@
 """Incremental smoothing: iSAM2 over the whole dive, or over a fixed lag.
 
 iSAM2 (Kaess et al. 2012) with QR, as Cholesky finds preintegrated IMU factors indefinite
-now and then, and thresholds of relinearisation per kind of variable: positions and most
-calibration variables enter linearly. The measurements' factors call back into Python; the reference
-to the linearisation point that is kept here lets the bindings hand them that object
-instead of a copy, without which the cost of a callback grows with the dive.
+now and then, and thresholds of relinearisation per kind of variable. Over a whole dive
+the measurements' factors call back into Python; the reference to the linearisation point
+that is kept here lets the bindings hand them that object instead of a copy, without which
+the cost of a callback grows with the dive.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,27 +20,30 @@ from rovgraph.graph.batch import indeterminate
 from rovgraph.graph.keys import key
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, State
 
-ROTATION_THRESHOLD = 0.02  # [rad]
-VELOCITY_THRESHOLD = 0.05  # [m/s], as the IMU's factor multiplies it with the attitude
-CALIBRATION_THRESHOLD = 0.01  # [rad, 1]
-NEVER = 1e9  # for what enters linearly
-WILDFIRE = 1e-3
+# Changes beyond which iSAM2 relinearises a variable. Positions and velocities too: the IMU's
+# factor multiplies them with the attitude.
+THRESHOLDS = {
+    "x": [0.002, 0.002, 0.002, 0.005, 0.005, 0.005],  # [rad, m]
+    "v": [0.005, 0.005, 0.005],  # [m/s]
+    "b": [0.002] * 6,  # [m/s^2, rad/s]
+}
+CALIBRATION_THRESHOLD = 0.002  # [rad, 1]
+WILDFIRE = 1e-5  # change of an estimate below which it is not propagated
 
 
-def isam2_params() -> gtsam.ISAM2Params:
-    """Parameters shared by both engines."""
+def isam2_params(relinearise: bool) -> gtsam.ISAM2Params:
+    """Parameters of an engine; without relinearisation where all factors are linear."""
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.relinearizeSkip = 1
     params.findUnusedFactorSlots = True
+    params.enableRelinearization = relinearise
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
     thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", np.r_[np.full(3, ROTATION_THRESHOLD), np.full(3, NEVER)]))
-    thresholds.insert(("v", np.full(3, VELOCITY_THRESHOLD)))
-    thresholds.insert(("b", np.full(6, NEVER)))
+    for letter, changes in THRESHOLDS.items():
+        thresholds.insert((letter, np.array(changes)))
     for variable in TABLE.values():
-        threshold = NEVER if variable.linear else CALIBRATION_THRESHOLD
-        thresholds.insert((variable.letter, np.full(variable.dim, threshold)))
+        thresholds.insert((variable.letter, np.full(variable.dim, CALIBRATION_THRESHOLD)))
     params.setRelinearizeThreshold(thresholds)
     return params
 
@@ -57,7 +60,7 @@ class Incremental:
 
     def __init__(self, lag: float | None, fixed: Mapping[str, Array], estimated: tuple[str, ...]) -> None:
         self.lag, self._fixed, self._estimated = lag, fixed, estimated
-        params = isam2_params()
+        params = isam2_params(relinearise=lag is None)
         self._engine: Any = gtsam.ISAM2(params) if lag is None else gtsam.IncrementalFixedLagSmoother(lag, params)
         self._theta = self._engine.getLinearizationPoint()
 
@@ -89,7 +92,7 @@ class Incremental:
         values : of all variables
         times : keyframe -> time [s]
         """
-        self._engine = gtsam.IncrementalFixedLagSmoother(self.lag or 0.0, isam2_params())
+        self._engine = gtsam.IncrementalFixedLagSmoother(self.lag or 0.0, isam2_params(relinearise=False))
         stamps = {key(v, index): time for index, time in times.items() for v in DIMENSION}
         stamps |= dict.fromkeys([key(name) for name in self._estimated], max(times.values()))
         self._engine.update(gtsam.LinearContainerFactor.ConvertLinearGraph(linear, values), values, stamps)
