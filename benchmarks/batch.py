@@ -1,7 +1,7 @@
 """The batch solver against GTSAM's Levenberg-Marquardt, on the same graph from the same start.
 
     python benchmarks/batch.py                         500 s, both solvers; 4000 s, ours
-    python benchmarks/batch.py --seconds 20 --long 40  a smoke test
+    python benchmarks/batch.py --seconds 35 --long 40  a smoke test
 
 The reference solves `Problem.nonlinear()`: the same native factors, and one Python
 `gtsam.CustomFactor` per measurement. Both costs are evaluated by `Problem.cost` with the

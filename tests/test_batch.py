@@ -1,6 +1,9 @@
 """The batch smoother: exact on perfect logs, robust on bad ones, and the same optimum as GTSAM's own."""
 
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -31,6 +34,7 @@ from rovgraph.log import Log
 from rovgraph.simulate import CALM, Style, scenario
 
 DEG = np.deg2rad(1.0)
+BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "batch.py"
 HELD = {name: {"estimate": False} for name in TABLE}
 
 
@@ -343,3 +347,14 @@ def test_default_configuration_needs_no_tuning_for_a_dive_it_knows_nothing_of():
     smoother = batch(case.log, bare)
     estimate = smoother.solve()
     assert rms(position_errors(estimate.trajectory, case)) < 0.1 * case.truth.distance
+
+
+def test_benchmark_runs_and_both_solvers_find_the_same_cost():
+    done = subprocess.run(
+        [sys.executable, BENCHMARK, "--seconds", "35", "--long", "40"], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-500:]
+    rows = [line.split("|") for line in done.stdout.splitlines() if " s | " in line]
+    assert [row[1].strip() for row in rows] == ["rovgraph", "Levenberg-Marquardt", "rovgraph"]
+    ours, gtsams = (float(row[6]) for row in rows[:2])
+    assert ours == pytest.approx(gtsams, rel=1e-6)
