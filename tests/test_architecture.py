@@ -15,7 +15,7 @@ PACKAGE = ROOT / "rovgraph"
 LAYERS = (
     {"errors"},
     {"geometry"},
-    {"state", "calibration"},
+    {"state", "calibration", "thesis"},
     {"sensors"},
     {"config", "log", "trajectory"},
     {"instruments"},

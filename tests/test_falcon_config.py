@@ -13,13 +13,11 @@ from rovgraph.instruments import instruments
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import secrets, write_log
 from rovgraph.state import State
+from rovgraph.thesis import FLIP, R_DVL, R_MTI, THETA_DVL, THETA_MTI
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "data" / "falcon"
-D = np.diag([1.0, -1.0, -1.0])  # the thesis's forward, port, up to forward, starboard, down
-THETA_MTI, THETA_DVL = np.deg2rad([-3.4, -1.2, 0.0]), np.deg2rad([0.0, 0.0, -45.0])
-R_MTI = np.array([4.58e-5, 6.00e-5, 7.77e-5, 4.81e-5, 3.58e-5, 3.80e-5, 5.08e-7, 8.40e-7, 3.01e-6])
-R_DVL = np.array([1.400e-5, 1.247e-5, 2.409e-6, 6.182e-2])
+MTI, DVL = np.diag(R_MTI), np.diag(R_DVL)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +35,7 @@ def test_mountings_turn_vectors_as_the_thesis_does(config):
     for theta, mount in ((THETA_MTI, config.imu.mount_rpy_deg), (THETA_DVL, config.dvl.mount_rpy_deg)):
         for x_s in np.eye(3):
             thesis = sensor_to_thesis_body(theta) @ x_s  # forward, port, up
-            np.testing.assert_allclose(mount_matrix(mount) @ x_s, D @ thesis, atol=1e-12)
+            np.testing.assert_allclose(mount_matrix(mount) @ x_s, FLIP @ thesis, atol=1e-12)
 
 
 def test_resting_mti_reads_gravity_as_in_the_thesis(config):
@@ -54,23 +52,23 @@ def test_dvl_measures_what_3_17_says(config):
     angles = np.deg2rad(config.dvl.mount_rpy_deg)
     calibration = {f"dvl_{n}": angles[[i]] for i, n in enumerate(("roll", "pitch", "yaw"))}
     calibration["dvl_scale"] = np.zeros(1)
-    state = State(np.eye(3)[None], np.zeros((1, 3)), (D @ v_thesis)[None], np.zeros((1, 6)), calibration)
-    z, _ = instruments(config)["dvl"].model.predict(state, (D @ w_thesis)[None])
+    state = State(np.eye(3)[None], np.zeros((1, 3)), (FLIP @ v_thesis)[None], np.zeros((1, 6)), calibration)
+    z, _ = instruments(config)["dvl"].model.predict(state, (FLIP @ w_thesis)[None])
     np.testing.assert_allclose(z[0], expected, atol=1e-12)
 
 
 def test_lever_arms_are_the_thesiss(config):
-    np.testing.assert_allclose(D @ config.imu.lever_arm_m, [-0.11, -0.22, 0.10])
-    np.testing.assert_allclose(D @ config.dvl.lever_arm_m, [0.24, 0.0, -0.33])
+    np.testing.assert_allclose(FLIP @ config.imu.lever_arm_m, [-0.11, -0.22, 0.10])
+    np.testing.assert_allclose(FLIP @ config.dvl.lever_arm_m, [0.24, 0.0, -0.33])
 
 
 def test_noise_is_appendix_a(config):
     noise, rate = config.imu.noise, 100.0
-    assert noise.acc == pytest.approx(np.sqrt(R_MTI[:3].mean() / rate), rel=2e-3)
-    assert noise.gyr == pytest.approx(np.sqrt(R_MTI[3:6].mean() / rate), rel=2e-3)
-    np.testing.assert_allclose(config.dvl.velocity_sd_mps, np.sqrt(R_DVL[:3]), rtol=2e-3)
-    assert config.heading.dvl_sd_deg == pytest.approx(np.sqrt(R_DVL[3]), rel=1e-2)
-    assert instruments(config)["mag"].sd[0] == pytest.approx(np.sqrt(R_MTI[6:].mean()), rel=2e-2)
+    assert noise.acc == pytest.approx(np.sqrt(MTI[:3].mean() / rate), rel=2e-3)
+    assert noise.gyr == pytest.approx(np.sqrt(MTI[3:6].mean() / rate), rel=2e-3)
+    np.testing.assert_allclose(config.dvl.velocity_sd_mps, np.sqrt(DVL[:3]), rtol=2e-3)
+    assert config.heading.dvl_sd_deg == pytest.approx(np.rad2deg(np.sqrt(DVL[3])), rel=1e-2)
+    assert instruments(config)["mag"].sd[0] == pytest.approx(np.sqrt(MTI[6:].mean()), rel=2e-2)
 
 
 def test_dvl_misalignment_is_believed_to_be_its_mounting(config):

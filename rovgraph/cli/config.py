@@ -27,6 +27,7 @@ _GROUP_TEXT = {
     "depth": "depth: pressure sensor",
     "fix": "fix: position fixes",
     "calibration": "calibration: held at the mean, or estimated",
+    "vehicle": "vehicle: hydrodynamics, thesis (2.16)-(2.24)",
     "graph": "graph: how it is built and solved",
 }
 

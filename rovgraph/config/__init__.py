@@ -1,0 +1,11 @@
+"""The configuration: YAML, every key optional, an unknown key is an error.
+
+`Config` holds what an estimator believes about the vehicle, its sensors and the sea.
+`load_config` reads a file, `Config.to_yaml` writes the effective one, `describe` lists
+all keys, `beliefs` gives the calibration variables of `rovgraph.calibration` their priors.
+"""
+
+from rovgraph.config.reading import Config, beliefs, describe, load_config, mount_matrix, parse_config
+from rovgraph.config.sections import ImuNoise
+
+__all__ = ["Config", "ImuNoise", "beliefs", "describe", "load_config", "mount_matrix", "parse_config"]

@@ -1,0 +1,41 @@
+"""Calibration variables in the configuration, and the priors that come of them."""
+
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, Field, create_model
+
+from rovgraph.calibration import TABLE, Variable
+from rovgraph.config.sections import Positive, Section
+
+MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
+
+
+def _calibration_entry(variable: Variable) -> type[BaseModel]:
+    """The configuration of one row of the calibration table."""
+    tail = "_deg" if variable.angular else ""
+    scale = float(np.rad2deg(1.0)) if variable.angular else 1.0
+    unit = "degrees" if variable.angular else variable.unit
+    mounted = variable.name in MOUNT
+    fields: dict[str, Any] = {
+        "estimate": (bool, Field(variable.estimate, description=f"estimate it: {variable.about}")),
+        "mean" + tail: (
+            float | tuple[float, ...] | None,
+            Field(None, description=f"prior mean [{unit}]; null = " + ("the mounting" if mounted else "0")),
+        ),
+        "sd" + tail: (Positive, Field(round(variable.sd * scale, 12), description=f"prior sd [{unit}]")),
+    }
+    return create_model(
+        f"Calibration_{variable.name}", __base__=Section, __module__=__name__, __doc__=variable.about, **fields
+    )
+
+
+_ENTRIES = {name: _calibration_entry(v) for name, v in TABLE.items()}
+globals().update({entry.__name__: entry for entry in _ENTRIES.values()})  # where pickle looks for them
+Calibration: type[BaseModel] = create_model(
+    "Calibration",
+    __base__=Section,
+    __module__=__name__,
+    __doc__="Calibration variables: fixed at their mean, or estimated.",
+    **{name: (entry, entry()) for name, entry in _ENTRIES.items()},  # type: ignore[call-overload]
+)

@@ -1,0 +1,166 @@
+"""`Config`, and how it is read, written and described."""
+
+import difflib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from pydantic import BaseModel, Field, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from rovgraph.calibration import TABLE, Belief
+from rovgraph.config.priors import MOUNT, Calibration
+from rovgraph.config.sections import (
+    Depth,
+    Dvl,
+    Environment,
+    Fix,
+    Graph,
+    Heading,
+    Imu,
+    Section,
+    Start,
+    Triple,
+    Vehicle,
+)
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, matrix_from_rpy
+
+
+class Config(Section):
+    """What an estimator believes; see docs/configuration.md for all keys."""
+
+    name: str = Field("rovgraph", description="name, printed on figures")
+    start: Start = Start()
+    environment: Environment = Environment()
+    imu: Imu = Imu()
+    dvl: Dvl = Dvl()
+    heading: Heading = Heading()
+    depth: Depth = Depth()
+    fix: Fix = Fix()
+    calibration: Calibration = Calibration()
+    vehicle: Vehicle = Vehicle()
+    graph: Graph = Graph()
+    columns: dict[str, str] = Field(default_factory=dict, description="rovgraph's column: the log's own name for it")
+    units: dict[str, str] = Field(default_factory=dict, description="column or sensor: unit it is in, e.g. gyr: deg/s")
+
+    def to_yaml(self) -> str:
+        """The effective configuration, every key written out."""
+        stream = io.StringIO()
+        yaml = YAML(typ="safe", pure=True)
+        yaml.default_flow_style, yaml.width = None, 4096
+        yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+        yaml.dump(self.model_dump(mode="json"), stream)
+        return stream.getvalue()
+
+
+def mount_matrix(rpy_deg: Triple) -> Array:
+    """R_bs of a mounting given as roll, pitch, yaw in degrees; shape (3, 3)."""
+    return matrix_from_rpy(np.deg2rad(rpy_deg))
+
+
+def beliefs(config: Config) -> dict[str, Belief]:
+    """The prior of every calibration variable, in the order of the table.
+
+    The mean of the DVL's angles is its mounting where the configuration gives none.
+
+    Raises
+    ------
+    InputError : a mean with the wrong number of components
+    """
+    mount = dict(zip(MOUNT, config.dvl.mount_rpy_deg, strict=True))
+    out = {}
+    for name, variable in TABLE.items():
+        entry, tail = getattr(config.calibration, name), "_deg" if variable.angular else ""
+        unit = float(np.deg2rad(1.0)) if variable.angular else 1.0
+        mean = getattr(entry, "mean" + tail)
+        mean = mount.get(name, 0.0) if mean is None else mean
+        values = np.atleast_1d(np.asarray(mean, dtype=float))
+        if values.size not in (1, variable.dim):
+            raise InputError(f"calibration.{name}.mean{tail}: {values.size} numbers, expected {variable.dim}")
+        out[name] = Belief(
+            variable,
+            unit * np.broadcast_to(values, (variable.dim,)),
+            unit * getattr(entry, "sd" + tail),
+            entry.estimate,
+        )
+    return out
+
+
+def load_config(path: Path | str | None = None) -> Config:
+    """Read a YAML configuration; without a path, all defaults.
+
+    Raises
+    ------
+    InputError : no such file, no YAML, an unknown key (with the nearest known one), a
+        value of the wrong kind
+    """
+    if path is None:
+        return Config()
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a configuration ({_reason(error)})") from None
+    return parse_config(text, str(path))
+
+
+def parse_config(text: str, source: str = "configuration") -> Config:
+    """Parse YAML text; ``source`` names it in messages."""
+    try:
+        data = YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark else ""
+        problem = str(getattr(error, "problem", None) or "cannot be parsed").splitlines()[0]
+        raise InputError(f"{source}{where}: no valid YAML ({problem})") from None
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise InputError(f"{source}: expected keys and values at the top, found a {type(data).__name__}")
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{source}: " + "; ".join(_complaint(e) for e in error.errors())) from None
+
+
+def _reason(error: OSError | UnicodeDecodeError) -> str:
+    return error.strerror or str(error) if isinstance(error, OSError) else "not UTF-8 text"
+
+
+def _known_keys(location: tuple[int | str, ...]) -> list[str]:
+    """Keys that are known beside the one at ``location``; a number in it stands for an item of a list."""
+    model: Any = Config
+    for part in location[:-1]:
+        model = get_args(model)[0] if isinstance(part, int) else model.model_fields[part].annotation
+    return list(model.model_fields)
+
+
+def _complaint(error: Any) -> str:
+    """One validation error as a phrase that names key, problem and remedy."""
+    location = error["loc"]
+    key = ".".join(str(part) for part in location)
+    if error["type"] == "extra_forbidden":
+        known = _known_keys(location)
+        near = difflib.get_close_matches(str(location[-1]), known, 1, cutoff=0.0)
+        return f"unknown key {key}, nearest known key is {'.'.join([*map(str, location[:-1]), near[0]])}"
+    return f"{key}: {error['msg'][0].lower()}{error['msg'][1:]} (found {error['input']!r})"
+
+
+def describe(model: type[BaseModel] = Config, prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Every key with its default and meaning.
+
+    Yields
+    ------
+    key, default, meaning : str
+    """
+    for name, info in model.model_fields.items():
+        kind = info.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from describe(kind, f"{prefix}{name}.")
+        else:
+            default = model.model_construct().model_dump(mode="json")[name]
+            yield prefix + name, "null" if default is None else str(default), info.description or ""

@@ -1,0 +1,159 @@
+"""The sections of the configuration, and what may stand in them."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Triple = tuple[float, float, float]
+PositiveTriple = tuple[Positive, Positive, Positive]
+NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
+Loss = Literal["none", "huber", "cauchy"]
+HeadingSource = Literal["mag", "dvl", "ahrs"]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
+
+
+class Start(Section):
+    """Where the dive begins; null = from the log."""
+
+    north_m: float = Field(0.0, description="north of the first epoch")
+    east_m: float = Field(0.0, description="east of the first epoch")
+    down_m: float | None = Field(None, description="depth of the first epoch; null = first depth sample, else 0")
+    heading_deg: float | None = Field(None, description="heading; null = first heading samples")
+    roll_deg: float | None = Field(None, description="roll; null = gravity")
+    pitch_deg: float | None = Field(None, description="pitch; null = gravity")
+    position_sd_m: Positive = Field(0.1, description="sd of the start's north, east and down")
+    heading_sd_deg: Positive = Field(5.0, description="sd of the start's heading")
+    tilt_sd_deg: Positive = Field(2.0, description="sd of the start's roll and pitch, where it begins at rest")
+
+
+class Environment(Section):
+    """Gravity, magnetic field and Earth rate."""
+
+    gravity_mps2: Positive = Field(9.81, description="gravity")
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
+        None, description="latitude, for Earth rotation; null = of the first fix_lat"
+    )
+    declination_deg: float = Field(0.0, description="magnetic declination, east positive")
+    field_norm: Positive | None = Field(
+        None, description="magnitude of the field, log's unit; null = median of the log"
+    )
+    dip_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
+        None, description="dip of the field, down positive; null = from the log, against gravity"
+    )
+    earth_rotation: bool = Field(False, description="model the Earth's rotation (worth it for a FOG)")
+
+
+class ImuNoise(Section):
+    """Noise densities, per root hertz."""
+
+    acc: Positive = Field(8.0e-4, description="accelerometer [m/s2/rtHz]")
+    gyr: Positive = Field(6.9e-4, description="gyro [rad/s/rtHz]")
+    acc_walk: Positive = Field(3.0e-4, description="random walk of the accelerometer's bias [m/s2/rts]")
+    gyr_walk: Positive = Field(1.0e-5, description="random walk of the gyro's bias [rad/s/rts]")
+
+
+class Imu(Section):
+    """Inertial unit: mounting and noise."""
+
+    mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="IMU axes to body axes: roll, pitch, yaw")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the IMU in body axes")
+    noise: ImuNoise = ImuNoise()
+    acc_bias_sd_mps2: Positive = Field(0.05, description="sd of the accelerometer's bias at the start")
+    gyr_bias_sd_dps: Positive = Field(0.6, description="sd of the gyro's bias at the start, deg/s")
+    max_gap_s: Positive = Field(30.0, description="a longer silence of the IMU is refused")
+
+
+class Dvl(Section):
+    """Doppler velocity log: mounting and noise."""
+
+    mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="DVL axes to body axes: roll, pitch, yaw")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the DVL in body axes")
+    velocity_sd_mps: PositiveTriple = Field((0.01, 0.01, 0.01), description="noise of a ping, DVL axes")
+    scale_sd: NotNegative = Field(0.0, description="part of the speed added to the noise of a ping")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is left out; null = never")
+    max_speed_mps: Positive = Field(3.0, description="faster pings are left out")
+
+
+class Heading(Section):
+    """Heading sources and their noise."""
+
+    sources: tuple[HeadingSource, ...] | None = Field(
+        None, description="of mag, dvl, ahrs; null = dvl, and mag or else ahrs, as far as the log has them"
+    )
+    mag_sd_deg: Positive = Field(2.0, description="noise of a magnetometer heading")
+    dvl_sd_deg: Positive = Field(3.0, description="noise of the DVL's compass")
+    ahrs_sd_deg: Positive = Field(3.0, description="noise of the IMU's own heading")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a heading further off than this many sd is left out")
+
+
+class Depth(Section):
+    """Pressure sensor."""
+
+    sd_m: Positive = Field(0.05, description="noise of a depth")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is left out")
+
+
+class Fix(Section):
+    """Position fixes."""
+
+    sd_m: Positive = Field(2.0, description="noise of a fix, north and east; a fix's own fix_sd goes before it")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the antenna or transponder in body axes")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is left out")
+
+
+class Thruster(Section):
+    """One thruster: where it is and which way it pushes for a positive signal."""
+
+    position_m: Triple = Field(description="position in body axes")
+    direction: Triple = Field(description="direction of the force for a positive signal, body axes; any length")
+
+
+# The thesis gives none. Four vectored horizontal thrusters at the corners of the frame, 45 degrees
+# to the keel, and a vertical one in the middle, as on a Saab Seaeye Falcon: a choice.
+FALCON_THRUSTERS = (
+    Thruster(position_m=(0.35, 0.22, 0.0), direction=(1.0, -1.0, 0.0)),
+    Thruster(position_m=(0.35, -0.22, 0.0), direction=(1.0, 1.0, 0.0)),
+    Thruster(position_m=(-0.35, 0.22, 0.0), direction=(1.0, 1.0, 0.0)),
+    Thruster(position_m=(-0.35, -0.22, 0.0), direction=(1.0, -1.0, 0.0)),
+    Thruster(position_m=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0)),
+)
+
+
+class Vehicle(Section):
+    """Hydrodynamics (2.16)-(2.24); the defaults are the thesis's Falcon, along forward, starboard, down."""
+
+    mass_kg: Positive = Field(73.3, description="mass; buoyancy is taken as equal to the weight")
+    added_mass_kg: NotNegativeTriple = Field((27.0, 30.0, 110.0), description="added mass")
+    inertia_kgm2: PositiveTriple = Field((3.7, 7.6, 8.3), description="moments of inertia")
+    added_inertia_kgm2: NotNegativeTriple = Field((9.0, 15.0, 11.47), description="added moments of inertia")
+    drag_linear: NotNegativeTriple = Field((42.0, 180.0, 90.0), description="linear drag [N s/m]")
+    drag_quadratic: NotNegativeTriple = Field((140.0, 55.0, 400.0), description="quadratic drag [N s2/m2]")
+    turning_drag_linear: NotNegativeTriple = Field((42.0, 55.0, 90.0), description="linear drag of turning [N m s]")
+    turning_drag_quadratic: NotNegativeTriple = Field((42.0, 55.0, 90.0), description="quadratic drag of turning")
+    centre_of_buoyancy_m: Triple = Field((0.0, 0.0, -0.2), description="of buoyancy, from the centre of mass")
+    thrust: Triple = Field(
+        (0.32, -0.016, 2.98e-4), description="thrust [N] of a signal u: a u + b |u| u + c u^3 (2.21)"
+    )
+    thrusters: tuple[Thruster, ...] = Field(FALCON_THRUSTERS, description="thruster_1, thruster_2, ... of the log")
+    acceleration_sd_mps2: Positive = Field(0.03, description="error of the model's acceleration over an interval")
+
+
+class Graph(Section):
+    """How the graph is built and solved."""
+
+    keyframe: Literal["dvl"] = Field("dvl", description="what makes a keyframe")
+    max_gap_s: Positive = Field(1.0, description="longest time between keyframes")
+    min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
+    solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
+    lag_s: Positive = Field(5.0, description="lag of the fixed-lag smoother, which gives the filtered estimate")
+    hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
