@@ -30,6 +30,7 @@ class Variable:
     sensor : log sensor without which the variable has no meaning
     estimate : estimated unless the configuration says otherwise
     about : one line for people
+    walk : default random walk [unit per root second], 0 = constant over the dive
     """
 
     name: str
@@ -40,6 +41,7 @@ class Variable:
     sensor: str
     about: str
     estimate: bool = False
+    walk: float = 0.0
 
     @property
     def dim(self) -> int:
@@ -178,9 +180,11 @@ class Belief:
     mean : ndarray, shape (dim,) [unit]
     sd : float, every component [unit]
     estimate : False = held at the mean
+    walk : random walk [unit per root second], 0 = constant over the dive
     """
 
     variable: Variable
     mean: Array
     sd: float
     estimate: bool
+    walk: float = 0.0

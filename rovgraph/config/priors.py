@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import BaseModel, Field, create_model
 
 from rovgraph.calibration import TABLE, Variable
-from rovgraph.config.sections import Positive, Section
+from rovgraph.config.sections import NotNegative, Positive, Section
 
 MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 
@@ -24,6 +24,10 @@ def _calibration_entry(variable: Variable) -> type[BaseModel]:
             Field(None, description=f"prior mean [{unit}]; null = " + ("the mounting" if mounted else "0")),
         ),
         "sd" + tail: (Positive, Field(round(variable.sd * scale, 12), description=f"prior sd [{unit}]")),
+        "walk" + tail: (
+            NotNegative,
+            Field(round(variable.walk * scale, 12), description=f"random walk [{unit}/rts]; 0 = constant"),
+        ),
     }
     return create_model(
         f"Calibration_{variable.name}", __base__=Section, __module__=__name__, __doc__=variable.about, **fields

@@ -86,6 +86,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
             unit * np.broadcast_to(values, (variable.dim,)),
             unit * getattr(entry, "sd" + tail),
             entry.estimate,
+            unit * getattr(entry, "walk" + tail),
         )
     return out
 

@@ -13,11 +13,13 @@ none is locked out for ever.
 """
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.linalg import block_diag
 
 from rovgraph.config import beliefs
 from rovgraph.estimators.estimate import Estimate
@@ -34,21 +36,38 @@ from rovgraph.graph.assembly import Assembler, Attached, Interval
 from rovgraph.graph.batch import make_problem, make_values, solve
 from rovgraph.graph.factors import (
     Factor,
-    estimated_variables,
+    drift,
     linear_motion,
     motion,
     predict,
     priors,
-    values_of,
 )
 from rovgraph.graph.incremental import Incremental
+from rovgraph.graph.keys import Unknowns, unknowns
 from rovgraph.graph.measurements import Block, make_block
+from rovgraph.graph.preintegration import whole
+from rovgraph.graph.values import insert_calibration, state_values, values_at
 from rovgraph.log import Measurement
-from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, stack_states
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, propagate_with_jacobian, stack_states
 
 CALIBRATION_EVERY = 5  # keyframes between new marginals of the calibration
 RELINEARISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # since the start, while calibration settles
 READMIT_AFTER = 5  # rejections running, after which a sensor is believed until it is consistent again
+
+
+@dataclass
+class _Known:
+    """What is known of a keyframe before its measurements: State of one epoch, covariances by variable."""
+
+    state: State
+    covariances: Mapping[str, Array]
+    _point: Any = None
+
+    def point(self, attached: Attached, unknowns: Unknowns) -> Any:
+        """The state as GTSAM's values, made once."""
+        if self._point is None:
+            self._point = values_at(attached.keyframe, attached.segment, self.state, unknowns)
+        return self._point
 
 
 @dataclass
@@ -69,9 +88,8 @@ class IncrementalEstimator:
         self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
         self.intervals: list[Interval] = []
         self.beliefs = beliefs(b.config)
-        self.fixed = {name: belief.mean for name, belief in self.beliefs.items()}
-        self.estimated = estimated_variables(self.beliefs, b.instruments)
-        self.engine = Incremental(self.lag, self.fixed, self.estimated)
+        self.unknowns = unknowns(self.beliefs, b.instruments)
+        self.engine = Incremental(self.lag, self.unknowns)
         self._states: list[State] = []
         self._first_R_nb = self.beginning.start.state.R_nb
         self._settling = list(RELINEARISE_AT_S)
@@ -93,26 +111,28 @@ class IncrementalEstimator:
 
     def step(self, interval: Interval) -> None:
         """Add one interval to the graph and keep the newest keyframe's estimate."""
+        b, index, segment = self.beginning, interval.index, interval.segment
         if interval.pim is None:
-            before = state = replace(self.beginning.start.state, calibration=self.fixed)
-            factors = priors(self.beginning.start, self.beliefs, self.estimated)
-            values = values_of(0, state, self.estimated)
+            state = replace(b.start.state, calibration=self.unknowns.fixed)
+            factors = priors(b.start, self.beliefs, self.unknowns)
+            known = {index: _Known(state, {})}
         else:
-            state = predict(interval, self.latest())
             before = replace(self.latest(), R_nb=self._first_R_nb)
+            state = predict(interval, self.latest())
             factors = motion(interval) if self.lag is None else linear_motion(interval, before, state)
-            values = values_of(interval.index, state)
-        points: dict[int, Any] = {}
+            grown = self._predicted_covariances(interval)
+            known = {index - 1: _Known(before, self._covariances[-1]), index: _Known(state, grown)}
+        values = state_values(index, state)
+        if not self.intervals or segment > self.intervals[-1].segment:
+            factors += drift(self.unknowns, segment, b.config.graph.segment_s)
+            insert_calibration(values, state.calibration, self.unknowns, segment)
         for attached in interval.attached:
-            here = state if attached.keyframe == interval.index else before
-            if attached.keyframe not in points:
-                points[attached.keyframe] = values_of(attached.keyframe, here, self.estimated)
-            factors += self._factor(attached, here, points[attached.keyframe])
+            factors += self._factor(attached, known[attached.keyframe])
         self._first_R_nb = state.R_nb
-        self.engine.update(factors, values, interval.time)
+        self.engine.update(factors, values, interval.time, segment)
         self.intervals.append(interval)
-        self._states.append(self.engine.state(interval.index))
-        self._covariances.append(self._newest_covariances(interval.index))
+        self._states.append(self.engine.state(index, segment))
+        self._covariances.append(self._newest_covariances(interval))
         if self.lag is not None and self._settling and interval.time - self.intervals[0].time >= self._settling[0]:
             self._settling.pop(0)
             self._relinearise()
@@ -120,14 +140,14 @@ class IncrementalEstimator:
     def solve(self) -> Estimate:
         """The filtering estimate of every keyframe so far."""
         states = stack_states(self._states)
-        P = {v: np.array([c[v] for c in self._covariances]) for v in (*DIMENSION, *self.estimated)}
+        P = {v: np.array([c[v] for c in self._covariances]) for v in (*DIMENSION, *self.unknowns.estimated)}
         sd = {v: np.sqrt(np.diagonal(p, axis1=1, axis2=2)) for v, p in P.items()}
         arm = self.beginning.config.imu.lever_arm_m
         trajectory = body_trajectory(self.intervals, states, arm, P[POSE], P[VELOCITY])
         history = bias_histories(trajectory.time, states.bias, sd[BIAS])
-        for name in self.estimated:
+        for name in self.unknowns.estimated:
             history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[name])
-        final = {name: P[name][-1] for name in self.estimated}
+        final = {name: P[name][-1] for name in self.unknowns.estimated}
         sensors = [s for s in self.beginning.instruments if s in self._used]
         calibration = calibration_estimates(self.beliefs, sensors, self.latest().calibration, final)
         return Estimate("filtered", trajectory, calibration, history, self._residuals(), {"lag_s": self.lag})
@@ -138,22 +158,37 @@ class IncrementalEstimator:
         While heading and calibration are known only to several degrees, factors that were
         linearised once misstate what they know by the square of that.
         """
-        b, newest = self.beginning, self.intervals[-1].index
+        b, newest = self.beginning, self.intervals[-1]
         problem = make_problem(self.intervals, b.start, b.config, self.beliefs, b.instruments)
         values = make_values(problem, stack_states(self._states), self.latest().calibration)
         solution = solve(problem, values)
         linear = problem.linearize(solution.values, solution.gates)
-        self.engine.restart(linear, solution.values, {i.index: i.time for i in self.intervals})
-        self._states[-1] = self.engine.state(newest)
-        self._covariances[-1] = self.engine.covariances(newest)
+        keyframes = [(i.index, i.time, i.segment) for i in self.intervals]
+        self.engine.restart(linear, solution.values, keyframes)
+        self._states[-1] = self.engine.state(newest.index, newest.segment)
+        self._covariances[-1] = self.engine.covariances(newest.index, newest.segment, self.unknowns.estimated)
         self._first_R_nb = self.latest().R_nb
 
-    def _newest_covariances(self, index: int) -> dict[str, Array]:
+    def _newest_covariances(self, interval: Interval) -> dict[str, Array]:
         """Marginals of the newest keyframe; those of the slow calibration only now and then."""
-        if index % CALIBRATION_EVERY == 0:
-            return self.engine.covariances(index)
-        before = {name: self._covariances[-1][name] for name in self.estimated}
-        return before | self.engine.covariances(index, calibration=False)
+        names = self.unknowns.estimated
+        if interval.index % CALIBRATION_EVERY == 0:
+            return self.engine.covariances(interval.index, interval.segment, names)
+        before = {name: self._covariances[-1][name] for name in names}
+        return before | self.engine.covariances(interval.index, interval.segment, ())
+
+    def _predicted_covariances(self, interval: Interval) -> dict[str, Array]:
+        """Those of the newest keyframe carried to the end of an interval, where tilt has become velocity.
+
+        Correlations between the variables are left out, and the IMU's noise, which is small beside them.
+        """
+        assert interval.pim is not None
+        P = self._covariances[-1]
+        _, F = propagate_with_jacobian(
+            self.latest(), whole(interval.pim), self.beginning.config.environment.gravity_mps2
+        )
+        joint = F[0] @ block_diag(P[POSE], P[VELOCITY], P[BIAS]) @ F[0].T
+        return {**P, POSE: joint[:6, :6], VELOCITY: joint[6:9, 6:9], BIAS: joint[9:, 9:]}
 
     def _take(self, intervals: list[Interval]) -> list[Interval]:
         for interval in intervals:
@@ -163,35 +198,29 @@ class IncrementalEstimator:
     def _block(self, attached: list[Attached]) -> Block:
         b = self.beginning
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
-        return make_block(attached, instrument, gravity, self.fixed, self.estimated)
+        return make_block(attached, instrument, gravity, self.unknowns)
 
-    def _factor(self, attached: Attached, here: State, point: Any) -> list[Factor]:
-        """The factor of a measurement, or none where its gate keeps it out.
-
-        Parameters
-        ----------
-        attached : the measurement
-        here : State of its keyframe, one epoch, as far as it is known
-        point : the same as GTSAM's values
-        """
+    def _factor(self, attached: Attached, here: "_Known") -> list[Factor]:
+        """The factor of a measurement, or none where its gate keeps it out."""
         one = self._block([attached])
-        r, H = one.linearize(here)
-        admitted = self._admit(one, r, H)
-        self._used.setdefault(attached.sensor, []).append((attached, here, float(admitted)))
+        r, H = one.linearize(here.state)
+        admitted = self._admit(one, r, H, here.covariances)
+        self._used.setdefault(attached.sensor, []).append((attached, here.state, float(admitted)))
         if not admitted:
             return []
-        return [one.custom_factor() if self.lag is None else one.linear_factor(point, r, H)]
+        if self.lag is None:
+            return [one.custom_factor()]
+        return [one.linear_factor(here.point(attached, self.unknowns), r, H)]
 
-    def _admit(self, one: Block, r: Array, H: Jacobians) -> bool:
+    def _admit(self, one: Block, r: Array, H: Jacobians, covariances: Mapping[str, Array]) -> bool:
         """Whether a measurement's normalised innovation lies within its gate."""
         gate, sensor = one.instrument.gate_sd, one.instrument.model.sensor
-        if gate is None or not self._covariances or np.linalg.norm(r) <= gate:
+        if gate is None or not covariances or np.linalg.norm(r) <= gate:
             self._rejected[sensor] = 0
             return True
         S = np.eye(r.shape[1])
         for variable, jacobian in H.items():
-            # the blocks' correlations are left out, which only widens the gate
-            S = S + jacobian[0] @ self._covariances[-1][variable] @ jacobian[0].T
+            S = S + jacobian[0] @ covariances[variable] @ jacobian[0].T
         consistent = float(r[0] @ np.linalg.solve(S, r[0])) <= gate**2
         self._rejected[sensor] = 0 if consistent else self._rejected[sensor] + 1
         return consistent or self._rejected[sensor] > READMIT_AFTER

@@ -21,7 +21,6 @@ from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.batch import (
     Problem,
     Solution,
-    covariance,
     covariances,
     make_problem,
     make_values,
@@ -29,7 +28,6 @@ from rovgraph.graph.batch import (
     solution_at,
     solve,
 )
-from rovgraph.graph.keys import key
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY
 
@@ -73,7 +71,7 @@ class BatchSmoother:
         b = self.beginning
         problem = make_problem(self.intervals, b.start, b.config, beliefs(b.config), b.instruments)
         if incremental is None:
-            solution = solve(problem, make_values(problem, dead_reckon(self.intervals, b, problem.fixed)))
+            solution = solve(problem, make_values(problem, dead_reckon(self.intervals, b, problem.unknowns.fixed)))
         else:
             solution = solution_at(problem, incremental.engine.values())
         return _estimate(problem, solution, b, self.intervals)
@@ -100,16 +98,21 @@ def _estimate(problem: Problem, solution: Solution, b: Beginning, intervals: Seq
     )
     bias_sd = np.sqrt(np.diagonal(covariances(tree, BIAS, n), axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd)
-    known = {name: covariance(tree, key(name)) for name in problem.estimated}
-    ends = trajectory.time[[0, -1]]
-    for name, matrix in known.items():
-        value, sd = states.calibration[name], np.sqrt(np.diag(matrix))
-        history[name] = calibration_history(name, ends, np.tile(value, (2, 1)), np.tile(sd, (2, 1)))
+    final, known = dict(problem.unknowns.fixed), {}
+    begun = np.flatnonzero(np.diff(problem.segment)) + 1
+    for name, walk in problem.unknowns.walks.items():
+        rows = np.concatenate([[0], begun, [n - 1]]) if walk else np.array([0, n - 1])
+        segment = problem.segment[rows] if walk else np.zeros_like(rows)
+        P = covariances(tree, name, int(segment[-1]) + 1)
+        value = np.broadcast_to(states.calibration[name], (n, P.shape[1]))[rows]
+        sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))[segment]
+        history[name] = calibration_history(name, trajectory.time[rows], value, sd)
+        final[name], known[name] = value[-1], P[-1]
     here = {sensor: states.at(block.keyframe) for sensor, block in problem.blocks.items()}
     return Estimate(
         "smoothed",
         trajectory,
-        calibration_estimates(beliefs(b.config), list(problem.blocks), states.calibration, known),
+        calibration_estimates(beliefs(b.config), list(problem.blocks), final, known),
         history,
         residual_frame(problem.blocks, here, solution.weights),
         {

@@ -45,7 +45,7 @@ class Attached:
     Attributes
     ----------
     sensor : name of the log stream
-    keyframe : index
+    keyframe, segment : index of the keyframe, and the segment of time it lies in
     time, row : of the measurement, and its line in the log
     z : ndarray, shape (dim,)
     sd : ndarray, shape (dim,), the instrument's, or the measurement's own
@@ -56,6 +56,7 @@ class Attached:
 
     sensor: str
     keyframe: int
+    segment: int
     time: float
     row: int
     z: Array
@@ -73,6 +74,8 @@ class Interval:
     Attributes
     ----------
     index, time : of the keyframe that ends the interval
+    segment : of time that this keyframe lies in, from 0 and by steps of 0 or 1: calibration
+        variables that walk have one value in each
     rate_b, rate_sd : ndarray, shape (3,), float: measured rate at the keyframe, bias still
         in it, and its noise [rad/s]
     pim : preintegrated motion, None for the first keyframe
@@ -82,6 +85,7 @@ class Interval:
 
     index: int
     time: float
+    segment: int
     rate_b: Array
     rate_sd: float
     pim: gtsam.PreintegratedCombinedMeasurements | None
@@ -114,6 +118,7 @@ class Assembler:
         self._imu: list[tuple[float, Array]] = []
         self._waiting: list[Measurement] = []
         self._index, self._start = -1, 0.0
+        self._segment, self._segment_start = -1, -np.inf
         self._between: list[Measurement] = []
         self._periods: list[float] = []
         self._longest_step = np.inf
@@ -215,12 +220,14 @@ class Assembler:
         if self._index >= 0:
             pim, bridged, attached = self._integrate(samples, time)
         self._index, self._start, self._between = self._index + 1, time, []
+        if time - self._segment_start >= self.config.graph.segment_s:
+            self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._rate(samples, time)
         if ping is not None:
             attached.append(self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd))
         keep = max(int(np.searchsorted(samples[:, 0], time - HALF_WINDOW_S, side="right")) - 1, 0)
         self._imu = self._imu[keep:]
-        return Interval(self._index, time, rate_b, rate_sd, pim, bridged, attached)
+        return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, bridged, attached)
 
     def _integrate(
         self, samples: Array, time: float
@@ -289,4 +296,4 @@ class Assembler:
                 sd = np.hypot(sd, self.config.dvl.scale_sd * np.linalg.norm(z))
         if m.sensor == "fix" and np.isfinite(m.values[2]):
             sd = np.full(dim, m.values[2])
-        return Attached(m.sensor, self._index, m.time, m.row, z, sd, rate_b, rate_sd, motion, self.bias)
+        return Attached(m.sensor, self._index, self._segment, m.time, m.row, z, sd, rate_b, rate_sd, motion, self.bias)

@@ -20,8 +20,8 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Attached, Interval
-from rovgraph.graph.factors import Start, estimated_variables, motion, priors
-from rovgraph.graph.keys import key, key_name
+from rovgraph.graph.factors import Start, drift, motion, priors
+from rovgraph.graph.keys import Unknowns, key, key_name, unknowns
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.values import insert_calibration, insert_state, states_from
 from rovgraph.instruments import Instrument
@@ -32,6 +32,7 @@ Gates = dict[str, NDArray[np.bool_]]
 MAX_ITERATIONS = 50
 MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
+FARTHEST_STEP = 1e7  # beyond it QR has divided by rounding, where Cholesky found nothing to divide by
 RELATIVE_DECREASE = 1e-7  # of the cost, at which the last round stops
 COARSE_DECREASE = 1e-5  # and the rounds before the gates rest
 
@@ -44,20 +45,23 @@ class Problem:
     ----------
     native : priors and IMU factors
     blocks : sensor -> Block
-    count : number of keyframes
-    fixed : all calibration variables at their means
-    estimated : names of those that are estimated
+    segment : ndarray of int, shape (count,), the segment of time that each keyframe lies in
+    unknowns : the calibration variables
     """
 
     native: gtsam.NonlinearFactorGraph
     blocks: dict[str, Block]
-    count: int
-    fixed: Mapping[str, Array]
-    estimated: tuple[str, ...]
+    segment: NDArray[np.int64]
+    unknowns: Unknowns
+
+    @property
+    def count(self) -> int:
+        """Number of keyframes."""
+        return len(self.segment)
 
     def states(self, values: gtsam.Values) -> State:
         """State of every keyframe."""
-        return states_from(values, self.count, self.fixed, self.estimated)
+        return states_from(values, self.segment, self.unknowns)
 
     def open_gates(self) -> Gates:
         return {sensor: np.ones(len(block), dtype=bool) for sensor, block in self.blocks.items()}
@@ -135,17 +139,18 @@ def make_problem(
     for interval in intervals:
         for a in interval.attached:
             attached.setdefault(a.sensor, []).append(a)
-    fixed = {name: belief.mean for name, belief in beliefs.items()}
-    estimated = estimated_variables(beliefs, attached)
-    native = gtsam.NonlinearFactorGraph()
-    for factor in priors(start, beliefs, estimated):
-        native.add(factor)
+    wanted = unknowns(beliefs, attached)
+    factors = priors(start, beliefs, wanted)
     for interval in intervals:
-        for factor in motion(interval):
-            native.add(factor)
+        factors += motion(interval)
+    for segment in range(1, intervals[-1].segment + 1):
+        factors += drift(wanted, segment, config.graph.segment_s)
+    native = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        native.add(factor)
     gravity = config.environment.gravity_mps2
-    blocks = {s: make_block(rows, instruments[s], gravity, fixed, estimated) for s, rows in attached.items()}
-    return Problem(native, blocks, len(intervals), fixed, estimated)
+    blocks = {s: make_block(rows, instruments[s], gravity, wanted) for s, rows in attached.items()}
+    return Problem(native, blocks, np.array([i.segment for i in intervals]), wanted)
 
 
 def make_values(problem: Problem, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:
@@ -153,7 +158,8 @@ def make_values(problem: Problem, states: State, calibration: Mapping[str, Array
     values = gtsam.Values()
     for i in range(problem.count):
         insert_state(values, i, states.at([i]))
-    insert_calibration(values, problem.fixed if calibration is None else calibration, problem.estimated)
+    for segment in range(int(problem.segment[-1]) + 1):
+        insert_calibration(values, calibration or problem.unknowns.fixed, problem.unknowns, segment)
     return values
 
 
@@ -228,12 +234,15 @@ def _eliminate(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> g
     """The Gauss-Newton step: Cholesky, and QR where rounding makes that indefinite."""
     try:
         return linear.optimize(ordering)
-    except RuntimeError:
-        pass
+    except RuntimeError as error:
+        first = error
     try:
-        return linear.optimize(ordering, gtsam.EliminateQR)
+        delta = linear.optimize(ordering, gtsam.EliminateQR)
     except RuntimeError as error:
         raise InputError(indeterminate(error)) from None
+    if not delta.norm() < FARTHEST_STEP:
+        raise InputError(indeterminate(first))
+    return delta
 
 
 def indeterminate(error: RuntimeError) -> str:
@@ -253,7 +262,7 @@ def marginals(problem: Problem, solution: Solution) -> gtsam.GaussianBayesTree:
     is eliminated last, since all keyframes share it.
     """
     linear = problem.linearize(solution.values, solution.gates)
-    last = [key(name) for name in problem.estimated]
+    last = [key(name) for name, walk in problem.unknowns.walks.items() if not walk]
     ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last)
     try:
         return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)

@@ -3,7 +3,7 @@
 Batch, iSAM2 and fixed lag consume the same lists.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -12,8 +12,8 @@ import numpy as np
 from rovgraph.calibration import Belief
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Interval
-from rovgraph.graph.keys import key
-from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.values import insert_state
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 Factor = gtsam.NonlinearFactor
@@ -38,13 +38,7 @@ class Start:
     bias_sd: Array
 
 
-def estimated_variables(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> tuple[str, ...]:
-    """Calibration variables to be estimated: asked for, and their sensor is in use."""
-    present = set(sensors)
-    return tuple(name for name, b in beliefs.items() if b.estimate and b.variable.sensor in present)
-
-
-def priors(start: Start, beliefs: Mapping[str, Belief], estimated: Iterable[str]) -> list[Factor]:
+def priors(start: Start, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> list[Factor]:
     """Priors of the first keyframe and of the calibration variables."""
     state = start.state
     R_nb, sigmas = state.R_nb[0], gtsam.noiseModel.Diagonal.Sigmas
@@ -59,7 +53,7 @@ def priors(start: Start, beliefs: Mapping[str, Belief], estimated: Iterable[str]
         gtsam.PriorFactorConstantBias(key(BIAS, 0), bias, sigmas(start.bias_sd)),
         *(
             gtsam.PriorFactorVector(key(name), beliefs[name].mean, sigmas(np.full(b.variable.dim, b.sd)))
-            for name, b in ((name, beliefs[name]) for name in estimated)
+            for name, b in ((name, beliefs[name]) for name in unknowns.estimated)
         ),
     ]
 
@@ -71,6 +65,21 @@ def motion(interval: Interval) -> list[Factor]:
     i, j = interval.index - 1, interval.index
     before, after = (key(POSE, i), key(VELOCITY, i)), (key(POSE, j), key(VELOCITY, j))
     return [gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)]
+
+
+def drift(unknowns: Unknowns, segment: int, segment_s: float) -> list[Factor]:
+    """The random walk of calibration variables into a segment from the one before."""
+    if segment == 0:
+        return []
+    return [
+        gtsam.BetweenFactorVector(
+            unknowns.key(name, segment - 1),
+            unknowns.key(name, segment),
+            np.zeros(len(unknowns.fixed[name])),
+            gtsam.noiseModel.Isotropic.Sigma(len(unknowns.fixed[name]), unknowns.walks[name] * np.sqrt(segment_s)),
+        )
+        for name in unknowns.begun_by(segment)
+    ]
 
 
 def linear_motion(interval: Interval, before: State, after: State) -> list[Factor]:
@@ -106,11 +115,3 @@ def predict(interval: Interval, state: State) -> State:
     before = gtsam.NavState(gtsam.Rot3(state.R_nb[0]), state.p_n[0], state.v_n[0])
     after = interval.pim.predict(before, bias)
     return replace(state, R_nb=after.attitude().matrix()[None], p_n=after.position()[None], v_n=after.velocity()[None])
-
-
-def values_of(index: int, state: State, estimated: Iterable[str] = ()) -> gtsam.Values:
-    """Values of a keyframe's state, and of the calibration variables named."""
-    values = gtsam.Values()
-    insert_state(values, index, state)
-    insert_calibration(values, state.calibration, estimated)
-    return values

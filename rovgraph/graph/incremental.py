@@ -7,7 +7,7 @@ that is kept here lets the bindings hand them that object instead of a copy, wit
 the cost of a callback grows with the dive.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import gtsam
@@ -17,7 +17,7 @@ from rovgraph.calibration import TABLE
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import indeterminate
-from rovgraph.graph.keys import key
+from rovgraph.graph.keys import Unknowns, key
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, State
 
 # Changes beyond which iSAM2 relinearises a variable. Positions and velocities too: the IMU's
@@ -54,18 +54,23 @@ class Incremental:
     Parameters
     ----------
     lag : length of the window [s], or None for the whole dive
-    fixed : values of the calibration variables that are not estimated
-    estimated : names of those that are
+    unknowns : the calibration variables
     """
 
-    def __init__(self, lag: float | None, fixed: Mapping[str, Array], estimated: tuple[str, ...]) -> None:
-        self.lag, self._fixed, self._estimated = lag, fixed, estimated
+    def __init__(self, lag: float | None, unknowns: Unknowns) -> None:
+        self.lag, self._unknowns = lag, unknowns
         params = isam2_params(relinearise=lag is None)
         self._engine: Any = gtsam.ISAM2(params) if lag is None else gtsam.IncrementalFixedLagSmoother(lag, params)
         self._theta = self._engine.getLinearizationPoint()
 
-    def update(self, factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values, time: float) -> None:
+    def update(self, factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values, time: float, segment: int) -> None:
         """Add a step's factors and the initial values of its new variables.
+
+        Parameters
+        ----------
+        factors : of the step
+        values : of the variables that are new
+        time, segment : of the newest keyframe
 
         Raises
         ------
@@ -76,46 +81,51 @@ class Incremental:
             graph.add(factor)
         stamps: tuple[dict[int, float], ...] = ()
         if self.lag is not None:
-            calibration = [key(name) for name in self._estimated]
-            stamps = (dict.fromkeys([*values.keys(), *calibration], time),)
+            stamps = (dict.fromkeys([*values.keys(), *self._calibration_keys(segment)], time),)
         try:
             self._engine.update(graph, values, *stamps)
         except RuntimeError as error:
             raise InputError(indeterminate(error)) from None
 
-    def restart(self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, times: Mapping[int, float]) -> None:
+    def _calibration_keys(self, segment: int) -> list[int]:
+        return [self._unknowns.key(name, segment) for name in self._unknowns.estimated]
+
+    def restart(
+        self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, keyframes: Iterable[tuple[int, float, int]]
+    ) -> None:
         """Begin anew with a dive so far, linearised at its optimum; only with a lag.
 
         Parameters
         ----------
         linear : all factors, linearised at ``values``
         values : of all variables
-        times : keyframe -> time [s]
+        keyframes : index, time [s] and segment of each, in order
         """
         self._engine = gtsam.IncrementalFixedLagSmoother(self.lag or 0.0, isam2_params(relinearise=False))
-        stamps = {key(v, index): time for index, time in times.items() for v in DIMENSION}
-        stamps |= dict.fromkeys([key(name) for name in self._estimated], max(times.values()))
+        stamps: dict[int, float] = {}
+        for index, time, segment in keyframes:
+            stamps |= dict.fromkeys([*(key(v, index) for v in DIMENSION), *self._calibration_keys(segment)], time)
         self._engine.update(gtsam.LinearContainerFactor.ConvertLinearGraph(linear, values), values, stamps)
         self._theta = self._engine.getLinearizationPoint()
 
-    def state(self, index: int) -> State:
+    def state(self, index: int, segment: int) -> State:
         """Estimate of a keyframe within the lag, as a `State` of one epoch, calibration included."""
-        engine = self._engine
+        engine, unknowns = self._engine, self._unknowns
         pose = engine.calculateEstimatePose3(key(POSE, index))
-        calibration = {name: engine.calculateEstimateVector(key(name)) for name in self._estimated}
+        names = unknowns.estimated
+        calibration = {name: engine.calculateEstimateVector(unknowns.key(name, segment)) for name in names}
         return State(
             pose.rotation().matrix()[None],
             pose.translation()[None],
             engine.calculateEstimateVector(key(VELOCITY, index))[None],
             engine.calculateEstimateConstantBias(key(BIAS, index)).vector()[None],
-            {**self._fixed, **calibration},
+            {**unknowns.fixed, **calibration},
         )
 
-    def covariances(self, index: int, calibration: bool = True) -> dict[str, Array]:
-        """Marginal covariances of a keyframe's state variables, and of the calibration."""
+    def covariances(self, index: int, segment: int, names: Iterable[str]) -> dict[str, Array]:
+        """Marginal covariances of a keyframe's state variables, and of the calibration variables ``names``."""
         keys = {v: key(v, index) for v in DIMENSION}
-        if calibration:
-            keys |= {name: key(name) for name in self._estimated}
+        keys |= {name: self._unknowns.key(name, segment) for name in names}
         return {v: np.asarray(self._engine.marginalCovariance(k)) for v, k in keys.items()}
 
     def values(self) -> gtsam.Values:

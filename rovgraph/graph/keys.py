@@ -1,8 +1,12 @@
 """Keys of the graph's variables: x pose, v velocity, b bias, one letter per calibration."""
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
 import gtsam
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import TABLE, Belief
+from rovgraph.geometry import Array
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY
 
 _LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b"} | {v.name: v.letter for v in TABLE.values()}
@@ -15,7 +19,7 @@ def key(variable: str, index: int = 0) -> int:
     Parameters
     ----------
     variable : "pose", "velocity", "bias" or a name of the calibration table
-    index : keyframe; 0 for a calibration variable
+    index : keyframe; for a calibration variable that walks its segment, else 0
     """
     return _FIRST[variable] + index  # consecutive, as gtsam.symbol makes them
 
@@ -26,3 +30,43 @@ def key_name(key: int) -> str:
     letter = chr(symbol.chr())
     variable = next(name for name, own in _LETTER.items() if own == letter)
     return f"{variable} of keyframe {symbol.index()}" if variable in DIMENSION else variable
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What of the calibration a graph estimates.
+
+    Attributes
+    ----------
+    fixed : all calibration variables at their prior means; those that are not estimated
+        keep them
+    walks : random walk of each that is estimated [unit per root second]; with 0 it has one
+        value for all of the dive, otherwise one per segment of time
+    """
+
+    fixed: Mapping[str, Array]
+    walks: Mapping[str, float]
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        return tuple(self.walks)
+
+    def key(self, name: str, segment: int) -> int:
+        """Key of an estimated variable in a segment."""
+        return key(name, segment if self.walks[name] else 0)
+
+    def begun_by(self, segment: int) -> tuple[str, ...]:
+        """Those that have a new value in a segment."""
+        return tuple(name for name, walk in self.walks.items() if walk or segment == 0)
+
+    def of(self, names: Iterable[str]) -> "Unknowns":
+        """Only some of the estimated variables."""
+        wanted = set(names)
+        return Unknowns(self.fixed, {name: walk for name, walk in self.walks.items() if name in wanted})
+
+
+def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
+    """Calibration variables to be estimated: asked for, and their sensor is in use."""
+    present = set(sensors)
+    wanted = {n: b.walk for n, b in beliefs.items() if b.estimate and b.variable.sensor in present}
+    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted)

@@ -9,7 +9,7 @@ rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero wher
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import Any
@@ -21,7 +21,7 @@ from scipy.special import chdtri
 
 from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import Attached
-from rovgraph.graph.keys import key
+from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
@@ -37,19 +37,19 @@ class Block:
     Attributes
     ----------
     instrument : model, noise and loss
-    keyframe : ndarray of int, shape (n,)
+    keyframe, segment : ndarray of int, shape (n,)
     time, row : ndarray, shape (n,)
     z : ndarray, shape (n, dim)
     W : ndarray, shape (n, dim, dim), square-root information, lower triangular
     rate_b : ndarray, shape (n, 3), measured rate, bias still in it [rad/s]
     motion : Delta, n, from the keyframe to the measurement
     gravity : [m/s^2]
-    fixed : values of the calibration variables that are not estimated
-    estimated : names of those that are
+    unknowns : the calibration variables that are estimated, of those that the model has
     """
 
     instrument: Instrument
     keyframe: Array
+    segment: Array
     time: Array
     row: Array
     z: Array
@@ -57,8 +57,7 @@ class Block:
     rate_b: Array
     motion: Delta
     gravity: float
-    fixed: Mapping[str, Array]
-    estimated: tuple[str, ...]
+    unknowns: Unknowns
 
     def __len__(self) -> int:
         return len(self.z)
@@ -66,12 +65,13 @@ class Block:
     @property
     def variables(self) -> tuple[str, ...]:
         """Variables that the factors touch, in the order of their keys."""
-        return (*self.instrument.model.state, *self.estimated)
+        return (*self.instrument.model.state, *self.unknowns.estimated)
 
     @cached_property
     def keys(self) -> list[list[int]]:
         """Keys of every measurement, in the order of `variables`."""
-        columns = [key(v) + (self.keyframe if v in DIMENSION else 0 * self.keyframe) for v in self.variables]
+        columns = [key(v) + self.keyframe for v in self.instrument.model.state]
+        columns += [key(v) + (self.segment if walk else 0 * self.segment) for v, walk in self.unknowns.walks.items()]
         rows: list[list[int]] = np.column_stack(columns).tolist()
         return rows
 
@@ -133,10 +133,10 @@ class Block:
 
     def custom_factor(self, k: int = 0) -> gtsam.CustomFactor:
         """Measurement ``k`` as a nonlinear factor that calls back into `linearize`."""
-        one, index = self.at(slice(k, k + 1)), int(self.keyframe[k])
+        one, index, segment = self.at(slice(k, k + 1)), int(self.keyframe[k]), int(self.segment[k])
 
         def error(_: gtsam.CustomFactor, values: gtsam.Values, H: Any) -> Array:
-            r, jacobians = one.linearize(state_at(values, index, self.fixed, self.estimated))
+            r, jacobians = one.linearize(state_at(values, index, segment, self.unknowns))
             if H is not None:
                 for place, jacobian in enumerate(jacobians.values()):
                     H[place] = jacobian[0]
@@ -162,27 +162,25 @@ class Block:
         return replace(self, **arrays, motion=motion)
 
 
-_PER_MEASUREMENT = ("keyframe", "time", "row", "z", "W", "rate_b")
+_PER_MEASUREMENT = ("keyframe", "segment", "time", "row", "z", "W", "rate_b")
 
 
 def make_block(
     attached: Sequence[Attached],
     instrument: Instrument,
     gravity: float,
-    fixed: Mapping[str, Array],
-    estimated: Iterable[str],
+    unknowns: Unknowns,
 ) -> Block:
-    """Stack measurements of one sensor; ``estimated`` are all calibration variables that are."""
+    """Stack measurements of one sensor; ``unknowns`` are those of the whole graph."""
 
     def stack(name: str) -> Array:
         return np.array([getattr(a, name) for a in attached])
 
     dt, dR, dv, dp = (np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp"))
     delta = Delta(dt, dR, dv, dp, stack("bias"))
-    own = tuple(v for v in estimated if v in instrument.model.calibration)
     W = whitening(instrument, stack("sd"), stack("rate_sd"))
-    arrays = (stack("keyframe"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
-    return Block(instrument, *arrays, delta, gravity, fixed, own)
+    arrays = (stack("keyframe"), stack("segment"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
+    return Block(instrument, *arrays, delta, gravity, unknowns.of(instrument.model.calibration))
 
 
 def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.geometry import Array, cross
+from rovgraph.state import Delta
 
 EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
 INTEGRATION_SD = 1e-3  # per root second; smaller makes the covariance nearly singular
@@ -118,3 +119,9 @@ def preintegrate(
 
 def _snapshot(pim: gtsam.PreintegratedCombinedMeasurements) -> Snapshot:
     return Snapshot(pim.deltaTij(), pim.deltaRij().matrix(), pim.deltaVij(), pim.deltaPij())
+
+
+def whole(pim: gtsam.PreintegratedCombinedMeasurements) -> Delta:
+    """The motion over a whole interval, one epoch."""
+    motion, bias = _snapshot(pim), pim.biasHat().vector()
+    return Delta(np.array([motion.dt]), motion.dR[None], motion.dv[None], motion.dp[None], bias[None])

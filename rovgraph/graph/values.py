@@ -1,12 +1,13 @@
 """Between GTSAM's `Values` and the arrays of a `State`."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.graph.keys import key
+from rovgraph.graph.keys import Unknowns, key
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 
@@ -17,37 +18,60 @@ def insert_state(values: gtsam.Values, index: int, state: State) -> None:
     values.insert(key(BIAS, index), gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:]))
 
 
-def insert_calibration(values: gtsam.Values, calibration: Mapping[str, Array], estimated: Iterable[str]) -> None:
-    """Insert the calibration variables that are estimated."""
-    for name in estimated:
-        values.insert(key(name), np.array(calibration[name], dtype=float))
+def state_values(index: int, state: State) -> gtsam.Values:
+    """Values of one keyframe's state, without calibration."""
+    values = gtsam.Values()
+    insert_state(values, index, state)
+    return values
 
 
-def calibration_from(values: gtsam.Values, fixed: Mapping[str, Array], estimated: Iterable[str]) -> dict[str, Array]:
-    """All calibration variables: the estimated ones from ``values``, the rest from ``fixed``."""
-    return {**fixed, **{name: values.atVector(key(name)) for name in estimated}}
+def insert_calibration(
+    values: gtsam.Values, calibration: Mapping[str, Array], unknowns: Unknowns, segment: int = 0
+) -> None:
+    """Insert the calibration variables that a segment begins."""
+    for name in unknowns.begun_by(segment):
+        values.insert(unknowns.key(name, segment), np.array(calibration[name], dtype=float).ravel())
 
 
-def state_at(values: gtsam.Values, index: int, fixed: Mapping[str, Array], estimated: Iterable[str]) -> State:
-    """The state at one keyframe, as a `State` of one epoch."""
+def values_at(index: int, segment: int, state: State, unknowns: Unknowns) -> gtsam.Values:
+    """Values of one keyframe's state and of all calibration variables that are estimated."""
+    values = state_values(index, state)
+    for name in unknowns.estimated:
+        values.insert(unknowns.key(name, segment), np.array(state.calibration[name], dtype=float).ravel())
+    return values
+
+
+def state_at(values: gtsam.Values, index: int, segment: int, unknowns: Unknowns) -> State:
+    """The state at one keyframe, which lies in ``segment``, as a `State` of one epoch."""
     pose = values.atPose3(key(POSE, index))
+    estimated = {name: values.atVector(unknowns.key(name, segment)) for name in unknowns.estimated}
     return State(
         pose.rotation().matrix()[None],
         pose.translation()[None],
         values.atVector(key(VELOCITY, index))[None],
         values.atConstantBias(key(BIAS, index)).vector()[None],
-        calibration_from(values, fixed, estimated),
+        {**unknowns.fixed, **estimated},
     )
 
 
-def states_from(values: gtsam.Values, count: int, fixed: Mapping[str, Array], estimated: Iterable[str]) -> State:
-    """The states at keyframes 0 to count - 1, read in bulk."""
+def states_from(values: gtsam.Values, segment: NDArray[np.int64], unknowns: Unknowns) -> State:
+    """The states at all keyframes, read in bulk.
+
+    Parameters
+    ----------
+    values : of all variables
+    segment : ndarray of int, shape (n,), of each keyframe, from 0 and by steps of 1
+    unknowns : Unknowns; variables that walk come out per epoch, shape (n, dim)
+    """
     poses = gtsam.utilities.extractPose3(values)  # in the order of keys: 9 of R by rows, then p
-    biases = np.array([values.atConstantBias(key(BIAS, i)).vector() for i in range(count)])
+    biases = np.array([values.atConstantBias(key(BIAS, i)).vector() for i in range(len(segment))])
+    calibration = dict(unknowns.fixed)
+    for name, walk in unknowns.walks.items():
+        if walk:
+            per_segment = np.array([values.atVector(key(name, s)) for s in range(int(segment[-1]) + 1)])
+            calibration[name] = per_segment[segment]
+        else:
+            calibration[name] = values.atVector(key(name))
     return State(
-        poses[:, :9].reshape(-1, 3, 3),
-        poses[:, 9:],
-        gtsam.utilities.extractVectors(values, "v"),
-        biases,
-        calibration_from(values, fixed, estimated),
+        poses[:, :9].reshape(-1, 3, 3), poses[:, 9:], gtsam.utilities.extractVectors(values, "v"), biases, calibration
     )
