@@ -16,11 +16,12 @@ LAYERS = (
     {"errors"},
     {"geometry"},
     {"state", "calibration", "thesis"},
-    {"sensors"},
+    {"sensors", "vehicle"},
     {"config", "log", "trajectory"},
     {"instruments"},
     {"graph"},
     {"estimators", "simulate", "evaluate", "check"},
+    {"studies"},
     {"report"},
     {"cli"},
 )

@@ -1,0 +1,224 @@
+"""The estimators by name, for whoever compares them.
+
+An estimator is a chain of stages: the first takes a log and a configuration, each of the
+others what the stage before made. Estimators whose chains begin alike share what those
+stages made (filter and smoother of one pass, everything that needs the same keyframes),
+and each is charged for the whole of its chain.
+
+Headings, as the thesis letters them: a = magnetometer and the DVL's compass, b = the
+DVL's compass, c = the magnetometer.
+"""
+
+import difflib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.estimators.dive import assemble, run
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.log import Log
+
+Stage = Callable[[Any], Any]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the first stage of a chain takes."""
+
+    log: Log
+    config: Config
+
+
+@dataclass(frozen=True)
+class Named:
+    """An estimator that can be asked for by name.
+
+    Attributes
+    ----------
+    name : key of `ESTIMATORS`
+    family : "dead reckoning", "graph"
+    about : one line of what it is
+    headings : "a", "b", "c", or "" for those of the configuration
+    misalignment : whether the DVL's misalignment is estimated
+    smoothing : whether an epoch is estimated from what came after it, too
+    stages : the chain, from `Task` to `Estimate`
+    """
+
+    name: str
+    family: str
+    about: str
+    headings: str
+    misalignment: bool
+    smoothing: bool
+    stages: tuple[Stage, ...]
+
+    def __call__(self, log: Log, config: Config) -> Estimate:
+        """The estimate of one dive.
+
+        Raises
+        ------
+        InputError : the log lacks what the estimator needs
+        """
+        outcome = next(outcomes([self], log, config))
+        if outcome.error is not None:
+            raise outcome.error
+        assert outcome.estimate is not None
+        return outcome.estimate
+
+    def task(self, log: Log, config: Config) -> Task:
+        """The log with the configuration that this estimator works with.
+
+        Raises
+        ------
+        InputError : the log lacks a source of heading
+        """
+        if self.headings:
+            config = with_headings(log, config, self.headings)
+        return Task(log, with_misalignment(config, self.misalignment))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an estimator on one log.
+
+    Attributes
+    ----------
+    named : the estimator
+    estimate : or None where it failed
+    error : why it failed, or None
+    seconds : processor time of its chain, shared stages included [s]
+    """
+
+    named: Named
+    estimate: Estimate | None
+    error: Exception | None
+    seconds: float
+
+
+def outcomes(estimators: Sequence[Named], log: Log, config: Config) -> Iterator[Outcome]:
+    """Run estimators on one log; one that fails does not stop the others.
+
+    Parameters
+    ----------
+    estimators : those that share stages are best asked for together
+    log, config : the dive, and what is believed of vehicle and sensors
+
+    Yields
+    ------
+    Outcome : in the order of ``estimators``
+    """
+    made: dict[tuple[object, ...], tuple[Any, float]] = {}
+    for named in estimators:
+        try:
+            result, seconds = _run_chain(named, log, config, made)
+            yield Outcome(named, result, None, seconds)
+        except Exception as error:  # whatever an estimator runs into is a result of the comparison
+            yield Outcome(named, None, error, float("nan"))
+
+
+def _run_chain(
+    named: Named, log: Log, config: Config, made: dict[tuple[object, ...], tuple[Any, float]]
+) -> tuple[Any, float]:
+    """The result of a chain and its processor time; ``made`` keeps results by the chain that led to them."""
+    result: Any = named.task(log, config)
+    chain: tuple[object, ...] = (named.headings, named.misalignment)
+    total = 0.0
+    for stage in named.stages:
+        chain = (*chain, stage)
+        if chain not in made:
+            began = time.process_time()
+            made[chain] = stage(result), time.process_time() - began
+        result, seconds = made[chain]
+        total += seconds
+    return result, total
+
+
+def with_headings(log: Log, config: Config, letter: str) -> Config:
+    """A configuration with the heading sources that a letter stands for.
+
+    The magnetometer's heading is the IMU's own (``ahrs``, which is made from it) where the
+    log has no samples of the field, or the configuration prefers it.
+
+    Raises
+    ------
+    InputError : the log lacks one of them
+    """
+    given = config.heading.sources or ()
+    own = "mag" not in log or ("ahrs" in given and "mag" not in given)
+    magnetometer, compass = ("ahrs" if own else "mag"), "dvl"
+    if letter in "ac" and magnetometer not in log:
+        raise InputError(f"{log.source}: no magnetometer (mag_x, mag_y, mag_z, or ahrs_yaw)")
+    if letter in "ab" and "dvl_heading" not in log:
+        raise InputError(f"{log.source}: no compass of the DVL (dvl_heading)")
+    sources = {"a": (magnetometer, compass), "b": (compass,), "c": (magnetometer,)}[letter]
+    return config.model_copy(update={"heading": config.heading.model_copy(update={"sources": sources})})
+
+
+def with_misalignment(config: Config, estimate: bool) -> Config:
+    """A configuration that estimates the DVL's yaw, or holds it at its mean."""
+    entry = config.calibration.dvl_yaw.model_copy(update={"estimate": estimate})  # type: ignore[attr-defined]
+    return config.model_copy(update={"calibration": config.calibration.model_copy(update={"dvl_yaw": entry})})
+
+
+def assembled(task: Task) -> BatchSmoother:
+    """Keyframes of a log and what lies between them."""
+    return assemble(task.log, initialise(task.log, task.config))
+
+
+def filtered(batch: BatchSmoother) -> Estimate:
+    """The fixed-lag estimate over the same keyframes."""
+    return run(batch.intervals, batch.beginning, batch.beginning.config.graph.lag_s).solve()
+
+
+_WITH = {"a": "magnetometer and DVL compass", "b": "DVL compass alone", "c": "magnetometer alone"}
+
+
+def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> list[Named]:
+    """An estimator with each set of headings, and with the misalignment estimated."""
+    held = [
+        Named(f"{kind}-{letter}", family, f"{about}, {words}", letter, False, smoothing, (assembled, *stages))
+        for letter, words in _WITH.items()
+    ]
+    words = f"{about}, misalignment estimated"
+    return [*held, Named(f"{kind}-misalignment", family, words, "a", True, smoothing, (assembled, *stages))]
+
+
+ESTIMATORS: dict[str, Named] = {
+    named.name: named
+    for named in (
+        Named(
+            "dead-reckoning",
+            "dead reckoning",
+            "DVL along the best compass, gyro levelled by gravity",
+            "",
+            False,
+            False,
+            (assembled, BatchSmoother.dead_reckoning),
+        ),
+        *_variants("graph-filtered", "graph", "factor graph, fixed lag", False, filtered),
+        *_variants("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
+    )
+}
+
+
+def select(names: Sequence[str] | None = None) -> list[Named]:
+    """Estimators by name, in the order of `ESTIMATORS`, each once; all where none is named.
+
+    Raises
+    ------
+    InputError : an unknown name; the message lists the known ones, the nearest first
+    """
+    if names is None:
+        return list(ESTIMATORS.values())
+    for name in names:
+        if name not in ESTIMATORS:
+            near = difflib.get_close_matches(name, ESTIMATORS, len(ESTIMATORS), cutoff=0.0)
+            raise InputError(f"unknown estimator {name!r}, known are {', '.join(near)}")
+    if not names:
+        raise InputError(f"no estimator named, known are {', '.join(ESTIMATORS)}")
+    return [named for name, named in ESTIMATORS.items() if name in names]

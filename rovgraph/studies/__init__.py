@@ -1,0 +1,1 @@
+"""Studies: many dives, many estimators."""

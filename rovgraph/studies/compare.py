@@ -1,0 +1,171 @@
+"""Any set of estimators on any set of dives: what ``rovgraph compare`` does."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from rovgraph.errors import InputError
+from rovgraph.estimators.named import Named, Outcome, outcomes, select
+from rovgraph.studies.aggregate import aggregate
+from rovgraph.studies.measures import measures, misalignment_history, velocity_history
+from rovgraph.studies.runs import Case, Run
+from rovgraph.studies.workers import cores, in_workers
+
+Progress = Callable[[float], None]
+REFERENCE = "reference"  # in the place of an estimator's name
+
+# columns that every row has, in the order of the file; others follow as far as any row has them
+RUN_COLUMNS = [
+    "run", "estimator", "error", "duration_s", "epochs", "coverage", "distance_m", "end_m", "end_north_m",
+    "end_east_m", "end_cov_north_m2", "end_cov_east_m2", "end_cov_north_east_m2", "rms_m", "max_m",
+    "heading_rms_deg", "velocity_rms_mps", "nees", "nees_end", "inside_track", "inside_end", "cpu_per_s",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Tables of a comparison; docs/compare.md describes their columns.
+
+    Attributes
+    ----------
+    table : a row per estimator
+    runs : a row per run and estimator
+    misalignment : a row per run, estimator and epoch: run, estimator, time [s], value_deg,
+        sd_deg, true_deg
+    velocity : of the first run, a row per estimator and epoch: estimator, time [s], v_north,
+        v_east [m/s]; the reference is among the estimators
+    """
+
+    table: pd.DataFrame
+    runs: pd.DataFrame
+    misalignment: pd.DataFrame
+    velocity: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Some estimators on one run; ``first`` of all runs, whose velocity is kept."""
+
+    run: Run
+    names: tuple[str, ...]
+    first: bool
+
+
+@dataclass(frozen=True)
+class _Result:
+    """Rows and histories of one task."""
+
+    rows: list[dict[str, Any]]
+    misalignment: list[pd.DataFrame]
+    velocity: list[pd.DataFrame]
+
+
+def compare(
+    runs: Sequence[Run],
+    estimators: Sequence[str] | None = None,
+    jobs: int | None = None,
+    progress: Progress = lambda done: None,
+) -> Comparison:
+    """Run estimators on dives, in parallel, and measure them.
+
+    The result does not depend on ``jobs``, the time it took aside. An estimator that fails
+    on a run has a row that says why.
+
+    Parameters
+    ----------
+    runs : the dives
+    estimators : names of `rovgraph.estimators.named.ESTIMATORS`, all by default
+    jobs : processes, by default one per core
+    progress : called with the share that is done
+
+    Raises
+    ------
+    InputError : no runs, an unknown estimator, less than one job; a dive that cannot be made
+    """
+    named = select(estimators)
+    jobs = cores() if jobs is None else jobs
+    if not runs:
+        raise InputError("nothing to compare on: no log and no seeds")
+    if jobs < 1:
+        raise InputError(f"{jobs} jobs: at least 1 is expected")
+    groups = [tuple(n.name for n in named)] if len(runs) >= jobs else _sharing(named)
+    tasks = [_Task(run, group, run is runs[0]) for run in runs for group in groups]
+    results = in_workers(_work, tasks, jobs, progress)
+    by_run = {run.name: i for i, run in enumerate(runs)}
+    by_name = {n.name: i for i, n in enumerate(named)} | {REFERENCE: -1}
+
+    def stacked(frames: list[pd.DataFrame], keys: list[str]) -> pd.DataFrame:
+        """In the order of runs and estimators, whichever task they came from."""
+        if not frames:
+            return pd.DataFrame()
+        order = {"run": by_run, "estimator": by_name}
+        whole = pd.concat(frames, ignore_index=True)
+        return whole.sort_values(keys, key=lambda c: c.map(order[str(c.name)]), kind="stable", ignore_index=True)
+
+    rows = stacked([pd.DataFrame(r.rows) for r in results], ["run", "estimator"])
+    rows = rows.reindex(columns=[*RUN_COLUMNS, *sorted(set(map(str, rows)) - set(RUN_COLUMNS))])
+    velocity = stacked([f for r in results for f in r.velocity], ["estimator"]).drop_duplicates(ignore_index=True)
+    misalignment = stacked([f for r in results for f in r.misalignment], ["run", "estimator"])
+    return Comparison(aggregate(rows, named), rows, misalignment, velocity)
+
+
+def _sharing(estimators: Sequence[Named]) -> list[tuple[str, ...]]:
+    """Names grouped by what they share, so that it is made once."""
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for n in estimators:
+        groups.setdefault((n.headings, n.misalignment, n.stages[0]), []).append(n.name)
+    return [tuple(names) for names in groups.values()]
+
+
+def _work(task: _Task) -> _Result:
+    """In a worker: load the dive, run the estimators, measure them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # those of one estimator of many; what matters is in its row
+        case = task.run.load()
+        result = _Result([], [], [])
+        for outcome in outcomes(select(task.names), case.log, case.config):
+            result.rows.append(_row(task.run.name, outcome, case))
+            if result.rows[-1]["error"] is None and outcome.estimate is not None:
+                _keep_histories(result, task, outcome, case)
+    if task.first:
+        track = velocity_history(case.reference, case.reference.time[0])
+        result.velocity.append(track.assign(estimator=REFERENCE))
+    return result
+
+
+def _row(run: str, outcome: Outcome, case: Case) -> dict[str, Any]:
+    """A row of runs.csv."""
+    duration = float(case.reference.time[-1] - case.reference.time[0])
+    row = {"run": run, "estimator": outcome.named.name, "error": None, "duration_s": duration}
+    try:
+        if outcome.estimate is None:
+            return {**row, "error": _reason(outcome.error)}
+        return {**row, **measures(outcome.estimate, case), "cpu_per_s": outcome.seconds / _recorded_s(case)}
+    except Exception as error:
+        return {**row, "error": _reason(error)}
+
+
+def _recorded_s(case: Case) -> float:
+    time = case.log["imu"].time
+    return float(time[-1] - time[0])
+
+
+def _reason(error: Exception | None) -> str:
+    """An error in one line; what is no bad input is named by its kind."""
+    text = (str(error).splitlines() or [""])[0][:300]
+    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
+
+
+def _keep_histories(result: _Result, task: _Task, outcome: Outcome, case: Case) -> None:
+    assert outcome.estimate is not None
+    name = outcome.named.name
+    history = misalignment_history(outcome.estimate, case)
+    if history is not None:
+        true = result.rows[-1].get("misalignment_true_deg")
+        result.misalignment.append(history.assign(run=task.run.name, estimator=name, true_deg=true))
+    if task.first:
+        track = outcome.estimate.trajectory
+        result.velocity.append(velocity_history(track, case.reference.time[0]).assign(estimator=name))

@@ -1,0 +1,103 @@
+"""Work spread over the machine's cores, in processes that end when they are no longer wanted."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar
+
+from rovgraph.errors import InputError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+# a pool of libraries' threads in every process would fight over the same cores
+_ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_workers(
+    function: Callable[[Task], Result], tasks: Sequence[Task], jobs: int, progress: Callable[[float], None]
+) -> list[Result]:
+    """``function`` of every task, in the order of the tasks, in processes of their own.
+
+    Processes are started afresh (spawned), so ``function`` has to be importable. An
+    interrupt or an error ends all of them at once.
+
+    Parameters
+    ----------
+    function, tasks : what to do, picklable
+    jobs : number of processes
+    progress : called with the share of tasks that are done
+
+    Raises
+    ------
+    InputError : a process was killed from outside
+    """
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(min(jobs, len(tasks)), multiprocessing.get_context("spawn"), _prepare)
+    try:
+        with _environment(_ONE_THREAD), _interrupts_ignored():  # both are inherited by what is started here
+            futures = [pool.submit(function, task) for task in tasks]
+        for done, future in enumerate(as_completed(futures), 1):
+            future.result()
+            progress(done / len(tasks))
+        results = [future.result() for future in futures]
+    except BaseException as error:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(multiprocessing.active_children()) - before:
+            child.terminate()
+        if isinstance(error, BrokenProcessPool):
+            raise InputError("a worker process was killed (out of memory?); try again with fewer --jobs") from None
+        raise
+    pool.shutdown()
+    return results
+
+
+def _prepare() -> None:
+    """In a worker: leave interrupts to the parent, and end when the parent has ended, however it did."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _end_with_the_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextlib.contextmanager
+def _environment(changes: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # only that one may set handlers
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
