@@ -1,6 +1,7 @@
 """The sensors of a configuration: measurement models with the noise that is believed.
 
-`instruments` is the one place where a configuration becomes measurement models.
+`instruments` is the one place where a configuration becomes measurement models, and
+`hydrodynamics` the one where it becomes a vehicle in water.
 """
 
 from dataclasses import dataclass
@@ -9,8 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rovgraph.config import Config, mount_matrix
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array, skew
 from rovgraph.sensors import CompassHeading, DvlVelocity, MagneticField, Position, SensorModel
+from rovgraph.vehicle import Hydrodynamics
 
 DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
 
@@ -98,3 +101,30 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
         "depth": make(config.depth, depth, config.depth.sd_m, ("down",)),
         "fix": make(config.fix, fix, config.fix.sd_m, ("north", "east")),
     }
+
+
+def hydrodynamics(config: Config) -> Hydrodynamics:
+    """The vehicle of a configuration, as a body in water; the body's origin is its centre of mass.
+
+    Raises
+    ------
+    InputError : a thruster without a direction
+    """
+    vehicle = config.vehicle
+    directions = np.array([t.direction for t in vehicle.thrusters], float).reshape(-1, 3)
+    idle = np.flatnonzero(~directions.any(axis=1))
+    if idle.size:
+        raise InputError(f"vehicle.thrusters.{idle[0]}.direction: 0, 0, 0 points nowhere; any other length will do")
+    return Hydrodynamics(
+        mass=vehicle.mass_kg + np.array(vehicle.added_mass_kg),
+        inertia=np.array(vehicle.inertia_kgm2) + np.array(vehicle.added_inertia_kgm2),
+        drag_linear=np.array(vehicle.drag_linear),
+        drag_quadratic=np.array(vehicle.drag_quadratic),
+        turning_drag_linear=np.array(vehicle.turning_drag_linear),
+        turning_drag_quadratic=np.array(vehicle.turning_drag_quadratic),
+        centre_of_buoyancy=np.array(vehicle.centre_of_buoyancy_m),
+        buoyancy=vehicle.mass_kg * config.environment.gravity_mps2,
+        thrust_curve=np.array(vehicle.thrust),
+        thruster_positions=np.array([t.position_m for t in vehicle.thrusters], float).reshape(-1, 3),
+        thruster_directions=directions / np.linalg.norm(directions, axis=1, keepdims=True),
+    )
