@@ -44,7 +44,7 @@ def smooth(
     settings = load_config(config)
     check_writable(out, force)
     began = time.perf_counter()
-    dive_log = read_log(log, settings.columns, settings.units)
+    dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
     check.warn(dive_log, settings)
     dive_log = check.without_frozen_pings(dive_log)
     seconds = {"reading": time.perf_counter() - began}

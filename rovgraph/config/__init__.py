@@ -6,6 +6,6 @@ all keys, `beliefs` gives the calibration variables of `rovgraph.calibration` th
 """
 
 from rovgraph.config.reading import Config, beliefs, describe, load_config, mount_matrix, parse_config
-from rovgraph.config.sections import ImuNoise
+from rovgraph.config.sections import ImuNoise, Mag
 
-__all__ = ["Config", "ImuNoise", "beliefs", "describe", "load_config", "mount_matrix", "parse_config"]
+__all__ = ["Config", "ImuNoise", "Mag", "beliefs", "describe", "load_config", "mount_matrix", "parse_config"]

@@ -2,7 +2,10 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic_core import PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -57,12 +60,35 @@ class ImuNoise(Section):
     gyr_walk: Positive = Field(1.0e-5, description="random walk of the gyro's bias [rad/s/rts]")
 
 
+class Mag(Section):
+    """The magnetometer's calibration, (3.2) with a full matrix: field = matrix (sample - centre)."""
+
+    centre: Triple = Field((0.0, 0.0, 0.0), description="hard iron, IMU axes, log's unit; taken off every sample")
+    matrix: tuple[Triple, Triple, Triple] = Field(
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description="soft iron and scale: what a sample without its centre is multiplied by",
+    )
+
+    @field_validator("matrix")
+    @classmethod
+    def _not_flat(cls, matrix: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+        values = np.linalg.svd(np.array(matrix), compute_uv=False)
+        if values[-1] < 0.01 * values[0]:
+            raise PydanticCustomError("singular", "expected a multiple of the unit matrix, or near it; it is singular")
+        return matrix
+
+    def calibrated(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The field of magnetometer samples, shape (n, 3), IMU axes."""
+        return (samples - np.array(self.centre)) @ np.array(self.matrix).T
+
+
 class Imu(Section):
     """Inertial unit: mounting and noise."""
 
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="IMU axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the IMU in body axes")
     noise: ImuNoise = ImuNoise()
+    mag: Mag = Mag()
     acc_bias_sd_mps2: Positive = Field(0.05, description="sd of the accelerometer's bias at the start")
     gyr_bias_sd_dps: Positive = Field(0.6, description="sd of the gyro's bias at the start, deg/s")
     max_gap_s: Positive = Field(30.0, description="a longer silence of the IMU is refused")

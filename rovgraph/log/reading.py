@@ -4,7 +4,8 @@ What can be repaired is repaired and said in a `DataWarning`; what cannot is an 
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,12 @@ Bools = NDArray[np.bool_]
 Lines = NDArray[np.int64]
 
 
-def read_log(path: Path | str, columns: Mapping[str, str] | None = None, units: Mapping[str, str] | None = None) -> Log:
+def read_log(
+    path: Path | str,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    mag: Callable[[Array], Array] | None = None,
+) -> Log:
     """Read a log.
 
     Parameters
@@ -32,6 +38,8 @@ def read_log(path: Path | str, columns: Mapping[str, str] | None = None, units: 
     path : CSV, gzipped CSV or Parquet
     columns : rovgraph's name -> the log's name, where they differ
     units : column or group of columns -> unit, where it is not SI
+    mag : the magnetometer's calibration, from samples to field, both of shape (n, 3) (`Mag.calibrated`
+        of a configuration); everything that takes the log then sees the field
 
     Returns
     -------
@@ -57,6 +65,8 @@ def read_log(path: Path | str, columns: Mapping[str, str] | None = None, units: 
     found = {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}
     if not found:
         raise InputError(f"{table.source}: no measurement of any sensor in it; {_found(table.names)}")
+    if mag is not None and "mag" in found:
+        found["mag"] = replace(found["mag"], data=mag(found["mag"].data))
     return Log(table.source, found, origin)
 
 

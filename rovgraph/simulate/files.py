@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.config import Config
+from rovgraph.config import Config, Mag
 from rovgraph.simulate.dive import Dive
 
 TRUTH_RATE = 10.0  # rows per second of truth.csv
@@ -45,10 +45,14 @@ def write_log(log_frame: pd.DataFrame, path: Path) -> None:
 
 
 def known(dive: Dive, config: Config) -> Config:
-    """What an estimator knows: the configuration with the planned start, for a log in rovgraph's own columns."""
+    """What an estimator knows: the configuration with the planned start, for a log in rovgraph's own columns.
+
+    The simulated magnetometer needs no calibration.
+    """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
     start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
-    return config.model_copy(update={"start": start, "columns": {}, "units": {}})
+    imu = config.imu.model_copy(update={"mag": Mag()})
+    return config.model_copy(update={"start": start, "columns": {}, "units": {}, "imu": imu})
 
 
 def secrets(dive: Dive) -> dict[str, Any]:
