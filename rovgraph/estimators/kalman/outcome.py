@@ -1,0 +1,158 @@
+"""From the states that a recursion kept to an `Estimate`."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.config import mount_matrix
+from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate, History
+from rovgraph.estimators.kalman.dvl import HEADING, MOUNT
+from rovgraph.estimators.kalman.quaternion import SECOND, rate_matrix, unit
+from rovgraph.estimators.kalman.recursion import Innovations, Recursion
+from rovgraph.estimators.results import calibration_estimates, calibration_history
+from rovgraph.geometry import Array, rotate, transpose
+from rovgraph.trajectory import Trajectory
+
+_IMU_COMPONENTS = [("imu", c) for c in ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")]
+_MTI_COMPONENTS = [*_IMU_COMPONENTS, *(("mag", c) for c in "xyz")]
+_DVL_COMPONENTS = [*(("dvl", c) for c in "xyz"), ("dvl_heading", "heading")]
+
+
+def estimate_of(done: Recursion) -> Estimate:
+    """The estimate of a recursion that has run.
+
+    The components of a measurement were whitened in order, so that the squares of a
+    sensor's normalised innovations sum to its normalised innovation squared given the
+    sensors before it: those of "imu" and "mag" at one time to that of the MTi, those of
+    "dvl" and "dvl_heading" to that of the ping.
+    """
+    setup = done.setup
+    time, epoch, x, P = (np.array(column) for column in zip(*done.kept, strict=True))
+    residuals = pd.concat([_imu_residuals(done), _dvl_residuals(done)], ignore_index=True)
+    residuals = residuals.sort_values("time", kind="stable", ignore_index=True)
+    history = _histories(done, time, x, P)
+    calibration = calibration_estimates(setup.beliefs, _sensors(done), *_final_calibration(done))
+    trajectory = _trajectory(done, time, epoch, x, P)
+    return Estimate(setup.variant.name, trajectory, calibration, history, residuals, _summary(done))
+
+
+def _trajectory(done: Recursion, time: Array, epoch: Array, x: Array, P: Array) -> Trajectory:
+    """Poses and velocities in n; the covariance of an attitude that was given is unknown."""
+    setup = done.setup
+    s, n = setup.places, len(time)
+    v, p = x[:, s["v"]], x[:, s["p"]]
+    slope_v = np.zeros((n, 3, x.shape[1]))  # of v_n by the state
+    if setup.known is not None:
+        R_nb, cov_theta = setup.known.R_nb[epoch], np.full((n, 3, 3), np.nan)
+    else:
+        q = unit(x[:, s["q"]])
+        slope = np.einsum("ijab,nb->nija", SECOND, q)
+        R_nb = np.eye(3) + 0.5 * np.einsum("nija,na->nij", slope, q)
+        turned = 2.0 * R_nb @ transpose(np.array([rate_matrix(each) for each in q]))
+        cov_theta = turned @ P[:, s["q"], s["q"]] @ transpose(turned)
+        if setup.variant.motion == "body":
+            slope_v[:, :, s["q"]] = np.einsum("nija,nj->nia", slope, v)
+    earth = setup.variant.motion == "earth"
+    slope_v[:, :, s["v"]] = np.eye(3) if earth else R_nb
+    v_n = v if earth else rotate(R_nb, v)
+    cov_v = slope_v @ P @ transpose(slope_v)
+    return Trajectory(time, p, R_nb, v_n, P[:, s["p"], s["p"]], cov_theta, cov_v)
+
+
+def _histories(done: Recursion, time: Array, x: Array, P: Array) -> dict[str, History]:
+    """Biases in body axes, hard iron in the MTi's, misalignment."""
+    setup, out = done.setup, {}
+    R_bs = mount_matrix(setup.config.imu.mount_rpy_deg)
+    for name, unit_of in (("acc_bias", "m/s2"), ("gyr_bias", "rad/s")):
+        if name in setup.places:
+            place = setup.places[name]
+            sd = _sd(R_bs @ P[:, place, place] @ R_bs.T)
+            out[name] = History(tuple(f"{name}_{c}" for c in "xyz"), unit_of, time, rotate(R_bs, x[:, place]), sd)
+    sd = _sd(P)
+    if setup.variant.magnetometer:
+        place = setup.places["mag_bias"]
+        out["hard_iron"] = calibration_history("hard_iron", time, x[:, place], sd[:, place])
+    if setup.variant.misalignment:
+        for k, name in enumerate(MOUNT, start=setup.places["mount"].start):
+            out[name] = calibration_history(name, time, x[:, [k]], sd[:, [k]])
+    return out
+
+
+def _final_calibration(done: Recursion) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Values of all calibration variables, and covariances of those that are states."""
+    setup = done.setup
+    values = {name: belief.mean for name, belief in setup.beliefs.items()}
+    covariance: dict[str, Array] = {}
+    places = {"hard_iron": setup.places["mag_bias"]} if setup.variant.magnetometer else {}
+    if setup.variant.misalignment:
+        first = setup.places["mount"].start
+        places |= {name: slice(first + k, first + k + 1) for k, name in enumerate(MOUNT)}
+    for name, place in places.items():
+        values[name], covariance[name] = done.x[place], done.P[place, place]
+    return values, covariance
+
+
+def _sensors(done: Recursion) -> list[str]:
+    variant = done.setup.variant
+    given = ["ahrs"] if variant.attitude_given and "ahrs" in done.setup.log else []
+    return ["dvl", *["mag"] * variant.magnetometer, *["dvl_heading"] * variant.compass, *given]
+
+
+def _imu_residuals(done: Recursion) -> pd.DataFrame:
+    imu, kept, setup = done.setup.log["imu"], done.imu, done.setup
+    scale = np.concatenate([np.ones(6), np.full(3, setup.field_length)])
+    rows = [
+        _rows(imu.time[i], setup.samples[i, :m] * scale[:m], imu.row[i], _MTI_COMPONENTS[:m], *_scaled(kept, k, scale))
+        for k, i in enumerate(kept.index)
+        for m in [len(kept.residual[k])]
+    ]
+    return _frame(rows)
+
+
+def _dvl_residuals(done: Recursion) -> pd.DataFrame:
+    kept, pings = done.dvl, done.setup.pings
+    rows = []
+    for k, i in enumerate(kept.index):
+        ping = pings[i]
+        names = [_DVL_COMPONENTS[r] for r in ping.rows]
+        rows.append(_rows(ping.time, ping.z, ping.line, names, *_scaled(kept, k, np.ones(HEADING + 1))))
+    return _frame(rows)
+
+
+def _scaled(kept: Innovations, k: int, scale: Array) -> tuple[Array, Array, Array]:
+    m = len(kept.residual[k])
+    return kept.residual[k] * scale[:m], kept.sd[k] * scale[:m], kept.normalised[k]
+
+
+def _rows(
+    time: float, z: Array, line: int, names: list[tuple[str, str]], nu: Array, sd: Array, normalised: Array
+) -> list[tuple[Any, ...]]:
+    columns = (z, z - nu, nu, sd, normalised)
+    return [
+        (time, *name, *numbers, 1.0, line) for name, *numbers in zip(names, *(c.tolist() for c in columns), strict=True)
+    ]
+
+
+def _frame(rows: list[list[tuple[Any, ...]]]) -> pd.DataFrame:
+    return pd.DataFrame([row for rows_of_one in rows for row in rows_of_one], columns=pd.Index(RESIDUAL_COLUMNS))
+
+
+def _summary(done: Recursion) -> dict[str, Any]:
+    """What was run, and the mean of the normalised innovations squared over their dimension."""
+    setup = done.setup
+    summary: dict[str, Any] = {
+        "section": setup.variant.section,
+        "about": setup.variant.about,
+        "samples": len(setup.samples) if setup.imu is not None else 0,
+        "pings": len(setup.pings),
+        "assumptions": setup.assumptions,
+    }
+    for name, kept in (("imu", done.imu), ("dvl", done.dvl)):
+        if kept.index:
+            summary[f"nis_per_dimension_{name}"] = float(np.mean(np.concatenate(kept.normalised) ** 2))
+    return summary
+
+
+def _sd(covariance: Array) -> Array:
+    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
