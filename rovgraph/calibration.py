@@ -166,6 +166,36 @@ TABLE: dict[str, Variable] = {
             "difference of the field's magnitude from environment.field_norm, as a fraction of it",
             True,
         ),
+        Variable(
+            "drag_linear",
+            "j",
+            _XYZ,
+            "1",
+            0.3,
+            "thruster",
+            "relative error of vehicle.drag_linear",
+            estimate=True,
+        ),
+        Variable(
+            "drag_quadratic",
+            "k",
+            _XYZ,
+            "1",
+            0.3,
+            "thruster",
+            "relative error of vehicle.drag_quadratic",
+            estimate=True,
+        ),
+        Variable(
+            "current",
+            "c",
+            ("_north", "_east"),
+            "m/s",
+            0.1,
+            "thruster",
+            "velocity of the water over ground",
+            estimate=True,
+        ),
     )
 }
 

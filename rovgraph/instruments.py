@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, skew
+from rovgraph.model_aiding import ModelAiding
 from rovgraph.sensors import CompassHeading, DvlVelocity, MagneticField, Position, SensorModel
 from rovgraph.vehicle import Hydrodynamics
 
@@ -66,7 +67,8 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
 
     Returns
     -------
-    dict : "dvl", "dvl_heading", "ahrs", "mag", "depth", "fix" -> Instrument
+    dict : "dvl", "dvl_heading", "ahrs", "mag", "depth", "fix", "thruster" -> Instrument; the sd of
+        "thruster" is that of a mean over one second
     """
     env = config.environment
     origin: Array = np.asarray(origin_b, float)
@@ -93,6 +95,7 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
     mag_sd = np.deg2rad(heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
     depth = Position("depth", arm(config.depth.lever_arm_m), (2,))
     fix = Position("fix", arm(config.fix.lever_arm_m), (0, 1))
+    aiding = ModelAiding(hydrodynamics(config), origin, env.gravity_mps2)
     return {
         "dvl": make(config.dvl, dvl, config.dvl.velocity_sd_mps, ("x", "y", "z")),
         "dvl_heading": make(heading, compass, np.deg2rad(heading.dvl_sd_deg), ("heading",)),
@@ -100,6 +103,7 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
         "mag": make(heading, MagneticField(declination, dip, magnitude, R_imu), mag_sd, ("x", "y", "z")),
         "depth": make(config.depth, depth, config.depth.sd_m, ("down",)),
         "fix": make(config.fix, fix, config.fix.sd_m, ("north", "east")),
+        "thruster": make(config.vehicle, aiding, config.vehicle.acceleration_sd_mps2, ("x", "y", "z")),
     }
 
 

@@ -16,7 +16,8 @@ LAYERS = (
     {"errors"},
     {"geometry"},
     {"state", "calibration", "thesis"},
-    {"sensors", "vehicle"},
+    {"vehicle"},
+    {"sensors", "model_aiding"},
     {"config", "log", "trajectory"},
     {"instruments"},
     {"graph"},
@@ -151,7 +152,7 @@ print("MODULES", *sys.modules)
 """
 
 
-@pytest.mark.parametrize("command", [[], ["smooth"], ["evaluate"], ["check"], ["config"], ["simulate"]])
+@pytest.mark.parametrize("command", [[], ["smooth"], ["evaluate"], ["compare"], ["check"], ["config"], ["simulate"]])
 def test_help_loads_nothing_heavy(command):
     done = run(HELP.format(arguments=[*command, "--help"]))
     assert done.returncode == 0, done.stderr

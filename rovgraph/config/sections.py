@@ -171,7 +171,9 @@ class Vehicle(Section):
         (0.32, -0.016, 2.98e-4), description="thrust [N] of a signal u: a u + b |u| u + c u^3 (2.21)"
     )
     thrusters: tuple[Thruster, ...] = Field(FALCON_THRUSTERS, description="thruster_1, thruster_2, ... of the log")
-    acceleration_sd_mps2: Positive = Field(0.03, description="error of the model's acceleration over an interval")
+    acceleration_sd_mps2: Positive = Field(0.03, description="error of the model's acceleration, mean of a second")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="an interval further off than this many sd is left out")
 
 
 class Graph(Section):

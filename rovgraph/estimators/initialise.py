@@ -66,7 +66,7 @@ def initialise(log: Log, config: Config) -> Beginning:
     config = _resolve_noise(log, config, assumptions)
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
-    used = [s for s in ("dvl", "depth", "fix") if s in log] + sources
+    used = [s for s in ("dvl", "depth", "fix") if s in log] + sources + _thrusters(log, config)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 
@@ -92,6 +92,23 @@ def initialise(log: Log, config: Config) -> Beginning:
     state = State(R_nb[None], at_imu[None], np.zeros((1, 3)), bias[None])
     prior = Start(state, rpy_sd, np.full(3, p_sd), np.full(3, START_VELOCITY_SD), bias_sd)
     return Beginning(config, sensors, prior, assumptions)
+
+
+def _thrusters(log: Log, config: Config) -> list[str]:
+    """The stream of thruster signals, where hydrodynamics are asked for."""
+    if not config.graph.hydrodynamics:
+        return []
+    wanted = len(config.vehicle.thrusters)
+    if "thruster" not in log:
+        raise InputError(
+            f"{log.source}: graph.hydrodynamics needs thruster signals, columns thruster_1, thruster_2, ..."
+        )
+    if len(log["thruster"].columns) != wanted:
+        raise InputError(
+            f"{log.source}: {len(log['thruster'].columns)} thruster columns, vehicle.thrusters has {wanted}; "
+            "describe every thruster in the configuration"
+        )
+    return ["thruster"]
 
 
 def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Config:

@@ -1,5 +1,6 @@
 """What the simulated vehicle does, apart from what an estimator believes of it."""
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -56,10 +57,15 @@ class Truth:
             raise InputError(f"unknown calibration variable {min(unknown)}")
 
     def draw_calibration(self, rng: np.random.Generator) -> dict[str, Array]:
-        """True value of every calibration variable, shape (dim,) each."""
+        """True value of every calibration variable, shape (dim,) each.
+
+        Each has a generator of its own, so that a variable more does not change the dives of old seeds.
+        """
         out = {}
+        entropy = int(rng.integers(2**62))
         for name, belief in beliefs(self.config).items():
-            draw = belief.sd * rng.standard_normal(belief.variable.dim)  # always, so that draws do not shift
+            own = np.random.default_rng([entropy, zlib.crc32(name.encode())])
+            draw = belief.sd * own.standard_normal(belief.variable.dim)
             value = belief.mean + draw if belief.estimate and self.noise else belief.mean
             out[name] = np.array(self.calibration.get(name, value), float).reshape(belief.variable.dim)
         return out
