@@ -9,6 +9,7 @@ import warnings
 import typer
 
 from rovgraph.cli.check import check
+from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
 from rovgraph.cli.evaluate import evaluate
 from rovgraph.cli.simulate import simulate
@@ -23,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _command in (smooth, evaluate, check, config, simulate):
+for _command in (smooth, evaluate, compare, check, config, simulate):
     app.command()(_command)
 
 

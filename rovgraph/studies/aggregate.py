@@ -80,8 +80,10 @@ def _consistency(nees: pd.Series) -> dict[str, Any]:
 def _misalignment(good: pd.DataFrame) -> dict[str, float]:
     if "misalignment_deg" not in good:
         return {}
+    error = good["misalignment_deg"] - good["misalignment_true_deg"]
     return {
         "misalignment_mean_deg": good["misalignment_deg"].mean(),
         "misalignment_sd_deg": _rms(good["misalignment_sd_deg"]),
-        "misalignment_error_rms_deg": _rms(good["misalignment_deg"] - good["misalignment_true_deg"]),
+        "misalignment_error_mean_deg": error.mean(),
+        "misalignment_error_rms_deg": _rms(error),
     }

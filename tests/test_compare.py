@@ -1,0 +1,341 @@
+"""Comparison of estimators: through the command line, over processes, and what the numbers mean."""
+
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from dives import falcon, simulated, without
+from scipy.stats import chi2
+
+from rovgraph.cli.app import main
+from rovgraph.errors import InputError
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.named import ESTIMATORS, Named, Task, outcomes, select
+from rovgraph.estimators.results import residual_frame
+from rovgraph.log import Log
+from rovgraph.studies.aggregate import aggregate, nees_band
+from rovgraph.studies.compare import RUN_COLUMNS, compare
+from rovgraph.studies.measures import measures
+from rovgraph.studies.runs import Case, Recorded
+from rovgraph.studies.workers import in_workers
+from rovgraph.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[1]
+FALCON = ROOT / "configs" / "falcon.yaml"
+FEW = "graph-smoothed-misalignment,dead-reckoning,graph-smoothed-c"
+DIVES = ["--scenario", "circle", "--duration", "45", "--config", str(FALCON)]
+
+
+def run(*arguments: object) -> int:
+    """Run the console script, give its exit code."""
+    before, sys.argv = sys.argv, ["rovgraph", "compare", *map(str, arguments)]
+    try:
+        main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    finally:
+        sys.argv = before
+    return 0
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two short dives in one process."""
+    out = tmp_path_factory.mktemp("compared") / "out"
+    assert run(*DIVES, "--seeds", 2, "--estimators", FEW, "--jobs", 1, "--out", out) == 0
+    return out
+
+
+def test_the_folder_holds_tables_summary_and_figures(compared):
+    tables = {"table.csv", "runs.csv", "misalignment.csv", "velocity.csv", "summary.json", "config.yaml"}
+    figures = {"errors.png", "end_points.png", "velocity.png", "misalignment.png"}
+    assert {p.name for p in compared.iterdir()} == tables | figures
+
+
+def test_rows_are_in_the_order_of_runs_and_of_the_registry(compared):
+    names = [name for name in ESTIMATORS if name in FEW.split(",")]
+    rows = pd.read_csv(compared / "runs.csv")
+    assert rows[["run", "estimator"]].to_numpy().tolist() == [[f"circle {s}", n] for s in (1, 2) for n in names]
+    assert pd.read_csv(compared / "table.csv")["estimator"].tolist() == names
+
+
+def test_the_same_seeds_give_the_same_table_whatever_the_jobs(compared, tmp_path):
+    assert run(*DIVES, "--seeds", 2, "--estimators", FEW, "--jobs", 3, "--out", tmp_path / "out") == 0
+    for name in ("runs", "table", "misalignment", "velocity"):
+        one, three = (pd.read_csv(folder / f"{name}.csv") for folder in (compared, tmp_path / "out"))
+        pd.testing.assert_frame_equal(
+            one.drop(columns="cpu_per_s", errors="ignore"), three.drop(columns="cpu_per_s", errors="ignore")
+        )
+
+
+def test_every_column_is_documented(compared):
+    text = (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
+    known = set(re.findall(r"`([a-z_0-9…, ]+)`", text))
+    known = {part.strip() for group in known for part in group.split(",")}
+    prefixes = tuple(name.removesuffix("…") for name in known if name.endswith("_…"))
+    columns = {
+        c for name in ("runs", "table", "misalignment", "velocity") for c in pd.read_csv(compared / f"{name}.csv")
+    }
+    assert {c for c in columns if c not in known and not c.startswith(prefixes)} == set()
+
+
+def test_every_estimator_is_documented():
+    text = (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
+    rows = [re.findall(r"`([^`]+)`", line.split("|")[1]) for line in text.splitlines() if line.startswith("| `")]
+    names = {
+        first if not n.startswith("-") else first.removesuffix("-a") + n
+        for first, *more in rows
+        for n in (first, *more)
+    }
+    assert set(ESTIMATORS) <= names
+
+
+def test_the_estimate_of_the_misalignment_is_compared_with_the_simulated_one(compared):
+    rows = pd.read_csv(compared / "runs.csv").set_index("estimator")
+    estimated = rows.loc["graph-smoothed-misalignment"]
+    assert (estimated["misalignment_true_deg"].abs() > 1e-6).all()
+    error = estimated["misalignment_deg"] - estimated["misalignment_true_deg"]
+    assert (error.abs() < 4.0 * estimated["misalignment_sd_deg"]).all()
+    assert rows.drop("graph-smoothed-misalignment")["misalignment_deg"].isna().all()
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Case:
+    dive = simulated(falcon(), 45.0, path="circle")
+    return Case(dive.log, dive.config, dive.truth.every(10))
+
+
+def test_an_estimator_that_fails_has_its_row_and_the_others_go_on(recorded):
+    case = Case(without(recorded.log, "mag"), recorded.config, recorded.reference)
+    result = compare([Recorded("lake", case)], ["graph-smoothed-b", "graph-smoothed-c"], jobs=2)
+    errors = result.runs.set_index("estimator")["error"]
+    assert errors["graph-smoothed-b"] is None
+    assert "no magnetometer" in errors["graph-smoothed-c"]
+    table = result.table.set_index("estimator")
+    assert table["failed"].to_dict() == {"graph-smoothed-b": 0.0, "graph-smoothed-c": 1.0}
+    assert np.isfinite(table["end_mean_m"]["graph-smoothed-b"])
+    assert np.isnan(table["end_mean_m"]["graph-smoothed-c"])
+
+
+def test_a_reference_on_another_clock_fails_every_estimator_with_the_reason(recorded):
+    late = Trajectory(recorded.reference.time + 1e6, *list(vars(recorded.reference).values())[1:])
+    result = compare([Recorded("lake", Case(recorded.log, recorded.config, late))], ["dead-reckoning"], jobs=1)
+    assert "are both on the same clock?" in result.runs["error"].iloc[0]
+
+
+def chain(name: str, *stages: object) -> Named:
+    return Named(name, "graph", "of a test", "", False, False, stages)  # type: ignore[arg-type]
+
+
+def test_estimators_share_the_stages_they_have_in_common(recorded):
+    calls: list[str] = []
+
+    def slow(task: Task) -> str:
+        calls.append("slow")
+        spent = time.process_time()
+        while time.process_time() - spent < 0.02:
+            pass
+        return task.log.source
+
+    def first(source: str) -> str:
+        return "first of " + source
+
+    def second(source: str) -> str:
+        return "second of " + source
+
+    done = list(outcomes([chain("a", slow, first), chain("b", slow, second)], recorded.log, recorded.config))
+    assert calls == ["slow"]
+    assert [o.estimate for o in done] == [f"{which} of dive.csv" for which in ("first", "second")]
+    assert all(o.seconds >= 0.02 for o in done)
+
+
+def test_any_exception_is_an_outcome(recorded):
+    def broken(task: Task) -> float:
+        return 1.0 / 0.0
+
+    def fine(task: Task) -> Log:
+        return task.log
+
+    done = list(outcomes([chain("a", broken), chain("b", fine)], recorded.log, recorded.config))
+    assert isinstance(done[0].error, ZeroDivisionError)
+    assert done[1].estimate is recorded.log
+    with pytest.raises(ZeroDivisionError):
+        chain("a", broken)(recorded.log, recorded.config)
+
+
+@pytest.mark.parametrize(
+    ("name", "sources", "estimated"),
+    [
+        ("graph-smoothed-a", ("mag", "dvl"), False),
+        ("graph-filtered-b", ("dvl",), False),
+        ("graph-smoothed-c", ("mag",), False),
+        ("graph-filtered-misalignment", ("mag", "dvl"), True),
+    ],
+)
+def test_a_name_stands_for_headings_and_misalignment(recorded, name, sources, estimated):
+    config = ESTIMATORS[name].task(recorded.log, recorded.config).config
+    assert config.heading.sources == sources
+    assert config.calibration.dvl_yaw.estimate is estimated
+    assert config.calibration.dvl_yaw.sd_deg == recorded.config.calibration.dvl_yaw.sd_deg
+
+
+def constant(p_n: tuple[float, float, float], v_n: tuple[float, float, float], sd: float) -> Trajectory:
+    """Eleven epochs in one place, 1 s apart."""
+    n, eye = 11, np.eye(3)
+    covariance = np.tile(sd**2 * eye, (n, 1, 1))
+    return Trajectory(
+        np.arange(n, dtype=float),
+        np.tile(p_n, (n, 1)),
+        np.tile(eye, (n, 1, 1)),
+        np.tile(v_n, (n, 1)),
+        *[covariance] * 3,
+    )
+
+
+def test_measures_of_a_constant_error_by_hand(recorded):
+    truth = constant((0.0, 0.0, 5.0), (0.1, 0.0, 0.0), np.nan)
+    estimate = Estimate("x", constant((3.0, 4.0, 9.0), (0.1, 0.2, 7.0), 2.0), [], {}, residual_frame({}, {}, {}))
+    row = measures(estimate, Case(recorded.log, recorded.config, truth))
+    assert (row["end_north_m"], row["end_east_m"]) == (3.0, 4.0)
+    wanted = {
+        "end_m": 5.0,
+        "rms_m": 5.0,
+        "velocity_rms_mps": 0.2,
+        "nees": 6.25,
+        "nees_end": 6.25,
+        "heading_rms_deg": 0.0,
+    }
+    assert {name: row[name] for name in wanted} == pytest.approx(wanted)
+    assert row["inside_end"] is True
+    assert row["inside_track"] == 1.0
+
+
+def test_an_estimate_that_is_not_finite_is_a_failure(recorded):
+    estimate = Estimate("x", constant((np.nan, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), [], {}, residual_frame({}, {}, {}))
+    with pytest.raises(FloatingPointError, match="diverged"):
+        measures(estimate, recorded)
+
+
+def rows(**columns: list[object]) -> pd.DataFrame:
+    return pd.DataFrame(columns).reindex(columns=[*RUN_COLUMNS, *(c for c in columns if c not in RUN_COLUMNS)])
+
+
+def test_a_table_by_hand():
+    name = "graph-filtered-misalignment"
+    frame = rows(
+        estimator=[name] * 4,
+        error=[None, None, None, "lost"],
+        end_m=[1.0, 2.0, 6.0, np.nan],
+        rms_m=[3.0, 4.0, 0.0, np.nan],
+        max_m=[3.0, 9.0, 1.0, np.nan],
+        nees=[1.0, 2.0, 6.0, np.nan],
+        nees_end=[10.0, 20.0, 30.0, np.nan],
+        inside_end=[True, False, False, None],
+        inside_track=[1.0, 0.5, 0.0, np.nan],
+        nis_dvl=[1.0, 1.5, 2.0, np.nan],
+        misalignment_deg=[1.0, 2.0, 3.0, np.nan],
+        misalignment_sd_deg=[3.0, 4.0, 0.0, np.nan],
+        misalignment_true_deg=[0.0, 2.0, 2.0, np.nan],
+        cpu_per_s=[0.1, 0.2, 0.3, np.nan],
+    )
+    row = aggregate(frame, select([name])).iloc[0]
+    wanted = {
+        "runs": 4,
+        "failed": 0.25,
+        "end_mean_m": 3.0,
+        "end_sd_m": math.sqrt(7.0),  # (4 + 1 + 9) / 2
+        "rms_m": math.sqrt(25.0 / 3.0),
+        "max_m": 9.0,
+        "nees_mean": 3.0,
+        "nees_end_mean": 20.0,
+        "inside_end": 1.0 / 3.0,
+        "inside_track": 0.5,
+        "nis_dvl": 1.5,
+        "misalignment_mean_deg": 2.0,
+        "misalignment_sd_deg": math.sqrt(25.0 / 3.0),
+        "misalignment_error_mean_deg": 2.0 / 3.0,
+        "misalignment_error_rms_deg": math.sqrt(2.0 / 3.0),
+        "cpu_per_s": 0.2,
+    }
+    assert row[list(wanted)].to_dict() == pytest.approx(wanted)
+    assert row["nees_end_band"] == "above"
+
+
+@pytest.mark.parametrize("count", [1, 3, 30])
+def test_the_band_of_the_mean_nees_is_that_of_chi_square(count):
+    assert nees_band(count) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 2 * count) / count))
+
+
+BAD = {
+    "neither log nor scenario": [],
+    "both": ["log.csv", "--scenario", "circle"],
+    "a log without a reference": ["log.csv"],
+    "a reference for a scenario": ["--scenario", "circle", "--reference", "truth.csv"],
+    "no seeds": ["--scenario", "circle", "--seeds", 0],
+    "fewer than no seeds": ["--scenario", "circle", "--seeds", -3],
+    "an unknown scenario": ["--scenario", "cirle"],
+    "an unknown estimator": ["--scenario", "circle", "--estimators", "graph-smothed-a"],
+    "no estimator": ["--scenario", "circle", "--estimators", ","],
+    "no jobs": ["--scenario", "circle", "--jobs", 0],
+    "no such log": ["missing.csv", "--reference", "missing.csv"],
+    "an impossible duration": ["--scenario", "vattern", "--duration", 1],
+}
+
+
+@pytest.mark.parametrize("arguments", BAD.values(), ids=BAD)
+def test_bad_input_is_one_line_and_makes_no_folder(arguments, tmp_path, capsys):
+    assert run(*arguments, "--out", tmp_path / "out") == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_estimator_is_answered_with_all_known_ones_the_nearest_first():
+    with pytest.raises(InputError) as caught:
+        select(["graph-smothed-a"])
+    known = str(caught.value).partition("known are ")[2].split(", ")
+    assert known[0] == "graph-smoothed-a"
+    assert set(known) == set(ESTIMATORS)
+
+
+def test_results_of_workers_come_in_the_order_of_the_tasks():
+    done: list[float] = []
+    assert in_workers(math.sqrt, [float(k * k) for k in range(9)], 2, done.append) == [float(k) for k in range(9)]
+    assert done[-1] == 1.0
+
+
+def test_a_worker_that_is_killed_is_one_clear_line():
+    with pytest.raises(InputError, match="fewer --jobs"):
+        in_workers(os._exit, [1, 1], 2, lambda done: None)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes by /proc")
+def test_an_interrupt_ends_all_workers_and_leaves_nothing(tmp_path):
+    script = "from rovgraph.cli.app import main\nif __name__ == '__main__':\n    main()\n"
+    (tmp_path / "run.py").write_text(script)
+    command = [sys.executable, str(tmp_path / "run.py"), "compare", "--scenario", "circle", "--seeds", "4"]
+    process = subprocess.Popen(
+        [*command, "--jobs", "2", "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True
+    )
+    children: set[int] = set()
+    deadline = time.monotonic() + 30.0
+    while len(children) < 3 and time.monotonic() < deadline:  # two workers and what keeps count of them
+        time.sleep(0.05)
+        children = {int(p) for p in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()}
+    assert len(children) >= 3
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert [p.name for p in tmp_path.iterdir()] == ["run.py"]
+    time.sleep(0.5)
+    assert [p for p in children if Path(f"/proc/{p}").exists()] == []
