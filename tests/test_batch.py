@@ -133,7 +133,7 @@ def test_track_does_not_suffer_from_a_calibration_that_is_found(calibrated):
 def test_without_fixes_on_a_straight_line_the_misalignment_keeps_its_prior():
     # the lever arm is left out: a DVL off the origin sees a known direction in every roll
     falcon_still = falcon(dvl={"lever_arm_m": [-0.11, 0.22, -0.10]}, start={"heading_deg": 0.0})
-    case = simulated(falcon_still, 120.0, path=scenario("straight", 120.0, 0.03, Style(waves=CALM)), seed=2)
+    case = simulated(falcon_still, 120.0, path=scenario("straight", 120.0, 0.02, Style(waves=CALM)), seed=2)
     found = {c.label: c for c in smoothed(case.log, case.config).calibration}["dvl_yaw"]
     assert found.prior_sd == pytest.approx(5 * DEG)
     assert 0.7 * found.prior_sd < found.sd < found.prior_sd
@@ -195,10 +195,10 @@ def with_outliers(log: Log, share: float, seed: int) -> Log:
 
 @pytest.mark.parametrize("calibration", [{}, HELD], ids=["estimated", "held"])
 def test_a_fifth_of_gross_outliers_costs_at_most_half_of_the_accuracy(calibration):
-    """Over three dives: in one alone, an error that is small by chance would be the measure."""
+    """Over ten dives: in a few, an error that is small by chance would be the measure."""
     clean, spoilt = [], []
-    for seed in (1, 2, 3):
-        case = simulated(falcon(calibration=calibration), 80.0, seed=seed)
+    for seed in range(1, 11):
+        case = simulated(falcon(calibration=calibration), 60.0, seed=seed)
         for errors, log in ((clean, case.log), (spoilt, with_outliers(case.log, 0.2, seed))):
             errors.append(rms(position_errors(smoothed(log, case.config).trajectory, case)))
     assert rms(np.array(spoilt)) < 1.5 * rms(np.array(clean))
