@@ -20,6 +20,7 @@ from rovgraph.errors import InputError
 from rovgraph.estimators.dive import assemble, run
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.kalman import FILTERS, Filter, run_filter
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.log import Log
 
@@ -41,11 +42,13 @@ class Named:
     Attributes
     ----------
     name : key of `ESTIMATORS`
-    family : "dead reckoning", "graph"
+    family : "dead reckoning", "thesis", "graph"
     about : one line of what it is
     headings : "a", "b", "c", or "" for those of the configuration
     misalignment : whether the DVL's misalignment is estimated
     smoothing : whether an epoch is estimated from what came after it, too
+    whitened : its residuals are normalised by the innovation's own covariance, so that their
+        squares sum to the NIS; otherwise by the measurement's alone
     stages : the chain, from `Task` to `Estimate`
     """
 
@@ -56,6 +59,7 @@ class Named:
     misalignment: bool
     smoothing: bool
     stages: tuple[Stage, ...]
+    whitened: bool = False
 
     def __call__(self, log: Log, config: Config) -> Estimate:
         """The estimate of one dive.
@@ -175,7 +179,18 @@ def filtered(batch: BatchSmoother) -> Estimate:
     return run(batch.intervals, batch.beginning, batch.beginning.config.graph.lag_s).solve()
 
 
+_LETTERS = {(True, True): "a", (False, True): "b", (True, False): "c"}  # magnetometer, compass
 _WITH = {"a": "magnetometer and DVL compass", "b": "DVL compass alone", "c": "magnetometer alone"}
+
+
+def _of_the_thesis(variant: Filter) -> Named:
+    """One of the thesis's filters, which hold calibration at its means but for what are their states."""
+
+    def filtered(task: Task) -> Estimate:
+        return run_filter(variant, task.log, task.config)
+
+    letter = _LETTERS.get((variant.magnetometer, variant.compass), "")
+    return Named(variant.name, "thesis", variant.about, letter, variant.misalignment, False, (filtered,), whitened=True)
 
 
 def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> list[Named]:
@@ -200,6 +215,7 @@ ESTIMATORS: dict[str, Named] = {
             False,
             (assembled, BatchSmoother.dead_reckoning),
         ),
+        *(_of_the_thesis(variant) for variant in FILTERS.values()),
         *_variants("graph-filtered", "graph", "factor graph, fixed lag", False, filtered),
         *_variants("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
     )

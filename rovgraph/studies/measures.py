@@ -23,8 +23,13 @@ NUMBERS = (
 )  # fmt: skip
 
 
-def measures(estimate: Estimate, case: Case) -> dict[str, Any]:
+def measures(estimate: Estimate, case: Case, whitened: bool = False) -> dict[str, Any]:
     """Every number of one estimate on one run, by the names of runs.csv's columns.
+
+    Parameters
+    ----------
+    estimate, case : what was estimated on what
+    whitened : of `rovgraph.estimators.named.Named`
 
     Raises
     ------
@@ -41,7 +46,7 @@ def measures(estimate: Estimate, case: Case) -> dict[str, Any]:
         "velocity_rms_mps": _velocity_rms(track, case.reference),
         **_end(track, case.reference),
         **_misalignment(estimate, case),
-        **_fit(estimate),
+        **_fit(estimate, whitened),
     }
 
 
@@ -94,17 +99,15 @@ def _mount_yaw(config: Config) -> float:
     return float(np.deg2rad(config.dvl.mount_rpy_deg[2]))
 
 
-def _fit(estimate: Estimate) -> dict[str, float]:
-    """Per sensor the mean NIS over its dimension, or, where that is not known, the mean square of the residuals.
+def _fit(estimate: Estimate, whitened: bool) -> dict[str, float]:
+    """Mean square of each sensor's normalised residuals, which is its mean NIS over its dimension where whitened.
 
-    Both leave out what was rejected.
+    What was rejected is left out.
     """
-    nis = estimate.summary.get("nis")
-    if nis is not None:
-        return {f"nis_{sensor}": float(value) for sensor, value in nis.items()}
+    prefix = "nis" if whitened else "fit"
     rows = estimate.residuals[estimate.residuals["weight"] > 0]
     square = rows["normalised"].astype(float).pow(2).groupby(rows["sensor"]).mean()
-    return {f"fit_{sensor}": float(value) for sensor, value in square.items()}
+    return {f"{prefix}_{sensor}": float(value) for sensor, value in square.items()}
 
 
 def misalignment_history(estimate: Estimate, case: Case) -> pd.DataFrame | None:
