@@ -1,0 +1,138 @@
+"""The error of a state as one vector, and how it moves from one estimate to another.
+
+The vector is the tangent space of `State`: pose, velocity, bias, then the calibration that
+is estimated. A Kalman filter linearises at an estimate which it then corrects. Measured in
+coordinates that turn with the correction, its errors become smaller than they are: it
+takes its own corrections of heading, misalignment and hard iron for knowledge (Huang,
+Mourikis and Roumeliotis 2010). An invariant filter chooses coordinates that stay (Barrau
+and Bonnabel 2017). Here these are attitude and position in n, and for one variable of each
+instrument the error of **what that instrument sees**: of velocity as the DVL sees it, of
+hard iron as the field that the magnetometer sees, of a compass offset as the heading it
+shows. A measurement of it is linear in them whatever heading and mounting are, so
+correcting it teaches nothing about those. `ErrorVector.retract` and `ErrorVector.local`
+move along these coordinates and give the change of basis of the tangent space.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from rovgraph.calibration import TABLE
+from rovgraph.geometry import Array, exp_rotation, log_rotation, rotate, transpose
+from rovgraph.instruments import Instrument
+from rovgraph.sensors import innovation
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, stack_states
+
+# the variable that each instrument sees directly: its model is linear in it
+SEEN = {"dvl": VELOCITY, "mag": "hard_iron", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
+_NO_RATE = np.zeros((2, 3))
+
+
+class ErrorVector:
+    """Layout and geometry of the error of a state of one epoch.
+
+    Parameters
+    ----------
+    estimated : names of the calibration variables that are estimated
+    instruments : the sensors in use, by stream
+
+    Attributes
+    ----------
+    columns : variable -> slice of the vector
+    size : length of the vector
+    """
+
+    def __init__(self, estimated: Iterable[str], instruments: Mapping[str, Instrument]) -> None:
+        self._estimated = tuple(estimated)
+        sizes = DIMENSION | {name: TABLE[name].dim for name in self._estimated}
+        ends = np.cumsum(list(sizes.values())).tolist()
+        self.columns = {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
+        self.size: int = ends[-1]
+        self._seen = [
+            (instruments[sensor].model, variable, self.columns[variable])
+            for sensor, variable in SEEN.items()
+            if sensor in instruments and variable in self.columns
+        ]
+
+    def matrix(self, H: Jacobians) -> Array:
+        """Jacobians by variable as one, shape (n, dim, size); what is not estimated is left out."""
+        out = np.zeros((*next(iter(H.values())).shape[:2], self.size))
+        for name, jacobian in H.items():
+            if name in self.columns:
+                out[..., self.columns[name]] = jacobian
+        return out
+
+    def retract(self, state: State, delta: Array) -> tuple[State, Array]:
+        """The state that lies ``delta`` away.
+
+        Parameters
+        ----------
+        state : State of one epoch
+        delta : ndarray, shape (size,)
+
+        Returns
+        -------
+        state : State of one epoch
+        basis : ndarray, shape (size, size), takes an error about the old state over to the new one,
+            to first order in ``delta``
+        """
+        moved = self._straight(state, delta)
+        both, before, after = stack_states([state, moved]), self._frame(state), self._frame(moved)
+        for model, variable, columns in self._seen:
+            z, H = model.predict(both, _NO_RATE)
+            before[columns], J = self.matrix(H)
+            after[columns] = J
+            missing = innovation(model, z[0] + before[columns] @ delta, z[1])
+            moved = moved.retract(variable, np.linalg.solve(J[:, columns], missing))
+        return moved, np.asarray(np.linalg.solve(after, before))
+
+    def local(self, state: State, other: State) -> tuple[Array, Array]:
+        """The error that leads from one state to another: the inverse of `retract`.
+
+        Parameters
+        ----------
+        state, other : State of one epoch each
+
+        Returns
+        -------
+        delta : ndarray, shape (size,)
+        basis : ndarray, shape (size, size), takes an error about ``other`` over to ``state``
+        """
+        delta = self._difference(state, other)
+        both, at_state, at_other = stack_states([state, other]), self._frame(state), self._frame(other)
+        for model, _, columns in self._seen:
+            z, H = model.predict(both, _NO_RATE)
+            at_state[columns], at_other[columns] = J, _ = self.matrix(H)
+            missing = innovation(model, z[1], z[0]) - J @ delta
+            delta[columns] += np.linalg.solve(J[:, columns], missing)
+        return delta, np.asarray(np.linalg.solve(at_state, at_other))
+
+    def _straight(self, state: State, delta: Array) -> State:
+        """All variables moved by themselves."""
+        part = {name: delta[columns] for name, columns in self.columns.items()}
+        return State(
+            state.R_nb @ exp_rotation(part[POSE][None, :3]),
+            state.p_n + rotate(state.R_nb, part[POSE][3:]),
+            state.v_n + part[VELOCITY],
+            state.bias + part[BIAS],
+            {**state.calibration, **{name: state.calibration[name] + part[name] for name in self._estimated}},
+        )
+
+    def _difference(self, state: State, other: State) -> Array:
+        """The inverse of `_straight`."""
+        R_bn = transpose(state.R_nb)
+        return np.concatenate(
+            [
+                log_rotation(R_bn @ other.R_nb)[0],
+                rotate(R_bn, other.p_n - state.p_n)[0],
+                other.v_n[0] - state.v_n[0],
+                other.bias[0] - state.bias[0],
+                *(other.calibration[name] - state.calibration[name] for name in self._estimated),
+            ]
+        )
+
+    def _frame(self, state: State) -> Array:
+        """From the tangent space to the coordinates that stay; rows of what is seen are still to come."""
+        frame = np.eye(self.size)
+        frame[:3, :3] = frame[3:6, 3:6] = state.R_nb[0]
+        return frame
