@@ -90,11 +90,7 @@ def test_every_column_is_documented(compared):
 def test_every_estimator_is_documented():
     text = (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
     rows = [re.findall(r"`([^`]+)`", line.split("|")[1]) for line in text.splitlines() if line.startswith("| `")]
-    names = {
-        first if not n.startswith("-") else first.removesuffix("-a") + n
-        for first, *more in rows
-        for n in (first, *more)
-    }
+    names = {first.removesuffix("-a") + n if n.startswith("-") else n for first, *more in rows for n in (first, *more)}
     assert set(ESTIMATORS) <= names
 
 

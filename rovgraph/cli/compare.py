@@ -58,8 +58,8 @@ def compare(
     if not console.is_terminal:
         console = Console(width=WIDE)
     console.print(comparison_table(comparison, title, thesis=scenario == THESIS))
-    for row in comparison.runs.dropna(subset="error").drop_duplicates(["estimator", "error"]).itertuples():
-        console.print(f"{row.estimator} failed, first on {row.run}: {row.error}", highlight=False, markup=False)
+    for row in comparison.runs.dropna(subset="error").drop_duplicates("estimator").itertuples():
+        console.print(f"{row.estimator} failed on {row.run}: {row.error}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
 
 

@@ -119,4 +119,4 @@ def _dvl_fit(row: "pd.Series[Any]") -> str:
 def _misalignment(row: "pd.Series[Any]") -> str:
     mean, error = row.get("misalignment_mean_deg", float("nan")), row.get("misalignment_error_mean_deg", float("nan"))
     value = mean if pd.isna(error) else error
-    return "" if pd.isna(value) else f"{_number(value)} ± {row['misalignment_sd_deg']:.2g}"
+    return "" if pd.isna(value) else f"{value:.2f} ± {row['misalignment_sd_deg']:.2g}"
