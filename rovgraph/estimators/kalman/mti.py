@@ -10,7 +10,6 @@ once; at 100 Hz that costs more than the filter itself. A test holds the two tog
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.errors import InputError
 from rovgraph.estimators.kalman.core import Linearized, Quadratic
 from rovgraph.estimators.kalman.known import KnownMotion
 from rovgraph.estimators.kalman.processes import Layout, centripetal, length
@@ -24,18 +23,9 @@ _EYE = np.eye(3)
 
 
 def reference_field(instrument: Instrument, beliefs: dict[str, Belief]) -> Array:
-    """Direction of the field in n that the thesis's filters hold fixed, shape (3,).
-
-    Raises
-    ------
-    InputError : the configuration gives the magnetometer a deviation curve
-    """
+    """Direction of the field in n that the thesis's filters hold fixed, shape (3,)."""
     model = instrument.model
     assert isinstance(model, MagneticField)
-    if beliefs["mag_deviation"].mean.any():
-        raise InputError(
-            "calibration.mag_deviation.mean_deg: the thesis's filters know no deviation curve, set it to 0"
-        )
     offset, dip = beliefs["mag_offset"].mean[0], beliefs["field_dip"].mean[0]
     return field_direction(model.declination - offset, model.dip + dip)
 

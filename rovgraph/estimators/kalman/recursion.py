@@ -166,6 +166,8 @@ class Recursion:
         residual, self.x, self.P, normalised, sd = iterated_update(
             self.x, self.P, innovate, R, self.setup.variant.iterations
         )
+        if not math.isfinite(self.x @ self.x):
+            raise FloatingPointError("the state is not finite")
         if self._quaternion is not None:
             q = self.x[self._quaternion]
             q *= 1.0 / math.sqrt(q @ q)

@@ -50,7 +50,7 @@ def run_filter(which: str | Filter, log: Log, config: Config, truth: Trajectory 
 
 def _named(name: str) -> Filter:
     if name not in FILTERS:
-        near = difflib.get_close_matches(name, FILTERS, 1)
+        near = difflib.get_close_matches(name.lower(), FILTERS, 1)
         hint = f", did you mean {near[0]}?" if near else ""
         raise InputError(f"unknown filter {name!r}{hint} (known: {', '.join(FILTERS)})")
     return FILTERS[name]

@@ -122,7 +122,7 @@ def prepare(variant: Filter, log: Log, config: Config) -> Setup:
 
 
 def _demand(variant: Filter, log: Log, config: Config) -> None:
-    """Refuse a log that lacks what the filter is made of, or whose IMU is silent for too long."""
+    """Refuse a log or a configuration that the filter cannot take."""
     needed = ["imu", "dvl"]
     needed += ["mag"] if variant.magnetometer else []
     needed += ["dvl_heading"] if variant.compass else []
@@ -130,6 +130,11 @@ def _demand(variant: Filter, log: Log, config: Config) -> None:
     for sensor in needed:
         if sensor not in log:
             raise InputError(f"{log.source}: filter {variant.name} needs {_NEEDED[sensor]}, the log has none")
+    if variant.magnetometer and beliefs(config)["mag_deviation"].mean.any():
+        raise InputError(
+            f"calibration.mag_deviation.mean_deg: filter {variant.name} knows no deviation curve of the magnetometer; "
+            "set it to 0"
+        )
     time = log["imu"].time
     gaps = np.diff(time)
     if len(gaps) and gaps.max() > config.imu.max_gap_s:
@@ -220,7 +225,8 @@ def _start(places: Layout, numbers: Numbers, beginning: Beginning, priors: dict[
     for name, place in places.items():
         x[place] = mean.get(name, 0.0)
         if name == "q":
-            P[place, place] = by_angle @ R_nb.T @ np.diag(start.rpy_sd**2) @ R_nb @ by_angle.T
+            root = by_angle @ R_nb.T * start.rpy_sd
+            P[place, place] = root @ root.T
         else:
             P[place, place] = np.diag(np.broadcast_to(np.asarray(variance[name]), (3,)))
     return x, P
