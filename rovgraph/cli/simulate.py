@@ -13,14 +13,42 @@ LIMIT_S = 6 * 3600.0  # of a dive's duration: beyond it the log outgrows the mem
 
 def simulate(
     scenario: Annotated[
-        str, typer.Argument(help="falcon, lawnmower, square, circle, figure8, straight or vattern.", show_default=False)
+        str,
+        typer.Argument(
+            help="Driven through thrusters: vattern, docking, excited, tank, stationary. "
+            "Motions as such: falcon, lawnmower, square, circle, figure8, straight.",
+            show_default=False,
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder to make.", show_default=False)],
     seed: Annotated[int, typer.Option(min=0, help="Seed: the same one gives the same dive.")] = 1,
     duration: Annotated[float | None, typer.Option(help="Duration in seconds; default: the scenario's own.")] = None,
     speed: Annotated[float | None, typer.Option(help="Speed in m/s; default: the scenario's own.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Configuration (YAML) of vehicle and sensors.")] = None,
+    variant: Annotated[
+        str | None,
+        typer.Option(
+            help="Of vattern: run 1, 2 or 3, default by the seed; of tank: raw, calibrated; of stationary: land, water."
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration (YAML); default: the thesis's Falcon where thrusters drive, else defaults."),
+    ] = None,
+    current: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Current, north and east in m/s; default: drawn.", metavar="NORTH EAST", show_default=False),
+    ] = None,
+    disturbances: Annotated[
+        bool | None,
+        typer.Option(
+            "--disturbances/--no-disturbances", help="Iron on the seabed; default: in a lake.", show_default=False
+        ),
+    ] = None,
     outliers: Annotated[float, typer.Option(help="Share of DVL pings that are wrong, 0 to 1.")] = 0.0,
+    dropout: Annotated[
+        list[str] | None,
+        typer.Option(help="No bottom lock from a second to another, as 100:130; may be repeated.", metavar="FROM:TO"),
+    ] = None,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Noise, biases and drawn calibration.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an older folder.")] = False,
 ) -> None:
@@ -28,10 +56,8 @@ def simulate(
 
     What the configuration says to estimate (calibration, biases) is drawn from its priors.
 
-    Example: rovgraph simulate falcon --seed 7 --out dive
+    Example: rovgraph simulate vattern --seed 7 --out dive
     """
-    import numpy as np
-
     from rovgraph import simulate as library
     from rovgraph.config import load_config
     from rovgraph.errors import InputError
@@ -41,14 +67,27 @@ def simulate(
     check_writable(out, force)
     if duration is not None and duration > LIMIT_S:
         raise InputError(f"duration of {duration} s: at most {LIMIT_S:.0f} s")
-    effective = load_config(config)
-    path = library.scenario(scenario, duration, speed)
-    truth = library.Truth(effective, noise=noise, outlier_share=outliers)
-    dive = library.simulate(path, truth, np.random.default_rng(seed))
-    origin = {"scenario": scenario, "seed": seed, "speed_mps": speed, "outlier_share": outliers, "noise": noise}
+    given = None if config is None else load_config(config)
+    dropouts = tuple(_interval(text) for text in dropout or ())
+    choices = library.Choices(duration, speed, variant, current, disturbances, outliers, dropouts, noise)
+    dive, believed = library.simulated(scenario, seed, given, choices)
     with results_folder(out, force) as folder:
-        write_dive(folder, dive, effective, {**STAMP, **origin})
+        write_dive(folder, dive, believed, {**STAMP, "scenario": scenario, "seed": seed, **choices.told()})
     _show(out, scenario, seed, figures(dive), dive)
+
+
+def _interval(text: str) -> tuple[float, float]:
+    """From and to [s] of ``FROM:TO``."""
+    from rovgraph.errors import InputError
+
+    begin, _, end = text.partition(":")
+    try:
+        interval = float(begin), float(end)
+    except ValueError:
+        interval = (float("nan"), float("nan"))
+    if not 0.0 <= interval[0] < interval[1]:
+        raise InputError(f"--dropout {text}: two times in seconds are expected, as 100:130")
+    return interval
 
 
 def _show(out: Path, scenario: str, seed: int, figures: dict[str, Any], dive: "Dive") -> None:

@@ -12,9 +12,12 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import mount_matrix
-from rovgraph.geometry import Array, rpy_from_matrix, wrap_angle
+from rovgraph.geometry import Array, rotate, rpy_from_matrix, transpose, wrap_angle
 from rovgraph.instruments import instruments
+from rovgraph.sensors import field_direction
 from rovgraph.simulate.imu import specific_force_and_rate, to_imu_axes, walk, white
+from rovgraph.simulate.magnetism import compass_turn
+from rovgraph.simulate.noise import correlated, remembered
 from rovgraph.simulate.path import Motion, Path
 from rovgraph.simulate.truth import Truth
 from rovgraph.state import State
@@ -36,7 +39,8 @@ class Dive:
     log_frame : the log, sparse and wide, columns of the log's contract, sorted by time
     truth : Trajectory at the IMU's epochs, without uncertainty
     hidden : "calibration": name -> ndarray, shape (dim,); "bias": ndarray, shape (n, 6), at
-        the epochs of ``truth``; "start_offset": ndarray, shape (3,) [m]
+        the epochs of ``truth``; "start_offset": ndarray, shape (3,) [m]; "world": name -> ndarray,
+        what else is so and an estimator must not know
     path : the path that was followed
     """
 
@@ -65,11 +69,22 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
     sample = _Sampler(truth, calibration, rng)
     frames = [_inertial(sample, motion, bias), _pings(sample, path)]
-    frames += [f for make in (_depths, _attitudes, _fixes) if (f := make(sample, path)) is not None]
+    frames += [f for make in (_depths, _attitudes, _fixes, _signals) if (f := make(sample, path)) is not None]
     log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
-    hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset}
+    hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
     return Dive(log, Trajectory.certain(time, motion.p_n, motion.R_nb, motion.v_n), hidden, path)
+
+
+def _world(truth: Truth) -> dict[str, Any]:
+    """What is magnetic about the truth beside its calibration."""
+    iron, distortion = truth.magnetism.iron, truth.magnetism.distortion
+    world: dict[str, Any] = {}
+    if len(iron.p_n):
+        world |= {"iron_p_n": iron.p_n, "iron_moment_n": iron.moment_n}
+    if distortion is not None:
+        world |= {"mag_scale": distortion.scale, "mag_offset": distortion.offset}
+    return world
 
 
 class _Sampler:
@@ -78,12 +93,39 @@ class _Sampler:
     def __init__(self, truth: Truth, calibration: Mapping[str, Array], rng: np.random.Generator) -> None:
         self.truth, self.calibration, self.rng = truth, calibration, rng
         self.instruments = instruments(truth.config)
+        self.covariances = truth.covariances if truth.noise else None
 
     def exact(self, sensor: str, motion: Motion) -> Array:
         """The measurement without noise, shape (n, dim)."""
         zero = np.zeros((len(motion), 6))
         state = State(motion.R_nb, motion.p_n, motion.v_n, zero, self.calibration)
-        return self.instruments[sensor].model.predict(state, motion.w_b)[0]
+        z = self.instruments[sensor].model.predict(state, motion.w_b)[0]
+        return self._disturbed(sensor, motion, z) if len(self.truth.magnetism.iron.p_n) else z
+
+    def _disturbed(self, sensor: str, motion: Motion, z: Array) -> Array:
+        """The measurement of a magnetic sensor among iron."""
+        config = self.truth.config
+        arm = config.dvl.lever_arm_m if sensor == "dvl_heading" else config.imu.lever_arm_m
+        iron_n = self.truth.magnetism.iron.field(motion.p_n + rotate(motion.R_nb, arm))
+        if sensor == "mag":
+            R_sb = mount_matrix(config.imu.mount_rpy_deg).T
+            return z + self.magnitude * rotate(R_sb, rotate(transpose(motion.R_nb), iron_n))
+        if sensor in ("ahrs", "dvl_heading"):
+            return wrap_angle(z - compass_turn(self.field_n, iron_n)[:, None])
+        return z
+
+    @property
+    def magnitude(self) -> float:
+        """Magnitude of the field that is believed, the unit of the magnetometer's samples."""
+        norm = self.truth.config.environment.field_norm
+        return 1.0 if norm is None else norm
+
+    @property
+    def field_n(self) -> Array:
+        """The Earth's field where the dive is, as a fraction of the one believed; shape (3,)."""
+        model: Any = self.instruments["mag"].model
+        dip = model.dip + self.calibration["field_dip"][0]
+        return np.asarray((1.0 + self.calibration["field_scale"][0]) * field_direction(model.declination, dip))
 
     def noisy(self, sensor: str, motion: Motion) -> Array:
         """The measurement with the noise of the configuration, shape (n, dim)."""
@@ -113,11 +155,21 @@ def _frame(time: Array, columns: list[str], values: Array) -> pd.DataFrame:
 
 def _inertial(sample: _Sampler, motion: Motion, bias: Array) -> pd.DataFrame:
     """Accelerometer, gyro and magnetometer, one row per sample."""
-    truth = sample.truth
+    truth, rng, n = sample.truth, sample.rng, len(motion)
     values = to_imu_axes(specific_force_and_rate(motion, truth.config) + bias, truth.config)
-    if truth.noise:
-        values = values + white(truth.config.imu.noise, truth.imu_rate, len(motion), sample.rng)
-    return _frame(motion.time, IMU_COLUMNS + MAG_COLUMNS, np.hstack([values, sample.noisy("mag", motion)]))
+    if truth.vibration is not None:
+        values[:, :3] += truth.vibration.at(motion.time, rng)
+    if sample.covariances is None:
+        if truth.noise:
+            values = values + white(truth.config.imu.noise, truth.imu_rate, n, rng)
+        field = sample.noisy("mag", motion)
+    else:
+        at_this_rate = sample.covariances.imu * (truth.imu_rate / sample.covariances.imu_rate)
+        noise = correlated(at_this_rate, n, rng)
+        values, field = values + noise[:, :6], sample.exact("mag", motion) + sample.magnitude * noise[:, 6:]
+    if truth.magnetism.distortion is not None:
+        field = truth.magnetism.distortion.raw(field)
+    return _frame(motion.time, IMU_COLUMNS + MAG_COLUMNS, np.hstack([values, field]))
 
 
 def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
@@ -125,9 +177,13 @@ def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
     truth, rng = sample.truth, sample.rng
     motion = path.motion(sample.epochs(path, 1.0 / truth.dvl_rate, truth.dvl_jitter))
     velocity = sample.exact("dvl", motion)
-    speed = np.linalg.norm(velocity, axis=1)[:, None]
-    sd = np.hypot(sample.instruments["dvl"].sd, truth.config.dvl.scale_sd * speed)
-    velocity = velocity + sample.noise(sd, velocity.shape)
+    if sample.covariances is None:
+        noise, speed = None, np.linalg.norm(velocity, axis=1)[:, None]
+        sd = np.hypot(sample.instruments["dvl"].sd, truth.config.dvl.scale_sd * speed)
+        velocity = velocity + sample.noise(sd, velocity.shape)
+    else:
+        noise = correlated(sample.covariances.dvl, len(motion), rng)
+        velocity = velocity + noise[:, :3]
     wrong = (rng.uniform(size=len(motion)) < truth.outlier_share) & truth.noise
     velocity[wrong] += truth.outlier_size * rng.standard_normal((int(wrong.sum()), 3))
     frame = _frame(motion.time, DVL_COLUMNS, velocity)
@@ -136,7 +192,11 @@ def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
         lost |= (motion.time >= begin) & (motion.time <= end)
     frame.loc[lost, DVL_COLUMNS] = np.nan
     frame["dvl_valid"] = pd.array(np.where(lost, 0, 1), dtype="Int64")
-    frame["dvl_heading"] = sample.noisy("dvl_heading", motion)[:, 0]
+    if noise is None:
+        heading = sample.noisy("dvl_heading", motion)
+    else:
+        heading = wrap_angle(sample.exact("dvl_heading", motion) + noise[:, 3:])
+    frame["dvl_heading"] = heading[:, 0]
     return frame
 
 
@@ -149,12 +209,16 @@ def _depths(sample: _Sampler, path: Path) -> pd.DataFrame | None:
 
 def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
     """The inertial unit's own fused attitude: roll and pitch of its axes, a compass heading."""
-    if sample.truth.ahrs_rate is None:
+    truth = sample.truth
+    if truth.ahrs_rate is None:
         return None
-    motion = path.motion(sample.epochs(path, 1.0 / sample.truth.ahrs_rate))
-    tilt = rpy_from_matrix(motion.R_nb @ mount_matrix(sample.truth.config.imu.mount_rpy_deg))[:, :2]
-    tilt = wrap_angle(tilt + sample.noise(AHRS_TILT_SD, tilt.shape))
-    return _frame(motion.time, ["ahrs_roll", "ahrs_pitch", "ahrs_yaw"], np.hstack([tilt, sample.noisy("ahrs", motion)]))
+    motion = path.motion(sample.epochs(path, 1.0 / truth.ahrs_rate))
+    memory = truth.ahrs_memory * truth.ahrs_rate
+    tilt = rpy_from_matrix(motion.R_nb @ mount_matrix(truth.config.imu.mount_rpy_deg))[:, :2]
+    tilt = tilt + remembered(sample.noise(AHRS_TILT_SD, tilt.shape), memory)
+    yaw = sample.exact("ahrs", motion)
+    yaw = yaw + remembered(sample.noise(sample.instruments["ahrs"].sd, yaw.shape), memory)
+    return _frame(motion.time, ["ahrs_roll", "ahrs_pitch", "ahrs_yaw"], wrap_angle(np.hstack([tilt, yaw])))
 
 
 def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
@@ -162,3 +226,11 @@ def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
         return None
     motion = path.motion(sample.epochs(path, sample.truth.fix_interval))
     return _frame(motion.time, ["fix_north", "fix_east"], sample.noisy("fix", motion))
+
+
+def _signals(sample: _Sampler, path: Path) -> pd.DataFrame | None:
+    """Drive signals of the thrusters, as they were given."""
+    if path.thrusters is None:
+        return None
+    signals = np.round(path.thrusters.signals, 2)
+    return _frame(path.thrusters.time, [f"thruster_{i + 1}" for i in range(signals.shape[1])], signals)

@@ -15,7 +15,18 @@ from rovgraph.config import Config, Mag
 from rovgraph.simulate.dive import Dive
 
 TRUTH_RATE = 10.0  # rows per second of truth.csv
-DECIMALS = {"time": 4, "acc": 4, "gyr": 5, "mag": 4, "ahrs": 5, "dvl": 4, "dvl_heading": 5, "depth": 3, "fix": 3}
+DECIMALS = {
+    "time": 4,
+    "acc": 4,
+    "gyr": 5,
+    "mag": 4,
+    "ahrs": 5,
+    "dvl": 4,
+    "dvl_heading": 5,
+    "depth": 3,
+    "fix": 3,
+    "thruster": 2,
+}
 
 
 def write_dive(folder: Path, dive: Dive, config: Config, summary: dict[str, Any]) -> None:
@@ -63,6 +74,7 @@ def secrets(dive: Dive) -> dict[str, Any]:
         "bias_first": dive.hidden["bias"][0].tolist(),
         "bias_last": dive.hidden["bias"][-1].tolist(),
         "start_offset_m": dive.hidden["start_offset"].tolist(),
+        **{name: np.asarray(value).tolist() for name, value in dive.hidden["world"].items()},
     }
 
 
@@ -70,7 +82,7 @@ def figures(dive: Dive) -> dict[str, Any]:
     """Length of the dive and number of measurements of each sensor."""
     log = dive.log_frame
     first = {"imu": "acc_x", "dvl": "dvl_vx", "dvl_heading": "dvl_heading", "mag": "mag_x", "depth": "depth"}
-    first |= {"ahrs": "ahrs_yaw", "fix": "fix_north"}
+    first |= {"ahrs": "ahrs_yaw", "fix": "fix_north", "thruster": "thruster_1"}
     counts = {sensor: int(log[c].notna().sum()) for sensor, c in first.items() if c in log}
     moved = dive.truth.p_n.max(axis=0) - dive.truth.p_n.min(axis=0)
     return {

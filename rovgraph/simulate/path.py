@@ -77,6 +77,20 @@ CALM = Waves(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
+class Thrusters:
+    """Drive signals of the thrusters, each held until the next.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,) [s]
+    signals : ndarray, shape (n, m) [percent]
+    """
+
+    time: Array
+    signals: Array
+
+
+@dataclass(frozen=True)
 class Path:
     """Smooth motion of the body's origin from time 0 to ``duration``.
 
@@ -85,25 +99,30 @@ class Path:
     spline : quintic spline of (north, east, down, roll, pitch, yaw) over time
     duration : [s]
     offset_n : ndarray, shape (3,), added to the spline's positions [m]
+    thrusters : what drove it, None = nothing did, it is a motion as such
     """
 
     spline: BSpline
     duration: float
     offset_n: Array = field(default_factory=lambda: np.zeros(3))
+    thrusters: Thrusters | None = None
 
     @staticmethod
-    def through(time: Array, p_n: Array, rpy: Array) -> "Path":
-        """The path through given positions and attitudes, at rest at both ends.
+    def through(time: Array, p_n: Array, rpy: Array, rest: bool = True, thrusters: Thrusters | None = None) -> "Path":
+        """The path through given positions and attitudes.
 
         Parameters
         ----------
         time : ndarray, shape (n,) [s], increasing from 0, n >= 6
         p_n : ndarray, shape (n, 3) [m]
         rpy : ndarray, shape (n, 3) [rad], yaw unwrapped
+        rest : it is at rest at both ends; otherwise the ends are like what is next to them
+        thrusters : what drove it
         """
-        rest = [(1, np.zeros(6)), (2, np.zeros(6))]
-        spline = make_interp_spline(time, np.hstack([p_n, rpy]), k=5, bc_type=(rest, rest))
-        return Path(spline, float(time[-1]))
+        still = [(1, np.zeros(6)), (2, np.zeros(6))]
+        ends = (still, still) if rest else None
+        spline = make_interp_spline(time, np.hstack([p_n, rpy]), k=5, bc_type=ends)
+        return Path(spline, float(time[-1]), thrusters=thrusters)
 
     def shifted(self, offset_n: ArrayLike) -> "Path":
         """The same path begun elsewhere; ``offset_n`` has shape (3,) [m]."""

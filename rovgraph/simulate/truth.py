@@ -9,6 +9,8 @@ import numpy as np
 from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.simulate.magnetism import UNDISTURBED, Magnetism
+from rovgraph.simulate.noise import Covariances, Vibration
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,10 @@ class Truth:
     dvl_jitter : intervals between pings vary by up to this share
     depth_rate, ahrs_rate : [Hz], None = no such sensor
     fix_interval : [s], None = no fixes
+    covariances : noise of IMU, magnetometer, DVL and its compass instead of the configuration's
+    vibration : a line in the accelerometer's spectrum
+    magnetism : iron around the vehicle, an uncalibrated magnetometer
+    ahrs_memory : correlation time of the errors of the unit's own attitude [s]
     outlier_share : part of the pings that are wrong
     outlier_size : sd of the error of a wrong ping, every component [m/s]
     dropouts : intervals (from, to) [s] without bottom lock
@@ -45,6 +51,10 @@ class Truth:
     depth_rate: float | None = 5.0
     ahrs_rate: float | None = None
     fix_interval: float | None = None
+    covariances: Covariances | None = None
+    vibration: Vibration | None = None
+    magnetism: Magnetism = UNDISTURBED
+    ahrs_memory: float = 0.0
     outlier_share: float = 0.0
     outlier_size: float = 0.5
     dropouts: tuple[tuple[float, float], ...] = ()

@@ -1,0 +1,62 @@
+"""What a person may choose of a simulated dive beside its scenario and seed."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from rovgraph.errors import InputError
+
+EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances"})
+
+
+@dataclass(frozen=True)
+class Choices:
+    """None = the scenario's own.
+
+    Attributes
+    ----------
+    duration : [s]
+    speed : [m/s]
+    variant : one of the scenario's variants
+    current : north, east [m/s]
+    disturbances : iron on the seabed
+    outliers : share of DVL pings that are wrong, 0 to 1
+    dropouts : intervals (from, to) [s] without bottom lock
+    noise : noise, biases, and everything about vehicle and sensors that is drawn
+    """
+
+    duration: float | None = None
+    speed: float | None = None
+    variant: str | None = None
+    current: tuple[float, float] | None = None
+    disturbances: bool | None = None
+    outliers: float = 0.0
+    dropouts: tuple[tuple[float, float], ...] = ()
+    noise: bool = True
+
+    def told(self) -> dict[str, Any]:
+        """What ``summary.json`` says: the common ones always, the others where something was chosen."""
+        common = {"speed_mps": self.speed, "outlier_share": self.outliers, "noise": self.noise}
+        others = {name: getattr(self, name) for name in ("variant", "current", "disturbances")}
+        others["dropouts"] = self.dropouts or None
+        return common | {name: value for name, value in others.items() if value is not None}
+
+    def require(self, scenario: str, known: frozenset[str], variants: tuple[str, ...] = ()) -> None:
+        """Refuse what a scenario cannot give.
+
+        Parameters
+        ----------
+        scenario : its name
+        known : names of the choices it has, beside those that all have
+        variants : that it has
+
+        Raises
+        ------
+        InputError : a choice or a variant that the scenario does not have
+        """
+        default: Any = Choices()
+        for name in (f.name for f in fields(self)):
+            if name not in EVERYWHERE | known and getattr(self, name) != getattr(default, name):
+                has = f"it has {', '.join(sorted(known))}" if known else "it has none of its own"
+                raise InputError(f"scenario {scenario}: no choice of {name}; {has}")
+        if self.variant is not None and self.variant not in variants:
+            raise InputError(f"scenario {scenario}: no variant {self.variant!r}; it has {', '.join(variants)}")

@@ -1,0 +1,76 @@
+"""A dive by the name of its scenario, with the configuration that an estimator may know."""
+
+import difflib
+from dataclasses import replace
+from importlib.resources import files
+
+import numpy as np
+
+from rovgraph.config import Config, parse_config
+from rovgraph.errors import InputError
+from rovgraph.simulate.choices import Choices
+from rovgraph.simulate.dive import Dive, simulate
+from rovgraph.simulate.driven_scenarios import DRIVEN
+from rovgraph.simulate.files import known
+from rovgraph.simulate.magnetism import Magnetism, iron_near
+from rovgraph.simulate.path import Path
+from rovgraph.simulate.scenario import SCENARIOS, scenario
+from rovgraph.simulate.truth import Truth
+from rovgraph.simulate.worlds import World
+
+NAMES = tuple(dict.fromkeys([*SCENARIOS, *DRIVEN]))
+_KINEMATIC = frozenset({"duration", "speed"})
+_OWN = Choices()
+
+
+def simulated(name: str, seed: int, config: Config | None = None, choices: Choices = _OWN) -> tuple[Dive, Config]:
+    """A dive of a scenario.
+
+    The scenarios of `DRIVEN` are driven through the thrusters and have the thesis's sensors;
+    the others are motions as such, with the noise of the configuration.
+
+    Parameters
+    ----------
+    name : one of `NAMES`
+    seed : the same one gives the same dive
+    config : vehicle, sensors and what is believed of them; None = the thesis's Falcon for a
+        scenario that is driven, all defaults for another
+    choices : Choices
+
+    Returns
+    -------
+    Dive, and the Config that an estimator may know: with the planned start
+
+    Raises
+    ------
+    InputError : no such scenario, or a choice that it does not have
+    """
+    if name not in NAMES:
+        near = difflib.get_close_matches(name, NAMES, 1)
+        hint = f", did you mean {near[0]}?" if near else ""
+        raise InputError(f"unknown scenario {name!r}{hint} (known: {', '.join(sorted(NAMES))})")
+    if name in DRIVEN:
+        driven = DRIVEN[name]
+        choices.require(name, driven.choices, driven.variants)
+        config = falcon() if config is None else config
+        path, truth = driven.make(World.drawn(config, choices, seed))
+    else:
+        choices.require(name, _KINEMATIC)
+        config = Config() if config is None else config
+        path = scenario(name, choices.duration, choices.speed)
+        truth = _kinematic(path, config, choices, seed)
+    dive = simulate(path, truth, np.random.default_rng(seed))
+    return dive, known(dive, config)
+
+
+def _kinematic(path: Path, config: Config, choices: Choices, seed: int) -> Truth:
+    """What the sensors obey in a dive that nothing drives."""
+    truth = Truth(config, noise=choices.noise, outlier_share=choices.outliers, dropouts=choices.dropouts)
+    if not choices.disturbances:
+        return truth
+    return replace(truth, magnetism=Magnetism(iron_near(path, config, np.random.default_rng([seed, 1]))))
+
+
+def falcon() -> Config:
+    """The configuration of the thesis's vehicle, ``configs/falcon.yaml``."""
+    return parse_config((files("rovgraph.config") / "falcon.yaml").read_text(encoding="utf-8"), "falcon.yaml")
