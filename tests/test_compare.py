@@ -199,7 +199,7 @@ def constant(p_n: tuple[float, float, float], v_n: tuple[float, float, float], s
 def test_measures_of_a_constant_error_by_hand(recorded):
     truth = constant((0.0, 0.0, 5.0), (0.1, 0.0, 0.0), np.nan)
     estimate = Estimate("x", constant((3.0, 4.0, 9.0), (0.1, 0.2, 7.0), 2.0), [], {}, residual_frame({}, {}, {}))
-    row = measures(estimate, Case(recorded.log, recorded.config, truth))
+    row = measures(estimate, Case(recorded.log, recorded.config, truth), chain("x"))
     assert (row["end_north_m"], row["end_east_m"]) == (3.0, 4.0)
     wanted = {
         "end_m": 5.0,
@@ -217,7 +217,7 @@ def test_measures_of_a_constant_error_by_hand(recorded):
 def test_an_estimate_that_is_not_finite_is_a_failure(recorded):
     estimate = Estimate("x", constant((np.nan, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), [], {}, residual_frame({}, {}, {}))
     with pytest.raises(FloatingPointError, match="diverged"):
-        measures(estimate, recorded)
+        measures(estimate, recorded, chain("x"))
 
 
 def rows(**columns: list[object]) -> pd.DataFrame:

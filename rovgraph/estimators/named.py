@@ -18,6 +18,7 @@ from typing import Any
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import assemble, run
+from rovgraph.estimators.error_state import ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.kalman import FILTERS, Filter, run_filter
@@ -42,13 +43,13 @@ class Named:
     Attributes
     ----------
     name : key of `ESTIMATORS`
-    family : "dead reckoning", "thesis", "graph"
+    family : "dead reckoning", "thesis", "error state", "graph"
     about : one line of what it is
     headings : "a", "b", "c", or "" for those of the configuration
     misalignment : whether the DVL's misalignment is estimated
     smoothing : whether an epoch is estimated from what came after it, too
     whitened : its residuals are normalised by the innovation's own covariance, so that their
-        squares sum to the NIS; otherwise by the measurement's alone
+        squares sum to the NIS; otherwise by the measurement's noise alone
     stages : the chain, from `Task` to `Estimate`
     """
 
@@ -174,6 +175,11 @@ def assembled(task: Task) -> BatchSmoother:
     return assemble(task.log, initialise(task.log, task.config))
 
 
+def stepped(batch: BatchSmoother) -> ErrorStateFilter:
+    """The error-state filter over the same keyframes."""
+    return replay(batch.intervals, batch.beginning)
+
+
 def filtered(batch: BatchSmoother) -> Estimate:
     """The fixed-lag estimate over the same keyframes."""
     return run(batch.intervals, batch.beginning, batch.beginning.config.graph.lag_s).solve()
@@ -216,6 +222,8 @@ ESTIMATORS: dict[str, Named] = {
             (assembled, BatchSmoother.dead_reckoning),
         ),
         *(_of_the_thesis(variant) for variant in FILTERS.values()),
+        *_variants("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
+        *_variants("rts", "error state", "its Rauch-Tung-Striebel smoother", True, stepped, ErrorStateFilter.smoothed),
         *_variants("graph-filtered", "graph", "factor graph, fixed lag", False, filtered),
         *_variants("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
     )

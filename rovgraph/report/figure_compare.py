@@ -75,7 +75,9 @@ def draw_errors(table: pd.DataFrame, runs: pd.DataFrame, title: str) -> Figure:
     known = table["thesis_end_mean_m"].notna().to_numpy()
     if known.any():
         at = np.flatnonzero(known)
-        grid[0].plot(table["thesis_end_mean_m"][known], at, "x", color="black", ms=6, mew=1.3, label="as printed there")
+        grid[0].plot(
+            table["thesis_end_mean_m"][known], at, "x", color="black", ms=6, mew=1.3, zorder=5, label="as printed there"
+        )
     grid[0].set_yticks(range(len(names)), names)
     grid[0].set_ylim(len(names) - 0.4, -0.6)
     figure.suptitle(f"{title}: each dot a run, marks the mean (end) or rms over runs", x=0.01, ha="left", fontsize=9)

@@ -143,7 +143,7 @@ def _row(run: str, outcome: Outcome, case: Case) -> dict[str, Any]:
     try:
         if outcome.estimate is None:
             return {**row, "error": _reason(outcome.error)}
-        numbers = measures(outcome.estimate, case, outcome.named.whitened)
+        numbers = measures(outcome.estimate, case, outcome.named)
         return {**row, **numbers, "cpu_per_s": outcome.seconds / _recorded_s(case)}
     except Exception as error:
         return {**row, "error": _reason(error)}

@@ -11,6 +11,7 @@ import pandas as pd
 
 from rovgraph.config import Config
 from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.named import Named
 from rovgraph.evaluate import WITHIN_ELLIPSE, evaluate, normalised_error
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.studies.runs import Case
@@ -23,13 +24,12 @@ NUMBERS = (
 )  # fmt: skip
 
 
-def measures(estimate: Estimate, case: Case, whitened: bool = False) -> dict[str, Any]:
+def measures(estimate: Estimate, case: Case, named: Named) -> dict[str, Any]:
     """Every number of one estimate on one run, by the names of runs.csv's columns.
 
     Parameters
     ----------
-    estimate, case : what was estimated on what
-    whitened : of `rovgraph.estimators.named.Named`
+    estimate, case, named : what was estimated, on what, by what
 
     Raises
     ------
@@ -46,7 +46,7 @@ def measures(estimate: Estimate, case: Case, whitened: bool = False) -> dict[str
         "velocity_rms_mps": _velocity_rms(track, case.reference),
         **_end(track, case.reference),
         **_misalignment(estimate, case),
-        **_fit(estimate, whitened),
+        **_fit(estimate, named),
     }
 
 
@@ -99,12 +99,15 @@ def _mount_yaw(config: Config) -> float:
     return float(np.deg2rad(config.dvl.mount_rpy_deg[2]))
 
 
-def _fit(estimate: Estimate, whitened: bool) -> dict[str, float]:
-    """Mean square of each sensor's normalised residuals, which is its mean NIS over its dimension where whitened.
+def _fit(estimate: Estimate, named: Named) -> dict[str, float]:
+    """Per sensor the mean NIS over its dimension, or where that is not known, the mean square of the residuals.
 
     What was rejected is left out.
     """
-    prefix = "nis" if whitened else "fit"
+    stated = {} if named.smoothing else estimate.summary.get("nis", {})
+    if stated:
+        return {f"nis_{sensor}": nis["mean"] / nis["dim"] for sensor, nis in stated.items() if nis["count"]}
+    prefix = "nis" if named.whitened else "fit"
     rows = estimate.residuals[estimate.residuals["weight"] > 0]
     square = rows["normalised"].astype(float).pow(2).groupby(rows["sensor"]).mean()
     return {f"{prefix}_{sensor}": float(value) for sensor, value in square.items()}
