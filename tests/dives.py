@@ -14,8 +14,7 @@ from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning, initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
-from rovgraph.log import STREAMS, Log, Stream
-from rovgraph.log.streams import OPTIONAL
+from rovgraph.log import STREAMS, Log, Stream, log_from_frame
 from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
 from rovgraph.trajectory import Trajectory
 
@@ -43,21 +42,9 @@ def merge(into: dict[str, Any], new: Mapping[str, Any]) -> None:
             into[key] = value
 
 
-def as_log(frame: pd.DataFrame, source: str = "dive.csv") -> Log:
+def as_log(frame: pd.DataFrame) -> Log:
     """The streams of a simulated log."""
-    streams = {}
-    for sensor, columns in STREAMS.items():
-        required = [c for c in columns if c not in OPTIONAL]
-        if not set(required) <= set(frame.columns):
-            continue
-        kept = frame.dropna(subset=required)
-        data = kept.reindex(columns=list(columns)).to_numpy(float)
-        if sensor == "dvl":
-            data[:, 3] = np.nan_to_num(data[:, 3], nan=1.0)
-        if len(kept):
-            rows = kept.index.to_numpy(dtype=np.int64) + 2
-            streams[sensor] = Stream(sensor, columns, kept["time"].to_numpy(float), data, rows)
-    return Log(source, streams)
+    return log_from_frame(frame, "dive.csv")
 
 
 def without(log: Log, *sensors: str) -> Log:

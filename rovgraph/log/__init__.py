@@ -4,7 +4,7 @@
 into columns of numbers, `reading` makes streams of them. docs/log-format.md is the contract.
 """
 
-from rovgraph.log.reading import read_log
+from rovgraph.log.reading import log_from_frame, read_log
 from rovgraph.log.streams import STREAMS, Log, Measurement, Stream
 
-__all__ = ["STREAMS", "Log", "Measurement", "Stream", "read_log"]
+__all__ = ["STREAMS", "Log", "Measurement", "Stream", "log_from_frame", "read_log"]

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pymap3d
 from numpy.typing import NDArray
 
@@ -53,9 +54,30 @@ def read_log(
     -----
     DataWarning : what was left out or put in order
     """
-    table = read_table(path)
-    scale = factors(units or {}, table.source)
-    names = _names(table, columns or {})
+    return _assembled(read_table(path), columns or {}, units or {}, mag)
+
+
+def log_from_frame(frame: pd.DataFrame, source: str = "log") -> Log:
+    """A log that is in memory already, as `read_log` would read it from a file.
+
+    Parameters
+    ----------
+    frame : columns of a log under rovgraph's names, in SI
+    source : name for messages
+
+    Raises
+    ------
+    InputError : a frame that cannot be worked with
+    """
+    return _assembled(Table(source, frame, np.arange(len(frame), dtype=np.int64) + 2), {}, {}, None)
+
+
+def _assembled(
+    table: Table, columns: Mapping[str, str], units: Mapping[str, str], mag: Callable[[Array], Array] | None
+) -> Log:
+    """The streams of a table."""
+    scale = factors(units, table.source)
+    names = _names(table, columns)
     cells = {name: _finite(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
     cells, line = _in_order(cells, table.line, table.source)
     origin = _add_local_fixes(cells, line, table.source)
