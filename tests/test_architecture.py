@@ -21,7 +21,7 @@ LAYERS = (
     {"config", "log", "trajectory"},
     {"instruments"},
     {"graph"},
-    {"estimators", "simulate", "evaluate", "check"},
+    {"estimators", "simulate", "evaluate", "check", "calibrate"},
     {"studies"},
     {"report"},
     {"cli"},
@@ -152,7 +152,21 @@ print("MODULES", *sys.modules)
 """
 
 
-@pytest.mark.parametrize("command", [[], ["smooth"], ["evaluate"], ["compare"], ["check"], ["config"], ["simulate"]])
+@pytest.mark.parametrize(
+    "command",
+    [
+        [],
+        ["smooth"],
+        ["evaluate"],
+        ["compare"],
+        ["check"],
+        ["config"],
+        ["simulate"],
+        ["calibrate"],
+        ["calibrate", "magnetometer"],
+        ["calibrate", "noise"],
+    ],
+)
 def test_help_loads_nothing_heavy(command):
     done = run(HELP.format(arguments=[*command, "--help"]))
     assert done.returncode == 0, done.stderr

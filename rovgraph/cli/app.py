@@ -8,6 +8,7 @@ import warnings
 
 import typer
 
+from rovgraph.cli.calibrate import calibrate
 from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
@@ -26,6 +27,7 @@ app = typer.Typer(
 
 for _command in (smooth, evaluate, compare, check, config, simulate):
     app.command()(_command)
+app.add_typer(calibrate, name="calibrate")
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:

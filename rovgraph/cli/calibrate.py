@@ -1,0 +1,140 @@
+"""``rovgraph calibrate``: calibrations from a log of their own."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from rovgraph.calibrate import MagnetometerCalibration, NoiseReport
+
+calibrate = typer.Typer(help="Calibrate the magnetometer, or read the noise of sensors at rest.", no_args_is_help=True)
+
+LogPath = Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")]
+ConfigPath = Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")]
+OutPath = Annotated[Path, typer.Option("--out", "-o", help="results folder to make", show_default=False)]
+Force = Annotated[bool, typer.Option("--force", help="replace an older results folder")]
+
+
+class Method(StrEnum):
+    """How a magnetometer is calibrated."""
+
+    ellipsoid = "ellipsoid"
+    turns = "turns"
+
+
+@calibrate.command()
+def magnetometer(
+    log: LogPath,
+    out: OutPath,
+    config: ConfigPath = None,
+    method: Annotated[Method, typer.Option(help="turns: a turn about z and one about x")] = Method.ellipsoid,
+    force: Force = False,
+) -> None:
+    """Hard and soft iron from a log in which the vehicle was turned about all its axes.
+
+    Example: rovgraph calibrate magnetometer turned.csv --out magnetometer
+    """
+    from rich.console import Console
+
+    from rovgraph.calibrate import calibrate_magnetometer
+    from rovgraph.config import load_config
+    from rovgraph.log import read_log
+    from rovgraph.report.calibrations import write_magnetometer
+    from rovgraph.report.folder import check_writable, results_folder
+
+    check_writable(out, force)
+    settings = load_config(config)
+    found = calibrate_magnetometer(read_log(log, settings.columns, settings.units), settings, method.value)
+    with results_folder(out, force) as folder:
+        write_magnetometer(folder, found, settings)
+    console = Console()
+    console.print(_magnetometer_table(found))
+    console.print(f"for the configuration: {out / 'magnetometer.yaml'}", highlight=False, markup=False)
+
+
+@calibrate.command()
+def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = False) -> None:
+    """Noise of IMU, DVL and compasses from a log in which the vehicle stands still; waves are tolerated.
+
+    Example: rovgraph calibrate noise standing.csv --out noise
+    """
+    from rich.console import Console
+
+    from rovgraph.calibrate import calibrate_noise
+    from rovgraph.config import load_config
+    from rovgraph.log import read_log
+    from rovgraph.report.calibrations import write_noise
+    from rovgraph.report.folder import check_writable, results_folder
+
+    check_writable(out, force)
+    settings = load_config(config)
+    recorded = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
+    found = calibrate_noise(recorded, settings)
+    with results_folder(out, force) as folder:
+        write_noise(folder, found, settings)
+    console = Console()
+    for table in _noise_tables(found):
+        console.print(table)
+    for line in found.remarks:
+        console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"for the configuration: {out / 'noise.yaml'}", highlight=False, markup=False)
+
+
+def _magnetometer_table(found: "MagnetometerCalibration") -> "Table":
+    import numpy as np
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("", "", title=Text(found.source), title_justify="left", box=box.SIMPLE, show_header=False)
+    table.add_row("method, samples used", f"{found.method}, {found.used.sum()} of {len(found.used)}")
+    known = f" ± {_vector(found.centre_sd)}" if np.isfinite(found.centre_sd).all() else ""
+    table.add_row("centre (hard iron)", _vector(found.centre) + known)
+    table.add_row("radii", _vector(found.radii))
+    table.add_row("field's length", f"{found.length:.4g}")
+    lengths = [f"{100 * fit.length_rms:.2f} %" for fit in (found.before, found.after)]
+    table.add_row("its scatter, before and after", ", ".join(lengths))
+    if found.dip is not None:
+        dips = [f"{np.rad2deg(fit.dip_rms or 0.0):.2f}°" for fit in (found.before, found.after)]
+        table.add_row("dip, its scatter before and after", f"{np.rad2deg(found.dip):.1f}°, " + ", ".join(dips))
+    if found.disturbances is None:
+        table.add_row("disturbances", "not looked for: no gyro in the log")
+    for d in found.disturbances or []:
+        when = f"{d.start - found.time[0]:.1f} s to {d.end - found.time[0]:.1f} s"
+        table.add_row("disturbance", f"{when}: {_vector(d.vector)} ± {_vector(d.sd)}")
+    if found.disturbances == []:
+        table.add_row("disturbances", "none")
+    return table
+
+
+def _vector(values: object) -> str:
+    import numpy as np
+
+    return "(" + ", ".join(f"{x:.3g}" for x in np.asarray(values)) + ")"
+
+
+def _noise_tables(found: "NoiseReport") -> "list[Table]":
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    title = f"{found.source}, {found.duration:.0f} s"
+    noise = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("channel", "sd", "without lines", "density [/rtHz]", "instability", "walk [/rts]", "unit"):
+        noise.add_column(Text(heading), justify="left" if heading in ("channel", "unit") else "right", no_wrap=True)
+    for c in found.channels:
+        readings = [f"{x:.2g}" if x is not None else "–" for x in (c.allan.instability, c.allan.walk)]
+        noise.add_row(c.name, f"{c.sd:.3g}", f"{c.quiet_sd:.3g}", f"{c.allan.density:.3g}", *readings, c.unit)
+    noise.caption = "–: does not show in a log of this length"
+    lines = Table(title="lines in the spectra", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("sensor", "Hz", "rad/sample", "looks like", "rms, strongest channel"):
+        lines.add_column(heading, justify="left" if heading in ("sensor", "looks like") else "right", no_wrap=True)
+    for p in found.peaks:
+        name = max(p.rms, key=lambda n: p.rms[n] / found.channel(n).quiet_sd)
+        strongest = f"{p.rms[name]:.2g} {found.channel(name).unit} {name}"
+        lines.add_row(p.sensor, f"{p.frequency:.3f}", f"{p.rad_per_sample:.3f}", p.kind, strongest)
+    return [noise, lines] if found.peaks else [noise]
