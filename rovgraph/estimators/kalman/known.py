@@ -9,13 +9,13 @@ heading; such an attitude is far noisier than a fused one.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.log import Log
+from rovgraph.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -83,16 +83,10 @@ def _fused(log: Log, config: Config, beliefs: dict[str, Belief], level: Array) -
     tilt = np.column_stack([ahrs["ahrs_roll"], ahrs["ahrs_pitch"]])
     if np.isfinite(tilt).all():
         R_nb = matrix_from_rpy(np.column_stack([tilt, yaw])) @ R_bs.T
-        return _interpolated(ahrs.time, R_nb, imu.time)
+        nowhere = np.zeros((len(ahrs), 3))
+        return Trajectory.certain(ahrs.time, nowhere, R_nb, nowhere).at(imu.time).R_nb
     at = np.interp(imu.time, ahrs.time, np.unwrap(yaw))
     return matrix_from_rpy(np.column_stack([level, at]))
-
-
-def _interpolated(time: Array, R: Array, at: Array) -> Array:
-    """Along the shortest arc, held beyond the ends; shape (n, 3, 3)."""
-    if len(time) == 1:
-        return np.repeat(R, len(at), axis=0)
-    return np.asarray(Slerp(time, Rotation.from_matrix(R))(np.clip(at, time[0], time[-1])).as_matrix())
 
 
 def _magnetic(log: Log, config: Config, beliefs: dict[str, Belief], level: Array) -> Array:
