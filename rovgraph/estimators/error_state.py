@@ -92,6 +92,7 @@ class ErrorStateFilter:
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
+    filtered : Gaussian of each keyframe so far, from all data up to it
     """
 
     beginning: Beginning
@@ -103,8 +104,8 @@ class ErrorStateFilter:
         self.beliefs = beliefs(b.config)
         self.unknowns = unknowns(self.beliefs, b.instruments)
         self.error = ErrorVector(self.unknowns.estimated, b.instruments)
-        self._filtered: list[Gaussian] = []  # at each keyframe, from all data up to it
-        self._departed: list[Gaussian] = []  # and with what was measured before the next
+        self.filtered: list[Gaussian] = []
+        self._departed: list[Gaussian] = []  # with what was measured before the next keyframe, too
         self._steps: list[Step] = []
         self._used: dict[str, list[tuple[Attached, State, float]]] = {}
         self._tally: dict[str, Tally] = {}
@@ -119,7 +120,7 @@ class ErrorStateFilter:
 
     def latest(self) -> State:
         """The newest keyframe's state, at the IMU, calibration included."""
-        return self._filtered[-1].state
+        return self.filtered[-1].state
 
     def step(self, interval: Interval) -> None:
         """Take one interval: update, predict, update."""
@@ -127,26 +128,30 @@ class ErrorStateFilter:
             predicted = self._start()
         else:
             before = [a for a in interval.attached if a.keyframe < interval.index]
-            self._departed.append(self._update(self._filtered[-1], before))
+            self._departed.append(self._update(self.filtered[-1], before))
             predicted = self._predict(interval, self._departed[-1])
         here = [a for a in interval.attached if a.keyframe == interval.index]
-        self._filtered.append(self._update(predicted, here))
+        self.filtered.append(self._update(predicted, here))
         self.intervals.append(interval)
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""
-        return self._estimate("ekf", self._filtered)
+        return self._estimate("ekf", self.filtered)
 
     def smoothed(self) -> Estimate:
-        """The smoother's estimate of every keyframe so far.
+        """The smoother's estimate of every keyframe so far."""
+        return self._estimate("rts", self.backward())
+
+    def backward(self) -> list[Gaussian]:
+        """Every keyframe so far, from all data, before it and after.
 
         e_s = e_f + G (e_s,next - e_predicted,next), G = P_f F' P_predicted^-1, with the
         differences taken along `ErrorVector`'s coordinates.
         """
-        known = [self._filtered[-1]]
+        known = [self.filtered[-1]]
         for departed, step in zip(reversed(self._departed), reversed(self._steps), strict=True):
             known.append(self._back(departed, step, known[-1]))
-        return self._estimate("rts", known[::-1])
+        return known[::-1]
 
     def _take(self, intervals: list[Interval]) -> list[Interval]:
         for interval in intervals:
@@ -275,3 +280,11 @@ class ErrorStateFilter:
             "nis": nis,
             "bridged_intervals": sum(i.bridged for i in self.intervals),
         }
+
+
+def replay(intervals: Sequence[Interval], beginning: Beginning) -> ErrorStateFilter:
+    """A filter that has taken the intervals of a dive."""
+    estimator = ErrorStateFilter(beginning)
+    for interval in intervals:
+        estimator.step(interval)
+    return estimator
