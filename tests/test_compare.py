@@ -31,7 +31,7 @@ from rovgraph.trajectory import Trajectory
 ROOT = Path(__file__).parents[1]
 FALCON = ROOT / "configs" / "falcon.yaml"
 FEW = "graph-smoothed-misalignment,dead-reckoning,graph-smoothed-c"
-DIVES = ["--scenario", "circle", "--duration", "45", "--config", str(FALCON)]
+DIVES = ["--scenario", "circle", "--duration", "40", "--config", str(FALCON)]
 
 
 def run(*arguments: object) -> int:
@@ -105,7 +105,7 @@ def test_the_estimate_of_the_misalignment_is_compared_with_the_simulated_one(com
 
 @pytest.fixture(scope="module")
 def recorded() -> Case:
-    dive = simulated(falcon(), 45.0, path="circle")
+    dive = simulated(falcon(), 40.0, path="circle")
     return Case(dive.log, dive.config, dive.truth.every(10))
 
 
@@ -275,6 +275,7 @@ BAD = {
     "both": ["log.csv", "--scenario", "circle"],
     "a log without a reference": ["log.csv"],
     "a reference for a scenario": ["--scenario", "circle", "--reference", "truth.csv"],
+    "a duration for a log": ["log.csv", "--reference", "truth.csv", "--duration", 60],
     "no seeds": ["--scenario", "circle", "--seeds", 0],
     "fewer than no seeds": ["--scenario", "circle", "--seeds", -3],
     "an unknown scenario": ["--scenario", "cirle"],

@@ -45,7 +45,7 @@ def compare(
     names = None if estimators is None else [name.strip() for name in estimators.split(",") if name.strip()]
     select(names)
     check_writable(out, force)
-    settings = load_config(config)
+    settings = None if config is None else load_config(config)
     runs, about, title = _runs(log, reference, scenario, settings, range(first_seed, first_seed + seeds), duration)
     began = time.perf_counter()
     with progress_bar() as progress:
@@ -53,7 +53,7 @@ def compare(
     about["seconds"] = time.perf_counter() - began
     with results_folder(out, force) as folder:
         draw_comparison(folder, comparison, title)
-        write_comparison(folder, comparison, settings, about)
+        write_comparison(folder, comparison, about)
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
@@ -67,7 +67,7 @@ def _runs(
     log: Path | None,
     reference: Path | None,
     scenario: str | None,
-    settings: "Config",
+    settings: "Config | None",
     seeds: range,
     duration: float | None,
 ) -> tuple[list["Run"], dict[str, Any], str]:
@@ -79,13 +79,15 @@ def _runs(
     if scenario is not None:
         return _simulated(scenario, settings, seeds, duration, reference)
     assert log is not None
+    if duration is not None:
+        raise InputError("--duration goes with --scenario; a LOG has its own")
     if reference is None:
         raise InputError(f"{log}: a --reference (CSV with time, north, east) is needed to compare with")
     return _recorded(log, reference, settings)
 
 
 def _simulated(
-    scenario: str, settings: "Config", seeds: range, duration: float | None, reference: Path | None
+    scenario: str, settings: "Config | None", seeds: range, duration: float | None, reference: Path | None
 ) -> tuple[list["Run"], dict[str, Any], str]:
     from rovgraph.errors import InputError
     from rovgraph.studies.runs import Simulated
@@ -99,13 +101,15 @@ def _simulated(
     return runs, about, f"{scenario}, {len(seeds)} seeds"
 
 
-def _recorded(log: Path, reference: Path, settings: "Config") -> tuple[list["Run"], dict[str, Any], str]:
+def _recorded(log: Path, reference: Path, settings: "Config | None") -> tuple[list["Run"], dict[str, Any], str]:
     from rovgraph import check
+    from rovgraph.config import Config
     from rovgraph.evaluate import read_reference
     from rovgraph.log import read_log
     from rovgraph.studies.runs import Case, Recorded
 
-    recorded = read_log(log, settings.columns, settings.units)
+    settings = settings or Config()
+    recorded = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
     check.warn(recorded, settings)
     case = Case(check.without_frozen_pings(recorded), settings, read_reference(reference))
     return [Recorded(log.name, case)], {"log": str(log), "reference": str(reference)}, log.name

@@ -12,7 +12,6 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from rovgraph.config import Config
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
 from rovgraph.studies.compare import Comparison
@@ -22,14 +21,13 @@ DIGITS = "%.7g"
 MARKS = {"above": "↑", "below": "↓", "within": " "}  # of a mean NEES against its band
 
 
-def write_comparison(folder: Path, comparison: Comparison, config: Config, about: Mapping[str, Any]) -> None:
+def write_comparison(folder: Path, comparison: Comparison, about: Mapping[str, Any]) -> None:
     """Write every file but the figures.
 
     Parameters
     ----------
     folder : an existing folder, such as `results_folder` yields
     comparison : of `rovgraph.studies.compare.compare`
-    config : the configuration that the estimators were given
     about : what it was made of and how long it took, for summary.json
     """
     tables = {
@@ -41,7 +39,7 @@ def write_comparison(folder: Path, comparison: Comparison, config: Config, about
     for name, frame in tables.items():
         if len(frame):
             frame.to_csv(folder / f"{name}.csv", index=False, float_format=DIGITS)
-    (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
+    (folder / "config.yaml").write_text(comparison.config.to_yaml(), encoding="utf-8")
     failed = comparison.runs[comparison.runs["error"].notna()]
     summary = {
         **STAMP,
@@ -49,7 +47,7 @@ def write_comparison(folder: Path, comparison: Comparison, config: Config, about
         "estimators": comparison.table["estimator"].tolist(),
         "failures": failed[["run", "estimator", "error"]].to_dict("records"),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
-        "config": config.model_dump(mode="json"),
+        "config": comparison.config.model_dump(mode="json"),
     }
     text = json.dumps(to_plain(summary), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
@@ -77,8 +75,9 @@ def comparison_table(comparison: Comparison, title: str, thesis: bool) -> Table:
         table.add_row(*_cells(row, thesis))
     table.caption = (
         "end error: mean ± sd over runs. rms, heading, velocity: along the track. NEES: at the end, 2 where honest,\n"
-        "↑↓ outside the 95 % band of its mean. in 99 %: ends inside their ellipse. DVL fit: mean NIS / dimension, in ()\n"
-        "mean square of residuals. misalignment: mean error of the DVL's yaw ± stated sd. cost: processor per s of log"
+        "↑↓ outside the 95 % band of its mean. in 99 %: ends inside their ellipse. DVL fit: mean NIS / dimension,\n"
+        "in () mean square of residuals. misalignment: mean error of the DVL's yaw ± stated sd. cost: processor time\n"
+        "per second of log"
     )
     return table
 

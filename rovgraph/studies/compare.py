@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.named import Named, Outcome, outcomes, select
 from rovgraph.studies.aggregate import aggregate
@@ -37,12 +38,14 @@ class Comparison:
         sd_deg, true_deg
     velocity : of the first run, a row per estimator and epoch: estimator, time [s], v_north,
         v_east [m/s]; the reference is among the estimators
+    config : that the estimators were given on the first run
     """
 
     table: pd.DataFrame
     runs: pd.DataFrame
     misalignment: pd.DataFrame
     velocity: pd.DataFrame
+    config: Config
 
 
 @dataclass(frozen=True)
@@ -56,8 +59,9 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Result:
-    """Rows and histories of one task."""
+    """Rows and histories of one task, and the configuration of its run."""
 
+    config: Config
     rows: list[dict[str, Any]]
     misalignment: list[pd.DataFrame]
     velocity: list[pd.DataFrame]
@@ -109,7 +113,7 @@ def compare(
     rows = rows.reindex(columns=[*RUN_COLUMNS, *sorted(set(map(str, rows)) - set(RUN_COLUMNS))])
     velocity = stacked([f for r in results for f in r.velocity], ["estimator"]).drop_duplicates(ignore_index=True)
     misalignment = stacked([f for r in results for f in r.misalignment], ["run", "estimator"])
-    return Comparison(aggregate(rows, named), rows, misalignment, velocity)
+    return Comparison(aggregate(rows, named), rows, misalignment, velocity, results[0].config)
 
 
 def _sharing(estimators: Sequence[Named]) -> list[tuple[str, ...]]:
@@ -125,11 +129,12 @@ def _work(task: _Task) -> _Result:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # those of one estimator of many; what matters is in its row
         case = task.run.load()
-        result = _Result([], [], [])
-        for outcome in outcomes(select(task.names), case.log, case.config):
-            result.rows.append(_row(task.run.name, outcome, case))
-            if result.rows[-1]["error"] is None and outcome.estimate is not None:
-                _keep_histories(result, task, outcome, case)
+        result = _Result(case.config, [], [], [])
+        for group in _sharing(select(task.names)):  # what one made is forgotten before the next
+            for outcome in outcomes(select(group), case.log, case.config):
+                result.rows.append(_row(task.run.name, outcome, case))
+                if result.rows[-1]["error"] is None:
+                    _keep_histories(result, task, outcome, case)
     if task.first:
         track = velocity_history(case.reference, case.reference.time[0])
         result.velocity.append(track.assign(estimator=REFERENCE))

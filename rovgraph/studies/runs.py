@@ -4,13 +4,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import pandas as pd
 
 from rovgraph.config import Config
-from rovgraph.log import STREAMS, Log, Stream
-from rovgraph.log.streams import OPTIONAL
-from rovgraph.simulate import Truth, scenario, simulate
-from rovgraph.simulate.files import known
+from rovgraph.log import Log, log_from_frame
+from rovgraph.simulate import Choices, simulated
 from rovgraph.trajectory import Trajectory
 
 REFERENCE_RATE = 10.0  # epochs per second at which a simulated truth is compared
@@ -68,13 +65,13 @@ class Simulated:
     ----------
     scenario : key of `rovgraph.simulate.SCENARIOS`
     seed : the same one gives the same dive
-    config : of vehicle and sensors
+    config : of vehicle and sensors; None = the scenario's own
     duration : [s], None = the scenario's own
     """
 
     scenario: str
     seed: int
-    config: Config
+    config: Config | None = None
     duration: float | None = None
 
     @property
@@ -88,23 +85,7 @@ class Simulated:
         ------
         InputError : no such scenario, a duration that it cannot have
         """
-        path = scenario(self.scenario, self.duration)
-        dive = simulate(path, Truth(self.config), np.random.default_rng(self.seed))
+        dive, config = simulated(self.scenario, self.seed, self.config, Choices(duration=self.duration))
         step = max(round(1.0 / (REFERENCE_RATE * float(np.median(np.diff(dive.truth.time))))), 1)
         yaw = float(dive.hidden["calibration"]["dvl_yaw"][0])
-        return Case(log_of(dive.log_frame, self.name), known(dive, self.config), dive.truth.every(step), yaw)
-
-
-def log_of(frame: pd.DataFrame, source: str) -> Log:
-    streams = {}
-    for sensor, columns in STREAMS.items():
-        required = [c for c in columns if c not in OPTIONAL]
-        if not set(required) <= set(frame.columns):
-            continue
-        kept = frame.dropna(subset=required)
-        data = kept.reindex(columns=list(columns)).to_numpy(float)
-        if sensor == "dvl":
-            data[:, 3] = np.nan_to_num(data[:, 3], nan=1.0)
-        rows = kept.index.to_numpy(dtype=np.int64) + 2
-        streams[sensor] = Stream(sensor, columns, kept["time"].to_numpy(float), data, rows)
-    return Log(source, streams)
+        return Case(log_from_frame(dive.log_frame, self.name), config, dive.truth.every(step), yaw)
