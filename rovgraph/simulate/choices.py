@@ -1,10 +1,12 @@
 """What a person may choose of a simulated dive beside its scenario and seed."""
 
 from dataclasses import dataclass, fields
+from math import hypot
 from typing import Any
 
 from rovgraph.errors import InputError
 
+CURRENT_MAX = 1.0  # that may be chosen [m/s]
 EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances"})
 
 
@@ -51,12 +53,16 @@ class Choices:
 
         Raises
         ------
-        InputError : a choice or a variant that the scenario does not have
+        InputError : a choice or a variant that the scenario does not have, a current out of bounds
         """
         default: Any = Choices()
         for name in (f.name for f in fields(self)):
             if name not in EVERYWHERE | known and getattr(self, name) != getattr(default, name):
                 has = f"it has {', '.join(sorted(known))}" if known else "it has none of its own"
                 raise InputError(f"scenario {scenario}: no choice of {name}; {has}")
+        if self.current is not None and not hypot(*self.current) <= CURRENT_MAX:
+            raise InputError(
+                f"current of {self.current[0]:g}, {self.current[1]:g} m/s: at most {CURRENT_MAX} is expected"
+            )
         if self.variant is not None and self.variant not in variants:
             raise InputError(f"scenario {scenario}: no variant {self.variant!r}; it has {', '.join(variants)}")

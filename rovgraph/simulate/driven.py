@@ -19,6 +19,7 @@ from math import cos, sin
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.simulate.path import Path, Thrusters
 from rovgraph.simulate.sea import GRAVITY, Sea
@@ -29,6 +30,8 @@ CONTROL_S = 0.1  # between two signals
 SETTLING_S = 40.0  # driven before the log begins, so that it begins on station
 RISE_S = 0.12  # from 10 to 90 percent of a thruster's signal, below (2.22)
 LAG_S = RISE_S / 3.36  # time constant of each of two first-order lags that rise so
+
+WILDEST = 50.0  # velocity or angular rate beyond which the integration has failed [m/s, rad/s]
 
 _SUBSTEPS = round(CONTROL_S / STEP_S)
 Vector = tuple[float, ...]
@@ -71,6 +74,10 @@ def drive(vehicle: Hydrodynamics, sea: Sea, pilot: Pilot, start: ArrayLike, dura
     Returns
     -------
     Path, with the signals of its thrusters
+
+    Raises
+    ------
+    InputError : the motion leaves all bounds, as with drag too large for the mass
     """
     ticks, settling = int(np.ceil(duration / CONTROL_S - 1e-9)), round(SETTLING_S / CONTROL_S)
     time = CONTROL_S * np.arange(-settling, ticks + 1)
@@ -92,6 +99,11 @@ def drive(vehicle: Hydrodynamics, sea: Sea, pilot: Pilot, start: ArrayLike, dura
             before = before or rate
             state = tuple([x + STEP_S * (1.5 * a - 0.5 * b) for x, a, b in zip(state, rate, before, strict=True)])
             before = rate
+            if not -WILDEST < min(state[:6]) <= max(state[:6]) < WILDEST:
+                raise InputError(
+                    f"vehicle: at {now:.1f} s the motion leaves all bounds; steps of {STEP_S} s are too long "
+                    "for drag, inertia or thrust as large or small as these"
+                )
     first, last = settling * _SUBSTEPS, (settling + ticks) * _SUBSTEPS
     motion = np.array(states[first : last + 1])
     thrusters = Thrusters(np.round(time[settling:], 4), np.array(signals[settling:]))

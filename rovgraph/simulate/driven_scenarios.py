@@ -13,10 +13,11 @@ from rovgraph.simulate.magnetism import drawn_distortion
 from rovgraph.simulate.noise import Vibration
 from rovgraph.simulate.path import Path, Thrusters
 from rovgraph.simulate.route import Route
+from rovgraph.simulate.scenario import VATTERN
 from rovgraph.simulate.sea import STILL, drawn_sea
 from rovgraph.simulate.truth import Truth
 from rovgraph.simulate.worlds import REST_S, World
-from rovgraph.thesis import END_N, FAN_RAD_PER_SAMPLE, SAMPLE_S
+from rovgraph.thesis import FAN_RAD_PER_SAMPLE, SAMPLE_S
 
 RIPPLES_M = 0.005  # amplitude of the waves in the tank: a choice
 FAN_MPS2 = 0.004  # amplitude of the fan's line: a choice, clear of the white noise around it
@@ -53,9 +54,7 @@ class Run:
     pause: tuple[float, ...]
 
 
-# The route's bends and depths are choices, its end is the thesis's (4.3). Durations and the
-# highest speed, 0.6 m/s, are the thesis's; how they came about is a choice.
-BENDS = [(0, 0, 5), (8, 2, 5), (17, -6, 6), (18, -17, 7), (28, -21, 7), (34, -31, 6), (*END_N, 6)]
+# Durations and the highest speed, 0.6 m/s, are the thesis's (4.3); how they came about is a choice.
 RUNS = {
     "1": Run(0.35, 250.0, (1, 1, 1, 1, 1, 1), (0, 0, 0, 0, 0, 0, 0)),
     "2": Run(0.35, 250.0, (1, 1.7, 1, 0.8, 1.7, 0.8), (0, 0, 15, 0, 15, 0, 0)),
@@ -67,7 +66,7 @@ def _vattern(world: World) -> Made:
     """The thesis's route; which of the three runs comes with the seed."""
     choices = world.choices
     run = RUNS[choices.variant or str(world.seed % len(RUNS) + 1)]
-    route = Route.of(BENDS, run.pace, run.pause)
+    route = Route.of(VATTERN, run.pace, run.pause)
     return _followed(world, route, run.speed, run.duration)
 
 

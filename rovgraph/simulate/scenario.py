@@ -13,10 +13,12 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.simulate.path import Path, Style, moving_time, path_along
 from rovgraph.simulate.route import Route
+from rovgraph.thesis import END_N
 
 Scenario = Callable[[float | None, float | None, Style], Path]
 FASTEST = 20.0  # [m/s]
-VATTERN_END = (39.9, -33.7)  # north, east [m]: end of the thesis's reference path (4.3)
+# The thesis's route: its end is that of (4.3), bends and depths on the way are a choice
+VATTERN = [(0, 0, 5), (8, 2, 5), (17, -6, 6), (18, -17, 7), (28, -21, 7), (34, -31, 6), (*END_N, 6)]
 
 
 def scenario(name: str, duration: float | None = None, speed: float | None = None, style: Style | None = None) -> Path:
@@ -120,9 +122,8 @@ def _falcon() -> Route:
 
 
 def _vattern() -> Route:
-    """From the origin to the thesis's end point with a few bends on the way."""
-    bends = [(0, 0, 5), (8, 2, 5), (17, -6, 6), (18, -17, 7), (28, -21, 7), (34, -31, 6)]
-    return Route.of([*bends, (*VATTERN_END, 6)])
+    """From the origin to the thesis's end point."""
+    return Route.of(VATTERN)
 
 
 SCENARIOS: dict[str, Scenario] = {
