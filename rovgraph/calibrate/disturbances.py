@@ -261,7 +261,8 @@ def _kinds(offset: Array, own_sd: Array, lasting: NDArray[np.int64], least: floa
     """
     tolerance = np.clip(3.0 * np.hypot(own_sd[:, None], own_sd[None]), least, most)
     near = np.linalg.norm(offset[:, None] - offset[None], axis=2) < tolerance
-    usual = near[int(np.argmax(near @ lasting))]
+    sure = 3.0 * own_sd <= most
+    usual = near[int(np.argmax((near @ lasting) * sure))]  # a stretch that says little is near to all
     kind, count = np.zeros(len(offset), dtype=np.int64), 0
     for i in np.flatnonzero(~usual):
         goes_on = i > 0 and not usual[i - 1] and near[i, i - 1]

@@ -103,7 +103,7 @@ def fit_ellipsoid(samples: Array, source: str) -> Ellipsoid:
         worst = AXES[int(np.argmax(sd))]
         raise InputError(
             f"{source}: does not turn far enough to determine an ellipsoid, least along the IMU's {worst} axis; "
-            "turn the vehicle a full turn about each axis while logging"
+            "turn the vehicle a full turn about all three axes, or take the method of turns (one about z, one about x)"
         )
     return Ellipsoid(scale * fit.x[:3], scale * sd, _positive(matrix) / scale)
 

@@ -138,7 +138,7 @@ def calibrate_noise(log: Log, config: Config | None = None) -> NoiseReport:
         raise InputError(
             f"{log.source}: {duration:.0f} s without a gap, at least {SHORTEST_S:.0f} s are needed; an hour shows walks"
         )
-    require_still(log)
+    require_still(replace(log, streams={**log.streams, **streams}))
     channels = [channel for stream in streams.values() for channel in _channels(stream)]
     remarks: list[str] = []
     piece = _piece({c.name: c for c in channels}, config, remarks)

@@ -138,13 +138,18 @@ def _background(frequency: Array, density: Array) -> Array:
     running = np.interp(cells, edges, np.concatenate([[0.0], np.cumsum(density * step)]))
     grid = np.sqrt(cells[1:] * cells[:-1])
     level = np.log(np.maximum(np.diff(running) / np.diff(cells), 1e-300))
-    wide, narrow = (
-        median_filter(level, size=2 * int(0.5 * decades * PER_DECADE) + 1, mode="reflect") for decades in DECADES
-    )
+    wide, narrow = (_running_median(level, 2 * int(0.5 * decades * PER_DECADE) + 1) for decades in DECADES)
     falling = np.minimum.accumulate(narrow)
     hump = (grid <= 2.0 * WAVES_HZ[1]) & (narrow > falling + np.log(HUMP))
     level = np.where(hump, np.minimum(wide, falling), wide)
     return np.asarray(np.exp(np.interp(np.log(frequency), np.log(grid), level)))
+
+
+def _running_median(level: Array, width: int) -> Array:
+    """Median over ``width`` values; a slope (of a walk) goes on below the first, what is above the last is like it."""
+    half = min(width // 2, len(level) - 1)
+    padded = np.pad(np.pad(level, (half, 0), mode="reflect", reflect_type="odd"), (0, half), mode="symmetric")
+    return np.asarray(median_filter(padded, size=2 * half + 1)[half : len(padded) - half])
 
 
 def _lines(frequency: Array, density: Array, background: Array, freedom: float) -> list[Line]:

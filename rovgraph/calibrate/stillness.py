@@ -7,6 +7,7 @@ Signals are averaged under a Hann window of `WINDOW_S`, which takes an oscillati
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import fftconvolve  # type: ignore[attr-defined]
 
 from rovgraph.errors import InputError
@@ -26,11 +27,11 @@ class _Watch:
     most: float
     unit: str
     says: str
-    angle: bool = False
+    angle: bool = False  # a heading, which wanders at rest too: asked only where there is no gyro
 
 
 _DEG = float(np.deg2rad(1.0))
-# a bias drifts, a magnetic heading wanders: the limits are well above that
+# biases drift: the limits are well above that
 _WATCHES = (
     _Watch("imu", ("gyr_x", "gyr_y", "gyr_z"), 0.3 * _DEG, "rad/s", "the gyro turns"),
     _Watch("imu", ("acc_x", "acc_y", "acc_z"), 0.2, "m/s2", "the accelerometer tilts or is pushed"),
@@ -49,7 +50,7 @@ def require_still(log: Log) -> None:
     InputError : says which sensor shows it, when and how much
     """
     for watch in _WATCHES:
-        if watch.sensor in log:
+        if watch.sensor in log and not (watch.angle and "imu" in log):
             stream = log[watch.sensor]
             data = np.column_stack([stream[c] for c in watch.columns])
             whole = np.isfinite(data).all(axis=1)
@@ -60,7 +61,9 @@ def require_still(log: Log) -> None:
 def _require(watch: _Watch, time: Array, data: Array, source: str) -> None:
     data = np.unwrap(data, axis=0) if watch.angle else data
     steps = np.arange(time[0], time[-1], GRID_S)
-    smooth = np.column_stack([_smooth(np.interp(steps, time, column)) for column in data.T])
+    integral = cumulative_trapezoid(data, time, axis=0, initial=0.0)
+    means = [np.diff(np.interp(steps, time, column)) / GRID_S for column in integral.T]
+    smooth = np.column_stack([_smooth(mean) for mean in means])
     off = np.linalg.norm(smooth - np.median(smooth, axis=0), axis=1)
     worst = int(np.argmax(off))
     if off[worst] > watch.most:

@@ -92,8 +92,9 @@ def _magnetometer_table(found: "MagnetometerCalibration") -> "Table":
 
     table = Table("", "", title=Text(found.source), title_justify="left", box=box.SIMPLE, show_header=False)
     table.add_row("method, samples used", f"{found.method}, {found.used.sum()} of {len(found.used)}")
-    known = f" ± {_vector(found.centre_sd)}" if np.isfinite(found.centre_sd).all() else ""
-    table.add_row("centre (hard iron)", _vector(found.centre) + known)
+    table.add_row("centre (hard iron)", _vector(found.centre))
+    if np.isfinite(found.centre_sd).all():
+        table.add_row("its sd", _vector(found.centre_sd))
     table.add_row("radii", _vector(found.radii))
     table.add_row("field's length", f"{found.length:.4g}")
     lengths = [f"{100 * fit.length_rms:.2f} %" for fit in (found.before, found.after)]
@@ -105,7 +106,7 @@ def _magnetometer_table(found: "MagnetometerCalibration") -> "Table":
         table.add_row("disturbances", "not looked for: no gyro in the log")
     for d in found.disturbances or []:
         when = f"{d.start - found.time[0]:.1f} s to {d.end - found.time[0]:.1f} s"
-        table.add_row("disturbance", f"{when}: {_vector(d.vector)} ± {_vector(d.sd)}")
+        table.add_row("disturbance", f"{when}: {_vector(d.vector)}")
     if found.disturbances == []:
         table.add_row("disturbances", "none")
     return table
@@ -124,12 +125,15 @@ def _noise_tables(found: "NoiseReport") -> "list[Table]":
 
     title = f"{found.source}, {found.duration:.0f} s"
     noise = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("channel", "sd", "without lines", "density [/rtHz]", "instability", "walk [/rts]", "unit"):
+    for heading in ("channel", "sd", "no lines", "/rtHz", "bias", "/rts", "unit"):
         noise.add_column(Text(heading), justify="left" if heading in ("channel", "unit") else "right", no_wrap=True)
     for c in found.channels:
         readings = [f"{x:.2g}" if x is not None else "–" for x in (c.allan.instability, c.allan.walk)]
-        noise.add_row(c.name, f"{c.sd:.3g}", f"{c.quiet_sd:.3g}", f"{c.allan.density:.3g}", *readings, c.unit)
-    noise.caption = "–: does not show in a log of this length"
+        noise.add_row(c.name, f"{c.sd:.2g}", f"{c.quiet_sd:.2g}", f"{c.allan.density:.2g}", *readings, c.unit)
+    noise.caption = (
+        "sd of the samples, and without the spectra's lines; noise density; bias instability; random walk\n"
+        "–: does not show in a log of this length"
+    )
     lines = Table(title="lines in the spectra", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("sensor", "Hz", "rad/sample", "looks like", "rms, strongest channel"):
         lines.add_column(heading, justify="left" if heading in ("sensor", "looks like") else "right", no_wrap=True)

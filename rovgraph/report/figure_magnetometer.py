@@ -48,7 +48,7 @@ def draw_magnetometer(found: MagnetometerCalibration) -> Figure:
 def _projection(
     axes: Axes, cloud: Array, used: NDArray[np.bool_], side: tuple[int, int], colour: str, name: str
 ) -> None:
-    look: dict[str, Any] = {"ls": "none", "marker": ".", "ms": 1.6, "mew": 0}
+    look: dict[str, Any] = {"ls": "none", "marker": ".", "ms": 2.2, "mew": 0}
     x, y = cloud[:, side[0]], cloud[:, side[1]]
     axes.plot(x[used], y[used], color=colour, label=name, **look)
     if not used.all():

@@ -94,8 +94,10 @@ def _readings(axes: Axes, channels: Sequence[Channel]) -> None:
     unit = channels[0].unit
     density = float(np.median([c.allan.density for c in channels]))
     look: dict[str, Any] = {"color": "black", "lw": 0.7, "zorder": 1}
-    axes.plot(tau, density / np.sqrt(tau), ls=(0, (6, 2)), **look)
-    words = [f"noise {density:.2g} {unit}/√Hz"]
+    words = []
+    if density > 0.0:
+        axes.plot(tau, density / np.sqrt(tau), ls=(0, (6, 2)), **look)
+        words.append(f"noise {density:.2g} {unit}/√Hz")
     floors = [c.allan.instability for c in channels if c.allan.instability is not None]
     if floors:
         floor = float(np.median(floors))
