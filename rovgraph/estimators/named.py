@@ -10,6 +10,7 @@ DVL's compass, c = the magnetometer.
 """
 
 import difflib
+import fnmatch
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -231,18 +232,19 @@ ESTIMATORS: dict[str, Named] = {
 
 
 def select(names: Sequence[str] | None = None) -> list[Named]:
-    """Estimators by name, in the order of `ESTIMATORS`, each once; all where none is named.
+    """Estimators by name or pattern (``graph-*``), in the order of `ESTIMATORS`, each once; without names all.
 
     Raises
     ------
     InputError : an unknown name; the message lists the known ones, the nearest first
     """
-    if names is None:
-        return list(ESTIMATORS.values())
-    for name in names:
-        if name not in ESTIMATORS:
+    chosen: set[str] = set(ESTIMATORS) if names is None else set()
+    for name in names or ():
+        matching = fnmatch.filter(ESTIMATORS, name)
+        if not matching:
             near = difflib.get_close_matches(name, ESTIMATORS, len(ESTIMATORS), cutoff=0.0)
             raise InputError(f"unknown estimator {name!r}, known are {', '.join(near)}")
-    if not names:
+        chosen.update(matching)
+    if not chosen:
         raise InputError(f"no estimator named, known are {', '.join(ESTIMATORS)}")
-    return [named for name, named in ESTIMATORS.items() if name in names]
+    return [named for name, named in ESTIMATORS.items() if name in chosen]

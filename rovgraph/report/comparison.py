@@ -14,6 +14,7 @@ from rich.table import Table
 
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
+from rovgraph.report.units import plus_minus
 from rovgraph.studies.compare import Comparison
 
 LIBRARIES = ("numpy", "scipy", "pandas", "gtsam")
@@ -101,7 +102,7 @@ def _number(value: float) -> str:
 
 
 def _spread(mean: float, sd: float) -> str:
-    return _number(mean) if pd.isna(sd) else f"{_number(mean)} ± {sd:.2g}"
+    return _number(mean) if pd.isna(sd) or pd.isna(mean) else plus_minus(mean, sd)
 
 
 def _share(value: float) -> str:
@@ -118,4 +119,4 @@ def _dvl_fit(row: "pd.Series[Any]") -> str:
 def _misalignment(row: "pd.Series[Any]") -> str:
     mean, error = row.get("misalignment_mean_deg", float("nan")), row.get("misalignment_error_mean_deg", float("nan"))
     value = mean if pd.isna(error) else error
-    return "" if pd.isna(value) else f"{value:.2f} ± {row['misalignment_sd_deg']:.2g}"
+    return "" if pd.isna(value) else plus_minus(value, row["misalignment_sd_deg"])

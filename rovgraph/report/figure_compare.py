@@ -26,6 +26,7 @@ FAMILIES: dict[str, dict[str, Any]] = {
 }
 OTHER: dict[str, Any] = {"color": "#CC79A7", "marker": "v"}
 INSIDE, OUTSIDE = "#0072B2", "#D55E00"
+SETTLED = 0.25  # of the dive; the misalignment may leave its panel before
 MOST_SEEN = 0.75  # share of estimators whose end points all lie within the panels
 
 
@@ -182,18 +183,19 @@ def draw_misalignment(history: pd.DataFrame) -> Figure | None:
     names = list(history["estimator"].unique())
     true = history["true_deg"].fillna(0.0)
     history = history.assign(error_deg=history["value_deg"] - true)
-    late = history[history["time"] > 0.25 * history["time"].max()]
-    top = 1.1 * float((late["error_deg"].abs() + 2.0 * late["sd_deg"]).quantile(0.98))
-    figure, grid = _grid(names, 1.9, "time [s]", "[deg]", 3)
+    figure, grid = _grid(names, 1.9, "time [s]", "[deg]", 3, one_scale=False)
     for axes, name in zip(grid, names, strict=True):
-        for i, (_, rows) in enumerate(history[history["estimator"] == name].groupby("run", sort=False)):
+        own = history[history["estimator"] == name]
+        for i, (_, rows) in enumerate(own.groupby("run", sort=False)):
             _misalignment_line(axes, rows, i == 0)
         axes.axhline(0.0, color="black", lw=0.6, zorder=1)
+        late = own[own["time"] > SETTLED * own["time"].max()]
+        top = 1.1 * float((late["error_deg"].abs() + 2.0 * late["sd_deg"]).quantile(0.98)) or 1.0
         axes.set_ylim(-top, top)
         axes.set_xlim(0.0, float(history["time"].max()))
     known = bool(history["true_deg"].notna().all())
     what = "estimated minus true" if known else "estimated minus the mounting"
-    figure.suptitle(f"misalignment of the DVL in yaw, {what}", x=0.01, ha="left", fontsize=9)
+    figure.suptitle(f"DVL's misalignment in yaw, {what}; scales differ", x=0.01, ha="left", fontsize=9)
     legend_below(figure, grid)
     return figure
 
@@ -207,12 +209,14 @@ def _misalignment_line(axes: Axes, rows: pd.DataFrame, first: bool) -> None:
     axes.plot(time, error, color="#0072B2", lw=1.1, zorder=4, label="first run")
 
 
-def _grid(names: Sequence[str], height: float, x: str, y: str, columns: int = COLUMNS) -> tuple[Figure, list[Axes]]:
+def _grid(
+    names: Sequence[str], height: float, x: str, y: str, columns: int = COLUMNS, one_scale: bool = True
+) -> tuple[Figure, list[Axes]]:
     """A panel per estimator, with its name above; x and y name the outer axes."""
     columns = min(columns, len(names))
     lines = -(-len(names) // columns)
     figure = new_figure(0.9 + height * lines, max(WIDTH * columns / COLUMNS, 0.6 * WIDTH))
-    grid: list[Axes] = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
+    grid: list[Axes] = list(figure.subplots(lines, columns, sharex=True, sharey=one_scale, squeeze=False).flat)
     for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
         axes.set_title(name, loc="left", fontsize=7, pad=3)
         if i % columns == 0:
