@@ -251,6 +251,8 @@ def test_falcon_travels_with_the_package():
         ("vattern", {"speed": 4.0}, "at most 1"),
         ("vattern", {"speed": float("nan")}, "at most 1"),
         ("docking", {"duration": float("inf")}, "duration"),
+        ("docking", {"speed": 1e-3}, "duration"),
+        ("vattern", {"duration": 3601.0}, "between 1 and 3600"),
         ("excited", {"speed": 0.3}, "no choice of speed"),
         ("tank", {"current": (0.1, 0.0)}, "no choice of current"),
         ("tank", {"speed": 0.0}, "speed"),

@@ -21,7 +21,7 @@ from rovgraph.thesis import FAN_RAD_PER_SAMPLE, SAMPLE_S
 
 RIPPLES_M = 0.005  # amplitude of the waves in the tank: a choice
 FAN_MPS2 = 0.004  # amplitude of the fan's line: a choice, clear of the white noise around it
-LONGEST_S = 6 * 3600.0
+LONGEST_S = 3600.0  # of a dive that is driven: its steps are held in memory
 
 Made = tuple[Path, Truth]
 
@@ -88,7 +88,7 @@ def _followed(world: World, route: Route, speed: float, duration: float) -> Made
     moving = duration - REST_S - route.pause.sum()
     if chosen.speed is not None:
         moving, speed = moving * speed / chosen.speed, chosen.speed
-        duration = np.ceil(moving + REST_S + route.pause.sum())
+        duration = _duration(float(np.ceil(moving + REST_S + route.pause.sum())), duration)
     if chosen.duration is not None:
         left = _duration(chosen.duration, duration) - REST_S - route.pause.sum()
         if left <= 0.0:
@@ -187,7 +187,7 @@ def _stationary(world: World) -> Made:
 
 def _duration(chosen: float | None, own: float) -> float:
     if chosen is not None and not (1.0 <= chosen <= LONGEST_S):
-        raise InputError(f"duration of {chosen} s: between 1 and {LONGEST_S:.0f} s are expected")
+        raise InputError(f"duration of {chosen:g} s: between 1 and {LONGEST_S:.0f} s are expected")
     return own if chosen is None else chosen
 
 
