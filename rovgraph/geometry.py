@@ -41,7 +41,10 @@ def cross(a: Array, b: Array) -> Array:
     """``np.cross`` of vectors in three dimensions, at a tenth of its overhead; shape (..., 3)."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    x = ay * bz - az * by
+    out = np.empty((*x.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, az * bx - ax * bz, ax * by - ay * bx
+    return out
 
 
 def matrix_from_rpy(rpy: ArrayLike) -> Array:
@@ -56,8 +59,9 @@ def matrix_from_rpy(rpy: ArrayLike) -> Array:
     ndarray, shape (..., 3, 3)
     """
     rpy = np.asarray(rpy, dtype=float)
-    cr, cp, cy = np.moveaxis(np.cos(rpy), -1, 0)
-    sr, sp, sy = np.moveaxis(np.sin(rpy), -1, 0)
+    cosine, sine = np.cos(rpy), np.sin(rpy)
+    cr, cp, cy = cosine[..., 0], cosine[..., 1], cosine[..., 2]
+    sr, sp, sy = sine[..., 0], sine[..., 1], sine[..., 2]
     out = np.empty((*rpy.shape, 3))
     out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
     out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr

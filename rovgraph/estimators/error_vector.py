@@ -21,7 +21,7 @@ from rovgraph.calibration import TABLE
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rotate, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
-from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, stack_states
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State
 
 # the variable that each instrument sees directly: its model is linear in it
 SEEN = {"dvl": VELOCITY, "mag": "hard_iron", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
@@ -77,7 +77,7 @@ class ErrorVector:
             to first order in ``delta``
         """
         moved = self._straight(state, delta)
-        both, before, after = stack_states([state, moved]), self._frame(state), self._frame(moved)
+        both, before, after = self._both(state, moved), self._frame(state), self._frame(moved)
         for model, variable, columns in self._seen:
             z, H = model.predict(both, _NO_RATE)
             before[columns], J = self.matrix(H)
@@ -99,7 +99,7 @@ class ErrorVector:
         basis : ndarray, shape (size, size), takes an error about ``other`` over to ``state``
         """
         delta = self._difference(state, other)
-        both, at_state, at_other = stack_states([state, other]), self._frame(state), self._frame(other)
+        both, at_state, at_other = self._both(state, other), self._frame(state), self._frame(other)
         for model, _, columns in self._seen:
             z, H = model.predict(both, _NO_RATE)
             at_state[columns], at_other[columns] = J, _ = self.matrix(H)
@@ -129,6 +129,17 @@ class ErrorVector:
                 other.bias[0] - state.bias[0],
                 *(other.calibration[name] - state.calibration[name] for name in self._estimated),
             ]
+        )
+
+    def _both(self, state: State, other: State) -> State:
+        """Two states of one epoch as one `State`; what is not estimated stays as it is."""
+        own = {name: np.array([state.calibration[name], other.calibration[name]]) for name in self._estimated}
+        return State(
+            np.concatenate([state.R_nb, other.R_nb]),
+            np.concatenate([state.p_n, other.p_n]),
+            np.concatenate([state.v_n, other.v_n]),
+            np.concatenate([state.bias, other.bias]),
+            {**state.calibration, **own},
         )
 
     def _frame(self, state: State) -> Array:
