@@ -11,6 +11,7 @@ from dives import (
     LIVELY,
     Simulated,
     altered,
+    attitude_errors,
     changed,
     falcon,
     kept,
@@ -326,6 +327,17 @@ def test_clean_dive_is_recovered(name, path):
     assert case.truth.distance > 8.0
     assert position_errors(estimate.trajectory, case).max() < 0.01
     assert np.abs(estimate.trajectory.v_n - truth.v_n).max() < 0.005
+
+
+def test_what_waves_do_to_a_clean_dive_is_the_angular_acceleration_that_3_1_neglects():
+    """Roll at the MTi's lever arm is felt as acceleration, and becomes bias, tilt and heading."""
+    worst = {}
+    for arm in (CONFIG.imu.lever_arm_m, (0.0, 0.0, 0.0)):
+        config = falcon(imu={"lever_arm_m": list(arm)})
+        case = simulated(config, 40.0, path="circle", style=replace(QUICK, waves=LIVELY.waves), noise=False)
+        trajectory = run_filter("4.3c", case.log, started(case)).trajectory
+        worst[arm] = np.abs(attitude_errors(trajectory, case)).max()
+    assert worst[CONFIG.imu.lever_arm_m] > 5.0 * worst[0.0, 0.0, 0.0]
 
 
 @cache
