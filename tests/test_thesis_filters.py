@@ -455,13 +455,13 @@ def mean_squares(variant: Filter, believed: Filter, seeds: int) -> dict[str, tup
 @pytest.mark.parametrize("name", ["4.3a", "4.3b", "4.3c", "4.4a", "4.5"])
 def test_innovations_are_consistent_where_the_thesis_assumptions_hold(name):
     """Mean NIS per dimension within four of its standard deviations, sqrt(2 / count)."""
-    for sensor, (mean, count) in mean_squares(FILTERS[name], FILTERS[name], 6).items():
+    for sensor, (mean, count) in mean_squares(FILTERS[name], FILTERS[name], 4).items():
         assert abs(mean - 1.0) < 4.0 * np.sqrt(2.0 / count), sensor
 
 
 def test_wrong_noise_is_seen_in_the_innovations():
-    wrong = FILTERS["4.3a"].with_numbers(R_mti=1.3 * thesis.R_MTI, R_dvl=1.5 * thesis.R_DVL)
-    for sensor, (mean, count) in mean_squares(FILTERS["4.3a"], wrong, 6).items():
+    wrong = FILTERS["4.3a"].with_numbers(R_mti=1.3 * thesis.R_MTI, R_dvl=2.0 * thesis.R_DVL)
+    for sensor, (mean, count) in mean_squares(FILTERS["4.3a"], wrong, 4).items():
         assert abs(mean - 1.0) > 4.0 * np.sqrt(2.0 / count), sensor
 
 
