@@ -113,7 +113,7 @@ def test_an_estimator_that_fails_has_its_row_and_the_others_go_on(recorded):
     case = Case(without(recorded.log, "mag"), recorded.config, recorded.reference)
     result = compare([Recorded("lake", case)], ["graph-smoothed-b", "graph-smoothed-c"], jobs=1)
     errors = result.runs.set_index("estimator")["error"]
-    assert errors["graph-smoothed-b"] is None
+    assert pd.isna(errors["graph-smoothed-b"])
     assert "no magnetometer" in errors["graph-smoothed-c"]
     table = result.table.set_index("estimator")
     assert table["failed"].to_dict() == {"graph-smoothed-b": 0.0, "graph-smoothed-c": 1.0}

@@ -47,7 +47,7 @@ def in_workers(
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(jobs, len(tasks)), multiprocessing.get_context("spawn"), _prepare)
     try:
-        with _environment(_ONE_THREAD), _interrupts_ignored():  # both are inherited by what is started here
+        with _environment(_ONE_THREAD), _interrupts_held_back():  # both are inherited by what is started here
             futures = [pool.submit(function, task) for task in tasks]
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
@@ -92,12 +92,13 @@ def _environment(changes: dict[str, str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # only that one may set handlers
+def _interrupts_held_back() -> Iterator[None]:
+    """An interrupt waits for the end of the block; processes started within never see one."""
+    if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
