@@ -8,7 +8,7 @@ as such (`scenario`) they agree where nothing else is said.
 from rovgraph.simulate.choices import Choices
 from rovgraph.simulate.dive import Dive, simulate
 from rovgraph.simulate.driven_scenarios import DRIVEN
-from rovgraph.simulate.named import NAMES, falcon, simulated
+from rovgraph.simulate.named import NAMES, falcon, lake, simulated
 from rovgraph.simulate.path import CALM, Motion, Path, Style, Waves
 from rovgraph.simulate.scenario import SCENARIOS, scenario
 from rovgraph.simulate.truth import Truth
@@ -26,6 +26,7 @@ __all__ = [
     "Truth",
     "Waves",
     "falcon",
+    "lake",
     "scenario",
     "simulate",
     "simulated",

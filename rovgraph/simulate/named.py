@@ -33,8 +33,8 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
     ----------
     name : one of `NAMES`
     seed : the same one gives the same dive
-    config : vehicle, sensors and what is believed of them; None = the thesis's Falcon for a
-        scenario that is driven, all defaults for another
+    config : vehicle, sensors and what is believed of them; None = the thesis's Falcon with its
+        compasses (`lake`) for a scenario that is driven, all defaults for another
     choices : Choices
 
     Returns
@@ -52,7 +52,7 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
     if name in DRIVEN:
         driven = DRIVEN[name]
         choices.require(name, driven.choices, driven.variants)
-        config = falcon() if config is None else config
+        config = lake() if config is None else config
         path, truth = driven.make(World.drawn(config, choices, seed))
     else:
         choices.require(name, _KINEMATIC)
@@ -69,6 +69,27 @@ def _kinematic(path: Path, config: Config, choices: Choices, seed: int) -> Truth
     if not choices.disturbances:
         return truth
     return replace(truth, magnetism=Magnetism(iron_near(path, config, np.random.default_rng([seed, 1]))))
+
+
+def lake() -> Config:
+    """`falcon` with its compasses as their data sheets have them, after a calibration in the tank.
+
+    Xsens MTi: static heading within 1 degree, dynamic 2 degrees rms; RDI's compass within 2 degrees,
+    and a deviation of 1 degree once per turn is a choice. So no heading is exact.
+    """
+    config = falcon()
+    entries = {
+        "mag_offset": {"estimate": True, "sd_deg": 1.0},
+        "ahrs_offset": {"estimate": True, "sd_deg": 1.0},
+        "dvl_compass_offset": {"estimate": True, "sd_deg": 2.0},
+        "dvl_compass_deviation": {"estimate": True, "sd_deg": 1.0},
+        "ahrs_deviation": {"estimate": True, "sd_deg": 1.0},
+    }
+    calibration = config.calibration.model_copy(
+        update={name: getattr(config.calibration, name).model_copy(update=entry) for name, entry in entries.items()}
+    )
+    heading = config.heading.model_copy(update={"ahrs_sd_deg": 2.0})
+    return config.model_copy(update={"calibration": calibration, "heading": heading})
 
 
 def falcon() -> Config:
