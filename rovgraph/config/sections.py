@@ -79,7 +79,7 @@ class Mag(Section):
 
     def calibrated(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
         """The field of magnetometer samples, shape (n, 3), IMU axes."""
-        return (samples - np.array(self.centre)) @ np.array(self.matrix).T
+        return np.asarray((samples - np.array(self.centre)) @ np.array(self.matrix).T)
 
 
 class Imu(Section):

@@ -13,8 +13,9 @@ none is locked out for ever.
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,10 +58,10 @@ READMIT_AFTER = 5  # rejections running, after which a sensor is believed until 
 
 @dataclass
 class _Known:
-    """What is known of a keyframe before its measurements: State of one epoch, covariances by variable."""
+    """What is known of a keyframe before its measurements: State of one epoch, covariances where they are needed."""
 
     state: State
-    covariances: Mapping[str, Array]
+    covariances: Callable[[], Mapping[str, Array]]
     _point: Any = None
 
     def point(self, attached: Attached, unknowns: Unknowns) -> Any:
@@ -115,13 +116,14 @@ class IncrementalEstimator:
         if interval.pim is None:
             state = replace(b.start.state, calibration=self.unknowns.fixed)
             factors = priors(b.start, self.beliefs, self.unknowns)
-            known = {index: _Known(state, {})}
+            known = {index: _Known(state, dict)}
         else:
             before = replace(self.latest(), R_nb=self._first_R_nb)
             state = predict(interval, self.latest())
             factors = motion(interval) if self.lag is None else linear_motion(interval, before, state)
-            grown = self._predicted_covariances(interval)
-            known = {index - 1: _Known(before, self._covariances[-1]), index: _Known(state, grown)}
+            P = self._covariances[-1]
+            grown = partial(self._predicted_covariances, interval)
+            known = {index - 1: _Known(before, lambda: P), index: _Known(state, grown)}
         values = state_values(index, state)
         if not self.intervals or segment > self.intervals[-1].segment:
             factors += drift(self.unknowns, segment, b.config.graph.segment_s)
@@ -200,11 +202,11 @@ class IncrementalEstimator:
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
         return make_block(attached, instrument, gravity, self.unknowns)
 
-    def _factor(self, attached: Attached, here: "_Known") -> list[Factor]:
+    def _factor(self, attached: Attached, here: _Known) -> list[Factor]:
         """The factor of a measurement, or none where its gate keeps it out."""
         one = self._block([attached])
         r, H = one.linearize(here.state)
-        admitted = self._admit(one, r, H, here.covariances)
+        admitted = self._admit(one, r, H, here)
         self._used.setdefault(attached.sensor, []).append((attached, here.state, float(admitted)))
         if not admitted:
             return []
@@ -212,10 +214,10 @@ class IncrementalEstimator:
             return [one.custom_factor()]
         return [one.linear_factor(here.point(attached, self.unknowns), r, H)]
 
-    def _admit(self, one: Block, r: Array, H: Jacobians, covariances: Mapping[str, Array]) -> bool:
+    def _admit(self, one: Block, r: Array, H: Jacobians, here: _Known) -> bool:
         """Whether a measurement's normalised innovation lies within its gate."""
         gate, sensor = one.instrument.gate_sd, one.instrument.model.sensor
-        if gate is None or not covariances or np.linalg.norm(r) <= gate:
+        if gate is None or np.linalg.norm(r) <= gate or not (covariances := here.covariances()):
             self._rejected[sensor] = 0
             return True
         S = np.eye(r.shape[1])

@@ -126,7 +126,9 @@ class Incremental:
         """Marginal covariances of a keyframe's state variables, and of the calibration variables ``names``."""
         keys = {v: key(v, index) for v in DIMENSION}
         keys |= {name: self._unknowns.key(name, segment) for name in names}
-        return {v: np.asarray(self._engine.marginalCovariance(k)) for v, k in keys.items()}
+        isam = self._engine if self.lag is None else self._engine.getISAM2()
+        joint = isam.jointMarginalCovariance(list(keys.values()))  # one sweep for all of them
+        return {v: np.asarray(joint.at(k, k)) for v, k in keys.items()}
 
     def values(self) -> gtsam.Values:
         """Estimates of all variables that are still in the graph."""
