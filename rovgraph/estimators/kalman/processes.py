@@ -71,6 +71,7 @@ def noise_per_second(places: Layout, numbers: Numbers) -> Array:
         "acc_bias": numbers.acc_bias,
         "gyr_bias": numbers.gyr_bias,
         "mag_bias": numbers.mag_bias,
+        "mount": numbers.mount,
     }
     if "a" not in places:
         values["v"] = numbers.acceleration

@@ -20,6 +20,7 @@ class Numbers:
     acceleration, rate : process noise per sample of 10 ms, variance for each axis; in 4.2,
         which has no acceleration, that of velocity
     acc_bias, gyr_bias, mag_bias : walk of the MTi's biases, variance per sample
+    mount : walk of the DVL's angles, variance per sample; (4.5) has none
     R_mti : ndarray, shape (9, 9), per sample, MTi axes; field as a fraction of its length
     R_dvl : ndarray, shape (4, 4), per ping, velocity in DVL axes, heading
     acceleration_sd, rate_sd : of the start, not printed: a choice [m/s^2, rad/s]
@@ -30,6 +31,7 @@ class Numbers:
     acc_bias: float = thesis.Q_ACC_BIAS
     gyr_bias: float = thesis.Q_GYR_BIAS
     mag_bias: float = thesis.Q_MAG_BIAS
+    mount: float = 0.0
     R_mti: Array = field(default_factory=thesis.R_MTI.copy)
     R_dvl: Array = field(default_factory=thesis.R_DVL.copy)
     acceleration_sd: float = 0.3
