@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config, load_config
+from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning, initialise
@@ -117,9 +118,14 @@ def batch(log: Log, config: Config) -> BatchSmoother:
     return fed(BatchSmoother(initialise(log, config)), log)
 
 
-def incremental(log: Log, config: Config, lag: float | None = None) -> IncrementalEstimator:
-    """An incremental estimator that has taken a whole log."""
-    return fed(IncrementalEstimator(initialise(log, config), lag), log)
+def incremental(log: Log, config: Config) -> IncrementalEstimator:
+    """iSAM2 that has taken a whole log."""
+    return fed(IncrementalEstimator(initialise(log, config)), log)
+
+
+def renewed(log: Log, config: Config) -> ErrorStateFilter:
+    """The filter of `rovgraph smooth` that has taken a whole log."""
+    return fed(ErrorStateFilter(initialise(log, config), RENEW_AT_S), log)
 
 
 def fed(estimator: Any, log: Log) -> Any:

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
-from dives import Simulated, as_log, attitude_errors, batch, changed, falcon, incremental, true_at
+from dives import Simulated, as_log, attitude_errors, batch, changed, falcon, renewed, true_at
 from scipy.stats import chi2
 
 from rovgraph.config import Config
@@ -47,7 +47,7 @@ def one_dive(seed: int) -> Array:
     """NEES of one dive: smoothed at mid-dive, filtered at the end, smoothed with a boastful DVL; shape (3, 3)."""
     case, config = drawn(seed)
     smoothed = batch(case.log, config).solve().trajectory
-    filtered = incremental(case.log, config, lag=config.graph.lag_s).solve().trajectory
+    filtered = renewed(case.log, config).solve().trajectory
     sd = [s / OVERCONFIDENT for s in config.dvl.velocity_sd_mps]
     boastful = batch(case.log, changed(config, dvl={"velocity_sd_mps": sd})).solve().trajectory
     middle = len(smoothed) // 2

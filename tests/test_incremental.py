@@ -1,4 +1,4 @@
-"""iSAM2 and the fixed lag: agreement with the batch, gating, and a cost that does not grow."""
+"""iSAM2 and the renewed filter: agreement with the batch, gating, and a cost that does not grow."""
 
 import time
 
@@ -14,12 +14,13 @@ from dives import (
     fed,
     incremental,
     position_errors,
+    renewed,
     rms,
     simulated,
 )
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.dive import run
+from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.incremental import READMIT_AFTER, IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import log_rotation, transpose
@@ -39,12 +40,12 @@ def case():
 @pytest.fixture(scope="session")
 def whole(case) -> IncrementalEstimator:
     """iSAM2 over the whole dive."""
-    return incremental(case.log, case.config, None)
+    return incremental(case.log, case.config)
 
 
 @pytest.fixture(scope="session")
-def lagged(case) -> IncrementalEstimator:
-    return incremental(case.log, case.config, case.config.graph.lag_s)
+def filtered(case) -> ErrorStateFilter:
+    return renewed(case.log, case.config)
 
 
 def test_isam2_ends_where_the_batch_does(case, whole):
@@ -56,9 +57,9 @@ def test_isam2_ends_where_the_batch_does(case, whole):
     np.testing.assert_allclose(got.p_sd, expected.p_sd, rtol=0.05, atol=1e-3)
 
 
-def test_filter_ends_where_the_batch_does(case, lagged):
+def test_filter_ends_where_the_batch_does(case, filtered):
     """At the last keyframe both know the same: all of the dive."""
-    expected, got = batch(case.log, case.config).solve().trajectory, lagged.solve().trajectory
+    expected, got = batch(case.log, case.config).solve().trajectory, filtered.solve().trajectory
     assert np.linalg.norm(got.p_n[-1] - expected.p_n[-1]) < 0.02
     turn = log_rotation(transpose(expected.R_nb[-1:]) @ got.R_nb[-1:])
     assert np.linalg.norm(turn) < 0.05 * DEG
@@ -66,32 +67,32 @@ def test_filter_ends_where_the_batch_does(case, lagged):
         np.testing.assert_allclose(getattr(got, known)[-1], getattr(expected, known)[-1], rtol=0.15)
 
 
-def test_filter_is_as_good_as_isam2(case, whole, lagged):
-    a, b = whole.solve().trajectory, lagged.solve().trajectory
+def test_filter_is_as_good_as_isam2(case, whole, filtered):
+    a, b = whole.solve().trajectory, filtered.solve().trajectory
     np.testing.assert_array_equal(a.time, b.time)
     errors = [rms(position_errors(t, case)) for t in (a, b)]
     assert errors[1] < 1.2 * errors[0] + 0.02
 
 
-def test_filtered_errors_lie_within_what_is_said_of_them(case, lagged):
-    trajectory = lagged.solve().trajectory
+def test_filtered_errors_lie_within_what_is_said_of_them(case, filtered):
+    trajectory = filtered.solve().trajectory
     assert (position_errors(trajectory, case) < 5.0 * np.linalg.norm(trajectory.p_sd, axis=1)).all()
     yaw = attitude_errors(trajectory, case)[:, 2]
     assert (np.abs(yaw) < 5.0 * trajectory.rpy_sd[:, 2]).all()
 
 
-def test_feeding_measurements_and_replaying_intervals_are_the_same(case, lagged):
-    again = run(batch(case.log, case.config).intervals, initialise(case.log, case.config), case.config.graph.lag_s)
-    a, b = lagged.solve(), again.solve()
+def test_feeding_measurements_and_replaying_intervals_are_the_same(case, filtered):
+    again = replay(batch(case.log, case.config).intervals, initialise(case.log, case.config), RENEW_AT_S)
+    a, b = filtered.solve(), again.solve()
     np.testing.assert_allclose(a.trajectory.p_n, b.trajectory.p_n, atol=1e-9)
     np.testing.assert_allclose(a.trajectory.cov_p, b.trajectory.cov_p, atol=1e-9)
 
 
-def test_the_future_does_not_change_what_was_filtered(case, lagged):
+def test_the_future_does_not_change_what_was_filtered(case, filtered):
     half = Log(case.log.source, {s: _until(stream, 40.0) for s, stream in case.log.streams.items()})
     # the start resolves the log's own noise and field, so both are told the same
-    estimator = fed(IncrementalEstimator(lagged.beginning, lagged.lag), half)
-    short, full = estimator.solve().trajectory, lagged.solve().trajectory
+    estimator = fed(ErrorStateFilter(filtered.beginning, RENEW_AT_S), half)
+    short, full = estimator.solve().trajectory, filtered.solve().trajectory
     n = int(np.searchsorted(full.time, 39.0))
     np.testing.assert_allclose(short.p_n[:n], full.p_n[:n], atol=1e-9)
 
@@ -103,11 +104,10 @@ def _until(stream, end):
 
 def test_progress_is_reported():
     case = simulated(falcon(), 33.0, seed=6, dvl_rate=5.0)
-    told: list[tuple[str, float]] = []
-    intervals = batch(case.log, case.config).intervals
-    run(intervals, initialise(case.log, case.config), 5.0, lambda what, done: told.append((what, done)))
-    assert told and all(0.0 <= done <= 1.0 for _, done in told)
-    assert [done for _, done in told] == sorted(done for _, done in told)
+    told: list[float] = []
+    replay(batch(case.log, case.config).intervals, initialise(case.log, case.config), progress=told.append)
+    assert told and all(0.0 <= done <= 1.0 for done in told)
+    assert told == sorted(told)
 
 
 # gates
@@ -125,23 +125,23 @@ def dvl_weights(estimator) -> dict[float, float]:
     return dict(zip(dvl["time"], dvl["weight"], strict=True))
 
 
-def test_a_gross_outlier_is_kept_out(case, lagged):
+def test_a_gross_outlier_is_kept_out(case, filtered):
     wrong = np.arange(100, 200, 20)
-    estimator = incremental(spoilt(case, wrong), case.config, case.config.graph.lag_s)
+    estimator = renewed(spoilt(case, wrong), case.config)
     weights = dvl_weights(estimator)
     assert {t for t, w in weights.items() if w == 0.0 and t > 5.0} == set(case.log["dvl"].time[wrong])
-    a, b = estimator.solve().trajectory, lagged.solve().trajectory
+    a, b = estimator.solve().trajectory, filtered.solve().trajectory
     assert np.linalg.norm(a.p_n - b.p_n, axis=1).max() < 0.1
 
 
-def test_a_good_ping_is_not_kept_out_while_the_level_is_uncertain(lagged):
-    assert all(weight > 0.0 for weight in dvl_weights(lagged).values())
+def test_a_good_ping_is_not_kept_out_while_the_level_is_uncertain(filtered):
+    assert all(weight > 0.0 for weight in dvl_weights(filtered).values())
 
 
 def test_a_sensor_that_is_rejected_many_times_running_is_let_in_again(case):
     begin = 120
     config = changed(case.config, dvl={"gate_sd": 4.0, "loss": "none"})
-    weights = dvl_weights(incremental(spoilt(case, slice(begin, None)), config, case.config.graph.lag_s))
+    weights = dvl_weights(renewed(spoilt(case, slice(begin, None)), config))
     later = [weights[t] for t in case.log["dvl"].time[begin:] if t in weights]
     assert later[:READMIT_AFTER] == [0.0] * READMIT_AFTER
     assert 1.0 in later[READMIT_AFTER : READMIT_AFTER + 3]
@@ -149,18 +149,18 @@ def test_a_sensor_that_is_rejected_many_times_running_is_let_in_again(case):
 
 def test_an_open_gate_lets_everything_in(case):
     config = changed(case.config, dvl={"gate_sd": None})
-    weights = dvl_weights(incremental(spoilt(case, np.arange(100, 200, 20)), config, case.config.graph.lag_s))
+    weights = dvl_weights(renewed(spoilt(case, np.arange(100, 200, 20)), config))
     assert min(weights.values()) > 0.0
 
 
 def test_a_variable_that_nothing_determines_is_named_in_one_line():
-    engine = Incremental(None, Unknowns({}, {}))
+    engine = Incremental(Unknowns({}, {}))
     factor = gtsam.BetweenFactorPose3(key(POSE, 0), key(POSE, 1), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6))
     values = gtsam.Values()
     values.insert(key(POSE, 0), gtsam.Pose3())
     values.insert(key(POSE, 1), gtsam.Pose3())
     with pytest.raises(InputError, match=r"^the data do not determine pose of keyframe [01]: [^\n]*$"):
-        engine.update([factor], values, 0.0, 0)
+        engine.update([factor], values)
 
 
 # the cost of a callback
@@ -212,11 +212,11 @@ def callback_seconds() -> dict[tuple[int, bool], float]:
 
 
 def test_the_engine_keeps_the_linearisation_point_alive():
-    engine = Incremental(None, Unknowns({}, {}))
+    engine = Incremental(Unknowns({}, {}))
     values = gtsam.Values()
     values.insert(key(POSE, 0), gtsam.Pose3())
     prior = gtsam.PriorFactorPose3(key(POSE, 0), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6))
-    engine.update([prior], values, 0.0, 0)
+    engine.update([prior], values)
     assert engine._theta is engine._engine.getLinearizationPoint()
     assert engine._theta.size() == 1
 

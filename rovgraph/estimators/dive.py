@@ -3,9 +3,11 @@
 import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import Pool
 
 from rovgraph.config import Config
+from rovgraph.estimators.error_state import PROGRESS_EVERY, RENEW_AT_S, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning, initialise
@@ -14,7 +16,6 @@ from rovgraph.graph.assembly import Interval
 from rovgraph.log import Log
 
 Progress = Callable[[str, float], None]
-PROGRESS_EVERY = 50  # keyframes
 
 
 def no_progress(what: str, done: float) -> None:
@@ -72,7 +73,7 @@ def smooth(
         if estimate != "filtered":
             estimates.append(_solve(batch, progress))
         if estimate != "smoothed":
-            estimates.append(run(batch.intervals, beginning, config.graph.lag_s, progress).solve())
+            estimates.append(_filter(batch, progress))
     return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
 
 
@@ -88,25 +89,28 @@ def assemble(log: Log, beginning: Beginning) -> BatchSmoother:
 def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
     progress("smoothing", 0.1)
     if batch.beginning.config.graph.solver == "isam2":
-        return batch.solve(run(batch.intervals, batch.beginning, None, progress))
+        return batch.solve(run(batch.intervals, batch.beginning, progress))
     return batch.solve()
 
 
 def _filtered(log: Log, beginning: Beginning) -> Estimate:
-    return run(assemble(log, beginning).intervals, beginning, beginning.config.graph.lag_s).solve()
+    return _filter(assemble(log, beginning))
+
+
+def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:
+    filtering = partial(progress, "filtering")
+    return replay(batch.intervals, batch.beginning, RENEW_AT_S, filtering).solve()
 
 
 def _leave_interrupts_to_the_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def run(
-    intervals: Sequence[Interval], beginning: Beginning, lag: float | None, progress: Progress = no_progress
-) -> IncrementalEstimator:
-    """Feed intervals to an incremental estimator: a replay of online."""
-    estimator = IncrementalEstimator(beginning, lag)
+def run(intervals: Sequence[Interval], beginning: Beginning, progress: Progress = no_progress) -> IncrementalEstimator:
+    """Feed intervals to iSAM2."""
+    estimator = IncrementalEstimator(beginning)
     for interval in intervals:
         estimator.step(interval)
         if interval.index % PROGRESS_EVERY == 0:
-            progress("filtering" if lag else "incremental smoothing", interval.index / len(intervals))
+            progress("incremental smoothing", interval.index / len(intervals))
     return estimator

@@ -11,7 +11,7 @@ the graph; the state goes on to the next keyframe with the IMU; what was measure
 updates it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,12 +32,18 @@ from rovgraph.estimators.results import (
 from rovgraph.estimators.robust_update import normalised_squared, robust_update
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Assembler, Attached, Interval
+from rovgraph.graph.batch import make_problem, make_values, newest_covariance, solve
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import Block, make_block
 from rovgraph.graph.transition import transition
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY, State, stack_states
+
+# since the start, for `ErrorStateFilter.renew_at`: while heading, mounting and compasses are known to
+# several degrees only, what was linearised once misstates what it knows by the square of that
+RENEW_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+PROGRESS_EVERY = 50  # keyframes
 
 
 @dataclass(frozen=True)
@@ -92,10 +98,13 @@ class ErrorStateFilter:
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
+    renew_at : times since the start at which the dive so far is solved as a graph, and the filter
+        goes on from there [s]
     filtered : Gaussian of each keyframe so far, from all data up to it
     """
 
     beginning: Beginning
+    renew_at: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         b = self.beginning
@@ -105,6 +114,7 @@ class ErrorStateFilter:
         self.unknowns = unknowns(self.beliefs, b.instruments)
         self.error = ErrorVector(self.unknowns.estimated, b.instruments)
         self.filtered: list[Gaussian] = []
+        self._renewals = list(self.renew_at)
         self._departed: list[Gaussian] = []  # with what was measured before the next keyframe, too
         self._steps: list[Step] = []
         self._used: dict[str, list[tuple[Attached, State, float]]] = {}
@@ -133,13 +143,16 @@ class ErrorStateFilter:
         here = [a for a in interval.attached if a.keyframe == interval.index]
         self.filtered.append(self._update(predicted, here))
         self.intervals.append(interval)
+        if self._renewals and interval.time - self.intervals[0].time >= self._renewals[0]:
+            self._renewals.pop(0)
+            self.filtered[-1] = self._renewed()
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""
-        return self._estimate("ekf", self.filtered)
+        return self._estimate("filtered" if self.renew_at else "ekf", self.filtered)
 
     def smoothed(self) -> Estimate:
-        """The smoother's estimate of every keyframe so far."""
+        """The smoother's estimate of every keyframe so far; not of a filter that was renewed."""
         return self._estimate("rts", self.backward())
 
     def backward(self) -> list[Gaussian]:
@@ -167,6 +180,19 @@ class ErrorStateFilter:
         P = np.diag(np.concatenate(sd) ** 2)
         P[:3, :3], P[3:6, 3:6] = (transpose(R_nb) @ P[i : i + 3, i : i + 3] @ R_nb for i in (0, 3))
         return Gaussian(replace(start.state, calibration=self.unknowns.fixed), P)
+
+    def _renewed(self) -> Gaussian:
+        """The newest keyframe as the graph of the dive so far has it, every factor linearised at the optimum."""
+        b, before = self.beginning, self.filtered[-1]
+        problem = make_problem(self.intervals, b.start, b.config, self.beliefs, b.instruments)
+        states = stack_states([known.state for known in self.filtered])
+        solution = solve(problem, make_values(problem, states, before.state.calibration))
+        newest = problem.states(solution.values).at([problem.count - 1])
+        calibration = {name: value.reshape(-1) for name, value in newest.calibration.items()}
+        known = [np.arange(15)] + [np.r_[self.error.columns[name]] for name in problem.unknowns.estimated]
+        P = self._start().P  # of what no sensor has shown yet
+        P[np.ix_(np.concatenate(known), np.concatenate(known))] = newest_covariance(problem, solution)
+        return Gaussian(replace(newest, calibration=calibration), P)
 
     def _predict(self, interval: Interval, before: Gaussian) -> Gaussian:
         """The next keyframe, from the IMU alone; calibration walks."""
@@ -282,9 +308,16 @@ class ErrorStateFilter:
         }
 
 
-def replay(intervals: Sequence[Interval], beginning: Beginning) -> ErrorStateFilter:
-    """A filter that has taken the intervals of a dive."""
-    estimator = ErrorStateFilter(beginning)
+def replay(
+    intervals: Sequence[Interval],
+    beginning: Beginning,
+    renew_at: tuple[float, ...] = (),
+    progress: Callable[[float], None] = lambda done: None,
+) -> ErrorStateFilter:
+    """A filter that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
+    estimator = ErrorStateFilter(beginning, renew_at)
     for interval in intervals:
         estimator.step(interval)
+        if interval.index % PROGRESS_EVERY == 0:
+            progress(interval.index / len(intervals))
     return estimator

@@ -1,22 +1,13 @@
-"""The filtering estimate: what is known at each keyframe from the data up to then.
+"""Incremental smoothing: iSAM2 over the whole dive, fed interval by interval.
 
-Over a fixed lag every factor is linearised once, and the attitude of a keyframe always
-at its first estimate (first-estimates Jacobians: Huang, Mourikis and Roumeliotis 2010).
-Linearised anew after each correction, a filter learns heading and misalignment from its
-own corrections, and becomes far too sure of both. Without a lag, factors stay nonlinear
-and iSAM2 relinearises them.
-
-Feeds the graph interval by interval to an incremental engine and keeps the newest
-keyframe's estimate after each. A measurement is gated by its normalised innovation
-before it enters; a sensor that is rejected many times running is let in again, so that
-none is locked out for ever.
+A measurement is gated by its normalised innovation before it enters; a sensor that is
+rejected many times running is let in again, so that none is locked out for ever.
 """
 
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,55 +25,43 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Attached, Interval
-from rovgraph.graph.batch import make_problem, make_values, solve
 from rovgraph.graph.factors import (
     Factor,
     drift,
-    linear_motion,
     motion,
     predict,
     priors,
 )
 from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.keys import Unknowns, unknowns
+from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import Block, make_block
 from rovgraph.graph.preintegration import whole
-from rovgraph.graph.values import insert_calibration, state_values, values_at
+from rovgraph.graph.values import insert_calibration, state_values
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State, propagate_with_jacobian, stack_states
 
 CALIBRATION_EVERY = 5  # keyframes between new marginals of the calibration
-RELINEARISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # since the start, while calibration settles
 READMIT_AFTER = 5  # rejections running, after which a sensor is believed until it is consistent again
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Known:
     """What is known of a keyframe before its measurements: State of one epoch, covariances where they are needed."""
 
     state: State
     covariances: Callable[[], Mapping[str, Array]]
-    _point: Any = None
-
-    def point(self, attached: Attached, unknowns: Unknowns) -> Any:
-        """The state as GTSAM's values, made once."""
-        if self._point is None:
-            self._point = values_at(attached.keyframe, attached.segment, self.state, unknowns)
-        return self._point
 
 
 @dataclass
 class IncrementalEstimator:
-    """iSAM2 over the whole dive or a fixed lag, fed measurement by measurement.
+    """iSAM2 over the whole dive, fed measurement by measurement.
 
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
-    lag : length of the window [s], None = whole dive
     """
 
     beginning: Beginning
-    lag: float | None = None
 
     def __post_init__(self) -> None:
         b = self.beginning
@@ -90,10 +69,8 @@ class IncrementalEstimator:
         self.intervals: list[Interval] = []
         self.beliefs = beliefs(b.config)
         self.unknowns = unknowns(self.beliefs, b.instruments)
-        self.engine = Incremental(self.lag, self.unknowns)
+        self.engine = Incremental(self.unknowns)
         self._states: list[State] = []
-        self._first_R_nb = self.beginning.start.state.R_nb
-        self._settling = list(RELINEARISE_AT_S)
         self._covariances: list[dict[str, Array]] = []
         self._used: dict[str, list[tuple[Attached, State, float]]] = {}
         self._rejected: Counter[str] = Counter()
@@ -118,9 +95,9 @@ class IncrementalEstimator:
             factors = priors(b.start, self.beliefs, self.unknowns)
             known = {index: _Known(state, dict)}
         else:
-            before = replace(self.latest(), R_nb=self._first_R_nb)
-            state = predict(interval, self.latest())
-            factors = motion(interval) if self.lag is None else linear_motion(interval, before, state)
+            before = self.latest()
+            state = predict(interval, before)
+            factors = motion(interval)
             P = self._covariances[-1]
             grown = partial(self._predicted_covariances, interval)
             known = {index - 1: _Known(before, lambda: P), index: _Known(state, grown)}
@@ -130,14 +107,10 @@ class IncrementalEstimator:
             insert_calibration(values, state.calibration, self.unknowns, segment)
         for attached in interval.attached:
             factors += self._factor(attached, known[attached.keyframe])
-        self._first_R_nb = state.R_nb
-        self.engine.update(factors, values, interval.time, segment)
+        self.engine.update(factors, values)
         self.intervals.append(interval)
         self._states.append(self.engine.state(index, segment))
         self._covariances.append(self._newest_covariances(interval))
-        if self.lag is not None and self._settling and interval.time - self.intervals[0].time >= self._settling[0]:
-            self._settling.pop(0)
-            self._relinearise()
 
     def solve(self) -> Estimate:
         """The filtering estimate of every keyframe so far."""
@@ -152,24 +125,7 @@ class IncrementalEstimator:
         final = {name: P[name][-1] for name in self.unknowns.estimated}
         sensors = [s for s in self.beginning.instruments if s in self._used]
         calibration = calibration_estimates(self.beliefs, sensors, self.latest().calibration, final)
-        return Estimate("filtered", trajectory, calibration, history, self._residuals(), {"lag_s": self.lag})
-
-    def _relinearise(self) -> None:
-        """Solve the dive so far as a whole, and go on from there.
-
-        While heading and calibration are known only to several degrees, factors that were
-        linearised once misstate what they know by the square of that.
-        """
-        b, newest = self.beginning, self.intervals[-1]
-        problem = make_problem(self.intervals, b.start, b.config, self.beliefs, b.instruments)
-        values = make_values(problem, stack_states(self._states), self.latest().calibration)
-        solution = solve(problem, values)
-        linear = problem.linearize(solution.values, solution.gates)
-        keyframes = [(i.index, i.time, i.segment) for i in self.intervals]
-        self.engine.restart(linear, solution.values, keyframes)
-        self._states[-1] = self.engine.state(newest.index, newest.segment)
-        self._covariances[-1] = self.engine.covariances(newest.index, newest.segment, self.unknowns.estimated)
-        self._first_R_nb = self.latest().R_nb
+        return Estimate("filtered", trajectory, calibration, history, self._residuals())
 
     def _newest_covariances(self, interval: Interval) -> dict[str, Array]:
         """Marginals of the newest keyframe; those of the slow calibration only now and then."""
@@ -210,9 +166,7 @@ class IncrementalEstimator:
         self._used.setdefault(attached.sensor, []).append((attached, here.state, float(admitted)))
         if not admitted:
             return []
-        if self.lag is None:
-            return [one.custom_factor()]
-        return [one.linear_factor(here.point(attached, self.unknowns), r, H)]
+        return [one.custom_factor()]
 
     def _admit(self, one: Block, r: Array, H: Jacobians, here: _Known) -> bool:
         """Whether a measurement's normalised innovation lies within its gate."""

@@ -18,8 +18,8 @@ from typing import Any
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.estimators.dive import assemble, run
-from rovgraph.estimators.error_state import ErrorStateFilter, replay
+from rovgraph.estimators.dive import assemble
+from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.kalman import FILTERS, Filter, run_filter
@@ -49,6 +49,7 @@ class Named:
     headings : "a", "b", "c", or "" for those of the configuration
     misalignment : whether the DVL's misalignment is estimated
     smoothing : whether an epoch is estimated from what came after it, too
+    hydrodynamics : whether thrusters and drag are a source of velocity; False leaves it to the configuration
     whitened : its residuals are normalised by the innovation's own covariance, so that their
         squares sum to the NIS; otherwise by the measurement's noise alone
     stages : the chain, from `Task` to `Estimate`
@@ -62,6 +63,7 @@ class Named:
     smoothing: bool
     stages: tuple[Stage, ...]
     whitened: bool = False
+    hydrodynamics: bool = False
 
     def __call__(self, log: Log, config: Config) -> Estimate:
         """The estimate of one dive.
@@ -85,6 +87,8 @@ class Named:
         """
         if self.headings:
             config = with_headings(log, config, self.headings)
+        if self.hydrodynamics:
+            config = with_hydrodynamics(config)
         return Task(log, with_misalignment(config, self.misalignment))
 
 
@@ -132,7 +136,7 @@ def _run_chain(
 ) -> tuple[Any, float]:
     """The result of a chain and its processor time; ``made`` keeps results by the chain that led to them."""
     result: Any = named.task(log, config)
-    chain: tuple[object, ...] = (named.headings, named.misalignment)
+    chain: tuple[object, ...] = (named.headings, named.misalignment, named.hydrodynamics)
     total = 0.0
     for stage in named.stages:
         chain = (*chain, stage)
@@ -171,6 +175,11 @@ def with_misalignment(config: Config, estimate: bool) -> Config:
     return config.model_copy(update={"calibration": config.calibration.model_copy(update={"dvl_yaw": entry})})
 
 
+def with_hydrodynamics(config: Config) -> Config:
+    """A configuration that uses thrusters and drag."""
+    return config.model_copy(update={"graph": config.graph.model_copy(update={"hydrodynamics": True})})
+
+
 def assembled(task: Task) -> BatchSmoother:
     """Keyframes of a log and what lies between them."""
     return assemble(task.log, initialise(task.log, task.config))
@@ -182,8 +191,8 @@ def stepped(batch: BatchSmoother) -> ErrorStateFilter:
 
 
 def filtered(batch: BatchSmoother) -> Estimate:
-    """The fixed-lag estimate over the same keyframes."""
-    return run(batch.intervals, batch.beginning, batch.beginning.config.graph.lag_s).solve()
+    """The error-state filter over the same keyframes, renewed from the graph of the dive so far."""
+    return replay(batch.intervals, batch.beginning, RENEW_AT_S).solve()
 
 
 _LETTERS = {(True, True): "a", (False, True): "b", (True, False): "c"}  # magnetometer, compass
@@ -210,6 +219,12 @@ def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stag
     return [*held, Named(f"{kind}-misalignment", family, words, "a", True, smoothing, (assembled, *stages))]
 
 
+def _driven(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> Named:
+    """An estimator that knows thrusters and drag, with both headings."""
+    name, words = f"{kind}-hydrodynamics", f"{about}, {_WITH['a']}, thrusters and drag"
+    return Named(name, family, words, "a", False, smoothing, (assembled, *stages), hydrodynamics=True)
+
+
 ESTIMATORS: dict[str, Named] = {
     named.name: named
     for named in (
@@ -225,8 +240,10 @@ ESTIMATORS: dict[str, Named] = {
         *(_of_the_thesis(variant) for variant in FILTERS.values()),
         *_variants("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
         *_variants("rts", "error state", "its Rauch-Tung-Striebel smoother", True, stepped, ErrorStateFilter.smoothed),
-        *_variants("graph-filtered", "graph", "factor graph, fixed lag", False, filtered),
+        *_variants("graph-filtered", "graph", "filter renewed from the graph of the dive so far", False, filtered),
         *_variants("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
+        _driven("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
+        _driven("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
     )
 }
 

@@ -5,5 +5,5 @@ preintegration  IMU samples between two keyframes -> one preintegrated motion
 measurements    measurements of one sensor, linearised all at once or one by one
 factors         the lists of factors: priors, and each interval's
 batch           Gauss-Newton with step control over the whole dive
-incremental     iSAM2 and fixed lag
+incremental     iSAM2
 """

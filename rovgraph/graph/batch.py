@@ -25,7 +25,7 @@ from rovgraph.graph.keys import Unknowns, key, key_name, unknowns
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.values import insert_calibration, insert_state, states_from
 from rovgraph.instruments import Instrument
-from rovgraph.state import State
+from rovgraph.state import DIMENSION, State
 
 Gates = dict[str, NDArray[np.bool_]]
 
@@ -268,6 +268,29 @@ def marginals(problem: Problem, solution: Solution) -> gtsam.GaussianBayesTree:
         return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
     except RuntimeError as error:
         raise InputError(indeterminate(error)) from None
+
+
+def newest_covariance(problem: Problem, solution: Solution) -> Array:
+    """Joint covariance of the newest keyframe and of the calibration there.
+
+    Returns
+    -------
+    ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Problem.unknowns`
+    """
+    linear = problem.linearize(solution.values, solution.gates)
+    last = [key(v, problem.count - 1) for v in DIMENSION]
+    last += [problem.unknowns.key(name, int(problem.segment[-1])) for name in problem.unknowns.estimated]
+    ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last, True)
+    try:
+        net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+    except RuntimeError as error:
+        raise InputError(indeterminate(error)) from None
+    ends, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    for i, one in enumerate(last, net.size() - len(last)):
+        ends.push_back(net.at(i))
+        order.push_back(one)
+    root = np.linalg.inv(np.linalg.qr(ends.jacobian(order)[0], mode="r"))
+    return np.asarray(root @ root.T)
 
 
 def covariance(tree: gtsam.GaussianBayesTree, of: int) -> Array:

@@ -1,6 +1,6 @@
 """The graph as lists of factors: priors, and what an interval adds.
 
-Batch, iSAM2 and fixed lag consume the same lists.
+Batch and iSAM2 consume the same lists.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,6 @@ from rovgraph.calibration import Belief
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.keys import Unknowns, key
-from rovgraph.graph.values import insert_state
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 Factor = gtsam.NonlinearFactor
@@ -80,26 +79,6 @@ def drift(unknowns: Unknowns, segment: int, segment_s: float) -> list[Factor]:
         )
         for name in unknowns.begun_by(segment)
     ]
-
-
-def linear_motion(interval: Interval, before: State, after: State) -> list[Factor]:
-    """`motion`, linearised for good.
-
-    The factor multiplies the change of velocity with the attitude, so the velocities must
-    belong together: the one after is predicted from the one before with ``before``'s own
-    attitude. A correction between them would pass for an acceleration.
-
-    Parameters
-    ----------
-    interval : with motion
-    before, after : State of one epoch each, at which to linearise; of ``after`` only the
-        attitude is taken
-    """
-    after = replace(predict(interval, before), R_nb=after.R_nb)
-    values = gtsam.Values()
-    insert_state(values, interval.index - 1, before)
-    insert_state(values, interval.index, after)
-    return [gtsam.LinearContainerFactor(factor.linearize(values), values) for factor in motion(interval)]
 
 
 def predict(interval: Interval, state: State) -> State:

@@ -144,17 +144,6 @@ class Block:
 
         return gtsam.CustomFactor(robust_noise(self.instrument), self.keys[k], error)
 
-    def linear_factor(self, point: gtsam.Values, r: Array, H: Jacobians) -> gtsam.LinearContainerFactor:
-        """A block of one, already linearised at ``point``, as a factor that never calls back.
-
-        The loss's weight is that of ``r``.
-        """
-        root = np.sqrt(loss_and_weight(r, self.instrument.loss)[1][0])
-        terms = [(j, root * h[0]) for j, h in zip(self.keys[0], H.values(), strict=True)]
-        unit = gtsam.noiseModel.Unit.Create(r.shape[1])
-        factor = gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, root * r[0], unit))
-        return gtsam.LinearContainerFactor(factor, point)
-
     def at(self, index: slice | Array) -> "Block":
         """Some of the measurements."""
         arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name in _PER_MEASUREMENT}

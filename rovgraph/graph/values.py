@@ -33,14 +33,6 @@ def insert_calibration(
         values.insert(unknowns.key(name, segment), np.array(calibration[name], dtype=float).ravel())
 
 
-def values_at(index: int, segment: int, state: State, unknowns: Unknowns) -> gtsam.Values:
-    """Values of one keyframe's state and of all calibration variables that are estimated."""
-    values = state_values(index, state)
-    for name in unknowns.estimated:
-        values.insert(unknowns.key(name, segment), np.array(state.calibration[name], dtype=float).ravel())
-    return values
-
-
 def state_at(values: gtsam.Values, index: int, segment: int, unknowns: Unknowns) -> State:
     """The state at one keyframe, which lies in ``segment``, as a `State` of one epoch."""
     pose = values.atPose3(key(POSE, index))
