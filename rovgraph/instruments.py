@@ -95,7 +95,7 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
     mag_sd = np.deg2rad(heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
     depth = Position("depth", arm(config.depth.lever_arm_m), (2,))
     fix = Position("fix", arm(config.fix.lever_arm_m), (0, 1))
-    aiding = ModelAiding(hydrodynamics(config), origin, env.gravity_mps2)
+    aiding = ModelAiding(hydrodynamics(config), origin, env.gravity_mps2, config.vehicle.thrust_rise_s)
     return {
         "dvl": make(config.dvl, dvl, config.dvl.velocity_sd_mps, ("x", "y", "z")),
         "dvl_heading": make(heading, compass, np.deg2rad(heading.dvl_sd_deg), ("heading",)),

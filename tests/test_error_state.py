@@ -138,7 +138,7 @@ def test_process_noise_is_that_of_noisy_samples():
 def error_vector_and_state(rng: np.random.Generator) -> tuple[ErrorVector, State]:
     everything = {n: {"estimate": True} for n in ("dvl_roll", "dvl_pitch", "dvl_scale", "ahrs_offset", "mag_offset")}
     config = falcon(calibration=everything, environment={"field_norm": 48.0})
-    sensors = {s: i for s, i in instruments(config).items() if s != "thruster"}
+    sensors = instruments(config)
     estimated = [n for i in sensors.values() for n in i.model.calibration]
     calibration = {n: 0.05 * rng.standard_normal(TABLE[n].dim) for n in estimated}
     state = moving(0.1)[0]
@@ -170,7 +170,7 @@ def test_what_an_instrument_sees_is_linear_in_the_error(sensor):
     """At the size of an unknown heading and mounting, where the first order of `State` is off by per cents."""
     rng = np.random.default_rng(3)
     error, state = error_vector_and_state(rng)
-    model = instruments(falcon(environment={"field_norm": 48.0}))[sensor].model
+    model = error_vector.seen_model(instruments(falcon(environment={"field_norm": 48.0}))[sensor].model)
     delta = 0.1 * rng.standard_normal(error.size)
     z, H = model.predict(state, np.zeros((1, 3)))
     moved = model.predict(error.retract(state, delta)[0], np.zeros((1, 3)))[0]

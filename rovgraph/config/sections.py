@@ -170,8 +170,11 @@ class Vehicle(Section):
     thrust: Triple = Field(
         (0.32, -0.016, 2.98e-4), description="thrust [N] of a signal u: a u + b |u| u + c u^3 (2.21)"
     )
+    thrust_rise_s: NotNegative = Field(
+        0.12, description="time from 10 to 90 percent of a change of thrust, below (2.22); 0 = at once"
+    )
     thrusters: tuple[Thruster, ...] = Field(FALCON_THRUSTERS, description="thruster_1, thruster_2, ... of the log")
-    acceleration_sd_mps2: Positive = Field(0.03, description="error of the model's acceleration, mean of a second")
+    acceleration_sd_mps2: Positive = Field(0.02, description="error of the model's acceleration, mean of a second")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="an interval further off than this many sd is left out")
 
@@ -184,5 +187,5 @@ class Graph(Section):
     min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
     solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
     segment_s: Positive = Field(10.0, description="a calibration variable that walks has a new value this often")
-    lag_s: Positive = Field(5.0, description="lag of the fixed-lag smoother, which gives the filtered estimate")
+    lag_s: Positive = Field(5.0, description="window of an online estimate; without effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")

@@ -8,9 +8,10 @@ Mourikis and Roumeliotis 2010). An invariant filter chooses coordinates that sta
 and Bonnabel 2017). Here these are attitude and position in n, and for one variable of each
 instrument the error of **what that instrument sees**: of velocity as the DVL sees it, of
 hard iron as the field that the magnetometer sees, of a compass offset as the heading it
-shows. A measurement of it is linear in them whatever heading and mounting are, so
-correcting it teaches nothing about those. `ErrorVector.retract` and `ErrorVector.local`
-move along these coordinates and give the change of basis of the tangent space.
+shows, of a current as the water's velocity along the vehicle's axes, which drag shows. A
+measurement of it is linear in them whatever heading and mounting are, so correcting it
+teaches nothing about those. `ErrorVector.retract` and `ErrorVector.local` move along these
+coordinates and give the change of basis of the tangent space.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,12 +21,24 @@ import numpy as np
 from rovgraph.calibration import TABLE
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rotate, transpose
 from rovgraph.instruments import Instrument
-from rovgraph.sensors import innovation
+from rovgraph.model_aiding import WaterVelocity
+from rovgraph.sensors import SensorModel, innovation
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State
 
 # the variable that each instrument sees directly: its model is linear in it
-SEEN = {"dvl": VELOCITY, "mag": "hard_iron", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
+SEEN = {
+    "dvl": VELOCITY,
+    "mag": "hard_iron",
+    "ahrs": "ahrs_offset",
+    "dvl_heading": "dvl_compass_offset",
+    "thruster": "current",
+}
 _NO_RATE = np.zeros((2, 3))
+
+
+def seen_model(model: SensorModel) -> SensorModel:
+    """The model that is linear in what its instrument sees: its own, but for thrusters, whose drag is not linear."""
+    return WaterVelocity() if model.sensor == "thruster" else model
 
 
 class ErrorVector:
@@ -49,7 +62,7 @@ class ErrorVector:
         self.columns = {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
         self.size: int = ends[-1]
         self._seen = [
-            (instruments[sensor].model, variable, self.columns[variable])
+            (seen_model(instruments[sensor].model), variable, self.columns[variable])
             for sensor, variable in SEEN.items()
             if sensor in instruments and variable in self.columns
         ]

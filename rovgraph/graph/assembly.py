@@ -20,6 +20,7 @@ import numpy as np
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.graph.aiding import Aiding
 from rovgraph.graph.preintegration import (
     BRIDGE_ACC,
     BRIDGE_GYR,
@@ -36,7 +37,6 @@ from rovgraph.model_aiding import ModelAiding
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 HALF_WINDOW_S = 0.05  # around a ping, over which the rate is averaged; measurements wait that long
 ENOUGH_FOR_A_CURVE = 5  # samples in that window; a slower IMU is interpolated between two
-OLDEST_SIGNAL_S = 1.0  # a thruster's signal is believed to last that long
 GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
@@ -120,7 +120,9 @@ class Assembler:
         self._bridge = preintegration_params(self.config, BRIDGE_ACC, BRIDGE_GYR)
         self._imu: list[tuple[float, Array]] = []
         self._waiting: list[Measurement] = []
-        self._signals: list[Measurement] = []
+        self._aiding: Aiding | None = None
+        if "thruster" in self.instruments:
+            self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
         self._segment, self._segment_start = -1, -np.inf
         self._between: list[Measurement] = []
@@ -139,9 +141,11 @@ class Assembler:
         InputError : an IMU gap longer than ``imu.max_gap_s``
         """
         if measurement.sensor != "imu":
-            if self._admissible(measurement):
-                queue = self._signals if measurement.sensor == "thruster" else self._waiting
-                queue.append(measurement)
+            if measurement.sensor == "thruster":
+                if self._aiding is not None:
+                    self._aiding.add(measurement)
+            elif self._admissible(measurement):
+                self._waiting.append(measurement)
             return []
         self._take_sample(measurement)
         done: list[Interval] = []
@@ -243,32 +247,17 @@ class Assembler:
                 taken.append(m)
             if m.sensor in ONCE_PER_INTERVAL:
                 seen.add(m.sensor)
-        taken = sorted(taken + self._aiding(samples, time), key=lambda m: m.time)
-        stops = np.array([m.time for m in taken])
         bridged = bool(np.diff(samples[:, 0]).max() > self._longest_step)
+        if self._aiding is not None and not bridged:
+            aiding = self._aiding.between(self._start, time, samples, lambda t: self._rate(samples, t)[0])
+            taken = sorted(taken + aiding, key=lambda m: m.time)
+        stops = np.array([m.time for m in taken])
         params = self._bridge if bridged else self._params_for(samples)
         pim, motions = preintegrate(params, self.bias, samples, self._start, stops, time)
         attached = [
             self._attach(m, motion, *self._rate_for(m, samples)) for m, motion in zip(taken, motions, strict=True)
         ]
         return pim, bridged, attached
-
-    def _aiding(self, samples: Array, time: float) -> list[Measurement]:
-        """What thrusters and specific force say of the middle of the interval that ends at ``time``."""
-        instrument, middle = self.instruments.get("thruster"), 0.5 * (self._start + time)
-        if instrument is None:
-            return []
-        inside = samples[(samples[:, 0] >= self._start) & (samples[:, 0] <= time)]
-        before = sum(m.time <= self._start for m in self._signals)
-        self._signals = self._signals[max(before - 1, 0) :]
-        signals = [m for m in self._signals if m.time <= time]
-        if not signals or not len(inside) or signals[-1].time < time - OLDEST_SIGNAL_S:
-            return []
-        turned = self._rate(samples, time)[0] - self._rate(samples, self._start)[0]
-        model = cast(ModelAiding, instrument.model)
-        held = np.array([m.values for m in signals])
-        z = model.measured(inside[:, 1:4].mean(axis=0), held, turned / (time - self._start))
-        return [Measurement(middle, "thruster", z, signals[-1].row)]
 
     def _params_for(self, samples: Array) -> gtsam.PreintegrationCombinedParams:
         """The believed noise, or where a knock shakes the samples far more, what they show."""
@@ -281,8 +270,8 @@ class Assembler:
         return preintegration_params(self.config, max(acc, noise.acc), max(gyr, noise.gyr))
 
     def _rate_for(self, m: Measurement, samples: Array) -> tuple[Array, float]:
-        """The rate, for those instruments that it reaches."""
-        reached = self.instruments[m.sensor].rate_gain.any()
+        """The rate, for those instruments that it reaches: by a lever arm, or by the motion of a turning body."""
+        reached = m.sensor == "thruster" or self.instruments[m.sensor].rate_gain.any()
         return self._rate(samples, m.time) if reached else (np.zeros(3), 0.0)
 
     def _rate(self, samples: Array, time: float) -> tuple[Array, float]:
@@ -317,8 +306,8 @@ class Assembler:
                 sd = np.maximum(sd, m.values[4])
             if self.config.dvl.scale_sd:
                 sd = np.hypot(sd, self.config.dvl.scale_sd * np.linalg.norm(z))
-        if m.sensor == "thruster":  # attached at the middle of its interval
-            sd = sd / math.sqrt(max(2.0 * (m.time - self._start), 1e-3))
+        if m.sensor == "thruster":  # a mean over values[3] seconds
+            sd = sd / math.sqrt(m.values[3])
         if m.sensor == "fix" and np.isfinite(m.values[2]):
             sd = np.full(dim, m.values[2])
         return Attached(m.sensor, self._index, self._segment, m.time, m.row, z, sd, rate_b, rate_sd, motion, self.bias)
