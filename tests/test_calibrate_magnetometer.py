@@ -15,7 +15,7 @@ from rovgraph.calibrate.turns import calibrate_turns
 from rovgraph.cli import app
 from rovgraph.config import Config, Mag, load_config, parse_config
 from rovgraph.errors import InputError
-from rovgraph.geometry import exp_rotation, rotate, transpose
+from rovgraph.geometry import exp_rotation, rotate, rpy_from_matrix, transpose
 from rovgraph.log import STREAMS, Log, Stream, read_log
 from rovgraph.sensors import field_direction
 
@@ -147,6 +147,28 @@ def test_two_turns_give_gains_and_offsets_of_the_axes(gyro):
     assert found.after.length_rms < 0.02 < found.before.length_rms
 
 
+def test_turns_are_the_vehicles_whatever_the_imus_mounting():
+    """A mounting a few degrees askew would put the dip into the centre otherwise."""
+    rng = np.random.default_rng(5)
+    R_bs = exp_rotation(np.array([0.06, -0.02, 0.0]))
+    rate = np.vstack([np.zeros((200, 3)), steady(2, 60.0), steady(0, 60.0)])
+    body = make_log(rate, rng)
+    centre = np.array([4.0, -8.0, 6.0])
+    turned_axes = {
+        s: stream.data.reshape(-1, stream.data.shape[1] // 3, 3) @ R_bs for s, stream in body.streams.items()
+    }
+    streams = {
+        s: Stream(
+            s, STREAMS[s], body[s].time, data.reshape(len(data), -1) + (centre if s == "mag" else 0.0), body[s].row
+        )
+        for s, data in turned_axes.items()
+    }
+    log = Log("turned.csv", streams)
+    mount = {"imu": {"mount_rpy_deg": np.rad2deg(rpy_from_matrix(R_bs)).tolist()}}
+    assert np.abs(calibrate_magnetometer(log, Config.model_validate(mount), "turns").centre - centre).max() < 1.0
+    assert np.abs(calibrate_magnetometer(log, None, "turns").centre - centre).max() > 2.0
+
+
 def test_the_method_of_turns_is_exact_on_exact_turns():
     angle = np.linspace(0.0, 2.0 * np.pi, 721)
     about_z = np.column_stack([30.0 * np.cos(angle), -30.0 * np.sin(angle), np.full(721, 40.0)])
@@ -223,7 +245,7 @@ def test_a_log_that_cannot_calibrate_says_what_it_lacks(kind):
 def test_the_method_of_turns_names_the_turn_it_misses():
     rng = np.random.default_rng(1)
     rate = np.vstack([steady(2, 60.0), steady(1, 60.0)])
-    with pytest.raises(InputError, match="no full turn about the IMU's x axis in it, by the gyro"):
+    with pytest.raises(InputError, match="no full turn about the vehicle's x axis in it, by the gyro"):
         calibrate_magnetometer(make_log(rate, rng, iron), None, "turns")
 
 

@@ -21,7 +21,7 @@ TURNING = 0.05  # scatter of the samples, of their length, below which nothing t
 FLAT = 0.1  # scatter across a plane, of that in it, below which it turned about one axis only
 KNOWN_SD = 0.05  # of the field: a centre less certain than this is refused
 STRETCHED = 3.0  # longest over shortest radius, beyond which it is no magnetometer's ellipsoid
-BEND = 0.01  # residual at which the robust loss bends, of the field
+BEND = 0.02  # residual at which the robust loss bends, of the field
 CELL = 0.1  # side of the cells of the unit sphere that samples are averaged over
 BLOCKS = 50  # stretches of the log whose errors are taken as independent of each other
 
@@ -95,9 +95,10 @@ def fit_ellipsoid(samples: Array, source: str) -> Ellipsoid:
     def misfit(p: Array) -> Array:
         return np.asarray(np.linalg.norm((y - p[:3]) @ _symmetric(p[3:]), axis=1) - 1.0)
 
-    fit = least_squares(misfit, start, loss="soft_l1", f_scale=BEND)  # type: ignore[operator]
+    fit = least_squares(misfit, start, loss="cauchy", f_scale=BEND)  # type: ignore[operator]
     matrix = _symmetric(fit.x[3:])
-    values, sd = np.abs(np.linalg.eigvalsh(matrix)), _clustered_sd(fit.jac, fit.fun)[:3]
+    jacobian = least_squares(misfit, fit.x, max_nfev=1).jac  # type: ignore[operator]  # the robust loss bends fit.jac
+    values, sd = np.abs(np.linalg.eigvalsh(matrix)), _clustered_sd(jacobian, fit.fun)[:3]
     inverse_radius = float(np.cbrt(np.prod(values)))
     if values.max() > STRETCHED * values.min() or sd.max() * inverse_radius > KNOWN_SD:
         worst = AXES[int(np.argmax(sd))]
@@ -140,12 +141,17 @@ def _sphere_centre(y: Array) -> Array:
 
 
 def _clustered_sd(J: Array, r: Array) -> Array:
-    """Standard deviations of a least-squares fit whose errors are alike over stretches of the log.
+    """Standard deviations of a robust fit whose errors are alike over stretches of the log.
 
     The sandwich estimator with clusters: samples that follow each other share the error of the
     model, and would count as far too many if taken as independent.
+
+    Parameters
+    ----------
+    J, r : ndarray, shape (n, k), (n,), Jacobian and residuals at the optimum
     """
-    begins = np.linspace(0, len(r), BLOCKS, endpoint=False).astype(int)
-    score = np.add.reduceat(J * r[:, None], np.unique(begins), axis=0)
-    bread = np.linalg.pinv(J.T @ J)
+    weighted = J / (1.0 + (r / BEND) ** 2)[:, None]  # of Cauchy's loss
+    begins = np.unique(np.linspace(0, len(r), BLOCKS, endpoint=False).astype(int))
+    score = np.add.reduceat(weighted * r[:, None], begins, axis=0)
+    bread = np.linalg.pinv(J.T @ weighted)
     return np.asarray(np.sqrt(np.diag(bread @ (score.T @ score) @ bread)))

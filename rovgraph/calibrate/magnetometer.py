@@ -18,7 +18,7 @@ from rovgraph.calibrate.disturbances import Disturbance, find_disturbances, make
 from rovgraph.calibrate.ellipsoid import fit_ellipsoid, require_turning
 from rovgraph.calibrate.piece import Piece, digits
 from rovgraph.calibrate.turns import Turn, calibrate_turns, find_turn
-from rovgraph.config import Config
+from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Log, Stream
@@ -26,8 +26,8 @@ from rovgraph.log import Log, Stream
 METHODS = ("ellipsoid", "turns")
 Method = Literal["ellipsoid", "turns"]
 LEAST_SAMPLES = 200
-# A disturbance before and after soft iron is known, of the field: until it is, it looks like one.
-COARSE, FINE = 0.2, 0.05
+# Least size of a disturbance, of the field, pass by pass: until soft iron is known, it looks like one.
+PASSES = (0.12, 0.08, 0.05, 0.05)
 MARGIN_S = 1.0  # around a disturbance, left out
 GRAVITY_ONLY = 0.03  # specific force within this part of its median: good for the dip
 
@@ -119,7 +119,7 @@ def calibrate_magnetometer(
     Parameters
     ----------
     log : read without ``imu.mag``, whose successor this gives
-    config : ``environment.field_norm`` of it is used
+    config : ``environment.field_norm`` of it is used, and ``imu.mount_rpy_deg`` for the method of turns
     method : "ellipsoid", or "turns" for the thesis's (3.3)-(3.9)
 
     Raises
@@ -136,25 +136,31 @@ def calibrate_magnetometer(
         raise InputError(f"{log.source}: {len(mag)} samples of the magnetometer, at least {LEAST_SAMPLES} are needed")
     require_turning(mag.data, log.source)
     imu = log.streams.get("imu")
-    fit = _method(method, mag, imu, log.source)
+    fit = _method(method, mag, imu, config, log.source)
     shape, disturbances, used = _undisturbed(mag, imu, fit)
     return _result(log.source, method, mag, imu, config, shape, disturbances, used)
 
 
-def _method(method: Method, mag: Stream, imu: Stream | None, source: str) -> Callable[[NDArray[np.bool_]], _Shape]:
+def _method(
+    method: Method, mag: Stream, imu: Stream | None, config: Config, source: str
+) -> Callable[[NDArray[np.bool_]], _Shape]:
     """The fit of some of the samples."""
+    R_bs = mount_matrix(config.imu.mount_rpy_deg)
 
     def ellipsoid(used: NDArray[np.bool_]) -> _Shape:
         found = fit_ellipsoid(mag.data[used], source)
         return _Shape(found.centre, found.matrix, found.centre_sd, [])
 
     def turns(used: NDArray[np.bool_]) -> _Shape:
-        time, samples = mag.time[used], mag.data[used]
-        rate = None if imu is None else np.column_stack([np.interp(time, imu.time, w) for w in imu.data[:, 3:].T])
+        """In body axes: a crew turns the vehicle, and an IMU a few degrees askew would see the dip in its turns."""
+        time, samples = mag.time[used], mag.data[used] @ R_bs.T
+        rate = None
+        if imu is not None:
+            rate = np.column_stack([np.interp(time, imu.time, w) for w in imu.data[:, 3:].T]) @ R_bs.T
         found = [find_turn(axis, time, samples, rate, source) for axis in (2, 0)]
         about_z, about_x = (samples[(time >= turn.start) & (time <= turn.end)] for turn in found)
         centre, gain = calibrate_turns(about_z, about_x)
-        return _Shape(centre, np.diag(gain), np.full(3, np.nan), found)
+        return _Shape(centre @ R_bs, R_bs.T @ np.diag(gain) @ R_bs, np.full(3, np.nan), found)
 
     return ellipsoid if method == "ellipsoid" else turns
 
@@ -167,14 +173,14 @@ def _undisturbed(
     if imu is None or len(imu) < LEAST_SAMPLES:
         return fit(used), None, used
     R = turned(imu.time, imu.data[:, 3:])
-    matrix, threshold = np.eye(3), COARSE
-    for _ in range(3):
+    matrix = np.eye(3)
+    for least in PASSES:
         field = mag.data @ matrix.T
         length = float(np.median(np.linalg.norm(field[used] - 0.5 * _middle(field[used]), axis=1)))
-        disturbances = find_disturbances(make_bins(mag.time, field, imu.time, R), length, threshold * length)
+        disturbances = find_disturbances(make_bins(mag.time, field, imu.time, R), length, least * length)
         used = _outside(mag.time, disturbances)
         shape = fit(used)
-        matrix, threshold = shape.matrix / np.cbrt(np.linalg.det(shape.matrix)), FINE
+        matrix = shape.matrix / np.cbrt(np.linalg.det(shape.matrix))
     return shape, disturbances, used
 
 

@@ -27,7 +27,7 @@ FULL = 0.97 * 2.0 * np.pi  # of the field's angle: what counts as a full turn [r
 
 @dataclass(frozen=True)
 class Turn:
-    """A full turn about one of the IMU's axes.
+    """A full turn about one of the vehicle's axes.
 
     Attributes
     ----------
@@ -41,14 +41,14 @@ class Turn:
 
 
 def find_turn(axis: int, time: Array, samples: Array, rate: Array | None, source: str) -> Turn:
-    """The longest stretch of a log that turns about an axis of the IMU, a full turn at least.
+    """The longest stretch of a log that turns about an axis, a full turn at least.
 
     Parameters
     ----------
     axis : 0 = x, 2 = z
     time : ndarray, shape (n,) [s]
-    samples : ndarray, shape (n, 3), magnetometer
-    rate : ndarray, shape (n, 3), angular rate [rad/s], IMU axes; None = from the field
+    samples : ndarray, shape (n, 3), magnetometer, body axes
+    rate : ndarray, shape (n, 3), angular rate [rad/s], body axes; None = from the field
     source : name of the log
 
     Raises
@@ -61,8 +61,8 @@ def find_turn(axis: int, time: Array, samples: Array, rate: Array | None, source
     if not runs:
         by = "field" if rate is None else "gyro"
         raise InputError(
-            f"{source}: no full turn about the IMU's {name} axis in it, by the {by}; the method needs a turn about z "
-            "and one about x, each slow and about that axis alone"
+            f"{source}: no full turn about the vehicle's {name} axis in it, by the {by}; "
+            "the method needs a turn about z and one about x, each slow and about that axis alone"
         )
     longest = max(runs, key=lambda run: time[run[-1]] - time[run[0]])
     return Turn(name, float(time[longest[0]]), float(time[longest[-1]]))
