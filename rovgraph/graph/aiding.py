@@ -63,10 +63,10 @@ class Aiding:
         if not (len(inside) and signals):
             return None
         if signals[0].time > begin - self.model.memory:
-            self.left_out["thruster", "intervals before the first signal"] += 1
+            self.left_out["thruster", "pieces before the first signal"] += 1
             return None
         if signals[-1].time < end - OLDEST_SIGNAL_S:
-            self.left_out["thruster", f"intervals without a signal for {OLDEST_SIGNAL_S:g} s"] += 1
+            self.left_out["thruster", f"pieces without a signal for {OLDEST_SIGNAL_S:g} s"] += 1
             return None
         time, values = np.array([m.time for m in signals]), np.array([m.values for m in signals])
         turning = self.model.turning(time, values, inside[:, 0])
