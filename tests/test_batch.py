@@ -361,3 +361,13 @@ def test_benchmark_runs_and_both_solvers_find_the_same_cost():
     assert [row[1].strip() for row in rows] == ["rovgraph", "Levenberg-Marquardt", "rovgraph"]
     ours, gtsams = (float(row[6]) for row in rows[:2])
     assert ours == pytest.approx(gtsams, rel=1e-6)
+
+
+def test_a_sensor_that_its_gate_keeps_out_altogether_does_no_harm(noisy):
+    """Nothing is then left that ties its calibration variables to the rest of the graph."""
+    far = noisy.log["mag"].data + np.where(np.arange(len(noisy.log["mag"]))[:, None] % 2, 0.5, -0.5)
+    config = changed(noisy.config, heading={"mag_sd_deg": 0.01, "loss": "none"})
+    estimate = smoothed(altered(noisy.log, "mag", far), config)
+    residuals = estimate.residuals
+    assert (residuals.loc[residuals["sensor"] == "mag", "weight"] == 0.0).all()
+    assert np.isfinite(estimate.trajectory.p_n).all()

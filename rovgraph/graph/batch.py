@@ -171,14 +171,16 @@ def solve(problem: Problem, values: gtsam.Values) -> Solution:
     InputError : the data do not determine some variable, which is named
     """
     gates, iterations = problem.open_gates(), 0
+    # of the whole graph, as METIS crashes on a variable that the gates have cut off
+    ordering = gtsam.Ordering.MetisGaussianFactorGraph(problem.linearize(values, gates))
     for _ in range(MAX_GATINGS):
-        values, _, steps, _ = _minimise(problem, values, gates, COARSE_DECREASE)
+        values, _, steps, _ = _minimise(problem, values, gates, COARSE_DECREASE, ordering)
         iterations += steps
         renewed = problem.gates(values)
         if all(np.array_equal(renewed[s], gates[s]) for s in gates):
             break
         gates = renewed
-    values, cost, steps, converged = _minimise(problem, values, gates, RELATIVE_DECREASE)
+    values, cost, steps, converged = _minimise(problem, values, gates, RELATIVE_DECREASE, ordering)
     iterations += steps
     return Solution(values, gates, problem.weights(values, gates), cost, iterations, converged)
 
@@ -190,14 +192,12 @@ def solution_at(problem: Problem, values: gtsam.Values) -> Solution:
 
 
 def _minimise(
-    problem: Problem, values: gtsam.Values, gates: Gates, tolerance: float
+    problem: Problem, values: gtsam.Values, gates: Gates, tolerance: float, ordering: gtsam.Ordering
 ) -> tuple[gtsam.Values, float, int, bool]:
     """Gauss-Newton with step halving for fixed gates."""
-    cost, ordering = problem.cost(values, gates), None
+    cost = problem.cost(values, gates)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        linear = problem.linearize(values, gates)
-        ordering = ordering or gtsam.Ordering.MetisGaussianFactorGraph(linear)
-        delta = _eliminate(linear, ordering)
+        delta = _eliminate(problem.linearize(values, gates), ordering)
         trial, trial_cost = _search(problem, values, gates, delta, cost)
         decrease = cost - trial_cost
         values, cost = trial, trial_cost
