@@ -11,9 +11,11 @@ A dive is made of its seed alone; ``--seconds`` ends its log early. Nothing is a
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from inspect import signature
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -259,35 +261,36 @@ OF_4_5: dict[str, Callable[[Filter], Filter]] = CHANGES | {
 OTHERS = ("ekf-misalignment", "graph-filtered-misalignment", "graph-smoothed-misalignment")
 
 
+SOUGHT: dict[str, Callable[..., Case]] = {
+    "vattern": partial(driven, "vattern"),
+    "turning, calm": partial(moved, "square", CALM),
+    "turning, waves": partial(moved, "square", LIVELY),
+}
+
+
 def misalignment(seed: int, seconds: float) -> list[Row]:
     """Angles of the DVL that 4.5, the error-state filter and the graph find, against the true ones."""
-    rows = []
-    dives = {
-        "vattern": lambda: driven("vattern", seed, seconds),
-        "turning, calm": lambda: moved("square", CALM, seed, seconds),
-        "turning, waves": lambda: moved("square", LIVELY, seed, seconds),
-    }
-    for dive, make in dives.items():
-        case = make()
-        label: Row = {"dive": dive}
-        truth = case.truth
-        for what, change in OF_4_5.items():
-            estimate = run_filter(change(FILTERS["4.5"]), case.log, case.config, truth)
-            rows.append({**label, "estimator": f"4.5, {what}"} | _angles(estimate, case))
-        tight = believing(case.config, **TIGHT)
-        rows.append({**label, "estimator": "4.5, tilt sd 0.1 deg"} | _angles(run_filter("4.5", case.log, tight), case))
-        if dive != "vattern":
-            armless = moved("square", MOTIONS[dive][1], seed, seconds, arm=False)
-            estimate = run_filter("4.5", armless.log, armless.config)
-            rows.append({**label, "estimator": "4.5, no lever arm"} | _angles(estimate, armless))
-        for name in OTHERS:
-            rows.append({**label, "estimator": name} | _angles(ESTIMATORS[name](case.log, case.config), case))
-        three = believing(case.config, **{name: {"estimate": True} for name in ANGLES[:2]})
-        name = "graph-smoothed-misalignment"
-        rows.append({**label, "estimator": f"{name}, 3 angles"} | _angles(ESTIMATORS[name](case.log, three), case))
-        held = run_filter("4.3a", case.log, case.config)
-        rows.append({**label, "estimator": "4.3a, none estimated"} | track_errors(held.trajectory, truth))
-    return rows
+    return [
+        {"dive": dive, "estimator": what} | _angles(estimate, case)
+        for dive, make in SOUGHT.items()
+        for what, case, estimate in _found(make, seed, seconds)
+    ]
+
+
+def _found(make: Callable[..., Case], seed: int, seconds: float) -> Iterator[tuple[str, Case, Estimate]]:
+    """What was run, on what, and its estimate."""
+    case = make(seed=seed, seconds=seconds)
+    for what, change in OF_4_5.items():
+        yield f"4.5, {what}", case, run_filter(change(FILTERS["4.5"]), case.log, case.config, case.truth)
+    yield "4.5, tilt sd 0.1 deg", case, run_filter("4.5", case.log, believing(case.config, **TIGHT))
+    if "arm" in signature(make).parameters:
+        armless = make(seed=seed, seconds=seconds, arm=False)
+        yield "4.5, no lever arm", armless, run_filter("4.5", armless.log, armless.config)
+    for name in OTHERS:
+        yield name, case, ESTIMATORS[name](case.log, case.config)
+    three = believing(case.config, **{name: {"estimate": True} for name in ANGLES[:2]})
+    yield f"{OTHERS[-1]}, 3 angles", case, ESTIMATORS[OTHERS[-1]](case.log, three)
+    yield "4.3a, none estimated", case, run_filter("4.3a", case.log, case.config)
 
 
 def _angles(estimate: Estimate, case: Case) -> Row:
@@ -375,20 +378,26 @@ def other_field(case: Case, middle: float) -> Case:
     return replace(case, log=Log(case.log.source, streams, case.log.origin))
 
 
-def field(seed: int, seconds: float, case: Case | None = None, among_iron: bool = True) -> list[Row]:
-    """Errors with the field believed fixed, constant and walking, with and without the change."""
+def field(
+    seed: int, seconds: float, case: Case | None = None, letters: str = "ac", among_iron: bool = True
+) -> list[Row]:
+    """Errors with the field believed fixed, constant and walking, with and without the change.
+
+    Parameters
+    ----------
+    seed, seconds : of the dive, unless ``case`` is one
+    letters : sources of heading
+    among_iron : also with iron on the seabed instead of the change
+    """
     case = case or driven("vattern", seed, seconds, disturbances=False)
     middle = 0.5 * float(case.log["imu"].time[-1] + case.log["imu"].time[0])
     dives = {"the same": case, "another": other_field(case, middle)}
     if among_iron:
         dives["the same, iron on the seabed"] = driven("vattern", seed, seconds)
     rows = []
-    for log, dive in dives.items():
-        for what, entries in BELIEVED.items():
-            config = believing(dive.config, **entries)
-            for letter in "ac":
-                track = ESTIMATORS[f"graph-smoothed-{letter}"](dive.log, config).trajectory
-                rows.append({"headings": letter, "field": log, "believed": what} | track_errors(track, dive.truth))
+    for (which, dive), (what, entries), letter in product(dives.items(), BELIEVED.items(), letters):
+        track = ESTIMATORS[f"graph-smoothed-{letter}"](dive.log, believing(dive.config, **entries)).trajectory
+        rows.append({"headings": letter, "field": which, "believed": what} | track_errors(track, dive.truth))
     return rows
 
 
@@ -408,7 +417,7 @@ class Study:
     seeds, seconds : of the document
     """
 
-    run: Callable[[int, float], list[Row]]
+    run: Callable[..., list[Row]]
     labels: tuple[str, ...]
     numbers: dict[str, tuple[str, str, str]]
     across: str | None = None
