@@ -191,7 +191,7 @@ def test_no_thrusters_or_too_few_are_refused_in_one_line(still):
     old = still.log["thruster"]
     few = Stream("thruster", old.columns[:4], old.time, old.data[:, :4], old.row)
     log = Log(still.log.source, {**still.log.streams, "thruster": few})
-    with pytest.raises(InputError, match="4 thruster columns, vehicle[.]thrusters has 5"):
+    with pytest.raises(InputError, match=r"4 thruster columns, vehicle\.thrusters has 5"):
         initialise(log, still.config)
 
 

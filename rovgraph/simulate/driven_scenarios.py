@@ -23,6 +23,9 @@ RIPPLES_M = 0.005  # amplitude of the waves in the tank: a choice
 FAN_MPS2 = 0.004  # amplitude of the fan's line: a choice, clear of the white noise around it
 LONGEST_S = 3600.0  # of a dive that is driven: its steps are held in memory
 
+# of the steps of thrust, surge, sway, heave [m/s], yaw [rad/s]: a choice
+EXCITED_SPEEDS = ((0.3, 0.6, 0.9), (0.3, 0.6, 0.9), (0.1, 0.25, 0.4), (0.2, 0.4, 0.6))
+
 Made = tuple[Path, Truth]
 
 
@@ -100,10 +103,14 @@ def _followed(world: World, route: Route, speed: float, duration: float) -> Made
 
 
 def _excited(world: World) -> Made:
-    """Steps of thrust in surge, sway, heave and yaw, each forth and back, at three speeds each."""
+    """Steps of thrust in surge, sway, heave and yaw, each forth and back, at three speeds each.
+
+    The highest are about half of what the thrusters give: only there does quadratic drag stand
+    out from linear drag, in sway most of all.
+    """
     vehicle, station = world.believed, np.array([0.0, 0.0, 8.0, 0.0])
     forces = []
-    for axis, speeds in enumerate(((0.2, 0.4, 0.6), (0.15, 0.3, 0.45), (0.1, 0.2, 0.3), (0.2, 0.4, 0.6))):
+    for axis, speeds in enumerate(EXCITED_SPEEDS):
         for speed in speeds:
             motion = np.zeros(6)
             motion[AXES[axis]] = speed
