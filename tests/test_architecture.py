@@ -14,7 +14,7 @@ PACKAGE = ROOT / "rovgraph"
 # Bottom first. Members of one layer are independent: they may not import each other.
 LAYERS = (
     {"errors"},
-    {"geometry"},
+    {"geometry", "workers"},
     {"state", "calibration", "thesis"},
     {"vehicle"},
     {"sensors", "model_aiding"},

@@ -271,12 +271,15 @@ def test_a_read_only_place_is_refused_before_the_work(monkeypatch, capsys, tmp_p
     assert "locked" in one_line(capsys)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes by /proc")
 def test_ctrl_c_in_the_middle_leaves_nothing_and_exits_130(tmp_path, config):
     command = [sys.executable, "-c", "from rovgraph.cli.app import main; main()", "smooth"]
     arguments = [str(SHIPPED / "log.csv.gz"), "-c", str(config), "-o", str(tmp_path / "out")]
     process = subprocess.Popen([*command, *arguments], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    time.sleep(4.0)
+    children, deadline = Path(f"/proc/{process.pid}/task/{process.pid}/children"), time.monotonic() + 60.0
+    while not children.read_text() and time.monotonic() < deadline:  # the filter's process, when work begins
+        time.sleep(0.05)
+    time.sleep(0.5)
     assert process.poll() is None, "it was faster than the interrupt"
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)

@@ -25,8 +25,8 @@ from rovgraph.studies.aggregate import aggregate, nees_band
 from rovgraph.studies.compare import RUN_COLUMNS, compare
 from rovgraph.studies.measures import measures
 from rovgraph.studies.runs import Case, Recorded
-from rovgraph.studies.workers import in_workers
 from rovgraph.trajectory import Trajectory
+from rovgraph.workers import in_workers
 
 ROOT = Path(__file__).parents[1]
 FALCON = ROOT / "configs" / "falcon.yaml"
@@ -316,7 +316,7 @@ def test_results_of_workers_come_in_the_order_of_the_tasks():
 
 
 def test_a_worker_that_is_killed_is_one_clear_line():
-    with pytest.raises(InputError, match="fewer --jobs"):
+    with pytest.raises(InputError, match="a worker process was killed"):
         in_workers(os._exit, [1, 1], 2, lambda done: None)
 
 

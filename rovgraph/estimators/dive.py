@@ -1,10 +1,8 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
-import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import Pool
 
 from rovgraph.config import Config
 from rovgraph.estimators.error_state import PROGRESS_EVERY, RENEW_AT_S, replay
@@ -14,6 +12,7 @@ from rovgraph.estimators.initialise import Beginning, initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.graph.assembly import Interval
 from rovgraph.log import Log
+from rovgraph.workers import starting, workers
 
 Progress = Callable[[str, float], None]
 
@@ -62,12 +61,13 @@ def smooth(
     """
     beginning = initialise(log, config)
     if estimate == "both" and parallel:
-        with Pool(1, initializer=_leave_interrupts_to_the_parent) as pool:
-            filtering = pool.apply_async(_filtered, (log, beginning))
+        with workers(1) as pool:
+            with starting():
+                filtering = pool.submit(_filtered, log, beginning)
             batch = assemble(log, beginning)
             estimates = [_solve(batch, progress)]
             progress("filtering", 0.9)
-            estimates.append(filtering.get())
+            estimates.append(filtering.result())
     else:
         batch, estimates = assemble(log, beginning), []
         if estimate != "filtered":
@@ -100,10 +100,6 @@ def _filtered(log: Log, beginning: Beginning) -> Estimate:
 def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:
     filtering = partial(progress, "filtering")
     return replay(batch.intervals, batch.beginning, RENEW_AT_S, filtering).solve()
-
-
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def run(intervals: Sequence[Interval], beginning: Beginning, progress: Progress = no_progress) -> IncrementalEstimator:

@@ -13,7 +13,7 @@ from rovgraph.estimators.named import Named, Outcome, outcomes, select
 from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.measures import measures, misalignment_history, velocity_history
 from rovgraph.studies.runs import Case, Run
-from rovgraph.studies.workers import cores, in_workers
+from rovgraph.workers import cores, in_workers
 
 Progress = Callable[[float], None]
 REFERENCE = "reference"  # in the place of an estimator's name

@@ -26,13 +26,42 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@contextlib.contextmanager
+def workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that an error or an interrupt within the block ends at once.
+
+    They are started afresh (spawned) with the first tasks, which `submit` has to be given
+    within `starting`; what they call has to be importable.
+
+    Raises
+    ------
+    InputError : a process was killed from outside
+    """
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _prepare)
+    try:
+        yield pool
+    except BaseException as error:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(multiprocessing.active_children()) - before:
+            child.terminate()
+        if isinstance(error, BrokenProcessPool):
+            raise InputError("a worker process was killed (out of memory?); try again with fewer of them") from None
+        raise
+    pool.shutdown()
+
+
+@contextlib.contextmanager
+def starting() -> Iterator[None]:
+    """Around what starts processes: they inherit one thread for each library, and no interrupts."""
+    with _environment(_ONE_THREAD), _interrupts_held_back():
+        yield
+
+
 def in_workers(
     function: Callable[[Task], Result], tasks: Sequence[Task], jobs: int, progress: Callable[[float], None]
 ) -> list[Result]:
     """``function`` of every task, in the order of the tasks, in processes of their own.
-
-    Processes are started afresh (spawned), so ``function`` has to be importable. An
-    interrupt or an error ends all of them at once.
 
     Parameters
     ----------
@@ -44,24 +73,13 @@ def in_workers(
     ------
     InputError : a process was killed from outside
     """
-    before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(min(jobs, len(tasks)), multiprocessing.get_context("spawn"), _prepare)
-    try:
-        with _environment(_ONE_THREAD), _interrupts_held_back():  # both are inherited by what is started here
+    with workers(min(jobs, len(tasks))) as pool:
+        with starting():
             futures = [pool.submit(function, task) for task in tasks]
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
             progress(done / len(tasks))
-        results = [future.result() for future in futures]
-    except BaseException as error:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in set(multiprocessing.active_children()) - before:
-            child.terminate()
-        if isinstance(error, BrokenProcessPool):
-            raise InputError("a worker process was killed (out of memory?); try again with fewer --jobs") from None
-        raise
-    pool.shutdown()
-    return results
+        return [future.result() for future in futures]
 
 
 def _prepare() -> None:
