@@ -195,6 +195,7 @@ TABLE: dict[str, Variable] = {
             "thruster",
             "velocity of the water over ground",
             estimate=True,
+            walk=5e-4,  # a centimetre a second in seven minutes: none stays as it is to the millimetre
         ),
     )
 }
