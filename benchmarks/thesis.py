@@ -32,8 +32,8 @@ from rovgraph.sensors import field_direction
 from rovgraph.simulate import CALM, Choices, Dive, Style, Truth, Waves, lake, scenario, simulate, simulated
 from rovgraph.simulate.files import known
 from rovgraph.simulate.noise import THESIS
-from rovgraph.studies.workers import cores, in_workers
 from rovgraph.trajectory import Trajectory
+from rovgraph.workers import cores, in_workers
 
 Row = dict[str, Any]
 ANGLES = ("dvl_roll", "dvl_pitch", "dvl_yaw")
