@@ -173,7 +173,7 @@ def test_drag_current_and_track_are_recovered_without_noise(still, graph, smooth
 
 
 def test_graph_and_rts_smoother_agree(graph, smoothed):
-    """To half an sd of the track and 10 percent of drag: the smoother of one pass linearises with drag a quarter off."""
+    """To half an sd of the track and 10 percent of drag: one pass linearises with drag a quarter off."""
     rts = replay(graph.intervals, graph.beginning).smoothed()
     far = np.linalg.norm(rts.trajectory.p_n - smoothed.trajectory.p_n, axis=1)
     sd = np.sqrt(np.trace(smoothed.trajectory.cov_p, axis1=1, axis2=2))
