@@ -249,13 +249,15 @@ ESTIMATORS: dict[str, Named] = {
 
 
 def select(names: Sequence[str] | None = None) -> list[Named]:
-    """Estimators by name or pattern (``graph-*``), in the order of `ESTIMATORS`, each once; without names all.
+    """Estimators by name or pattern (``graph-*``), in the order of `ESTIMATORS`, each once.
+
+    Without names all but those that need thrusters.
 
     Raises
     ------
     InputError : an unknown name; the message lists the known ones, the nearest first
     """
-    chosen: set[str] = set(ESTIMATORS) if names is None else set()
+    chosen = {name for name, named in ESTIMATORS.items() if names is None and not named.hydrodynamics}
     for name in names or ():
         matching = fnmatch.filter(ESTIMATORS, name)
         if not matching:
