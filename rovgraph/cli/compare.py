@@ -23,7 +23,8 @@ def compare(
     first_seed: Annotated[int, typer.Option(min=0, help="seed of the first of them")] = 1,
     duration: Annotated[float | None, typer.Option(help="of a simulated dive [s]; default: the scenario's own")] = None,
     estimators: Annotated[
-        str | None, typer.Option(help="names or patterns (graph-*), separated by commas; default: all that need no thrusters")
+        str | None,
+        typer.Option(help="names or patterns (graph-*), separated by commas; default: all that need no thrusters"),
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
