@@ -72,7 +72,9 @@ def driven(name: str, seed: int, seconds: float, **choices: Any) -> Case:
     return case_of(*simulated(name, seed, choices=Choices(variant=variant, **choices)), seconds)
 
 
-def moved(path: str, waves: Waves, seed: int, seconds: float, noise: bool = True, arm: bool = True) -> Case:
+def moved(
+    path: str, waves: Waves, seed: int, seconds: float, noise: bool = True, arm: bool = True, exact: bool = False
+) -> Case:
     """A motion as such with the thesis's noise; the DVL's mounting is exactly as believed.
 
     Parameters
@@ -82,12 +84,13 @@ def moved(path: str, waves: Waves, seed: int, seconds: float, noise: bool = True
     seed, seconds : of the dive
     noise : False = nothing is drawn
     arm : False = the IMU is at the body's origin
+    exact : compasses and field are as believed
     """
     config = lake()
     if not arm:
         config = config.model_copy(update={"imu": config.imu.model_copy(update={"lever_arm_m": (0.0, 0.0, 0.0)})})
-    mounts = {name: beliefs(config)[name].mean for name in ANGLES}
-    truth = Truth(config, calibration=mounts, noise=noise, covariances=THESIS)
+    exactly = {name: belief.mean for name, belief in beliefs(config).items() if exact or name in ANGLES}
+    truth = Truth(config, calibration=exactly, noise=noise, covariances=THESIS)
     dive = simulate(scenario(path, seconds, None, Style(waves=waves)), truth, np.random.default_rng(seed))
     return case_of(dive, known(dive, config), seconds)
 
@@ -254,9 +257,12 @@ def _apart(case: Case, motion: str, what: str, change: Callable[[Filter], Filter
 
 
 TIGHT = {name: {"estimate": True, "sd_deg": 0.1} for name in ANGLES[:2]}
-OF_4_5: dict[str, Callable[[Filter], Filter]] = CHANGES | {
+OF_4_5: dict[str, Callable[[Filter], Filter]] = {
+    **{name: change for name, change in CHANGES.items() if name != "Coriolis exact"},
     "angles walk 0.1 deg/rts": lambda f: f.with_numbers(mount=0.01 * np.deg2rad(0.1) ** 2),
-    "sd 0.15, bias walks": lambda f: f.with_numbers(R_mti=louder(0.15), **CAREFUL),
+    "psi_DVL held in the heading": lambda f: replace(f, compass_mount="held"),
+    "no DVL compass": lambda f: replace(f, compass=False),
+    "no magnetometer": lambda f: replace(f, magnetometer=False),
 }
 OTHERS = ("ekf-misalignment", "graph-filtered-misalignment", "graph-smoothed-misalignment")
 
@@ -284,8 +290,11 @@ def _found(make: Callable[..., Case], seed: int, seconds: float) -> Iterator[tup
         yield f"4.5, {what}", case, run_filter(change(FILTERS["4.5"]), case.log, case.config, case.truth)
     yield "4.5, tilt sd 0.1 deg", case, run_filter("4.5", case.log, believing(case.config, **TIGHT))
     if "arm" in signature(make).parameters:
-        armless = make(seed=seed, seconds=seconds, arm=False)
-        yield "4.5, no lever arm", armless, run_filter("4.5", armless.log, armless.config)
+        for what, changed in (("no lever arm", {"arm": False}), ("exact compasses", {"exact": True})):
+            other = make(seed=seed, seconds=seconds, **changed)
+            yield f"4.5, {what}", other, run_filter("4.5", other.log, other.config)
+        other = make(seed=seed, seconds=seconds, arm=False, exact=True)
+        yield "4.5, no lever arm, exact compasses", other, run_filter("4.5", other.log, other.config)
     for name in OTHERS:
         yield name, case, ESTIMATORS[name](case.log, case.config)
     three = believing(case.config, **{name: {"estimate": True} for name in ANGLES[:2]})

@@ -206,12 +206,14 @@ def test_accelerometer_of_4_1_is_that_of_the_whole_mti():
     assert_allclose(model(x, 2)[1], differences(lambda x: model(x, 2)[0], x), atol=1e-8)
 
 
+@pytest.mark.parametrize("mount_in_heading", [True, False])
 @pytest.mark.parametrize("name", FILTERS)
-def test_dvl_jacobian_is_its_derivative(name):
+def test_dvl_jacobian_is_its_derivative(name, mount_in_heading):
     variant, process = FILTERS[name], a_process(name)
     known = any_known() if variant.attitude_given else None
     config = changed(CONFIG, calibration={"dvl_compass_deviation": {"mean_deg": (2.0, -1.0)}})
-    dvl = DvlModel(process.layout, variant.motion != "earth", instruments(config), beliefs(config), known)
+    sensors, body = instruments(config), variant.motion != "earth"
+    dvl = DvlModel(process.layout, body, sensors, beliefs(config), known, mount_in_heading)
     x = any_state(process.layout)
     h, H = dvl(x, 1, variant.compass)
     numeric = differences(lambda x: h + wrap_angle(dvl(x, 1, variant.compass)[0] - h), x)

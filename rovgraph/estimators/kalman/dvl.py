@@ -75,6 +75,7 @@ class DvlModel:
     sensors : of `rovgraph.instruments.instruments`, at the body's origin
     beliefs : of the calibration variables, which stand at their means
     known : attitude and rate where the state has none
+    mount_in_heading : the angles that are states enter the heading too; False = their means do
     """
 
     def __init__(
@@ -84,9 +85,11 @@ class DvlModel:
         sensors: dict[str, Instrument],
         beliefs: dict[str, Belief],
         known: KnownMotion | None,
+        mount_in_heading: bool = True,
     ) -> None:
         self._places, self._body, self._known = places, body, known
         self._velocity, self._compass = sensors["dvl"].model, sensors["dvl_heading"].model
+        self._mount_in_heading = mount_in_heading
         self._means = {name: belief.mean for name, belief in beliefs.items()}
 
     def __call__(self, x: Array, epoch: int, heading: bool) -> Linearized:
@@ -101,6 +104,8 @@ class DvlModel:
         H[:3, s["v"]] = J[VELOCITY][0] @ R_nb if self._body else J[VELOCITY][0]
         slopes = [(slice(0, 3), J)]
         if heading:
+            if not self._mount_in_heading:
+                state = State(state.R_nb, state.p_n, state.v_n, state.bias, self._means)
             z, J = self._compass.predict(state, w_b[None])
             h[HEADING] = z[0, 0]
             slopes.append((slice(HEADING, 4), J))
@@ -110,7 +115,7 @@ class DvlModel:
             for rows, J in slopes[int(self._body) :]:  # a velocity in b is seen alike at any attitude
                 H[rows, s["q"]] = J[POSE][0, :, :3] @ by_q
         if "mount" in s:
-            for rows, J in slopes:
+            for rows, J in slopes if self._mount_in_heading else slopes[:1]:
                 H[rows, s["mount"]] = np.column_stack([J[name][0, :, 0] for name in MOUNT])
         return h, H
 

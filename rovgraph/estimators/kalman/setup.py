@@ -108,7 +108,7 @@ def prepare(variant: Filter, log: Log, config: Config) -> Setup:
         beliefs=priors,
         process=process,
         imu=_imu_model(variant, config, process.layout, known, priors),
-        dvl=DvlModel(process.layout, body, sensors, priors, known),
+        dvl=DvlModel(process.layout, body, sensors, priors, known, variant.compass_mount == "estimated"),
         known=known,
         samples=samples,
         R_imu=variant.numbers.R_mti[:used, :used],

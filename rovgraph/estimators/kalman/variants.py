@@ -62,6 +62,8 @@ class Filter:
         it matters only where the three differ
     iterations : of a measurement update; 1 = EKF
     linearized_at : "estimate", or "truth": Jacobians at the true motion, which a study knows
+    compass_mount : the DVL's angles in its compass heading, where they are states:
+        "estimated", or "held" at their means, as psi_DVL of (3.17) may be read
     """
 
     name: str
@@ -77,6 +79,7 @@ class Filter:
     noise_frame: Literal["body", "earth"] | None = None
     iterations: int = 1
     linearized_at: Literal["estimate", "truth"] = "estimate"
+    compass_mount: Literal["estimated", "held"] = "estimated"
 
     def __post_init__(self) -> None:
         if self.attitude_given and (
