@@ -191,7 +191,7 @@ def test_a_gap_longer_than_allowed_is_refused_with_row_and_remedy():
     after = int(np.searchsorted(log["imu"].time, 21.0))
     row = log["imu"].row[after]
     with pytest.raises(InputError, match=rf"row {row}: the IMU is silent for 3\.0 s .* imu\.max_gap_s = 2"):
-        fed(IncrementalEstimator(initialise(log, case.config), 5.0), log)
+        fed(IncrementalEstimator(initialise(log, case.config)), log)
 
 
 def test_a_single_lost_sample_is_no_gap():

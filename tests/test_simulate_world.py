@@ -14,7 +14,7 @@ from rovgraph.geometry import rotate, transpose, wrap_angle
 from rovgraph.instruments import instruments
 from rovgraph.log import log_from_frame, read_log
 from rovgraph.sensors import field_direction
-from rovgraph.simulate import NAMES, Choices, Truth, falcon, scenario, simulate, simulated
+from rovgraph.simulate import NAMES, Choices, Truth, falcon, lake, scenario, simulate, simulated
 from rovgraph.simulate.files import write_log
 from rovgraph.simulate.imu import specific_force_and_rate, to_imu_axes
 from rovgraph.simulate.magnetism import EARTH_FIELD_T, Iron, compass_turn
@@ -260,7 +260,7 @@ def test_command_writes_a_driven_dive_with_everything_chosen(tmp_path, monkeypat
     told = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert told["current"] == [0.05, -0.02] and told["outlier_share"] == 0.1 and told["disturbances"] is False
     believed = load_config(tmp_path / "a" / "config.yaml")
-    assert believed.model_dump(exclude={"start"}) == CONFIG.model_dump(exclude={"start"})
+    assert believed.model_dump(exclude={"start"}) == lake().model_dump(exclude={"start"})
     assert abs(believed.start.north_m) < 1e-9  # planned; the dive began beside it
     assert np.linalg.norm(secret["start_offset_m"]) > 0.01
 
