@@ -58,7 +58,7 @@ def ashore():
 
 
 @pytest.fixture(scope="module")
-def lake():
+def lakes():
     """With iron and without, all else the same."""
     return [simulated("docking", 2, choices=Choices(disturbances=on))[0] for on in (True, False)]
 
@@ -163,9 +163,9 @@ def test_compass_turns_to_the_horizontal_part_of_the_whole_field():
     np.testing.assert_allclose(compass_turn(declined, np.array([0.2 * declined])), 0.0, atol=1e-12)
 
 
-def test_each_compass_feels_iron_where_it_is(lake):
+def test_each_compass_feels_iron_where_it_is(lakes):
     """The difference that iron makes to two dives with the same noise."""
-    among, clear = lake
+    among, clear = lakes
     world, calibration = among.hidden["world"], among.hidden["calibration"]
     iron = Iron(world["iron_p_n"], world["iron_moment_n"])
     assert "iron_p_n" not in clear.hidden["world"]
@@ -191,8 +191,8 @@ def test_each_compass_feels_iron_where_it_is(lake):
         np.testing.assert_array_equal(rows(among, columns)[1], rows(clear, columns)[1])
 
 
-def test_iron_lies_below_the_whole_track(lake):
-    among, _ = lake
+def test_iron_lies_below_the_whole_track(lakes):
+    among, _ = lakes
     clearance = among.hidden["world"]["iron_p_n"][:, 2] - among.truth.p_n[:, 2].max()
     assert clearance.min() > 1.0 and clearance.max() < 3.5
 
@@ -214,8 +214,8 @@ def test_field_of_the_lake_is_another_than_the_tanks_whatever_is_estimated():
     assert tank["field_scale"] == tank["field_dip"] == 0.0
 
 
-def test_misalignment_is_exactly_what_is_believed(lake):
-    among, _ = lake
+def test_misalignment_is_exactly_what_is_believed(lakes):
+    among, _ = lakes
     for name in ("dvl_roll", "dvl_pitch", "dvl_yaw"):
         np.testing.assert_array_equal(among.hidden["calibration"][name], beliefs(CONFIG)[name].mean)
 
@@ -229,9 +229,9 @@ def test_units_own_attitude_errs_slowly_and_by_its_sd():
     np.testing.assert_array_equal(remembered(white, 0.0), white)
 
 
-def test_frame_in_memory_is_the_log_that_is_written(lake, tmp_path):
-    write_log(lake[0].log_frame, tmp_path / "log.csv")
-    memory, file = log_from_frame(lake[0].log_frame), read_log(tmp_path / "log.csv")
+def test_frame_in_memory_is_the_log_that_is_written(lakes, tmp_path):
+    write_log(lakes[0].log_frame, tmp_path / "log.csv")
+    memory, file = log_from_frame(lakes[0].log_frame), read_log(tmp_path / "log.csv")
     assert memory.sensors == file.sensors and "thruster" in file
     for sensor in memory.sensors:
         np.testing.assert_allclose(memory[sensor].time, file[sensor].time, atol=1e-9)
