@@ -42,7 +42,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(study(), "MOTIONS", {"turning, calm": ("square", CALM)})
     changes = {name: study().CHANGES[name] for name in ("as printed", "Jacobians at the truth")}
     monkeypatch.setattr(study(), "CHANGES", changes)
-    monkeypatch.setattr(study(), "ON_ARMLESS", ("as printed",))
+    monkeypatch.setattr(study(), "ON_ARMLESS", ())
     monkeypatch.setattr(study(), "OF_4_5", changes)
     monkeypatch.setattr(study(), "SOUGHT", {"docking": partial(short_driven, "docking")})
     monkeypatch.setattr(study(), "BELIEVED", {"fixed": study().BELIEVED["fixed"]})
