@@ -42,9 +42,9 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
     try:
         yield pool
     except BaseException as error:
-        pool.shutdown(wait=False, cancel_futures=True)
         for child in set(multiprocessing.active_children()) - before:
             child.terminate()
+        pool.shutdown(cancel_futures=True)  # waits for the pool's own thread, which would complain at exit
         if isinstance(error, BrokenProcessPool):
             raise InputError("a worker process was killed (out of memory?); try again with fewer of them") from None
         raise
