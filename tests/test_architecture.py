@@ -22,7 +22,7 @@ LAYERS = (
     {"instruments"},
     {"graph"},
     {"estimators", "simulate", "evaluate", "check", "calibrate"},
-    {"studies"},
+    {"studies", "live"},
     {"report"},
     {"cli"},
 )

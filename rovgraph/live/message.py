@@ -1,0 +1,68 @@
+"""What a source says at one time, and from the cells of a row to readings."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rovgraph.geometry import Array
+from rovgraph.log.streams import LAT_LON, OPTIONAL, STREAMS, THRUSTER
+
+GEODETIC = "geodetic"  # a fix in latitude, longitude [deg], sd [m]: becomes "fix" once there is an origin
+
+
+class Reading(NamedTuple):
+    """One sensor's measurement without its time.
+
+    Attributes
+    ----------
+    sensor : key of `STREAMS`, "thruster" or `GEODETIC`
+    values : ndarray, shape (k,), SI, the stream's columns; what is optional and absent is NaN
+        (``dvl_valid``: 1)
+    """
+
+    sensor: str
+    values: Array
+
+
+@dataclass(frozen=True)
+class Message:
+    """What one source said at one time.
+
+    Attributes
+    ----------
+    source : the URL that a person gave
+    arrival : by the host's clock, seconds since 1970
+    stamp : time of validity by the source's own clock [s], None where it has none
+    readings : one per sensor
+    clock : which of the source's clocks the stamp is from, where it has several
+    """
+
+    source: str
+    arrival: float
+    stamp: float | None
+    readings: tuple[Reading, ...]
+    clock: str = ""
+
+
+def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
+    """Readings of a row: of every sensor whose required columns are all there and finite.
+
+    Parameters
+    ----------
+    cells : column of a log -> value in SI; NaN or an infinity counts as absent
+    """
+    cells = {name: value for name, value in cells.items() if np.isfinite(value)}
+    found = []
+    for sensor, columns in STREAMS.items():
+        lost = sensor == "dvl" and cells.get("dvl_valid") == 0.0  # a ping without bottom lock needs no velocities
+        if lost or all(c in cells for c in columns if c not in OPTIONAL):
+            values = np.array([cells.get(c, 1.0 if c == "dvl_valid" else np.nan) for c in columns])
+            found.append(Reading(sensor, values))
+    if all(name in cells for name in LAT_LON):
+        found.append(Reading(GEODETIC, np.array([*(cells[n] for n in LAT_LON), cells.get("fix_sd", np.nan)])))
+    thrusters = sorted((n for n in cells if THRUSTER.fullmatch(n)), key=lambda n: int(n.split("_")[1]))
+    if thrusters:
+        found.append(Reading("thruster", np.array([cells[n] for n in thrusters])))
+    return tuple(found)

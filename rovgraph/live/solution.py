@@ -1,0 +1,81 @@
+"""What the online mode says of a moment: where the vehicle is, how sure that is, and how the sensors are."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rovgraph.geometry import Array
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that a person should know.
+
+    Attributes
+    ----------
+    time : [s], the estimate's time
+    source : sensor or source that it is about
+    kind : short and fixed, as "rejected", "readmitted", "silent", "frozen", "gap", "clock"
+    text : one line for a person
+    """
+
+    time: float
+    source: str
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class SensorHealth:
+    """How a sensor is.
+
+    Attributes
+    ----------
+    state : "ok", "silent", "rejected", "frozen", "no lock"
+    age : since its last measurement [s]
+    used, rejected : counts since the start
+    """
+
+    state: str
+    age: float
+    used: int
+    rejected: int
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The navigation solution of one moment, of the body's origin.
+
+    Attributes
+    ----------
+    time : [s], of the estimator's clock
+    position, velocity : ndarray, shape (3,), n [m, m/s]
+    position_sd, velocity_sd : ndarray, shape (3,)
+    cov_north_east : [m^2]
+    rpy, rpy_sd : ndarray, shape (3,), roll, pitch, yaw [rad]
+    latitude, longitude : [deg], None without an origin
+    calibration : label -> (value, sd), radians and SI
+    sensors : name of the stream -> SensorHealth
+    events : since the last solution
+    distance : travelled [m]
+    predicted_s : how far the IMU alone carried it beyond the newest keyframe [s]
+    latency_s : from the arrival of the newest measurement to this, or None in a replay
+    update_s : time that the newest update took
+    """
+
+    time: float
+    position: Array
+    velocity: Array
+    rpy: Array
+    position_sd: Array
+    velocity_sd: Array
+    rpy_sd: Array
+    cov_north_east: float
+    latitude: float | None = None
+    longitude: float | None = None
+    calibration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    sensors: Mapping[str, SensorHealth] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
+    distance: float = 0.0
+    predicted_s: float = 0.0
+    latency_s: float | None = None
+    update_s: float = 0.0
