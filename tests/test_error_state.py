@@ -281,7 +281,7 @@ def test_covariances_are_symmetric_and_positive(estimator, smoothed):
 
 def test_calibration_converges_to_the_truth(case, estimator):
     estimate, hidden = estimator.solve(), case.dive.hidden["calibration"]
-    for name in estimator.unknowns.estimated:
+    for name in estimator.recursion.unknowns.estimated:
         history = estimate.history[name]
         assert (np.abs(history.value[-1] - hidden[name]) < 3.5 * history.sd[-1]).all(), name
     for name, part in (("dvl_yaw", 0.5), ("dvl_compass_offset", 0.2), ("hard_iron", 0.9)):
@@ -290,7 +290,7 @@ def test_calibration_converges_to_the_truth(case, estimator):
 
 def test_smoothed_constants_are_the_same_at_all_times(estimator):
     histories = estimator.smoothed().history
-    for name in estimator.unknowns.estimated:
+    for name in estimator.recursion.unknowns.estimated:
         history = histories[name]
         np.testing.assert_allclose(history.value, history.value[[-1]].repeat(len(history.value), 0), atol=2e-3)
 
