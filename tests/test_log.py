@@ -54,6 +54,29 @@ def test_windows_line_ends_and_byte_order_mark_are_read(tmp_path):
     np.testing.assert_array_equal(read_quietly(path)["depth"]["depth"], [5, 6])
 
 
+def test_a_log_with_a_column_received_may_have_its_rows_in_the_order_of_arrival(tmp_path):
+    rows = "\n1,5,11\n9,7,12\n2,6,13\n"
+    log = read_quietly(write(tmp_path, "time,depth,received" + rows))
+    assert log["depth"].time.tolist() == [1, 2, 9]
+    assert log["depth"]["depth"].tolist() == [5, 6, 7]
+    with pytest.raises(InputError, match="time goes back from 9"):
+        read_log(write(tmp_path, "time,depth,other" + rows))
+
+
+def test_a_clock_that_was_set_is_refused_even_by_the_order_of_arrival(tmp_path):
+    with pytest.raises(InputError, match=r"line 3: time goes back from 5000.000 to 1.000 s.*at most 600 s"):
+        read_log(write(tmp_path, "time,depth,received\n5000,1,11\n1,2,12\n"))
+
+
+def test_thrusters_and_a_kind_of_fix_that_stand_empty_are_as_good_as_absent(tmp_path):
+    head = "time,fix_north,fix_east,fix_lat,fix_lon,thruster_1,thruster_2"
+    log = read_quietly(write(tmp_path, f"{head}\n1,,,58,8,,\n2,,,58,8,,\n3,,,,,0.5,\n"))
+    assert log["thruster"].columns == ("thruster_1",)
+    assert log.origin == (58.0, 8.0)
+    log = read_quietly(write(tmp_path, f"{head}\n1,1,2,,,,\n"))
+    assert log["fix"].data[0, :2].tolist() == [1.0, 2.0]
+
+
 def test_gzip_is_told_by_content_not_by_name(tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(gzip.compress(b"time,depth\n1,5\n"))

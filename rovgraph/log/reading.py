@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import Array
-from rovgraph.log.streams import COLUMNS, LAT_LON, OPTIONAL, STREAMS, THRUSTER, Log, Stream, is_column
+from rovgraph.log.streams import COLUMNS, LAT_LON, OPTIONAL, RECEIVED, STREAMS, THRUSTER, Log, Stream, is_column
 from rovgraph.log.table import Table, read_table
 from rovgraph.log.units import factors, near_miss, nearest
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
+LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 ACC_GAP = 0.5  # accelerations further apart are not interpolated [s]
 
 Bools = NDArray[np.bool_]
@@ -79,7 +80,8 @@ def _assembled(
     scale = factors(units, table.source)
     names = _names(table, columns)
     cells = {name: _finite(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
-    cells, line = _in_order(cells, table.line, table.source)
+    cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
+    cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
     origin = _add_local_fixes(cells, line, table.source)
     streams = [_imu(cells, line, table.source)]
     streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
@@ -142,12 +144,21 @@ def _finite(table: Table, name: str, source: str) -> Array:
     return values
 
 
-def _in_order(cells: dict[str, Array], line: Lines, source: str) -> tuple[dict[str, Array], Lines]:
+def _may_lack(name: str) -> bool:
+    """Whether a column that stands empty is as good as none: a thruster, one of the two ways to give a fix."""
+    return name in (*LAT_LON, "fix_north", "fix_east") or THRUSTER.fullmatch(name) is not None
+
+
+def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool) -> tuple[dict[str, Array], Lines]:
     """Rows in the order of time, those without a time left out.
+
+    Parameters
+    ----------
+    by_arrival : rows stand as they arrived, so that being late is no fault
 
     Raises
     ------
-    InputError : time goes back further than `STEP_BACK`, or no row has a time
+    InputError : time goes back further than `STEP_BACK` (`LATE` by arrival), or no row has a time
     """
     timeless = np.isnan(cells["time"])
     if timeless.any():
@@ -160,13 +171,15 @@ def _in_order(cells: dict[str, Array], line: Lines, source: str) -> tuple[dict[s
     late = np.flatnonzero(time < latest)
     if not late.size:
         return cells, line
-    worst = late[np.argmax(latest[late] - time[late] > STEP_BACK)]
-    if latest[worst] - time[worst] > STEP_BACK:
+    limit = LATE if by_arrival else STEP_BACK
+    worst = late[np.argmax(latest[late] - time[late] > limit)]
+    if latest[worst] - time[worst] > limit:
         raise InputError(
             f"{source}: line {line[worst]}: time goes back from {latest[worst]:.3f} to {time[worst]:.3f} s, "
-            f"expected steps back of at most {STEP_BACK:g} s; was the clock set, or are two dives in one file? Split it"
+            f"expected steps back of at most {limit:g} s; was the clock set, or are two dives in one file? Split it"
         )
-    _warn(f"{source}: {late.size} rows behind the time before them, put in order; first in line {line[late[0]]}")
+    if not by_arrival:
+        _warn(f"{source}: {late.size} rows behind the time before them, put in order; first in line {line[late[0]]}")
     order = np.argsort(time, kind="stable")
     return {name: values[order] for name, values in cells.items()}, line[order]
 

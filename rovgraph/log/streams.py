@@ -23,6 +23,7 @@ STREAMS: dict[str, tuple[str, ...]] = {
 OPTIONAL = frozenset({"ahrs_roll", "ahrs_pitch", "dvl_valid", "dvl_sd", "fix_sd"})
 LAT_LON = ("fix_lat", "fix_lon")
 COLUMNS = ("time", *(c for columns in STREAMS.values() for c in columns), *LAT_LON)
+RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
 THRUSTER = re.compile(r"thruster_[1-9]\d*")
 
 
