@@ -1,0 +1,234 @@
+"""The recording and the checkpoint: what survives a crash, a full disk and a damaged file."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rovgraph.errors import InputError
+from rovgraph.live.message import GEODETIC, Reading
+from rovgraph.live.recorder import HEADER, Recorder
+from rovgraph.log import STREAMS, read_log
+
+EPOCH = 1.7e9
+RNG = np.random.default_rng(3)
+
+
+def imu(t: float) -> list[Reading]:
+    return [Reading("imu", np.array([0.01 * t, 0.1, -9.81, 0.2, np.sin(t), 1e-7 / 3.0]))]
+
+
+def read_quietly(path: Path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return read_log(path)
+
+
+def test_every_sensor_comes_back_as_the_very_same_numbers(tmp_path):
+    """With all their optional columns, and no warning about the columns that stayed empty."""
+    recorder = Recorder(tmp_path / "r.csv")
+    sent = {
+        sensor: RNG.normal(size=(20, len(columns))) * 10.0 ** RNG.integers(-9, 4, (20, len(columns)))
+        for sensor, columns in STREAMS.items()
+    }
+    sent["dvl"][:, 3] = 1.0
+    sent["thruster"] = RNG.normal(size=(20, 6))
+    times = EPOCH + np.cumsum(RNG.uniform(0.001, 0.1, 20))
+    for k, t in enumerate(times):
+        recorder.write(t, t + 0.01, [Reading(sensor, data[k]) for sensor, data in sent.items()])
+    recorder.close()
+    log = read_quietly(tmp_path / "r.csv")
+    assert log.sensors == set(sent)
+    for sensor, data in sent.items():
+        np.testing.assert_allclose(log[sensor].data, data, rtol=1e-15)
+        np.testing.assert_allclose(log[sensor].time, times, rtol=3e-16)
+
+
+def test_a_ping_without_bottom_lock_and_a_fix_in_degrees_come_back(tmp_path):
+    recorder = Recorder(tmp_path / "r.csv")
+    recorder.write(1.0, EPOCH, [Reading("dvl", np.array([np.nan, np.nan, np.nan, 0.0, np.nan]))])
+    recorder.write(2.0, EPOCH, [Reading(GEODETIC, np.array([58.3, 8.6, 1.5]))])
+    recorder.write(3.0, EPOCH, [Reading(GEODETIC, np.array([58.3001, 8.6, np.nan]))])
+    recorder.close()
+    log = read_quietly(tmp_path / "r.csv")
+    assert log["dvl"]["dvl_valid"].tolist() == [0.0]
+    assert log.origin == (58.3, 8.6)
+    np.testing.assert_allclose(log["fix"].data, [[0, 0, 1.5], [11.14, 0, np.nan]], atol=0.01)
+
+
+def test_the_arrival_is_the_last_column(tmp_path):
+    recorder = Recorder(tmp_path / "r.csv")
+    recorder.write(1.0, EPOCH + 0.25, imu(1.0))
+    recorder.close()
+    header, row = (tmp_path / "r.csv").read_text().splitlines()
+    assert header == ",".join(HEADER)
+    assert header.endswith(",received")
+    assert row.endswith(",1700000000.250000")
+
+
+def test_rows_that_arrived_late_are_put_in_the_order_of_time_without_complaint(tmp_path):
+    recorder = Recorder(tmp_path / "r.csv")
+    for t in (1.0, 2.0, 9.0, 3.0, 10.0):
+        recorder.write(t, EPOCH + t, imu(t))
+    recorder.close()
+    assert read_quietly(tmp_path / "r.csv")["imu"].time.tolist() == [1.0, 2.0, 3.0, 9.0, 10.0]
+
+
+def test_rows_reach_the_operating_system_within_a_fifth_of_a_second(tmp_path):
+    recorder = Recorder(tmp_path / "r.csv")
+    recorder.write(1.0, EPOCH, imu(1.0))
+    begin = time.monotonic()
+    while (tmp_path / "r.csv").read_bytes().count(b"\n") < 2 and time.monotonic() - begin < 5.0:
+        time.sleep(0.005)
+    took = time.monotonic() - begin
+    recorder.close()
+    assert took < 0.2 + 0.1  # the latter for a busy machine
+
+
+CRASHES = """
+import sys, time
+import numpy as np
+from rovgraph.live.message import Reading
+from rovgraph.live.recorder import Recorder
+recorder, k = Recorder(sys.argv[1]), 0
+while True:
+    now = time.monotonic()
+    recorder.write(now, time.time(), [Reading("imu", np.full(6, now))])
+    k += 1
+    if k % 20 == 0:
+        print(now, flush=True)
+    time.sleep(0.001)
+"""
+
+
+def test_a_kill_loses_a_fifth_of_a_second_at_most_and_the_recording_goes_on(tmp_path):
+    path = tmp_path / "r.csv"
+    child = subprocess.Popen([sys.executable, "-c", CRASHES, path], stdout=subprocess.PIPE, text=True)
+    last, begin = float(child.stdout.readline()), time.monotonic()
+    while time.monotonic() - begin < 1.0:
+        last = float(child.stdout.readline())
+    child.kill()
+    told = [float(line) for line in child.communicate()[0].splitlines() if line]
+    assert child.returncode == -signal.SIGKILL
+    last = max([last, *told])
+    content = path.read_bytes()
+    whole = content[: content.rindex(b"\n") + 1]
+    rows = [line.split(b",") for line in whole.splitlines()]
+    assert {len(row) for row in rows} == {len(HEADER)}
+    assert last - float(rows[-1][0]) < 0.2 + 0.1  # the latter for a busy machine
+    recorder = Recorder(path)
+    recorder.write(last + 1.0, EPOCH, imu(1.0))
+    recorder.close()
+    assert len(read_quietly(path)["imu"]) == len(rows)  # less the header, and one more
+
+
+@pytest.mark.parametrize("tail", [b"1700000000.5,0.1", b"17", b"\0" * 5000, b"1.5" + b"\0" * 200_000])
+def test_a_torn_end_is_dropped_when_the_recording_goes_on(tmp_path, tail):
+    path = tmp_path / "r.csv"
+    for t in (1.0, 2.0):
+        recorder = Recorder(path)
+        recorder.write(t, EPOCH, imu(t))
+        recorder.close()
+        whole = path.read_bytes()
+        path.write_bytes(whole + tail)
+    Recorder(path).close()
+    assert path.read_bytes() == whole
+    assert read_quietly(path)["imu"].time.tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("cut", [0, 1, 10, len(",".join(HEADER))])
+def test_a_torn_header_is_written_again(tmp_path, cut):
+    path = tmp_path / "r.csv"
+    path.write_text(",".join(HEADER)[:cut])
+    Recorder(path).close()
+    assert path.read_text() == ",".join(HEADER) + "\n"
+
+
+@pytest.mark.parametrize("content", ["time,depth\n1,2\n", "hello", ",".join(HEADER) + ",more\n", "\0\0\0"])
+def test_a_file_that_is_no_recording_is_refused_and_left_as_it_is(tmp_path, content):
+    path = tmp_path / "r.csv"
+    path.write_text(content)
+    with pytest.raises(InputError, match="no recording that can be continued"):
+        Recorder(path)
+    assert path.read_text() == content
+
+
+def test_a_place_that_cannot_be_written_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be written"):
+        Recorder(tmp_path / "missing" / "r.csv")
+    with pytest.raises(InputError, match="cannot be written"):
+        Recorder(tmp_path)
+
+
+FULL_DISK = """
+import json, resource, sys, time
+import numpy as np
+from rovgraph.live.message import Reading
+from rovgraph.live.recorder import Recorder
+said = []
+recorder = Recorder(sys.argv[1], lambda *about: said.append(about))
+_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+for k in range(1000):
+    recorder.write(float(k), 0.0, [Reading("imu", np.full(6, float(k)))])
+    if k % 100 == 0:
+        time.sleep(0.05)
+time.sleep(0.3)
+full = len(said)
+if "free" in sys.argv:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+recorder.close()
+print(json.dumps([said, full, recorder.lost]))
+"""
+
+
+def full_disk(*arguments) -> tuple[list[list[str]], int, int]:
+    done = subprocess.run([sys.executable, "-c", FULL_DISK, *arguments], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_a_full_disk_is_complained_of_once_and_nothing_is_lost_when_there_is_space_again(tmp_path):
+    said, full, lost = full_disk(tmp_path / "r.csv", "free")
+    assert [kind for _, kind, _ in said] == ["disk"]
+    assert "still trying" in said[0][2]
+    assert (full, lost) == (1, 0)
+    assert read_quietly(tmp_path / "r.csv")["imu"].time.tolist() == list(range(1000))
+
+
+def test_a_disk_that_stays_full_keeps_what_it_took_and_the_loss_is_counted(tmp_path):
+    said, _, lost = full_disk(tmp_path / "r.csv")
+    assert [kind for _, kind, _ in said] == ["disk", "lost"]
+    kept = (tmp_path / "r.csv").read_bytes()
+    assert len(kept) <= 20_000
+    assert kept.count(b"\n") - 1 + lost == 1000
+    Recorder(tmp_path / "r.csv").close()
+    assert len(read_quietly(tmp_path / "r.csv")["imu"]) == 1000 - lost
+
+
+def test_a_ninth_thruster_is_complained_of(tmp_path):
+    said = []
+    recorder = Recorder(tmp_path / "r.csv", lambda *about: said.append(about))
+    for t in (1.0, 2.0):
+        recorder.write(t, EPOCH, [Reading("thruster", np.ones(9))])
+    recorder.close()
+    assert [kind for _, kind, _ in said] == ["left out"]
+
+
+def test_a_row_costs_less_than_eight_microseconds(tmp_path):
+    """Best of twenty hundreds, so that a busy machine is forgiven."""
+    recorder = Recorder(tmp_path / "r.csv")
+    rows = [(EPOCH + 0.01 * k, [Reading("imu", RNG.normal(size=6))]) for k in range(100)]
+    spent = []
+    for _ in range(20):
+        begin = time.perf_counter()
+        for t, readings in rows:
+            recorder.write(t, t, readings)
+        spent.append((time.perf_counter() - begin) / len(rows))
+    recorder.close()
+    assert min(spent) < 8e-6
