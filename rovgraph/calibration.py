@@ -27,9 +27,10 @@ class Variable:
     components : suffixes of the scalar components; ("",) for a scalar
     unit : unit inside the program
     sd : default standard deviation of the prior, every component [unit]
-    sensor : log sensor without which the variable has no meaning
-    estimate : estimated unless the configuration says otherwise
+    sensors : log streams of which one must be in use, or the variable has no meaning
     about : one line for people
+    excited_by : what a dive must have for the data to show it
+    estimate : estimated unless the configuration says otherwise
     walk : default random walk [unit per root second], 0 = constant over the dive
     """
 
@@ -38,8 +39,9 @@ class Variable:
     components: tuple[str, ...]
     unit: str
     sd: float
-    sensor: str
+    sensors: tuple[str, ...]
     about: str
+    excited_by: str
     estimate: bool = False
     walk: float = 0.0
 
@@ -59,112 +61,148 @@ class Variable:
 
 
 _DEG = float(np.deg2rad(1.0))
+_ONE = ("",)
 _XYZ = ("_x", "_y", "_z")
 _CURVE = ("_sin", "_cos")
+_SYMMETRIC = ("_xx", "_yy", "_zz", "_xy", "_xz", "_yz")
+_DVL = ("dvl", "dvl_water")
+
+
+def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "") -> tuple[Variable, Variable]:
+    """Offset and deviation curve of a compass; one that has another correction ``beside`` holds its curve fixed."""
+    offset = Variable(
+        prefix + "_offset",
+        letters[0],
+        _ONE,
+        "rad",
+        5 * _DEG,
+        (sensor,),
+        f"offset of {whose} (deviation A)",
+        "position fixes, or a second compass whose offset is known better",
+        estimate=True,
+    )
+    deviation = Variable(
+        prefix + "_deviation",
+        letters[1],
+        _CURVE,
+        "rad",
+        3 * _DEG,
+        (sensor,),
+        f"deviation curve of {whose}{beside}: sine and cosine of heading (B, C)",
+        "turning through all headings, against the gyro",
+        estimate=not beside,
+    )
+    return offset, deviation
+
 
 TABLE: dict[str, Variable] = {
     v.name: v
     for v in (
-        Variable("dvl_roll", "r", ("",), "rad", 2 * _DEG, "dvl", "roll of the DVL's mounting"),
-        Variable("dvl_pitch", "p", ("",), "rad", 2 * _DEG, "dvl", "pitch of the DVL's mounting"),
+        Variable(
+            "dvl_roll",
+            "r",
+            _ONE,
+            "rad",
+            2 * _DEG,
+            _DVL,
+            "roll of the DVL's mounting",
+            "moving sideways and up and down, with a depth sensor",
+        ),
+        Variable(
+            "dvl_pitch",
+            "p",
+            _ONE,
+            "rad",
+            2 * _DEG,
+            _DVL,
+            "pitch of the DVL's mounting",
+            "moving forwards and up and down, with a depth sensor",
+        ),
         Variable(
             "dvl_yaw",
             "y",
-            ("",),
+            _ONE,
             "rad",
             5 * _DEG,
-            "dvl",
+            _DVL,
             "yaw of the DVL's mounting: misalignment",
-        ),
-        Variable("dvl_scale", "s", ("",), "1", 0.01, "dvl", "scale error of the DVL (sound speed)"),
-        Variable(
-            "dvl_compass_offset",
-            "d",
-            ("",),
-            "rad",
-            5 * _DEG,
-            "dvl_heading",
-            "offset of the DVL's compass (deviation A)",
-            estimate=True,
+            "starts, stops and turns, against the accelerometer; position fixes beside a compass that is known",
         ),
         Variable(
-            "dvl_compass_deviation",
-            "e",
-            _CURVE,
-            "rad",
-            3 * _DEG,
-            "dvl_heading",
-            "deviation curve of the DVL's compass: sine and cosine of heading (B, C)",
-            estimate=True,
+            "dvl_scale",
+            "s",
+            _ONE,
+            "1",
+            0.01,
+            _DVL,
+            "scale error of the DVL (sound speed)",
+            "position fixes far apart; large changes of depth; starts and stops, against the accelerometer",
         ),
         Variable(
-            "ahrs_offset",
-            "a",
-            ("",),
-            "rad",
-            5 * _DEG,
-            "ahrs",
-            "offset of the IMU's own heading (deviation A)",
-            estimate=True,
-        ),
-        Variable(
-            "ahrs_deviation",
-            "f",
-            _CURVE,
-            "rad",
-            3 * _DEG,
-            "ahrs",
-            "deviation curve of the IMU's own heading: sine and cosine of heading (B, C)",
-            estimate=True,
-        ),
-        Variable(
-            "mag_offset",
+            "dvl_lever_arm",
+            "l",
+            _XYZ,
             "m",
-            ("",),
-            "rad",
-            5 * _DEG,
-            "mag",
-            "offset of the magnetometer's heading (deviation A)",
-            estimate=True,
+            0.05,
+            _DVL,
+            "error of the DVL's place, dvl.lever_arm_m less imu.lever_arm_m, body axes",
+            "turning: yaw for forward and starboard, roll and pitch for down",
         ),
-        Variable(
-            "mag_deviation",
-            "g",
-            _CURVE,
-            "rad",
-            3 * _DEG,
-            "mag",
-            "deviation curve of the magnetometer beside its hard iron: sine and cosine of heading (B, C)",
-        ),
+        *_compass("dvl_compass", "de", "dvl_heading", "the DVL's compass"),
+        *_compass("ahrs", "af", "ahrs", "the IMU's own heading"),
+        *_compass("mag", "mg", "mag", "the magnetometer's heading", " beside its hard iron"),
         Variable(
             "hard_iron",
             "h",
             _XYZ,
             "field",
             0.02,
-            "mag",
+            ("mag",),
             "hard iron in IMU axes, as a fraction of the field's magnitude",
+            "turning through all headings; roll and pitch for the vertical axis",
             estimate=True,
+        ),
+        Variable(
+            "soft_iron",
+            "o",
+            _SYMMETRIC,
+            "1",
+            0.02,
+            ("mag",),
+            "soft iron in IMU axes beyond imu.mag.matrix: what a symmetric matrix has beyond the unit matrix",
+            "turning through all headings with much roll and pitch; hold field_scale fixed, which is its mean diagonal",
         ),
         Variable(
             "field_dip",
             "i",
-            ("",),
+            _ONE,
             "rad",
             3 * _DEG,
-            "mag",
+            ("mag",),
             "difference of the field's dip from environment.dip_deg",
-            True,
+            "always",
+            estimate=True,
         ),
         Variable(
             "field_scale",
             "q",
-            ("",),
+            _ONE,
             "1",
             0.05,
-            "mag",
+            ("mag",),
             "difference of the field's magnitude from environment.field_norm, as a fraction of it",
-            True,
+            "always",
+            estimate=True,
+        ),
+        Variable(
+            "depth_offset",
+            "z",
+            _ONE,
+            "m",
+            0.2,
+            ("depth",),
+            "offset of the depth sensor",
+            "a start at a known depth (start.down_m), and vertical velocity that is believed to keep it",
         ),
         Variable(
             "drag_linear",
@@ -172,8 +210,9 @@ TABLE: dict[str, Variable] = {
             _XYZ,
             "1",
             0.3,
-            "thruster",
+            ("thruster",),
             "relative error of vehicle.drag_linear",
+            "slow motion along each axis with a DVL",
             estimate=True,
         ),
         Variable(
@@ -182,8 +221,9 @@ TABLE: dict[str, Variable] = {
             _XYZ,
             "1",
             0.3,
-            "thruster",
+            ("thruster",),
             "relative error of vehicle.drag_quadratic",
+            "fast motion along each axis with a DVL",
             estimate=True,
         ),
         Variable(
@@ -192,8 +232,9 @@ TABLE: dict[str, Variable] = {
             ("_north", "_east"),
             "m/s",
             0.1,
-            "thruster",
+            ("thruster", "dvl_water"),
             "velocity of the water over ground",
+            "bottom track beside water track or thrusters; with thrusters, turning",
             estimate=True,
             walk=5e-4,  # a centimetre a second in seven minutes: none stays as it is to the millimetre
         ),

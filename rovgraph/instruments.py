@@ -67,8 +67,8 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
 
     Returns
     -------
-    dict : "dvl", "dvl_heading", "ahrs", "mag", "depth", "fix", "thruster" -> Instrument; the sd of
-        "thruster" is that of a mean over one second
+    dict : "dvl", "dvl_water", "dvl_heading", "ahrs", "mag", "depth", "fix", "thruster" -> Instrument; the
+        sd of "thruster" is that of a mean over one second
     """
     env = config.environment
     origin: Array = np.asarray(origin_b, float)
@@ -88,16 +88,17 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
             gain = mount_matrix(config.dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
         return Instrument(model, spread, section.loss, section.gate_sd, components, gain)  # type: ignore[attr-defined]
 
-    dvl = DvlVelocity(arm(config.dvl.lever_arm_m))
+    dvl, water = (DvlVelocity(arm(config.dvl.lever_arm_m), sensor) for sensor in ("dvl", "dvl_water"))
     compass = CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination)
     ahrs = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, R_imu)
     # a heading error of mag_sd turns the horizontal part of the field
     mag_sd = np.deg2rad(heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
-    depth = Position("depth", arm(config.depth.lever_arm_m), (2,))
+    depth = Position("depth", arm(config.depth.lever_arm_m), (2,), "depth_offset")
     fix = Position("fix", arm(config.fix.lever_arm_m), (0, 1))
     aiding = ModelAiding(hydrodynamics(config), origin, env.gravity_mps2, config.vehicle.thrust_rise_s)
     return {
         "dvl": make(config.dvl, dvl, config.dvl.velocity_sd_mps, ("x", "y", "z")),
+        "dvl_water": make(config.dvl, water, config.dvl.water_velocity_sd_mps, ("x", "y", "z")),
         "dvl_heading": make(heading, compass, np.deg2rad(heading.dvl_sd_deg), ("heading",)),
         "ahrs": make(heading, ahrs, np.deg2rad(heading.ahrs_sd_deg), ("heading",)),
         "mag": make(heading, MagneticField(declination, dip, magnitude, R_imu), mag_sd, ("x", "y", "z")),

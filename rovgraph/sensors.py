@@ -8,12 +8,14 @@ with it and observability analysis stacks it. Calibration variables are read fro
 ===========  =========================================================  ==================
 sensor       equation                                                   source
 ===========  =========================================================  ==================
-dvl          z = (1 + k) R_sb (R_bn v_n + (w - b_g) x l)                (3.16), (3.17)
+dvl          z = (1 + k) R_sb (R_bn v_n + (w - b_g) x (l + dl))         (3.16), (3.17)
+dvl_water    the same with v_n - c_n, c the current
 dvl_heading  z = h + A + B sin h + C cos h, h = heading - declination   (3.17); deviation
 ahrs         the same with the IMU's x axis                             curve: Bowditch
-mag          z = |H| ((1 + s) R_sb R_bn u(declination - A - ..., dip + d) + iron)
-                                                                        (3.11), (3.14)
-depth        z = p_d + (R_nb l)_d
+mag          z = |H| ((1 + s) S R_sb R_bn u(declination - A - ..., dip + d) + iron)
+                                                                        (3.11), (3.14),
+                                                                        S: (3.2)
+depth        z = p_d + (R_nb l)_d + offset
 fix          z = (p + R_nb l)_north,east
 ===========  =========================================================  ==================
 
@@ -100,36 +102,47 @@ def dvl_mount(state: State) -> tuple[Array, Jacobians]:
 
 @dataclass(frozen=True)
 class DvlVelocity:
-    """Velocity over ground in the DVL's axes (3.17).
+    """Velocity of the DVL in its own axes, over ground (3.17) or relative to the water.
 
     Attributes
     ----------
     lever_arm_b : ndarray, shape (3,), DVL relative to the state's origin [m]
+    sensor : "dvl" over ground, "dvl_water" relative to the water
     """
 
     lever_arm_b: Array
-    sensor = "dvl"
+    sensor: str = "dvl"
     dim = 3
     angular = False
     state = (POSE, VELOCITY, BIAS)
-    calibration = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale")
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        own = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm")
+        return (*own, "current") if self.sensor == "dvl_water" else own
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        n = len(state)
         R_bs, axes = dvl_mount(state)
-        R_bn = transpose(state.R_nb)
-        body = rotate(R_bn, state.v_n)
-        v_b = body + cross(rate_b - state.bias[:, 3:], self.lever_arm_b)
+        R_bn, v_n = transpose(state.R_nb), state.v_n.copy()
+        if self.sensor == "dvl_water":
+            v_n[:, :2] -= state.calibration["current"]
+        body, w = rotate(R_bn, v_n), rate_b - state.bias[:, 3:]
+        arm = np.broadcast_to(self.lever_arm_b + state.calibration["dvl_lever_arm"], (n, 3))
+        v_b = body + cross(w, arm)
         gain = (1.0 + _scalar(state, "dvl_scale"))[:, None]
         R_sb = transpose(R_bs) * gain[..., None]
 
-        pose, bias = np.zeros((len(state), 3, 6)), np.zeros((len(state), 3, 6))
+        pose, bias = np.zeros((n, 3, 6)), np.zeros((n, 3, 6))
         pose[..., :3] = R_sb @ skew(body)
-        bias[..., 3:] = R_sb @ skew(self.lever_arm_b)
-        H = {POSE: pose, VELOCITY: R_sb @ R_bn, BIAS: bias}
+        bias[..., 3:] = R_sb @ skew(arm)
+        H = {POSE: pose, VELOCITY: R_sb @ R_bn, BIAS: bias, "dvl_lever_arm": R_sb @ skew(w)}
         for name, axis in axes.items():
             H[name] = -rotate(R_sb, cross(axis, v_b))[..., None]
         z = rotate(R_sb, v_b)
         H["dvl_scale"] = (z / gain)[..., None]
+        if self.sensor == "dvl_water":
+            H["current"] = -H[VELOCITY][..., :2]
         return z, H
 
 
@@ -213,9 +226,20 @@ def field_direction(declination: Array | float, dip: Array | float) -> Array:
     return np.stack([np.cos(i) * np.cos(d), np.cos(i) * np.sin(d), np.sin(i)], axis=-1)
 
 
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # places of a symmetric matrix's six components
+
+
+def _symmetric(components: Array) -> Array:
+    """Symmetric matrices of components xx, yy, zz, xy, xz, yz; shape (..., 6) to (..., 3, 3)."""
+    out = np.zeros((*components.shape[:-1], 3, 3))
+    for k, (i, j) in enumerate(_PAIRS):
+        out[..., i, j] = out[..., j, i] = components[..., k]
+    return out
+
+
 @dataclass(frozen=True)
 class MagneticField:
-    """Magnetometer vector in IMU axes (3.14), soft iron taken as calibrated (3.2).
+    """Magnetometer vector in IMU axes (3.14), soft iron beyond its calibration (3.2) a symmetric matrix.
 
     Attributes
     ----------
@@ -232,7 +256,7 @@ class MagneticField:
     dim = 3
     angular = False
     state = (POSE, BIAS)
-    calibration = ("mag_offset", "mag_deviation", "hard_iron", "field_dip", "field_scale")
+    calibration = ("mag_offset", "mag_deviation", "hard_iron", "soft_iron", "field_dip", "field_scale")
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         n = len(state)
@@ -243,20 +267,22 @@ class MagneticField:
         u_n, dipped = field_direction(declination, dip), field_direction(declination, dip + 0.5 * np.pi)
         u_b = rotate(transpose(state.R_nb), u_n)
         turned = np.stack([-u_n[:, 1], u_n[:, 0], np.zeros(n)], axis=-1)  # du/d(declination)
-        R_sb = self.magnitude * (1.0 + _scalar(state, "field_scale"))[:, None, None] * self.R_bs.T
+        gain = self.magnitude * (1.0 + _scalar(state, "field_scale"))[:, None, None]
+        softened = (np.eye(3) + _symmetric(state.calibration["soft_iron"])) @ self.R_bs.T
+        R_sb = gain * softened
         by_deviation = -rotate(R_sb, rotate(transpose(state.R_nb), turned))
 
         pose = np.zeros((n, 3, 6))
         pose[..., :3] = R_sb @ skew(u_b) + by_deviation[..., None] * (slope[:, None] * gradient)[:, None, :]
-        iron = state.calibration["hard_iron"]
-        field = rotate(self.magnitude * self.R_bs.T, u_b)
+        iron, along = state.calibration["hard_iron"], rotate(gain * self.R_bs.T, u_b)
         H = {
             POSE: pose,
             "mag_offset": by_deviation[..., None],
             "mag_deviation": by_deviation[..., None] * sine_cosine[:, None, :],
             "hard_iron": np.tile(self.magnitude * np.eye(3), (n, 1, 1)),
             "field_dip": rotate(R_sb, rotate(transpose(state.R_nb), dipped))[..., None],
-            "field_scale": field[..., None],
+            "field_scale": rotate(self.magnitude * softened, u_b)[..., None],
+            "soft_iron": np.stack([_symmetric(one) @ along[..., None] for one in np.eye(6)], axis=-1)[..., 0, :],
         }
         return rotate(R_sb, u_b) + self.magnitude * iron, H
 
@@ -270,21 +296,30 @@ class Position:
     sensor : "depth" or "fix"
     lever_arm_b : ndarray, shape (3,), of the sensor relative to the state's origin [m]
     axes : indices of the components measured, (2,) for depth, (0, 1) for a fix
+    offset : name of the calibration variable that is added, or None
     """
 
     sensor: str
     lever_arm_b: Array
     axes: tuple[int, ...]
+    offset: str | None = None
     angular = False
     state = (POSE, VELOCITY, BIAS)
-    calibration: tuple[str, ...] = ()
 
     @property
     def dim(self) -> int:
         return len(self.axes)
 
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        return () if self.offset is None else (self.offset,)
+
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         rows = list(self.axes)
-        point = state.p_n + rotate(state.R_nb, self.lever_arm_b)
+        z = (state.p_n + rotate(state.R_nb, self.lever_arm_b))[:, rows]
         pose = np.concatenate([-state.R_nb @ skew(self.lever_arm_b), state.R_nb], axis=-1)
-        return point[:, rows], {POSE: pose[:, rows, :]}
+        H = {POSE: pose[:, rows, :]}
+        if self.offset is not None:
+            z = z + state.calibration[self.offset]
+            H[self.offset] = np.tile(np.eye(self.dim), (len(state), 1, 1))
+        return z, H

@@ -1,6 +1,7 @@
 """One table of calibration variables serves configuration, models, keys and simulator."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs, parse_config
 from rovgraph.errors import InputError
-from rovgraph.graph.keys import key, key_name
+from rovgraph.graph.keys import key, key_name, unknowns
 from rovgraph.instruments import instruments
 from rovgraph.state import DIMENSION
 
@@ -21,7 +22,22 @@ def test_every_variable_is_named_by_a_measurement_model():
 def test_every_variable_belongs_to_a_sensor_that_names_it():
     sensors = instruments(Config())
     for name, variable in TABLE.items():
-        assert name in sensors[variable.sensor].model.calibration
+        assert variable.sensors
+        for sensor in variable.sensors:
+            assert name in sensors[sensor].model.calibration
+
+
+def test_the_manual_says_of_every_variable_what_it_is_and_what_shows_it():
+    manual = (Path(__file__).parents[1] / "docs" / "calibration-variables.md").read_text(encoding="utf-8")
+    for v in TABLE.values():
+        assert f"| `{v.name}` |" in manual and v.about in manual and v.excited_by in manual, v.name
+
+
+def test_a_variable_is_estimated_only_where_a_sensor_that_shows_it_is_in_use():
+    believed = beliefs(parse_config("calibration: {dvl_yaw: {estimate: true}, depth_offset: {estimate: true}}"))
+    assert "depth_offset" not in unknowns(believed, {"dvl"}).estimated
+    assert {"dvl_yaw", "current"} <= set(unknowns(believed, {"dvl_water"}).estimated)
+    assert "current" not in unknowns(believed, {"dvl", "depth"}).estimated
 
 
 def test_letters_are_unique_and_none_is_a_state_variables():

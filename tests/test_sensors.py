@@ -103,6 +103,30 @@ def test_dvl_that_is_turned_and_upside_down_sees_the_velocity_in_its_own_axes():
     np.testing.assert_allclose(model.predict(state, np.zeros((1, 3)))[0][0], [0.1, 0.3, -0.02], atol=1e-12)
 
 
+def test_water_track_is_the_velocity_less_the_current_in_the_dvls_axes():
+    sensors = instruments(parse_config("dvl: {lever_arm_m: [0.5, 0, 0]}"))
+    state, rate = at_rest(dvl_roll=[np.pi], current=[0.2, -0.1]), np.array([[0.0, 0.0, 0.2]])
+    state.v_n[:] = [0.3, 0.1, 0.02]
+    ground, water = (sensors[s].model.predict(state, rate)[0][0] for s in ("dvl", "dvl_water"))
+    np.testing.assert_allclose(ground, [0.3, -0.2, -0.02], atol=1e-12)
+    np.testing.assert_allclose(water, [0.1, -0.3, -0.02], atol=1e-12)
+
+
+def test_an_error_of_the_lever_arm_moves_the_dvl_in_a_turn():
+    model = instruments(Config())["dvl"].model
+    z = model.predict(at_rest(dvl_lever_arm=[0.1, 0.2, 0.0]), np.array([[0.0, 0.0, 0.5]]))[0]
+    np.testing.assert_allclose(z[0], [-0.1, 0.05, 0.0], atol=1e-12)
+
+
+def test_soft_iron_is_a_symmetric_matrix_in_the_imus_axes():
+    model = instruments(parse_config("environment: {field_norm: 50, dip_deg: 90}"))["mag"].model
+    soft = [0.0, 0.0, 0.1, 0.0, 0.02, -0.04]  # xx, yy, zz, xy, xz, yz
+    np.testing.assert_allclose(model.predict(at_rest(soft_iron=soft), np.zeros((1, 3)))[0][0], [1, -2, 55], atol=1e-9)
+    level = instruments(parse_config("environment: {field_norm: 50, dip_deg: 0}"))["mag"].model
+    soft = [0.1, 0.0, 0.0, 0.02, -0.04, 0.0]
+    np.testing.assert_allclose(level.predict(at_rest(soft_iron=soft), np.zeros((1, 3)))[0][0], [55, 1, -2], atol=1e-9)
+
+
 def test_dvl_ahead_of_the_centre_moves_to_starboard_in_a_turn_to_starboard():
     model = instruments(parse_config("dvl: {lever_arm_m: [0.5, 0, 0]}"))["dvl"].model
     z = model.predict(at_rest(), np.array([[0.0, 0.0, 0.2]]))[0]
@@ -166,7 +190,8 @@ def test_depth_and_fix_are_those_of_their_own_place():
     sensors, state = instruments(CONFIG), random_state()
     for sensor, rows in (("depth", [2]), ("fix", [0, 1])):
         arm = getattr(CONFIG, sensor).lever_arm_m
-        expected = (state.p_n + rotate(state.R_nb, np.array(arm)))[:, rows]
+        offset = state.calibration["depth_offset"] if sensor == "depth" else 0.0
+        expected = (state.p_n + rotate(state.R_nb, np.array(arm)))[:, rows] + offset
         np.testing.assert_allclose(sensors[sensor].model.predict(state, np.zeros((N, 3)))[0], expected)
 
 

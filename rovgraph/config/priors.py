@@ -18,7 +18,10 @@ def _calibration_entry(variable: Variable) -> type[BaseModel]:
     unit = "degrees" if variable.angular else variable.unit
     mounted = variable.name in MOUNT
     fields: dict[str, Any] = {
-        "estimate": (bool, Field(variable.estimate, description=f"estimate it: {variable.about}")),
+        "estimate": (
+            bool,
+            Field(variable.estimate, description=f"estimate it: {variable.about}. Shown by: {variable.excited_by}"),
+        ),
         "mean" + tail: (
             float | tuple[float, ...] | None,
             Field(None, description=f"prior mean [{unit}]; null = " + ("the mounting" if mounted else "0")),

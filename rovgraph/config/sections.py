@@ -100,6 +100,7 @@ class Dvl(Section):
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="DVL axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the DVL in body axes")
     velocity_sd_mps: PositiveTriple = Field((0.01, 0.01, 0.01), description="noise of a ping, DVL axes")
+    water_velocity_sd_mps: PositiveTriple = Field((0.03, 0.03, 0.03), description="noise of a water-track ping")
     scale_sd: NotNegative = Field(0.0, description="part of the speed added to the noise of a ping")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is left out; null = never")

@@ -97,7 +97,7 @@ def _velocities(
     here = State(R_nb[index], R_nb[index, 0], R_nb[index, 0], biases[index], dict(calibration))
     z = np.array([a.z for _, a in pings]) / (1.0 + calibration["dvl_scale"])
     rate_b = np.array([a.rate_b for _, a in pings]) - biases[index, 3:]
-    arm = beginning.instruments["dvl"].model.lever_arm_b  # type: ignore[attr-defined]
+    arm = beginning.instruments["dvl"].model.lever_arm_b + calibration["dvl_lever_arm"]  # type: ignore[attr-defined]
     v_b = np.einsum("nij,nj->ni", dvl_mount(here)[0], z) - cross(rate_b, arm)
     v_n = np.einsum("nij,nj->ni", R_nb[index], v_b)
     time = np.array([i.time for i in intervals])

@@ -32,13 +32,14 @@ SEEN = {
     "ahrs": "ahrs_offset",
     "dvl_heading": "dvl_compass_offset",
     "thruster": "current",
+    "dvl_water": "current",
 }
 _NO_RATE = np.zeros((2, 3))
 
 
 def seen_model(model: SensorModel) -> SensorModel:
-    """The model that is linear in what its instrument sees: its own, but for thrusters, whose drag is not linear."""
-    return WaterVelocity() if model.sensor == "thruster" else model
+    """The model that is linear in what its instrument sees: its own, but for a current, which shows in drag."""
+    return WaterVelocity() if SEEN[model.sensor] == "current" else model
 
 
 class ErrorVector:

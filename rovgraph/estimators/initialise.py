@@ -66,7 +66,7 @@ def initialise(log: Log, config: Config) -> Beginning:
     config = _resolve_noise(log, config, assumptions)
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
-    used = [s for s in ("dvl", "depth", "fix") if s in log] + sources + _thrusters(log, config)
+    used = [s for s in ("dvl", "dvl_water", "depth", "fix") if s in log] + sources + _thrusters(log, config)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 

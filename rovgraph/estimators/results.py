@@ -62,7 +62,7 @@ def calibration_estimates(
     values: Mapping[str, Array],
     covariance: Mapping[str, Array],
 ) -> list[CalibrationEstimate]:
-    """One entry per component of every variable whose sensor is used.
+    """One entry per component of every variable of a sensor that is used.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def calibration_estimates(
     """
     out = []
     for name, belief in beliefs.items():
-        if belief.variable.sensor not in sensors:
+        if not set(belief.variable.sensors) & set(sensors):
             continue
         estimated = name in covariance
         sd = np.sqrt(np.diag(covariance[name])) if estimated else np.zeros(belief.variable.dim)

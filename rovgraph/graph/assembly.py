@@ -184,11 +184,10 @@ class Assembler:
         reason = None
         if m.sensor not in self.instruments:
             return False
-        if m.sensor == "dvl":
-            if m.values[3] == 0:
-                reason = "no bottom lock"
-            elif np.abs(m.values[:3]).max() > self.config.dvl.max_speed_mps:
-                reason = "faster than dvl.max_speed_mps"
+        if m.sensor == "dvl" and m.values[3] == 0:
+            reason = "no bottom lock"
+        elif m.sensor in ("dvl", "dvl_water") and np.abs(m.values[:3]).max() > self.config.dvl.max_speed_mps:
+            reason = "faster than dvl.max_speed_mps"
         if reason:
             self.left_out[m.sensor, reason] += 1
         return reason is None

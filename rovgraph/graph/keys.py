@@ -66,7 +66,7 @@ class Unknowns:
 
 
 def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
-    """Calibration variables to be estimated: asked for, and their sensor is in use."""
+    """Calibration variables to be estimated: asked for, and a sensor that shows them is in use."""
     present = set(sensors)
-    wanted = {n: b.walk for n, b in beliefs.items() if b.estimate and b.variable.sensor in present}
+    wanted = {n: b.walk for n, b in beliefs.items() if b.estimate and present & set(b.variable.sensors)}
     return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted)

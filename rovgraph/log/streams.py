@@ -15,6 +15,7 @@ STREAMS: dict[str, tuple[str, ...]] = {
     "mag": ("mag_x", "mag_y", "mag_z"),
     "ahrs": ("ahrs_yaw", "ahrs_roll", "ahrs_pitch"),
     "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_valid", "dvl_sd"),
+    "dvl_water": ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz"),
     "dvl_heading": ("dvl_heading",),
     "dvl_altitude": ("dvl_altitude",),
     "depth": ("depth",),

@@ -35,7 +35,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "gyr": STREAMS["imu"][3:],
     "mag": STREAMS["mag"],
     "ahrs": STREAMS["ahrs"],
-    "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_sd"),
+    "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_sd", *STREAMS["dvl_water"]),
     "dvl_heading": ("dvl_heading",),
     "dvl_altitude": ("dvl_altitude",),
     "depth": ("depth",),

@@ -26,6 +26,7 @@ from rovgraph.trajectory import Trajectory
 IMU_COLUMNS = ["acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z"]
 MAG_COLUMNS = ["mag_x", "mag_y", "mag_z"]
 DVL_COLUMNS = ["dvl_vx", "dvl_vy", "dvl_vz"]
+WATER_COLUMNS = ["dvl_water_vx", "dvl_water_vy", "dvl_water_vz"]
 TIME_STEP = 1e-4  # resolution of the log's clock [s]
 AHRS_TILT_SD = float(np.deg2rad(0.5))  # noise of the unit's own roll and pitch [rad]
 
@@ -197,6 +198,8 @@ def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
     else:
         heading = wrap_angle(sample.exact("dvl_heading", motion) + noise[:, 3:])
     frame["dvl_heading"] = heading[:, 0]
+    if truth.water_track:
+        frame[WATER_COLUMNS] = sample.noisy("dvl_water", motion)
     return frame
 
 

@@ -29,6 +29,7 @@ class Truth:
     imu_rate : [Hz]; the magnetometer has the same
     dvl_rate : mean rate of the pings [Hz]
     dvl_jitter : intervals between pings vary by up to this share
+    water_track : pings also measure the velocity relative to the water
     depth_rate, ahrs_rate : [Hz], None = no such sensor
     fix_interval : [s], None = no fixes
     covariances : noise of IMU, magnetometer, DVL and its compass instead of the configuration's
@@ -48,6 +49,7 @@ class Truth:
     imu_rate: float = 100.0
     dvl_rate: float = 5.6
     dvl_jitter: float = 0.1
+    water_track: bool = False
     depth_rate: float | None = 5.0
     ahrs_rate: float | None = None
     fix_interval: float | None = None
