@@ -62,11 +62,8 @@ class ErrorVector:
         ends = np.cumsum(list(sizes.values())).tolist()
         self.columns = {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
         self.size: int = ends[-1]
-        self._seen = [
-            (seen_model(instruments[sensor].model), variable, self.columns[variable])
-            for sensor, variable in SEEN.items()
-            if sensor in instruments and variable in self.columns
-        ]
+        shown = {v: instruments[s] for s, v in SEEN.items() if s in instruments and v in self.columns}
+        self._seen = [(seen_model(i.model), variable, self.columns[variable]) for variable, i in shown.items()]
 
     def matrix(self, H: Jacobians) -> Array:
         """Jacobians by variable as one, shape (n, dim, size); what is not estimated is left out."""
