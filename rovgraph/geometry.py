@@ -28,13 +28,11 @@ def skew(v: ArrayLike) -> Array:
     ndarray, shape (..., 3, 3)
     """
     v = np.asarray(v, dtype=float)
-    out = np.zeros((*v.shape[:-1], 9))
-    out[..., _SKEW_PLUS] = v
-    out[..., _SKEW_MINUS] = -v
-    return out.reshape(*v.shape, 3)
+    return np.asarray((v @ _SKEW).reshape(*v.shape, 3))
 
 
-_SKEW_PLUS, _SKEW_MINUS = [7, 2, 3], [5, 6, 1]  # where x, y, z stand in the flattened matrix
+_SKEW = np.zeros((3, 9))  # from x, y, z to the flattened matrix
+_SKEW[[0, 1, 2], [7, 2, 3]], _SKEW[[0, 1, 2], [5, 6, 1]] = 1.0, -1.0
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -144,9 +142,15 @@ def right_jacobian(rotvec: Array) -> Array:
     -------
     ndarray, shape (..., 3, 3)
     """
-    _, cosine, cubic = _rodrigues(rotvec)
+    return exp_and_right_jacobian(rotvec)[1]
+
+
+def exp_and_right_jacobian(rotvec: Array) -> tuple[Array, Array]:
+    """`exp_rotation` and `right_jacobian` of the same vectors, for little more than one of them."""
+    sine, cosine, cubic = _rodrigues(rotvec)
     S = skew(rotvec)
-    return _EYE - cosine * S + cubic * (S @ S)
+    square = S @ S
+    return _EYE + sine * S + cosine * square, _EYE - cosine * S + cubic * square
 
 
 _EYE = np.eye(3)
@@ -154,15 +158,25 @@ _EYE = np.eye(3)
 
 def _rodrigues(rotvec: Array) -> tuple[Array, Array, Array]:
     """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3 of the angle a, shapes (..., 1, 1)."""
-    square = (rotvec * rotvec).sum(axis=-1)[..., None, None]
-    if square.size and square.max() < 1e-8:  # the series are exact to rounding, the closed forms are not
-        return 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
-    small = square < 1e-8
+    square = rotvec[..., None, :] @ rotvec[..., :, None]
+    if square.size and square.max() < _SMALL:  # the series are exact to rounding, the closed forms are not
+        return _series(square)
+    small = square < _SMALL
     angle = np.sqrt(np.where(small, 1.0, square))
-    sine = np.where(small, 1.0 - square / 6.0, np.sin(angle) / angle)
-    cosine = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(angle)) / angle**2)
-    cubic = np.where(small, 1.0 / 6.0 - square / 120.0, (angle - np.sin(angle)) / angle**3)
+    closed = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    sine, cosine, cubic = (np.where(small, *pair) for pair in zip(_series(square), closed, strict=True))
     return sine, cosine, cubic
+
+
+_SMALL = 1e-4  # square of an angle
+
+
+def _series(square: Array) -> tuple[Array, Array, Array]:
+    return (
+        1.0 - square * (1.0 / 6.0 - square / 120.0),
+        0.5 - square * (1.0 / 24.0 - square / 720.0),
+        1.0 / 6.0 - square * (1.0 / 120.0 - square / 5040.0),
+    )
 
 
 def log_rotation(R: ArrayLike) -> Array:

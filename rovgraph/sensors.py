@@ -31,7 +31,7 @@ import numpy as np
 from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose, wrap_angle
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
-_EZ = np.array([0.0, 0.0, 1.0])
+_MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 
 
 class SensorModel(Protocol):
@@ -84,19 +84,21 @@ def _scalar(state: State, name: str) -> Array:
     return np.zeros(len(state)) + state.calibration[name][..., 0]
 
 
-def dvl_mount(state: State) -> tuple[Array, Jacobians]:
+def dvl_mount(state: State) -> tuple[Array, Array]:
     """R_bs of the DVL for each epoch, and the axes (in b) its angles turn about.
 
     Returns
     -------
     R_bs : ndarray, shape (n, 3, 3)
-    axes : variable -> ndarray, shape (n, 3)
+    axes : ndarray, shape (n, 3, 3), a column each for roll, pitch, yaw
     """
-    roll, pitch, yaw = (_scalar(state, f"dvl_{angle}") for angle in ("roll", "pitch", "yaw"))
-    zero = np.zeros_like(yaw)
-    R_bs = matrix_from_rpy(np.stack([roll, pitch, yaw], axis=-1))
-    pitch_axis = np.stack([-np.sin(yaw), np.cos(yaw), zero], axis=-1)
-    axes = {"dvl_roll": R_bs[..., 0], "dvl_pitch": pitch_axis, "dvl_yaw": np.zeros_like(pitch_axis) + _EZ}
+    rpy, axes = np.empty((len(state), 3)), np.zeros((len(state), 3, 3))
+    for k, name in enumerate(_MOUNT):
+        rpy[:, k] = state.calibration[name][..., 0]
+    R_bs, yaw = matrix_from_rpy(rpy), rpy[:, 2]
+    axes[:, :, 0] = R_bs[:, :, 0]
+    axes[:, 0, 1], axes[:, 1, 1] = -np.sin(yaw), np.cos(yaw)
+    axes[:, 2, 2] = 1.0
     return R_bs, axes
 
 
@@ -122,24 +124,23 @@ class DvlVelocity:
         return (*own, "current") if self.sensor == "dvl_water" else own
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        n = len(state)
         R_bs, axes = dvl_mount(state)
-        R_bn, v_n = transpose(state.R_nb), state.v_n.copy()
+        R_bn, v_n = transpose(state.R_nb), state.v_n
         if self.sensor == "dvl_water":
+            v_n = v_n.copy()
             v_n[:, :2] -= state.calibration["current"]
         body, w = rotate(R_bn, v_n), rate_b - state.bias[:, 3:]
-        arm = np.broadcast_to(self.lever_arm_b + state.calibration["dvl_lever_arm"], (n, 3))
-        v_b = body + cross(w, arm)
+        arm = skew(self.lever_arm_b + state.calibration["dvl_lever_arm"])
+        v_b = body - rotate(arm, w)
         gain = (1.0 + _scalar(state, "dvl_scale"))[:, None]
         R_sb = transpose(R_bs) * gain[..., None]
 
-        pose, bias = np.zeros((n, 3, 6)), np.zeros((n, 3, 6))
+        pose, bias = np.zeros((len(state), 3, 6)), np.zeros((len(state), 3, 6))
         pose[..., :3] = R_sb @ skew(body)
-        bias[..., 3:] = R_sb @ skew(arm)
+        bias[..., 3:] = R_sb @ arm
+        z, by_angle = rotate(R_sb, v_b), R_sb @ skew(v_b) @ axes
         H = {POSE: pose, VELOCITY: R_sb @ R_bn, BIAS: bias, "dvl_lever_arm": R_sb @ skew(w)}
-        for name, axis in axes.items():
-            H[name] = -rotate(R_sb, cross(axis, v_b))[..., None]
-        z = rotate(R_sb, v_b)
+        H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(_MOUNT)}
         H["dvl_scale"] = (z / gain)[..., None]
         if self.sensor == "dvl_water":
             H["current"] = -H[VELOCITY][..., :2]
@@ -152,7 +153,7 @@ def _heading(R_nb: Array, axis_b: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     R_nb : ndarray, shape (n, 3, 3)
-    axis_b : ndarray, shape (n, 3)
+    axis_b : ndarray, shape (n, 3) or (3,)
 
     Returns
     -------
@@ -160,10 +161,10 @@ def _heading(R_nb: Array, axis_b: Array) -> tuple[Array, Array]:
     gradient_b : ndarray, shape (n, 3): heading changes by ``gradient_b @ dtheta_b``
     """
     u = rotate(R_nb, axis_b)
-    across = np.stack([-u[:, 1], u[:, 0], np.zeros(len(u))], axis=-1) / (u[:, :1] ** 2 + u[:, 1:2] ** 2)
-    # du = R_nb (dtheta x axis), dh = across . du
-    gradient = cross(axis_b, rotate(transpose(R_nb), across))
-    return np.arctan2(u[:, 1], u[:, 0]), gradient
+    north, east = u[:, :1], u[:, 1:2]
+    # du = R_nb (dtheta x axis), dh = (north de - east dn) / (north^2 + east^2)
+    across_b = (north * R_nb[:, 1] - east * R_nb[:, 0]) / (north**2 + east**2)
+    return np.arctan2(u[:, 1], u[:, 0]), cross(axis_b, across_b)
 
 
 def _deviation(state: State, offset: str, curve: str, heading: Array) -> tuple[Array, Array, Array]:
@@ -171,7 +172,9 @@ def _deviation(state: State, offset: str, curve: str, heading: Array) -> tuple[A
     A = _scalar(state, offset)
     B, C = state.calibration[curve][..., 0], state.calibration[curve][..., 1]
     sine, cosine = np.sin(heading), np.cos(heading)
-    return A + B * sine + C * cosine, B * cosine - C * sine, np.stack([sine, cosine], axis=-1)
+    both = np.empty((len(heading), 2))
+    both[:, 0], both[:, 1] = sine, cosine
+    return A + B * sine + C * cosine, B * cosine - C * sine, both
 
 
 @dataclass(frozen=True)
@@ -198,15 +201,12 @@ class CompassHeading:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        mount = ("dvl_roll", "dvl_pitch", "dvl_yaw") if self.sensor == "dvl_heading" else ()
+        mount = _MOUNT if self.sensor == "dvl_heading" else ()
         return (self.offset, self.curve, *mount)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         n = len(state)
-        if self.sensor == "dvl_heading":
-            R_bs, axes = dvl_mount(state)
-        else:
-            R_bs, axes = np.tile(self.R_bs, (n, 1, 1)), {}
+        R_bs, axes = dvl_mount(state) if self.sensor == "dvl_heading" else (self.R_bs, None)
         heading, gradient = _heading(state.R_nb, R_bs[..., 0])
         heading = heading - self.declination
         deviation, slope, sine_cosine = _deviation(state, self.offset, self.curve, heading)
@@ -215,8 +215,9 @@ class CompassHeading:
         pose = np.zeros((n, 1, 6))
         pose[:, 0, :3] = gradient
         H = {POSE: pose, self.offset: np.ones((n, 1, 1)), self.curve: sine_cosine[:, None, :]}
-        for name, axis in axes.items():
-            H[name] = np.einsum("ij,ij->i", gradient, axis)[:, None, None]
+        if axes is not None:
+            by_angle = pose[..., :3] @ axes
+            H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(_MOUNT)}
         return wrap_angle(heading + deviation)[:, None], H
 
 
@@ -226,15 +227,25 @@ def field_direction(declination: Array | float, dip: Array | float) -> Array:
     return np.stack([np.cos(i) * np.cos(d), np.cos(i) * np.sin(d), np.sin(i)], axis=-1)
 
 
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # places of a symmetric matrix's six components
+def _field_turns(declination: Array, dip: Array) -> Array:
+    """`field_direction`, its derivative by the dip and that by the declination as columns, shape (n, 3, 3)."""
+    cos_d, sin_d, cos_i, sin_i = np.cos(declination), np.sin(declination), np.cos(dip), np.sin(dip)
+    out = np.zeros((len(dip), 3, 3))
+    out[:, 0, 0], out[:, 1, 0], out[:, 2, 0] = cos_i * cos_d, cos_i * sin_d, sin_i
+    out[:, 0, 1], out[:, 1, 1], out[:, 2, 1] = -sin_i * cos_d, -sin_i * sin_d, cos_i
+    out[:, 0, 2], out[:, 1, 2] = -out[:, 1, 0], out[:, 0, 0]
+    return out
+
+
+_ROW, _COLUMN = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # of a symmetric matrix's six components
+_SYMMETRIC = np.zeros((6, 3, 3))  # the matrix of each
+_SYMMETRIC[range(6), _ROW, _COLUMN] = _SYMMETRIC[range(6), _COLUMN, _ROW] = 1.0
+_TIMES_VECTOR = _SYMMETRIC.transpose(2, 1, 0).reshape(3, 18)
 
 
 def _symmetric(components: Array) -> Array:
     """Symmetric matrices of components xx, yy, zz, xy, xz, yz; shape (..., 6) to (..., 3, 3)."""
-    out = np.zeros((*components.shape[:-1], 3, 3))
-    for k, (i, j) in enumerate(_PAIRS):
-        out[..., i, j] = out[..., j, i] = components[..., k]
-    return out
+    return np.asarray((components @ _SYMMETRIC.reshape(6, 9)).reshape(*components.shape[:-1], 3, 3))
 
 
 @dataclass(frozen=True)
@@ -259,32 +270,30 @@ class MagneticField:
     calibration = ("mag_offset", "mag_deviation", "hard_iron", "soft_iron", "field_dip", "field_scale")
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        n = len(state)
-        heading, gradient = _heading(state.R_nb, np.tile(self.R_bs[:, 0], (n, 1)))
+        heading, gradient = _heading(state.R_nb, self.R_bs[:, 0])
         heading = heading - self.declination
         deviation, slope, sine_cosine = _deviation(state, "mag_offset", "mag_deviation", heading)
-        declination, dip = self.declination - deviation, self.dip + _scalar(state, "field_dip")
-        u_n, dipped = field_direction(declination, dip), field_direction(declination, dip + 0.5 * np.pi)
-        u_b = rotate(transpose(state.R_nb), u_n)
-        turned = np.stack([-u_n[:, 1], u_n[:, 0], np.zeros(n)], axis=-1)  # du/d(declination)
-        gain = self.magnitude * (1.0 + _scalar(state, "field_scale"))[:, None, None]
-        softened = (np.eye(3) + _symmetric(state.calibration["soft_iron"])) @ self.R_bs.T
-        R_sb = gain * softened
-        by_deviation = -rotate(R_sb, rotate(transpose(state.R_nb), turned))
+        turns_n = _field_turns(self.declination - deviation, self.dip + _scalar(state, "field_dip"))
+        gain = (1.0 + _scalar(state, "field_scale"))[:, None]
+        unsoftened = self.magnitude * gain[..., None] * self.R_bs.T
+        R_sb = (np.eye(3) + _symmetric(state.calibration["soft_iron"])) @ unsoftened
+        turns_b = transpose(state.R_nb) @ turns_n
+        u_b, seen = turns_b[..., 0], R_sb @ turns_b
+        field, by_dip, by_deviation = seen[..., 0], seen[..., 1:2], -seen[..., 2:]
 
-        pose = np.zeros((n, 3, 6))
-        pose[..., :3] = R_sb @ skew(u_b) + by_deviation[..., None] * (slope[:, None] * gradient)[:, None, :]
-        iron, along = state.calibration["hard_iron"], rotate(gain * self.R_bs.T, u_b)
+        pose, iron = np.zeros((len(state), 3, 6)), np.zeros((len(state), 3, 3))
+        pose[..., :3] = R_sb @ skew(u_b) + by_deviation * (slope[:, None] * gradient)[:, None, :]
+        iron[...] = self.magnitude * np.eye(3)
         H = {
             POSE: pose,
-            "mag_offset": by_deviation[..., None],
-            "mag_deviation": by_deviation[..., None] * sine_cosine[:, None, :],
-            "hard_iron": np.tile(self.magnitude * np.eye(3), (n, 1, 1)),
-            "field_dip": rotate(R_sb, rotate(transpose(state.R_nb), dipped))[..., None],
-            "field_scale": rotate(self.magnitude * softened, u_b)[..., None],
-            "soft_iron": np.stack([_symmetric(one) @ along[..., None] for one in np.eye(6)], axis=-1)[..., 0, :],
+            "mag_offset": by_deviation,
+            "mag_deviation": by_deviation * sine_cosine[:, None, :],
+            "hard_iron": iron,
+            "soft_iron": (rotate(unsoftened, u_b) @ _TIMES_VECTOR).reshape(-1, 3, 6),
+            "field_dip": by_dip,
+            "field_scale": (field / gain)[..., None],
         }
-        return rotate(R_sb, u_b) + self.magnitude * iron, H
+        return field + self.magnitude * state.calibration["hard_iron"], H
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rovgraph.geometry import Array, exp_rotation, right_jacobian, rotate, skew, transpose
+from rovgraph.geometry import Array, exp_and_right_jacobian, exp_rotation, rotate, skew, transpose
 
 POSE, VELOCITY, BIAS = "pose", "velocity", "bias"
 DIMENSION = {POSE: 6, VELOCITY: 3, BIAS: 6}
@@ -126,13 +126,13 @@ def propagate_with_jacobian(state: State, delta: Delta, gravity: float) -> tuple
     state : State, n epochs
     F : ndarray, shape (n, 15, 15), pose, velocity, bias by pose, velocity, bias
     """
-    there, dv, dp, turn = _propagate(state, delta, gravity)
+    there, dv, dp, turned, Jr = _propagate(state, delta, gravity)
     n, dt = len(delta.dt), delta.dt[:, None, None]
-    to_there = transpose(delta.dR @ exp_rotation(turn))
+    to_there = transpose(turned)
     F = np.zeros((n, 15, 15))
     F[:, _DIAGONAL, _DIAGONAL] = 1.0
     F[:, 0:3, 0:3] = F[:, 3:6, 3:6] = to_there
-    F[:, 0:3, 12:15] = -dt * right_jacobian(turn)
+    F[:, 0:3, 12:15] = -dt * Jr
     F[:, 3:6, 0:3] = -to_there @ skew(dp)
     F[:, 3:6, 6:9] = dt * (to_there @ transpose(state.R_nb))
     F[:, 3:6, 9:12] = -0.5 * dt**2 * to_there
@@ -144,16 +144,16 @@ def propagate_with_jacobian(state: State, delta: Delta, gravity: float) -> tuple
 _DIAGONAL = np.arange(15)
 
 
-def _propagate(state: State, delta: Delta, gravity: float) -> tuple[State, Array, Array, Array]:
-    """The state, and the motion corrected for the bias: velocity, position, turn."""
+def _propagate(state: State, delta: Delta, gravity: float) -> tuple[State, Array, Array, Array, Array]:
+    """The state, and the motion corrected for the bias: velocity, position, rotation, and Jr of its correction."""
     dt = delta.dt[:, None]
     excess = state.bias - delta.bias
     dv = delta.dv - dt * excess[:, :3]
     dp = delta.dp - 0.5 * dt**2 * excess[:, :3]
-    turn = -dt * excess[:, 3:]
+    correction, Jr = exp_and_right_jacobian(-dt * excess[:, 3:])
+    turned = delta.dR @ correction
     v_n = state.v_n + rotate(state.R_nb, dv)
     p_n = state.p_n + state.v_n * dt + rotate(state.R_nb, dp)
     v_n[:, 2] += gravity * delta.dt
     p_n[:, 2] += 0.5 * gravity * delta.dt**2
-    there = State(state.R_nb @ delta.dR @ exp_rotation(turn), p_n, v_n, state.bias, state.calibration)
-    return there, dv, dp, turn
+    return State(state.R_nb @ turned, p_n, v_n, state.bias, state.calibration), dv, dp, turned, Jr
