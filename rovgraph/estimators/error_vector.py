@@ -25,7 +25,7 @@ from rovgraph.model_aiding import WaterVelocity
 from rovgraph.sensors import SensorModel, innovation
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State
 
-# the variable that each instrument sees directly: its model is linear in it
+# the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
 SEEN = {
     "dvl": VELOCITY,
     "mag": "hard_iron",
@@ -88,14 +88,15 @@ class ErrorVector:
             to first order in ``delta``
         """
         moved = self._straight(state, delta)
-        both, before, after = self._both(state, moved), self._frame(state), self._frame(moved)
+        both, basis = self._both(state, moved), self._turned(state, moved)
         for model, variable, columns in self._seen:
             z, H = model.predict(both, _NO_RATE)
-            before[columns], J = self.matrix(H)
-            after[columns] = J
-            missing = innovation(model, z[0] + before[columns] @ delta, z[1])
-            moved = moved.retract(variable, np.linalg.solve(J[:, columns], missing))
-        return moved, np.asarray(np.linalg.solve(after, before))
+            before, after = self.matrix(H)
+            inverse = np.linalg.inv(after[:, columns])
+            missing = innovation(model, z[0] + before @ delta, z[1])
+            moved = moved.retract(variable, inverse @ missing)
+            basis[columns] = _seen_alike(before, after, columns, inverse, basis)
+        return moved, basis
 
     def local(self, state: State, other: State) -> tuple[Array, Array]:
         """The error that leads from one state to another: the inverse of `retract`.
@@ -110,13 +111,15 @@ class ErrorVector:
         basis : ndarray, shape (size, size), takes an error about ``other`` over to ``state``
         """
         delta = self._difference(state, other)
-        both, at_state, at_other = self._both(state, other), self._frame(state), self._frame(other)
+        both, basis = self._both(state, other), self._turned(other, state)
         for model, _, columns in self._seen:
             z, H = model.predict(both, _NO_RATE)
-            at_state[columns], at_other[columns] = J, _ = self.matrix(H)
-            missing = innovation(model, z[1], z[0]) - J @ delta
-            delta[columns] += np.linalg.solve(J[:, columns], missing)
-        return delta, np.asarray(np.linalg.solve(at_state, at_other))
+            at_state, at_other = self.matrix(H)
+            inverse = np.linalg.inv(at_state[:, columns])
+            missing = innovation(model, z[1], z[0]) - at_state @ delta
+            delta[columns] += inverse @ missing
+            basis[columns] = _seen_alike(at_other, at_state, columns, inverse, basis)
+        return delta, basis
 
     def _straight(self, state: State, delta: Array) -> State:
         """All variables moved by themselves."""
@@ -153,8 +156,22 @@ class ErrorVector:
             {**state.calibration, **own},
         )
 
-    def _frame(self, state: State) -> Array:
-        """From the tangent space to the coordinates that stay; rows of what is seen are still to come."""
-        frame = np.eye(self.size)
-        frame[:3, :3] = frame[3:6, 3:6] = state.R_nb[0]
-        return frame
+    def _turned(self, state: State, other: State) -> Array:
+        """The change of basis from one state to another, attitude and position in n staying; no more is known yet."""
+        basis = np.eye(self.size)
+        basis[:3, :3] = basis[3:6, 3:6] = other.R_nb[0].T @ state.R_nb[0]
+        return basis
+
+
+def _seen_alike(before: Array, after: Array, columns: slice, inverse: Array, basis: Array) -> Array:
+    """Rows of a basis for the variable that an instrument sees: ``after @ basis = before``.
+
+    Parameters
+    ----------
+    before, after : ndarray, shape (dim, size), the instrument's Jacobians at the two states
+    columns, inverse : place of the variable, and the inverse of its part of ``after``
+    basis : ndarray, shape (size, size), complete for all else that the instrument depends on
+    """
+    others = after.copy()
+    others[:, columns] = 0.0
+    return np.asarray(inverse @ (before - others @ basis))

@@ -9,9 +9,8 @@ import numpy as np
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.factors import motion
-from rovgraph.graph.keys import key
 from rovgraph.graph.values import insert_state
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.state import State
 
 
 def transition(interval: Interval, before: State, after: State) -> tuple[Array, Array]:
@@ -33,13 +32,10 @@ def transition(interval: Interval, before: State, after: State) -> tuple[Array, 
     values = gtsam.Values()
     insert_state(values, i, before)
     insert_state(values, j, after)
-    linear = gtsam.GaussianFactorGraph()
-    for factor in motion(interval):
-        linear.push_back(factor.linearize(values))
-    ordering = gtsam.Ordering()
-    for index in (j, i):
-        for variable in (POSE, VELOCITY, BIAS):
-            ordering.push_back(key(variable, index))
-    A, _ = linear.jacobian(ordering)
-    noise = np.linalg.inv(A[:, :15])
-    return -noise @ A[:, 15:], noise @ noise.T
+    (factor,) = motion(interval)
+    A, _ = factor.linearize(values).jacobian()  # pose and velocity of i and of j, bias of i and of j
+    noise = np.linalg.inv(A[:, _AFTER])
+    return -noise @ A[:, _BEFORE], noise @ noise.T
+
+
+_BEFORE, _AFTER = np.r_[0:9, 18:24], np.r_[9:18, 24:30]

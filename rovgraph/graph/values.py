@@ -15,7 +15,8 @@ def insert_state(values: gtsam.Values, index: int, state: State) -> None:
     """Insert pose, velocity and bias of a `State` of one epoch as keyframe ``index``."""
     values.insert(key(POSE, index), gtsam.Pose3(gtsam.Rot3(state.R_nb[0]), state.p_n[0]))
     values.insert(key(VELOCITY, index), state.v_n[0])
-    values.insert(key(BIAS, index), gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:]))
+    bias = gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
+    values.insert(j=key(BIAS, index), constant_bias=bias)  # unnamed, the bindings try dozens of other types first
 
 
 def state_values(index: int, state: State) -> gtsam.Values:
