@@ -29,6 +29,7 @@ class Instrument:
     sd : ndarray, shape (dim,), standard deviation of a measurement
     loss : "none", "huber" or "cauchy"
     gate_sd : normalised innovation beyond which a measurement is left out, or None
+    readmit_s : time of being left out after which a filter doubts itself [s]
     components : names of the components, dim of them
     rate_gain : ndarray, shape (dim, 3), how an error of the measured rate [rad/s] enters:
         through the DVL's lever arm, at the nominal mounting
@@ -38,6 +39,7 @@ class Instrument:
     sd: Array
     loss: str
     gate_sd: float | None
+    readmit_s: float
     components: tuple[str, ...]
     rate_gain: Array
 
@@ -86,7 +88,8 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
         gain = np.zeros((model.dim, 3))
         if isinstance(model, DvlVelocity):
             gain = mount_matrix(config.dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
-        return Instrument(model, spread, section.loss, section.gate_sd, components, gain)  # type: ignore[attr-defined]
+        limits = section.gate_sd, section.readmit_s  # type: ignore[attr-defined]
+        return Instrument(model, spread, section.loss, *limits, components, gain)  # type: ignore[attr-defined]
 
     dvl, water = (DvlVelocity(arm(config.dvl.lever_arm_m), sensor) for sensor in ("dvl", "dvl_water"))
     compass = CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination)

@@ -27,7 +27,6 @@ from rovgraph.config import Config
 from rovgraph.estimators import error_vector
 from rovgraph.estimators.error_state import ErrorStateFilter, replay
 from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.incremental import READMIT_AFTER
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.robust_update import robust_update
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
@@ -354,12 +353,18 @@ def test_a_loss_bounds_what_ungated_outliers_do(case, estimator):
     assert off["cauchy"] < 0.1 * off["none"]
 
 
-def test_a_sensor_that_is_rejected_many_times_running_is_let_in_again(case):
-    begin = 100
-    config = changed(case.config, dvl={"gate_sd": 4.0, "loss": "none"})
-    weights = dvl_weights(filtered(spoilt(case, slice(begin, None)), config))
-    later = [weights[t] for t in case.log["dvl"].time[begin:] if t in weights]
-    assert later[: READMIT_AFTER + 1] == [0.0] * READMIT_AFTER + [1.0]
+def test_a_sensor_that_is_kept_out_for_long_is_let_in_again_and_moves_nothing_by_more_than_three_sd(case):
+    begin, seconds = 100, 2.0
+    config = changed(case.config, dvl={"gate_sd": 4.0, "loss": "none", "readmit_s": seconds})
+    estimator = filtered(spoilt(case, slice(begin, None)), config)
+    time = case.log["dvl"].time[begin:]
+    weights = dvl_weights(estimator)
+    back = next(t for t in time if weights[t] > 0.0)
+    assert seconds < back - time[0] < seconds + 2.0
+    t = estimator.solve().trajectory
+    k = int(np.searchsorted(t.time, back - 1e-6))
+    jump = np.linalg.norm(t.v_n[k] - t.v_n[k - 1])
+    assert 0.5 < jump < 3.0 * np.linalg.norm(t.v_sd[k - 1])
 
 
 def test_a_dvl_that_vanishes_and_returns_leaves_an_honest_track():

@@ -21,7 +21,7 @@ from dives import (
 
 from rovgraph.errors import InputError
 from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter, replay
-from rovgraph.estimators.incremental import READMIT_AFTER, IncrementalEstimator
+from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import log_rotation, transpose
 from rovgraph.graph.incremental import Incremental
@@ -136,15 +136,6 @@ def test_a_gross_outlier_is_kept_out(case, filtered):
 
 def test_a_good_ping_is_not_kept_out_while_the_level_is_uncertain(filtered):
     assert all(weight > 0.0 for weight in dvl_weights(filtered).values())
-
-
-def test_a_sensor_that_is_rejected_many_times_running_is_let_in_again(case):
-    begin = 120
-    config = changed(case.config, dvl={"gate_sd": 4.0, "loss": "none"})
-    weights = dvl_weights(renewed(spoilt(case, slice(begin, None)), config))
-    later = [weights[t] for t in case.log["dvl"].time[begin:] if t in weights]
-    assert later[:READMIT_AFTER] == [0.0] * READMIT_AFTER
-    assert 1.0 in later[READMIT_AFTER : READMIT_AFTER + 3]
 
 
 def test_an_open_gate_lets_everything_in(case):

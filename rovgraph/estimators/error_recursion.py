@@ -16,7 +16,6 @@ import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.incremental import READMIT_AFTER
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.robust_update import normalised_squared, robust_update
 from rovgraph.geometry import Array, transpose
@@ -25,9 +24,12 @@ from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import Block, make_block
 from rovgraph.graph.transition import transition
-from rovgraph.state import State
+from rovgraph.sensors import Position
+from rovgraph.state import VELOCITY, State
 
-Gates = dict[str, int]  # sensor -> rejections running, since the last that was consistent
+RETURN_SD = 3.0  # a sensor that was kept out for long returns with an innovation within this many sd
+
+Gates = dict[str, float]  # sensor that is being kept out -> since when [s]
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,31 @@ class ErrorStateRecursion:
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
         return make_block(attached, instrument, gravity, self.unknowns)
 
+    def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
+        """Whether a measurement lies within its gate."""
+        instrument = self.beginning.instruments[a.sensor]
+        gate, since = instrument.gate_sd, gates.get(a.sensor)
+        if since is not None and a.time - since > instrument.readmit_s:
+            gate = RETURN_SD
+        if gate is not None and nis > gate**2:
+            gates.setdefault(a.sensor, a.time)
+            return False
+        gates.pop(a.sensor, None)
+        return True
+
+    def _seen(self, block: Block, state: State) -> Array:
+        """Directions of the error that a sensor sees, shape (size, k): velocity, or turn and shift along n's axes."""
+        model, R_bn = block.instrument.model, transpose(state.R_nb[0])
+        seen = np.zeros((self.error.size, 3))
+        if isinstance(model, Position):
+            seen[3:6] = R_bn
+            return seen[:, list(model.axes)]
+        if VELOCITY in model.state:
+            seen[self.error.columns[VELOCITY]] = np.eye(3)
+            return seen
+        seen[:3] = R_bn
+        return seen[:, 2:]
+
     def _update(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
         """The state corrected by measurements that belong to its keyframe."""
         r, H, losses, admitted = [], [], [], []
@@ -171,13 +198,15 @@ class ErrorStateRecursion:
             own_r, jacobians = block.linearize(before.state)
             own_H = self.error.matrix(jacobians)
             nis = normalised_squared(before.P, own_r[0], own_H[0])
-            if _admit(a.sensor, nis, block.instrument.gate_sd, gates):
+            if self._admit(a, nis, gates):
                 r.append(own_r[0])
                 H.append(own_H[0])
                 losses.append(block.instrument.loss)
                 admitted.append((a, nis))
             else:
                 used.append(Used(a, before.state, nis, 0.0))
+                if a.time - gates[a.sensor] > block.instrument.readmit_s:
+                    before = replace(before, P=doubted(before.P, own_r[0], own_H[0], self._seen(block, before.state)))
         if not admitted:
             return before
         delta, P, weights = robust_update(before.P, r, H, losses)
@@ -186,8 +215,16 @@ class ErrorStateRecursion:
         return Gaussian(state, basis @ P @ basis.T)
 
 
-def _admit(sensor: str, nis: float, gate_sd: float | None, gates: Gates) -> bool:
-    """Whether a measurement lies within its gate, or its sensor has been kept out for too long."""
-    consistent = gate_sd is None or nis <= gate_sd**2
-    gates[sensor] = 0 if consistent else gates.get(sensor, 0) + 1
-    return consistent or gates[sensor] > READMIT_AFTER
+def doubted(P: Array, r: Array, H: Array, seen: Array) -> Array:
+    """The covariance after something that no model knows has moved what a sensor sees, by as much as it shows.
+
+    As a knock does to the velocity, without doubt about anything else.
+
+    Parameters
+    ----------
+    P : ndarray, shape (size, size)
+    r, H : whitened innovation and Jacobian of a rejected measurement, shapes (dim,) and (dim, size)
+    seen : ndarray, shape (size, k), directions of the error that the sensor sees
+    """
+    moved = np.linalg.lstsq(H @ seen, r)[0]
+    return np.asarray(P + float(moved @ moved) * seen @ seen.T)
