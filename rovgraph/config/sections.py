@@ -8,6 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic_core import PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
+Readmission = Annotated[
+    float, Field(gt=0, description="left out for longer than this, it is taken back: a filter then doubts itself")
+]
 NotNegative = Annotated[float, Field(ge=0)]
 Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
@@ -104,7 +107,7 @@ class Dvl(Section):
     scale_sd: NotNegative = Field(0.0, description="part of the speed added to the noise of a ping")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is left out; null = never")
-    readmit_s: Positive = Field(2.0, description="after being left out this long a filter doubts what it sees, and takes it back")
+    readmit_s: Readmission = 2.0
     max_speed_mps: Positive = Field(3.0, description="faster pings are left out")
 
 
@@ -119,7 +122,7 @@ class Heading(Section):
     ahrs_sd_deg: Positive = Field(3.0, description="noise of the IMU's own heading")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a heading further off than this many sd is left out")
-    readmit_s: Positive = Field(60.0, description="after being left out this long a filter doubts what it sees, and takes it back")
+    readmit_s: Readmission = 60.0
 
 
 class Depth(Section):
@@ -129,7 +132,7 @@ class Depth(Section):
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is left out")
-    readmit_s: Positive = Field(10.0, description="after being left out this long a filter doubts what it sees, and takes it back")
+    readmit_s: Readmission = 10.0
 
 
 class Fix(Section):
@@ -139,7 +142,7 @@ class Fix(Section):
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the antenna or transponder in body axes")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is left out")
-    readmit_s: Positive = Field(60.0, description="after being left out this long a filter doubts what it sees, and takes it back")
+    readmit_s: Readmission = 60.0
 
 
 class Thruster(Section):
@@ -182,7 +185,7 @@ class Vehicle(Section):
     acceleration_sd_mps2: Positive = Field(0.02, description="error of the model's acceleration, mean of a second")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="an interval further off than this many sd is left out")
-    readmit_s: Positive = Field(10.0, description="after being left out this long a filter doubts what it sees, and takes it back")
+    readmit_s: Readmission = 10.0
 
 
 class Graph(Section):
