@@ -1,0 +1,53 @@
+"""Where solutions go: a name or URL to an `Output`. docs/online-output.md says what each sends.
+
+An output never blocks and never raises for what the far side does: what cannot be sent is
+dropped, counted, and complained of once per kind and minute.
+"""
+
+from rovgraph.errors import InputError
+from rovgraph.live.outputs.mavlink import MavlinkOutput
+from rovgraph.live.outputs.nmea import NmeaOutput
+from rovgraph.live.outputs.output import Output
+from rovgraph.live.outputs.standard import StandardOutput
+from rovgraph.live.outputs.tcp import TcpOutput
+from rovgraph.live.outputs.udp import UdpOutput
+from rovgraph.live.outputs.url import parsed
+from rovgraph.live.seldom import Complain
+
+__all__ = ["FORMS", "Output", "open_output"]
+
+FORMS = {
+    "-": "-",
+    "udp": "udp://host:port",
+    "tcp": "tcp://[host]:port",
+    "nmea-udp": "nmea-udp://host:port",
+    "mavlink": "mavlink:connection",
+}
+_OUTPUTS: dict[str, type[Output]] = {
+    "udp": UdpOutput,
+    "tcp": TcpOutput,
+    "nmea-udp": NmeaOutput,
+    "mavlink": MavlinkOutput,
+}
+
+
+def open_output(url: str, complain: Complain | None = None, patient: bool = False) -> Output:
+    """Open an output.
+
+    Parameters
+    ----------
+    url : one of `FORMS`, with options as in ``udp://host:port?rate=5``
+    complain : called with source (the URL), kind and text of what goes wrong later, from other
+        threads too; once per kind and minute
+    patient : standard output waits for its reader instead of dropping lines, as a replay may
+
+    Raises
+    ------
+    InputError : an unknown form or option, a host or port that cannot be used, a library that is missing
+    """
+    where = parsed(url)
+    if where.scheme == "-":
+        return StandardOutput(where, complain, patient)
+    if where.scheme not in _OUTPUTS:
+        raise InputError(f"output {url!r} is of no known form; known are {', '.join(FORMS.values())}")
+    return _OUTPUTS[where.scheme](where, complain)

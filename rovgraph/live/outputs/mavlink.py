@@ -1,0 +1,153 @@
+"""Solutions to an autopilot over any connection of pymavlink."""
+
+import math
+import re
+import time
+from importlib import import_module
+from typing import Any, ClassVar
+
+from rovgraph.errors import InputError
+from rovgraph.live.outputs.background import Background
+from rovgraph.live.outputs.mavlink_messages import MESSAGES
+from rovgraph.live.outputs.output import Output
+from rovgraph.live.outputs.url import Url
+from rovgraph.live.seldom import Complain
+from rovgraph.live.solution import Solution
+
+QUEUED = 4  # solutions; an autopilot wants the newest
+HEARTBEAT_S = 1.0
+RETRY_S = 2.0
+CLOSE_S = 0.5
+
+NETWORK = re.compile(r"(udpout|udpin|udpbcast|tcp):[^:]+:\d+")
+SERIAL = re.compile(r"(/|COM\d).*", re.IGNORECASE)
+
+
+class MavlinkOutput(Output):
+    """One message per solution, and a heartbeat a second, by a thread of its own.
+
+    Parameters
+    ----------
+    url : ``mavlink:CONNECTION?message=GPS_INPUT`` or ``VISION_POSITION_ESTIMATE``; connections as
+        pymavlink writes them. Further options: ``system`` (1, the autopilot's), ``component``, ``rate``
+    complain : where complaints go
+
+    Raises
+    ------
+    InputError : an unknown message or form of connection, or pymavlink is missing
+    """
+
+    OPTIONS: ClassVar[tuple[str, ...]] = ("message", "rate", "system", "component")
+
+    def __init__(self, url: Url, complain: Complain | None = None) -> None:
+        super().__init__(url, complain)
+        name = url.options.get("message", "GPS_INPUT")
+        if name not in MESSAGES:
+            raise InputError(f"output {url.text!r}: unknown message {name!r}; known are {', '.join(MESSAGES)}")
+        _require_connection(url)
+        self._message, component = MESSAGES[name]
+        self._system = int(url.number("system", 1, 1, 255) or 1)
+        self._component = int(url.number("component", component, 1, 255) or component)
+        self._link: Any = None
+        self._mav: Any = None
+        self._opened = self._beaten = -math.inf
+        self._background = Background(self._transmit, QUEUED, f"output: {url.text}")
+
+    def _send(self, solution: Solution) -> None:
+        lost = self._background.put(solution)
+        if lost:
+            self._drop(lost, "slow reader", "the connection is slower than the solutions; lower rate")
+
+    def close(self) -> None:
+        left = self._background.close(CLOSE_S)
+        if left:
+            self._drop(left, "slow reader", "the connection does not take what is left")
+
+    def _transmit(self, solution: Solution) -> None:
+        try:
+            message = self._message(solution)
+            if message is None:
+                self._complain("not known", "not sent: needs more than is known (GPS_INPUT: an origin or a fix)")
+                return
+            if self._link is None and not self._open():
+                self._drop(1, "connection", "not connected, still trying")
+                return
+            self._beat()
+            self._mav.send(message)
+            _drain(self._link)
+        except Exception as error:  # whatever a foreign library makes of a far side that is gone
+            self._give_up(error)
+
+    def _open(self) -> bool:
+        """Connect, unless that was tried a moment ago; whether it did."""
+        if time.monotonic() - self._opened < RETRY_S:
+            return False
+        self._opened = time.monotonic()
+        from pymavlink import mavutil
+        from pymavlink.dialects.v20 import common
+
+        self._link = mavutil.mavlink_connection(self.url.place, retries=1)
+        # pymavlink would print to standard output, where lines of JSON may go
+        self._link.handle_eof = self._link.handle_disconnect = _gone
+        self._link.portdead = True
+        self._mav = common.MAVLink(_Whole(self._link), srcSystem=self._system, srcComponent=self._component)
+        return True
+
+    def _beat(self) -> None:
+        """Say who is there, so that routers and autopilots know."""
+        if time.monotonic() - self._beaten < HEARTBEAT_S:
+            return
+        self._beaten = time.monotonic()
+        from pymavlink.dialects.v20 import common as m
+
+        self._mav.heartbeat_send(m.MAV_TYPE_ONBOARD_CONTROLLER, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE)
+
+    def _give_up(self, error: Exception) -> None:
+        """Let the link go; the next solution tries anew."""
+        link, self._link = self._link, None
+        self._drop(1, "connection", f"cannot be sent ({str(error) or type(error).__name__}), still trying")
+        if link is not None:
+            try:
+                link.close()
+            except Exception:
+                return
+
+
+class _Whole:
+    """What pymavlink's messages are written to; it raises where a link only tells that it failed."""
+
+    def __init__(self, link: Any) -> None:
+        self._link = link
+
+    def write(self, data: bytes) -> None:
+        if self._link.write(data) == -1:
+            raise ConnectionError("the serial port does not take it")
+
+
+def _gone() -> None:
+    raise ConnectionError("the far side has closed the connection")
+
+
+def _drain(link: Any) -> None:
+    """Take what comes in: it fills the system's buffers, and it is how ``udpin`` learns whom to send to."""
+    for _ in range(100):
+        if not link.recv(4096):
+            return
+
+
+def _require_connection(url: Url) -> None:
+    """The connection has a form that can be written to, and what it needs is installed."""
+    serial = SERIAL.fullmatch(url.place)
+    if not serial and not NETWORK.fullmatch(url.place):
+        raise InputError(
+            f"output {url.text!r}: unknown connection {url.place!r}; "
+            "known are udpout:host:port, udpin:host:port, udpbcast:host:port, tcp:host:port, /dev/tty...,baud"
+        )
+    try:
+        import_module("pymavlink.mavutil")
+        if serial:
+            import_module("serial")
+    except ImportError as error:
+        raise InputError(
+            f"output {url.text!r}: needs {error.name}; install it with: pip install 'rovgraph[online]'"
+        ) from None
