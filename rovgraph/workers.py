@@ -2,13 +2,14 @@
 
 import contextlib
 import multiprocessing
+import multiprocessing.process
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rovgraph.errors import InputError
 
@@ -56,6 +57,19 @@ def starting() -> Iterator[None]:
     """Around what starts processes: they inherit one thread for each library, and no interrupts."""
     with _environment(_ONE_THREAD), _interrupts_held_back():
         yield
+
+
+def companion(target: Callable[..., None], *args: Any) -> multiprocessing.process.BaseProcess:
+    """A process that works beside this one and ends with it; ``target`` and ``args`` as for `workers`."""
+    process = multiprocessing.get_context("spawn").Process(target=_accompany, args=(target, *args), daemon=True)
+    with starting():
+        process.start()
+    return process
+
+
+def _accompany(target: Callable[..., None], *args: Any) -> None:
+    _prepare()
+    target(*args)
 
 
 def in_workers(

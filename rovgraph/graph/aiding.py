@@ -30,6 +30,12 @@ class Aiding:
         self.model, self.left_out = model, left_out
         self._signals: list[Measurement] = []
 
+    def copy(self, left_out: Counter[tuple[str, str]]) -> "Aiding":
+        """One that goes on by itself from here."""
+        twin = Aiding(self.model, left_out)
+        twin._signals = self._signals[:]
+        return twin
+
     def add(self, signal: Measurement) -> None:
         """Take the signals of one epoch."""
         self._signals.append(signal)

@@ -11,6 +11,8 @@ longer than that, and counting each sample would make the estimate too sure of i
 
 import math
 from collections import Counter
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from typing import cast
 
@@ -33,6 +35,7 @@ from rovgraph.graph.preintegration import (
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
 from rovgraph.model_aiding import ModelAiding
+from rovgraph.state import State
 
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 HALF_WINDOW_S = 0.05  # around a ping, over which the rate is averaged; measurements wait that long
@@ -153,6 +156,33 @@ class Assembler:
             self._before_first(measurement.time)
             done.append(self._close(measurement.time, None))
         return done + self._take_until(measurement.time - HALF_WINDOW_S)
+
+    def copy(self) -> "Assembler":
+        """One that goes on by itself from here."""
+        twin = copy(self)
+        twin._imu, twin._waiting, twin._between = self._imu[:], self._waiting[:], self._between[:]
+        twin._periods, twin.left_out = self._periods[:], self.left_out.copy()
+        if self._aiding is not None:
+            twin._aiding = self._aiding.copy(twin.left_out)
+        return twin
+
+    def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> Interval:
+        """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.
+
+        Parameters
+        ----------
+        samples : of the IMU, those that have not been taken yet
+        time : [s]
+        state : State of one epoch, of the newest keyframe
+        """
+        twin = self.copy()
+        twin._between = []
+        for sample in samples:
+            twin._take_sample(sample)
+        if time - twin._imu[-1][0] > twin._longest_step:
+            force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
+            twin._imu.append((time, np.concatenate([force, np.zeros(3)]) + state.bias[0]))
+        return twin._close(time, None)
 
     def _take_until(self, time: float) -> list[Interval]:
         """Place what has waited for the IMU up to a time."""

@@ -106,7 +106,7 @@ class Log:
 
         So a ping makes its keyframe before what was measured together with it is attached.
         """
-        streams = sorted(self.streams.values(), key=_priority)
+        streams = sorted(self.streams.values(), key=lambda s: precedence(s.sensor))
         if not streams:
             return
         time = np.concatenate([s.time for s in streams])
@@ -120,5 +120,6 @@ class Log:
             yield Measurement(t, names[k], data[k][i], line)
 
 
-def _priority(stream: Stream) -> int:
-    return {"imu": 0, "dvl": 1}.get(stream.sensor, 2)
+def precedence(sensor: str) -> int:
+    """Place among measurements of one time."""
+    return {"imu": 0, "dvl": 1}.get(sensor, 2)

@@ -1,0 +1,187 @@
+"""The error-state filter on data that arrive late and in any order, for missions without end.
+
+Measurements are held back for a moment, put in order, and then taken. One that comes later
+still is put where it belongs: the filter goes back to the keyframe before it and takes
+everything since once more. So the estimate does not depend on the order of arrival, as
+long as nothing is later than the lag; and nothing older than that is kept.
+"""
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Used
+from rovgraph.estimators.initialise import Beginning
+from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.log import Measurement
+from rovgraph.log.streams import precedence
+
+
+class Taken(StrEnum):
+    """What became of a measurement."""
+
+    IN = "taken"
+    LATE = "later than the lag"
+    AGAIN = "repeated"
+
+
+def place(measurement: Measurement) -> tuple[float, int, str]:
+    """Order of measurements: by time, and the IMU's before the DVL's before others."""
+    return measurement.time, precedence(measurement.sensor), measurement.sensor
+
+
+@dataclass(frozen=True)
+class Mark:
+    """The filter as it was after a keyframe.
+
+    Attributes
+    ----------
+    interval : the keyframe's
+    known : its estimate, with what was measured up to it
+    gates : sensors that are being kept out
+    used : measurements that entered, or did not, since the mark before
+    assembler : what had been assembled
+    taken : count of measurements that had been taken
+    """
+
+    interval: Interval
+    known: Gaussian
+    gates: Gates
+    used: list[Used]
+    assembler: Assembler
+    taken: int
+
+
+@dataclass
+class FixedLag:
+    """Filter with a memory of ``lag_s``.
+
+    Attributes
+    ----------
+    beginning : of `rovgraph.estimators.initialise.initialise`
+    lag_s : how late a measurement may be against the newest of the IMU [s]
+    hold_s : how long measurements are held back before they are taken; later ones cost more [s]
+    passed : called with each `Mark` that the lag has passed, for good
+    settled : called with measurements, in order, that nothing can come before any more
+    """
+
+    beginning: Beginning
+    lag_s: float
+    hold_s: float
+    passed: Callable[[Mark], None] = lambda mark: None
+    settled: Callable[[list[Measurement]], None] = lambda measurements: None
+    marks: deque[Mark] = field(default_factory=deque)
+
+    def __post_init__(self) -> None:
+        self.recursion = ErrorStateRecursion(self.beginning)
+        self._assembler = self._fresh()
+        self._gates: Gates = {}
+        self._record: list[Measurement] = []  # in order; the first `_taken` have been taken
+        self._forgotten = 0  # measurements that have left the record
+        self._taken = 0
+        self._newest = -float("inf")  # of the IMU
+
+    def add(self, measurement: Measurement) -> Taken:
+        """Take a measurement, whenever it arrives."""
+        record, own = self._record, place(measurement)
+        position = len(record) if not record or own > place(record[-1]) else bisect_right(record, own, key=place)
+        if position < self._settled:
+            return Taken.LATE
+        if position and place(record[position - 1]) == own:
+            return Taken.AGAIN
+        record.insert(position, measurement)
+        if position < self._taken:
+            self._back_to(position)
+        if measurement.sensor == "imu":
+            self._newest = max(self._newest, measurement.time)
+        self._go_on(self._newest - self.hold_s)
+        return Taken.IN
+
+    def retract(self, sensor: str, since: float) -> None:
+        """Take back a sensor's measurements from a time on, as far as the lag goes."""
+        later = range(self._settled, len(self._record))
+        wrong = [k for k in later if self._record[k].sensor == sensor and self._record[k].time >= since]
+        if not wrong:
+            return
+        if wrong[0] < self._taken:
+            self._back_to(wrong[0])
+        for k in reversed(wrong):
+            del self._record[k]
+        self._go_on(self._newest - self.hold_s)
+
+    def adopt(self, index: int, known: Gaussian) -> bool:
+        """Go on from a better estimate of a keyframe; False = the lag has passed it."""
+        if not any(mark.interval.index == index for mark in self.marks):
+            return False
+        while self.marks[-1].interval.index != index:
+            self.marks.pop()
+        self.marks[-1] = replace(self.marks[-1], known=known)
+        self._back_to(self.marks[-1].taken - self._forgotten)
+        self._go_on(self._newest - self.hold_s)
+        return True
+
+    def settle(self) -> None:
+        """Forget the measurements that can be changed no more."""
+        old = self._settled
+        self.settled(self._record[:old])
+        del self._record[:old]
+        self._forgotten += old
+        self._taken -= old
+
+    @property
+    def _settled(self) -> int:
+        """Measurements of the record that no later one can come before."""
+        return self.marks[0].taken - self._forgotten if self.marks else 0
+
+    def finish(self) -> None:
+        """Take what is held back, and close the last interval."""
+        self._go_on(float("inf"))
+        self._step(self._assembler.finish())
+        while self.marks:
+            self.passed(self.marks.popleft())
+
+    def ahead(self, time: float) -> tuple[Interval, Gaussian]:
+        """The newest keyframe's estimate, carried on to a time with the IMU alone."""
+        mark = self.marks[-1]
+        if time <= mark.interval.time:
+            return mark.interval, mark.known
+        later = [m for m in self._record[self._taken :] if m.sensor == "imu" and m.time <= time]
+        interval = self._assembler.ahead(later, time, mark.known.state)
+        return interval, self.recursion.predict(interval, mark.known).predicted
+
+    def _go_on(self, until: float) -> None:
+        """Take measurements up to a time."""
+        while self._taken < len(self._record) and self._record[self._taken].time <= until:
+            self._taken += 1
+            self._step(self._assembler.add(self._record[self._taken - 1]))
+
+    def _step(self, intervals: list[Interval]) -> None:
+        """Take intervals that are complete, and forget what the lag has passed."""
+        if not intervals:
+            return
+        assembler, taken = self._assembler.copy(), self._forgotten + self._taken
+        for interval in intervals:
+            known = self.marks[-1].known if self.marks else None
+            passage = self.recursion.through(interval, known, self._gates)
+            self.marks.append(Mark(interval, passage.filtered, dict(self._gates), passage.used, assembler, taken))
+        while self.marks[0].interval.time < self.marks[-1].interval.time - self.lag_s:
+            self.passed(self.marks.popleft())
+        if self._settled > len(self._record) // 2:
+            self.settle()
+
+    def _back_to(self, position: int) -> None:
+        """Undo the taking of the measurement at a place of the record, and of all after it."""
+        while self.marks and self.marks[-1].taken - self._forgotten > position:
+            self.marks.pop()
+        if self.marks:
+            mark = self.marks[-1]
+            self._assembler, self._gates = mark.assembler.copy(), dict(mark.gates)
+            self._taken = mark.taken - self._forgotten
+        else:
+            self._assembler, self._gates, self._taken = self._fresh(), {}, 0
+
+    def _fresh(self) -> Assembler:
+        b = self.beginning
+        return Assembler(b.config, b.instruments, b.start.state.bias[0])

@@ -1,0 +1,140 @@
+"""The live filter: the same estimate whatever the order of arrival, late data put where they belong, renewal."""
+
+import numpy as np
+import pytest
+from dives import Simulated, falcon, fed, simulated
+
+from rovgraph.estimators.error_recursion import Gaussian
+from rovgraph.estimators.error_state import ErrorStateFilter
+from rovgraph.estimators.fixed_lag import FixedLag, Taken
+from rovgraph.estimators.initialise import Beginning, initialise
+from rovgraph.estimators.refiner import Refiner
+from rovgraph.log import Measurement
+
+LAG, HOLD = 5.0, 0.3
+
+
+@pytest.fixture(scope="module")
+def case() -> Simulated:
+    return simulated(falcon(), 40.0, seed=6, dvl_rate=3.0)
+
+
+@pytest.fixture(scope="module")
+def beginning(case) -> Beginning:
+    return initialise(case.log, case.config)
+
+
+@pytest.fixture(scope="module")
+def measurements(case) -> list[Measurement]:
+    return list(case.log.measurements())
+
+
+@pytest.fixture(scope="module")
+def reference(case, beginning) -> ErrorStateFilter:
+    return fed(ErrorStateFilter(beginning), case.log)
+
+
+def live(beginning: Beginning, measurements: list[Measurement], hold: float = HOLD) -> tuple[FixedLag, list[Gaussian]]:
+    """The filter after all measurements, and its estimate of every keyframe."""
+    known: list[Gaussian] = []
+    engine = FixedLag(beginning, LAG, hold, passed=lambda mark: known.append(mark.known))
+    for measurement in measurements:
+        engine.add(measurement)
+    engine.finish()
+    return engine, known
+
+
+def same(known: list[Gaussian], others: list[Gaussian], atol: float) -> None:
+    assert len(known) == len(others)
+    for a, b in zip(known, others, strict=True):
+        np.testing.assert_allclose(a.state.p_n, b.state.p_n, atol=atol)
+        np.testing.assert_allclose(a.state.R_nb, b.state.R_nb, atol=atol)
+        np.testing.assert_allclose(a.P, b.P, rtol=1e-6, atol=1e-9)
+
+
+def shuffled(measurements: list[Measurement], within: float, seed: int = 3) -> list[Measurement]:
+    rng = np.random.default_rng(seed)
+    arrival = [m.time + rng.uniform(0.0, within) for m in measurements]
+    return [measurements[k] for k in np.argsort(arrival)]
+
+
+def test_in_order_it_is_the_filter_of_a_recorded_dive(beginning, measurements, reference):
+    same(live(beginning, measurements)[1], reference.filtered, 1e-12)
+
+
+@pytest.mark.parametrize("hold", [HOLD, 0.0])
+def test_the_order_of_arrival_within_300_ms_changes_nothing(beginning, measurements, reference, hold):
+    first, rest = measurements[:50], measurements[50:]
+    same(live(beginning, first + shuffled(rest, 0.3), hold)[1], reference.filtered, 1e-9)
+
+
+def test_a_ping_three_seconds_late_is_used_at_its_own_time(beginning, measurements, reference):
+    k = next(k for k, m in enumerate(measurements) if m.sensor == "dvl" and m.time > 20.0)
+    late = next(j for j, m in enumerate(measurements) if m.time > measurements[k].time + 3.0)
+    order = measurements[:k] + measurements[k + 1 : late] + [measurements[k]] + measurements[late:]
+    same(live(beginning, order)[1], reference.filtered, 1e-9)
+
+
+def test_what_is_later_than_the_lag_or_repeated_is_left_out_and_said(beginning, measurements):
+    engine = FixedLag(beginning, LAG, HOLD)
+    cut = next(k for k, m in enumerate(measurements) if m.time > 15.0)
+    assert {engine.add(m) for m in measurements[:cut]} == {Taken.IN}
+    ping = next(m for m in measurements if m.sensor == "dvl" and m.time > 5.0)
+    recent = next(m for m in measurements if m.sensor == "dvl" and m.time > 13.0)
+    assert engine.add(ping) == Taken.LATE
+    assert engine.add(recent) == Taken.AGAIN
+
+
+def test_retracted_pings_leave_no_trace(case, beginning, measurements):
+    gone = [m for m in measurements if m.sensor == "dvl" and 28.0 < m.time < 30.0]
+    engine = FixedLag(beginning, LAG, HOLD)
+    cut = next(k for k, m in enumerate(measurements) if m.time > 30.0)
+    for m in measurements[:cut]:
+        engine.add(m)
+    engine.retract("dvl", 28.0)
+    never = FixedLag(beginning, LAG, HOLD)
+    for m in measurements[:cut]:
+        if not any(m is g for g in gone):
+            never.add(m)
+    same([engine.marks[-1].known], [never.marks[-1].known], 1e-9)
+
+
+def test_prediction_ahead_grows_uncertain_and_beyond_the_imu_more_so(beginning, measurements):
+    engine = FixedLag(beginning, LAG, HOLD)
+    for m in measurements[:2500]:
+        engine.add(m)
+    mark = engine.marks[-1]
+    newest = max(m.time for m in measurements[:2500] if m.sensor == "imu")
+    sd = [np.sqrt(np.diag(engine.ahead(t)[1].P)[6:9]).max() for t in (mark.interval.time, newest, newest + 3.0)]
+    assert sd[0] < sd[1] < 0.1 * sd[2]
+
+
+def test_memory_does_not_grow(beginning, measurements):
+    engine, sizes = FixedLag(beginning, LAG, HOLD), []
+    for k, m in enumerate(measurements):
+        engine.add(m)
+        if k in (len(measurements) // 2, len(measurements) - 1):
+            sizes.append((len(engine.marks), len(engine._record)))
+    assert sizes[1][0] <= sizes[0][0] + 2
+    assert sizes[1][1] <= 2 * sizes[0][1] + 100
+
+
+def test_a_renewal_of_the_second_process_makes_it_the_renewed_filter(case, beginning, measurements):
+    renewed = fed(ErrorStateFilter(beginning, (5.0, 10.0, 20.0)), case.log)
+    refiner = Refiner(beginning, (5.0, 10.0, 20.0))
+    try:
+        known: list[Gaussian] = []
+        engine = FixedLag(beginning, LAG, HOLD, passed=lambda m: known.append(m.known), settled=refiner.take)
+        asked = False
+        for measurement in measurements:
+            engine.add(measurement)
+            if not asked and engine.marks and engine.marks[-1].interval.time > measurements[0].time + 30.0:
+                engine.settle()
+                refiner.ask(engine.marks[0].interval.index)
+                index, better = refiner.answer(wait=True)
+                assert engine.adopt(index, better)
+                asked = True
+        engine.finish()
+    finally:
+        refiner.close()
+    same(known[-20:], renewed.filtered[-20:], 1e-7)
