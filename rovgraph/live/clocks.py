@@ -1,0 +1,122 @@
+"""Many clocks become one.
+
+The estimator's time is that of the clock that stamps the IMU. Any other clock is compared
+with it by way of the host's: the least delay between a stamp and its arrival, of the last
+minute, is taken for the transport, which is the same for all. Two clocks that agree from the
+start within `AGREE_S` are taken for synchronised, and their stamps believed to the
+millisecond; what they drift apart later is put right. Clocks that do not agree (seconds since
+switching on, say) are shifted by the difference of their least delays.
+
+A stamp that is suddenly seconds off is left out. When the stamps go on like that, the clock
+was set: it is shifted, so that time goes on.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from rovgraph.live.message import Message
+
+AGREE_S = 0.5
+JUMP_S = 5.0  # a delay that differs by more from the one before is no delay
+CONFIRM_S, CONFIRM = 2.0, 5  # so long, and so many stamps, until a clock counts as set
+WINDOW_S = 60.0  # over which the least delay is taken
+PIECES = 6  # that the window is kept in
+
+
+@dataclass
+class _LeastDelay:
+    """The least of arrival minus stamp over a sliding window."""
+
+    pieces: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=PIECES))
+
+    def add(self, arrival: float, delay: float) -> None:
+        if not self.pieces or arrival - self.pieces[-1][0] > WINDOW_S / PIECES:
+            self.pieces.append((arrival, delay))
+        elif delay < self.pieces[-1][1]:
+            self.pieces[-1] = (self.pieces[-1][0], delay)
+
+    @property
+    def value(self) -> float:
+        return min(delay for _, delay in self.pieces)
+
+    def shift(self, by: float) -> None:
+        for k, (arrival, delay) in enumerate(self.pieces):
+            self.pieces[k] = (arrival, delay + by)
+
+
+@dataclass
+class _Clock:
+    """One clock of one source."""
+
+    name: str
+    delay: _LeastDelay = field(default_factory=_LeastDelay)
+    shift: float = 0.0  # what was put right when it was set
+    apart: float | None = None  # from the IMU's clock at the start; None = not compared yet
+    odd: list[tuple[float, float]] = field(default_factory=list)  # arrival, delay
+
+
+@dataclass
+class Clocks:
+    """Times of messages by the estimator's clock.
+
+    Attributes
+    ----------
+    trust : stamps are as they should be: of recorded data
+    news : what happened to clocks since it was last emptied: (clock, text)
+    odd : count of messages left out for their stamp
+    """
+
+    trust: bool = False
+    news: list[tuple[str, str]] = field(default_factory=list)
+    odd: int = 0
+    _clocks: dict[tuple[str, str], _Clock] = field(default_factory=dict)
+    _base: _Clock | None = None
+
+    def time(self, message: Message) -> float | None:
+        """Of a message's measurements [s]; None = not to be known, leave it out.
+
+        A message of a source without a clock is as old as the IMU's newest at its arrival.
+        """
+        if self.trust and message.stamp is not None:
+            return message.stamp
+        if message.stamp is None:
+            return message.arrival - (self._base.delay.value if self._base and self._base.delay.pieces else 0.0)
+        clock = self._clocks.setdefault(
+            (message.source, message.clock), _Clock(f"{message.source} {message.clock}".strip())
+        )
+        if self._base is None and any(r.sensor == "imu" for r in message.readings):
+            self._base, clock.apart = clock, 0.0
+        stamp = message.stamp + clock.shift
+        if self._is_odd(clock, message.arrival, message.arrival - stamp):
+            self.odd += 1
+            return None
+        stamp = message.stamp + clock.shift  # it may have been set
+        clock.delay.add(message.arrival, message.arrival - stamp)
+        return stamp + self._correction(clock)
+
+    def _correction(self, clock: _Clock) -> float:
+        if clock is self._base or self._base is None:
+            return 0.0
+        apart = clock.delay.value - self._base.delay.value
+        if clock.apart is None:
+            agree = abs(apart) < AGREE_S
+            clock.apart = apart if agree else 0.0
+            if not agree:
+                self.news.append((clock.name, f"its clock differs by {-apart:.1f} s from the IMU's and is shifted"))
+        return apart - clock.apart
+
+    def _is_odd(self, clock: _Clock, arrival: float, delay: float) -> bool:
+        """Whether a stamp is seconds off; where they all are, the clock is shifted."""
+        if not clock.delay.pieces or abs(delay - clock.delay.value) < JUMP_S:
+            clock.odd.clear()
+            return False
+        if clock.odd and abs(delay - clock.odd[-1][1]) > JUMP_S:
+            clock.odd.clear()
+        clock.odd.append((arrival, delay))
+        if len(clock.odd) < CONFIRM or arrival - clock.odd[0][0] < CONFIRM_S:
+            return True
+        by = min(d for _, d in clock.odd) - clock.delay.value
+        clock.shift += by
+        clock.odd.clear()
+        self.news.append((clock.name, f"its clock was set by {-by:.1f} s; time goes on as before"))
+        return False

@@ -1,0 +1,131 @@
+"""Sensors that fail while they go on talking, or fall silent.
+
+What is wrong is told from a sensor's own values and the IMU's: a DVL that reports exact
+zeros although it moved a moment ago, or turns; values that repeat exactly; a compass that
+stands still while the vehicle turns. A measurement that is part of such a failure is kept out,
+and those before it that were, taken back. What disagrees with the estimate is the filter's to
+reject.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rovgraph.geometry import Array
+from rovgraph.live.solution import Event
+from rovgraph.log import Measurement
+
+SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
+MOVED = 0.1  # speed of a vehicle that does not stop within a ping [m/s]
+RECENT_S = 5.0
+FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
+TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
+HEADINGS = {"ahrs", "dvl_heading", "mag"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to do with a measurement.
+
+    Attributes
+    ----------
+    use : give it to the estimator
+    retract_since : take back the sensor's measurements from then on [s], or None
+    """
+
+    use: bool = True
+    retract_since: float | None = None
+
+
+@dataclass
+class Watch:
+    """What is remembered of one sensor.
+
+    Attributes
+    ----------
+    state : "ok", "silent", "frozen", "no lock"
+    """
+
+    state: str = "ok"
+    time: float = -np.inf
+    period: float = 0.0
+    values: Array | None = None
+    since: float = 0.0  # of the first of equal values
+    equal: int = 0
+    turned: Array = field(default_factory=lambda: np.zeros(3))  # meanwhile [rad]
+
+
+@dataclass
+class Faults:
+    """Looks at every measurement before the estimator does.
+
+    Attributes
+    ----------
+    watches : by sensor
+    events : since it was last emptied
+    """
+
+    watches: dict[str, Watch] = field(default_factory=dict)
+    events: list[Event] = field(default_factory=list)
+    _speeds: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=3))
+
+    def look(self, m: Measurement) -> Verdict:
+        """Whether a measurement is one."""
+        watch = self.watches.setdefault(m.sensor, Watch())
+        repeated = watch.values is not None and np.array_equal(m.values, watch.values, equal_nan=True)
+        if repeated:
+            watch.equal += 1
+        else:
+            watch.equal, watch.since, watch.turned = 1, m.time, np.zeros(3)
+        if m.sensor == "imu":
+            self._turn(m, watch)
+        if np.isfinite(watch.time):
+            step = m.time - watch.time
+            watch.period = step if not watch.period else watch.period + 0.05 * (step - watch.period)
+        watch.time, watch.values = max(m.time, watch.time), m.values
+        if m.sensor == "dvl":
+            return self._ping(m, watch)
+        frozen = watch.equal >= FROZEN.get(m.sensor, np.inf) or (
+            m.sensor in HEADINGS and watch.equal > 2 and float(np.abs(watch.turned).max()) > TURNED
+        )
+        return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
+
+    def tick(self, time: float) -> None:
+        """Note sensors that have said nothing for too long."""
+        for sensor, watch in self.watches.items():
+            quiet = time - watch.time
+            if watch.state != "silent" and quiet > max(SILENT_S, SILENT_PERIODS * watch.period):
+                watch.state = "silent"
+                self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))
+
+    def _turn(self, m: Measurement, watch: Watch) -> None:
+        step = m.time - watch.time
+        if 0.0 < step < 1.0:
+            for sensor in HEADINGS & self.watches.keys():
+                self.watches[sensor].turned = self.watches[sensor].turned + m.values[3:6] * step
+
+    def _ping(self, m: Measurement, watch: Watch) -> Verdict:
+        if m.values[3] == 0.0:
+            return self._verdict(m, watch, "no lock", "no bottom lock")
+        if m.values[:3].any():
+            verdict = self._verdict(m, watch, "frozen" if watch.equal >= FROZEN["dvl"] else "ok", "the same ping again")
+            if verdict.use:
+                self._speeds.append((m.time, float(np.linalg.norm(m.values[:3]))))
+            return verdict
+        speeds = [speed for time, speed in self._speeds if m.time - time < RECENT_S]
+        moved = bool(speeds) and float(np.median(speeds)) > MOVED
+        return self._verdict(
+            m, watch, "no lock" if moved or watch.state == "no lock" else "ok", "exactly zero although it moves"
+        )
+
+    def _verdict(self, m: Measurement, watch: Watch, state: str, text: str) -> Verdict:
+        before, watch.state = watch.state, state
+        if state == "ok":
+            if before != "ok":
+                self.events.append(Event(m.time, m.sensor, "back", f"{m.sensor}: measures again"))
+            return Verdict()
+        if before == state:
+            return Verdict(use=False)
+        self.events.append(Event(m.time, m.sensor, state, f"{m.sensor}: {text}; left out"))
+        return Verdict(False, watch.since if state == "frozen" else None)

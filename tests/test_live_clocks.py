@@ -1,0 +1,90 @@
+"""Clocks of sources: synchronised, differing, drifting, set, and stamps that cannot be."""
+
+import numpy as np
+import pytest
+
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.message import Message, Reading
+
+IMU, DVL = (Reading("imu", np.zeros(6)),), (Reading("dvl", np.zeros(5)),)
+
+
+def imu(arrival: float, delay: float = 0.01, epoch: float = 0.0) -> Message:
+    return Message("tcp://imu", arrival, arrival - delay - epoch, IMU)
+
+
+def dvl(arrival: float, stamp: float | None) -> Message:
+    return Message("tcp://dvl", arrival, stamp, DVL)
+
+
+def begun(epoch: float = 0.0) -> Clocks:
+    """The IMU's clock is known, with transports of 10 to 30 ms."""
+    clocks, rng = Clocks(), np.random.default_rng(1)
+    for k in range(500):
+        clocks.time(imu(1000.0 + 0.01 * k, 0.01 + 0.02 * rng.random(), epoch))
+    return clocks
+
+
+def test_the_imus_stamps_are_the_time_of_the_estimator():
+    assert begun(epoch=900.0).time(imu(1005.0, 0.02, 900.0)) == pytest.approx(104.98)
+
+
+def test_a_late_ping_of_a_synchronised_clock_keeps_its_time_of_validity():
+    clocks = begun()
+    times = [clocks.time(dvl(1005.0 + 0.2 * k, 1005.0 + 0.2 * k - 0.2)) for k in range(100)]
+    np.testing.assert_allclose(times, 1004.8 + 0.2 * np.arange(100), atol=1e-9)
+
+
+def test_a_clock_that_counts_from_switching_on_is_shifted_to_the_imus_and_said():
+    clocks, rng = begun(), np.random.default_rng(2)
+    for k in range(100):
+        true = 1005.0 + 0.2 * k
+        time = clocks.time(dvl(true + 0.01 + 0.02 * rng.random(), true - 970.0))
+    assert time == pytest.approx(true, abs=0.02)
+    assert len(clocks.news) == 1 and "shifted" in clocks.news[0][1]
+
+
+def test_a_source_without_a_clock_is_as_old_as_the_imus_newest():
+    assert begun(epoch=900.0).time(dvl(1005.0, None)) == pytest.approx(104.99, abs=2e-3)
+
+
+def test_clocks_that_drift_apart_over_a_day_are_kept_together():
+    clocks, rate = begun(), 50e-6
+    for k in range(0, 86400):
+        clocks.time(imu(1005.0 + k, 0.01))
+        true = 1005.0 + k
+        time = clocks.time(dvl(true + 0.2, true + rate * k))
+    assert rate * 86400 > 4.0
+    assert time == pytest.approx(true, abs=0.01)
+
+
+@pytest.mark.parametrize("stamp", [0.0, 4e9])
+def test_a_single_stamp_from_1970_or_the_future_is_left_out(stamp):
+    clocks = begun()
+    assert clocks.time(dvl(1005.0, 1004.9)) is not None
+    assert clocks.time(dvl(1005.2, stamp)) is None
+    assert clocks.time(dvl(1005.4, 1005.3)) == pytest.approx(1005.3)
+    assert clocks.odd == 1
+
+
+@pytest.mark.parametrize("by", [-3600.0, 40.0])
+def test_a_clock_that_was_set_goes_on_after_two_seconds(by):
+    clocks = begun()
+    for k in range(50):
+        clocks.time(dvl(1005.0 + 0.2 * k, 1004.9 + 0.2 * k))
+    times = [clocks.time(dvl(1015.0 + 0.2 * k, 1014.9 + 0.2 * k + by)) for k in range(50)]
+    assert times[:10] == [None] * 10
+    np.testing.assert_allclose([t for t in times if t is not None][-20:], 1014.9 + 0.2 * np.arange(30, 50), atol=1e-6)
+    assert any("was set" in text for _, text in clocks.news)
+
+
+def test_the_imus_own_clock_that_was_set_goes_on_too():
+    clocks = begun()
+    for k in range(400):
+        time = clocks.time(Message("tcp://imu", 1005.0 + 0.01 * k, 1004.99 + 0.01 * k - 500.0, IMU))
+    assert time == pytest.approx(1008.98, abs=1e-3)
+
+
+def test_recorded_stamps_are_trusted():
+    clocks = Clocks(trust=True)
+    assert clocks.time(dvl(5.0, 123.0)) == 123.0

@@ -1,0 +1,95 @@
+"""Sensors that fail while they go on talking, or fall silent: found, said once, and their return too."""
+
+import numpy as np
+
+from rovgraph.live.faults import FROZEN, Faults, Verdict
+from rovgraph.log import Measurement
+
+RNG = np.random.default_rng(5)
+
+
+def ping(time: float, *velocity: float, valid: float = 1.0) -> Measurement:
+    return Measurement(time, "dvl", np.array([*velocity, valid, np.nan]), 0)
+
+
+def moving(time: float) -> Measurement:
+    return ping(time, *(np.array([0.4, 0.05, 0.0]) + 0.01 * RNG.standard_normal(3)))
+
+
+def sample(time: float, rate: float = 0.0) -> Measurement:
+    return Measurement(time, "imu", np.array([0, 0, -9.8, 0, 0, rate]) + 0.01 * RNG.standard_normal(6), 0)
+
+
+def heading(time: float, yaw: float) -> Measurement:
+    return Measurement(time, "ahrs", np.array([yaw, np.nan, np.nan]), 0)
+
+
+def kinds(faults: Faults) -> list[str]:
+    return [event.kind for event in faults.events]
+
+
+def test_zeros_of_a_dvl_that_moved_a_moment_ago_are_left_out_until_it_measures_again():
+    faults = Faults()
+    assert all(faults.look(moving(0.2 * k)).use for k in range(20))
+    assert not any(faults.look(ping(4.0 + 0.2 * k, 0.0, 0.0, 0.0)).use for k in range(100))
+    assert faults.look(moving(24.0)).use
+    assert kinds(faults) == ["no lock", "back"]
+
+
+def test_zeros_of_a_vehicle_that_stands_still_are_used():
+    faults = Faults()
+    assert all(faults.look(ping(0.2 * k, 0.0, 0.0, 0.0)).use for k in range(50))
+    assert faults.events == []
+
+
+def test_a_lost_bottom_lock_is_said_once():
+    faults = Faults()
+    faults.look(moving(0.0))
+    assert not any(faults.look(ping(0.2 * k, np.nan, np.nan, np.nan, valid=0.0)).use for k in range(1, 10))
+    assert kinds(faults) == ["no lock"]
+
+
+def test_a_frozen_ping_is_taken_back_from_its_first_appearance():
+    faults = Faults()
+    for k in range(10):
+        faults.look(moving(0.2 * k))
+    verdicts = [faults.look(ping(2.0 + 0.2 * k, 0.41, 0.05, 0.01)) for k in range(10)]
+    assert [v.use for v in verdicts] == [True] * (FROZEN["dvl"] - 1) + [False] * (11 - FROZEN["dvl"])
+    assert [v.retract_since for v in verdicts if v.retract_since is not None] == [2.0]
+    assert faults.look(moving(5.0)) == Verdict()
+
+
+def test_a_compass_that_stands_still_while_the_vehicle_turns_is_frozen():
+    faults, used = Faults(), []
+    for k in range(1000):
+        faults.look(sample(0.01 * k, 0.2))
+        if k % 10 == 0:
+            used.append(faults.look(heading(0.01 * k, 1.0)).use)
+    assert used[0] and not used[-1]
+    assert kinds(faults) == ["frozen"]
+
+
+def test_a_coarse_compass_of_a_vehicle_that_does_not_turn_is_not_frozen():
+    faults = Faults()
+    for k in range(1000):
+        faults.look(sample(0.01 * k))
+        assert faults.look(heading(0.01 * k, 1.0)).use
+
+
+def test_a_frozen_imu_is_left_out():
+    faults = Faults()
+    faults.look(sample(0.0))
+    stuck = sample(0.01)
+    verdicts = [faults.look(stuck._replace(time=0.01 * k)).use for k in range(1, 100)]
+    assert verdicts == [True] * (FROZEN["imu"] - 1) + [False] * (100 - FROZEN["imu"])
+
+
+def test_silence_is_said_once_and_so_is_the_return():
+    faults = Faults()
+    for k in range(20):
+        faults.look(moving(0.2 * k))
+    for time in (5.0, 6.0, 8.0, 9.0):
+        faults.tick(time)
+    assert kinds(faults) == ["silent"]
+    faults.look(moving(9.5))
+    assert kinds(faults) == ["silent", "back"]
