@@ -22,10 +22,10 @@ from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Attached, Interval
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
-from rovgraph.graph.measurements import Block, make_block
+from rovgraph.graph.measurements import Block, make_block, motions, whitening
 from rovgraph.graph.transition import transition
-from rovgraph.sensors import Position
-from rovgraph.state import VELOCITY, State
+from rovgraph.sensors import Position, SensorModel, innovation
+from rovgraph.state import VELOCITY, State, propagate_with_jacobian
 
 RETURN_SD = 3.0  # a sensor that was kept out for long returns with an innovation within this many sd
 
@@ -165,6 +165,24 @@ class ErrorStateRecursion:
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
         return make_block(attached, instrument, gravity, self.unknowns)
 
+    def linearize(self, state: State, attached: Sequence[Attached]) -> list[tuple[Array, Array]]:
+        """Whitened innovation, shape (dim,), and Jacobian, shape (dim, size), of each measurement of a keyframe.
+
+        What `Block.linearize` says of many keyframes and one sensor, for one keyframe and many sensors.
+        """
+        there, F, linear = state.at([0] * len(attached)), None, []
+        if any(a.motion.dt for a in attached):
+            there, F = propagate_with_jacobian(there, motions(attached), self.beginning.config.environment.gravity_mps2)
+        for k, a in enumerate(attached):
+            instrument = self.beginning.instruments[a.sensor]
+            predicted, jacobians = instrument.model.predict(there.at(slice(k, k + 1)), a.rate_b[None])
+            H = self.error.matrix(jacobians)[0]
+            if F is not None:
+                H[:, :15] = H[:, :15] @ F[k]
+            W = whitening(instrument, a.sd[None], np.array([a.rate_sd]))[0]
+            linear.append((W @ innovation(instrument.model, a.z, predicted[0]), W @ H))
+        return linear
+
     def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
         """Whether a measurement lies within its gate."""
         instrument = self.beginning.instruments[a.sensor]
@@ -177,10 +195,9 @@ class ErrorStateRecursion:
         gates.pop(a.sensor, None)
         return True
 
-    def _seen(self, block: Block, state: State) -> Array:
+    def _seen(self, model: SensorModel, state: State) -> Array:
         """Directions of the error that a sensor sees, shape (size, k): velocity, or turn and shift along n's axes."""
-        model, R_bn = block.instrument.model, transpose(state.R_nb[0])
-        seen = np.zeros((self.error.size, 3))
+        R_bn, seen = transpose(state.R_nb[0]), np.zeros((self.error.size, 3))
         if isinstance(model, Position):
             seen[3:6] = R_bn
             return seen[:, list(model.axes)]
@@ -193,20 +210,19 @@ class ErrorStateRecursion:
     def _update(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
         """The state corrected by measurements that belong to its keyframe."""
         r, H, losses, admitted = [], [], [], []
-        for a in attached:
-            block = self.block([a])
-            own_r, jacobians = block.linearize(before.state)
-            own_H = self.error.matrix(jacobians)
-            nis = normalised_squared(before.P, own_r[0], own_H[0])
+        for a, (own_r, own_H) in zip(attached, self.linearize(before.state, attached), strict=True):
+            instrument = self.beginning.instruments[a.sensor]
+            nis = normalised_squared(before.P, own_r, own_H)
             if self._admit(a, nis, gates):
-                r.append(own_r[0])
-                H.append(own_H[0])
-                losses.append(block.instrument.loss)
+                r.append(own_r)
+                H.append(own_H)
+                losses.append(instrument.loss)
                 admitted.append((a, nis))
             else:
                 used.append(Used(a, before.state, nis, 0.0))
-                if a.time - gates[a.sensor] > block.instrument.readmit_s:
-                    before = replace(before, P=doubted(before.P, own_r[0], own_H[0], self._seen(block, before.state)))
+                if a.time - gates[a.sensor] > instrument.readmit_s:
+                    seen = self._seen(instrument.model, before.state)
+                    before = replace(before, P=doubted(before.P, own_r, own_H, seen))
         if not admitted:
             return before
         delta, P, weights = robust_update(before.P, r, H, losses)

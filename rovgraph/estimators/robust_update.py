@@ -6,7 +6,7 @@ from itertools import accumulate
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.graph.measurements import loss_and_weight
+from rovgraph.graph.measurements import loss_weight
 
 MAX_REWEIGHTINGS = 20
 SETTLED = 1e-3  # change of a weight
@@ -56,8 +56,9 @@ def robust_update(
         inverse = np.linalg.inv(root[:, None] * S * root + unit)
         gain = root * (inverse @ (root * residual))
         left = residual - S @ gain
-        renewed = [loss_and_weight(left[None, part], loss)[1][0] for part, loss in zip(parts, losses, strict=True)]
-        change, weights = np.abs(renewed - weights).max(), np.array(renewed)
+        squared = [left[part] @ left[part] for part in parts]
+        renewed = np.array([loss_weight(*one) for one in zip(squared, losses, sizes, strict=True)])
+        change, weights = np.abs(renewed - weights).max(), renewed
         if change < SETTLED:
             break
     K = (PJt * root) @ inverse

@@ -165,11 +165,15 @@ def make_block(
     def stack(name: str) -> Array:
         return np.array([getattr(a, name) for a in attached])
 
-    dt, dR, dv, dp = (np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp"))
-    delta = Delta(dt, dR, dv, dp, stack("bias"))
     W = whitening(instrument, stack("sd"), stack("rate_sd"))
     arrays = (stack("keyframe"), stack("segment"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
-    return Block(instrument, *arrays, delta, gravity, unknowns.of(instrument.model.calibration))
+    return Block(instrument, *arrays, motions(attached), gravity, unknowns.of(instrument.model.calibration))
+
+
+def motions(attached: Sequence[Attached]) -> Delta:
+    """From their keyframes to measurements, of one sensor or of many."""
+    dt, dR, dv, dp = (np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp"))
+    return Delta(dt, dR, dv, dp, np.array([a.bias for a in attached]))
 
 
 def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
@@ -186,6 +190,8 @@ def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
     ndarray, shape (n, dim, dim), lower triangular
     """
     gain = instrument.rate_gain
+    if not gain.any():
+        return np.eye(sd.shape[1]) / sd[:, :, None]
     covariance = np.eye(sd.shape[1]) * sd[:, :, None] ** 2 + (gain @ gain.T) * rate_sd[:, None, None] ** 2
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
@@ -209,14 +215,23 @@ def loss_and_weight(r: Array, loss: str) -> tuple[Array, Array]:
     rho, weight : ndarray, shape (n,); for "none" rho = d^2 / 2
     """
     d2 = np.sum(r**2, axis=1)
-    k = loss_threshold(loss, r.shape[1])
+    k, weight = loss_threshold(loss, r.shape[1]), loss_weight(d2, loss, r.shape[1])
     if loss == "none":
-        return 0.5 * d2, np.ones(len(r))
+        return 0.5 * d2, weight
     if loss == "cauchy":
-        return 0.5 * k**2 * np.log1p(d2 / k**2), 1.0 / (1.0 + d2 / k**2)
+        return 0.5 * k**2 * np.log1p(d2 / k**2), weight
     d = np.sqrt(d2)
-    far = d > k
-    return np.where(far, k * (d - 0.5 * k), 0.5 * d2), np.where(far, k / np.maximum(d, k), 1.0)
+    return np.where(d > k, k * (d - 0.5 * k), 0.5 * d2), weight
+
+
+def loss_weight(d2: Array, loss: str, dim: int) -> Array:
+    """Weight rho'(d)/d of innovations of ``dim`` components and squared length ``d2``, of any shape."""
+    k = loss_threshold(loss, dim)
+    if loss == "none":
+        return np.ones_like(d2)
+    if loss == "cauchy":
+        return np.asarray(1.0 / (1.0 + d2 / k**2))
+    return np.asarray(k / np.maximum(np.sqrt(d2), k))
 
 
 def robust_noise(instrument: Instrument) -> gtsam.noiseModel.Base:
