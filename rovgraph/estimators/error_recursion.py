@@ -115,6 +115,10 @@ class ErrorStateRecursion:
         self.beliefs = beliefs(beginning.config)
         self.unknowns = unknowns(self.beliefs, beginning.instruments)
         self.error = ErrorVector(self.unknowns.estimated, beginning.instruments)
+        self._walk = np.zeros((self.error.size, self.error.size))  # what walking adds to Q in a second
+        for name, walk in self.unknowns.walks.items():
+            columns = self.error.columns[name]
+            self._walk[columns, columns] = np.eye(self.beliefs[name].variable.dim) * walk**2
 
     def start(self) -> Gaussian:
         """The prior: the graph's."""
@@ -151,11 +155,8 @@ class ErrorStateRecursion:
         """The next keyframe, from the IMU alone; calibration walks."""
         assert interval.pim is not None
         state = predict(interval, before.state)
-        F, Q = np.eye(self.error.size), np.zeros_like(before.P)
+        F, Q = np.eye(self.error.size), self._walk * interval.pim.deltaTij()
         F[:15, :15], Q[:15, :15] = transition(interval, before.state, state)
-        for name, walk in self.unknowns.walks.items():
-            columns = self.error.columns[name]
-            Q[columns, columns] = np.eye(self.beliefs[name].variable.dim) * walk**2 * interval.pim.deltaTij()
         P = F @ before.P @ F.T + Q
         return Step(F, Q, Gaussian(state, 0.5 * (P + P.T)))
 
