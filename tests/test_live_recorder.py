@@ -10,8 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as nps
 
 from rovgraph.errors import InputError
+from rovgraph.live.checkpoint import ARRAY, read_checkpoint, write_checkpoint
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.recorder import HEADER, Recorder
 from rovgraph.log import STREAMS, read_log
@@ -232,3 +236,131 @@ def test_a_row_costs_less_than_eight_microseconds(tmp_path):
         spent.append((time.perf_counter() - begin) / len(rows))
     recorder.close()
     assert min(spent) < 8e-6
+
+
+# checkpoints
+
+numbers = st.sampled_from(["?", "i1", "<i4", ">i8", "u2", "<f4", "<f8", ">f8", "c16"]).map(np.dtype)
+arrays = numbers.flatmap(lambda dtype: nps.arrays(dtype, nps.array_shapes(min_dims=0, max_dims=3, min_side=0)))
+plain = st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats() | st.text()
+keys = st.text().filter(lambda key: key != ARRAY)
+states = st.dictionaries(
+    keys,
+    st.recursive(plain | arrays, lambda inner: st.lists(inner) | st.dictionaries(keys, inner), max_leaves=12),
+    max_size=5,
+)
+
+
+def same(a, b) -> bool:
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and (a == b or (a != a and b != b))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("checkpoint")
+
+
+@settings(deadline=None, max_examples=100)
+@given(states)
+def test_a_checkpoint_comes_back_as_it_was(folder, state):
+    write_checkpoint(folder / "a", state)
+    assert same(read_checkpoint(folder / "a"), state)
+
+
+def test_arrays_that_were_read_are_the_callers_own_whatever_their_order_in_memory(tmp_path):
+    state = {"a": np.arange(12.0).reshape(3, 4).T, "b": np.float64(2.5), "c": (1, np.int64(2))}
+    write_checkpoint(tmp_path / "a", state)
+    read = read_checkpoint(tmp_path / "a")
+    np.testing.assert_array_equal(read["a"], state["a"])
+    read["a"] += 1.0
+    assert (read["b"], read["c"]) == (2.5, [1, 2])
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.data())
+def test_any_damage_to_a_checkpoint_is_found(folder, data):
+    path = folder / "b"
+    write_checkpoint(path, {"a": np.arange(5.0), "b": [1, "x", None]})
+    content = bytearray(path.read_bytes())
+    place = data.draw(st.integers(0, len(content) - 1))
+    if data.draw(st.booleans()):
+        content = content[:place]
+    else:
+        content[place] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"delete it to start anew|is no checkpoint|go on with the rovgraph") as error:
+        read_checkpoint(path)
+    assert "\n" not in str(error.value)
+
+
+def test_no_checkpoint_and_one_of_another_version_are_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_checkpoint(tmp_path / "missing")
+    write_checkpoint(tmp_path / "a", {})
+    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 1 ", b"checkpoint 2 "))
+    with pytest.raises(InputError, match="of version 2, expected 1"):
+        read_checkpoint(tmp_path / "a")
+
+
+@pytest.mark.parametrize("value", [object(), b"bytes", np.array(["text"]), np.array([None]), {1: 2}, {ARRAY: 1}])
+def test_what_cannot_be_kept_is_refused_with_its_place_and_the_old_file_stands(tmp_path, value):
+    write_checkpoint(tmp_path / "a", {"old": 1})
+    with pytest.raises(TypeError, match=r"state\['x'\]\[1\]"):
+        write_checkpoint(tmp_path / "a", {"x": [0, value]})
+    assert read_checkpoint(tmp_path / "a") == {"old": 1}
+
+
+def test_a_checkpoint_that_fails_leaves_the_old_one_and_no_rest(tmp_path, monkeypatch):
+    write_checkpoint(tmp_path / "a", {"old": 1})
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        write_checkpoint(tmp_path / "a", {"new": 2})
+    monkeypatch.undo()
+    assert read_checkpoint(tmp_path / "a") == {"old": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+CHECKPOINTS = """
+import sys, numpy as np
+from rovgraph.live.checkpoint import write_checkpoint
+k = 0
+while True:
+    k += 1
+    write_checkpoint(sys.argv[1], {"k": k, "a": np.full(40_000, k)})
+    print(k, flush=True)
+"""
+
+
+def test_a_kill_while_checkpoints_are_written_leaves_a_whole_one(tmp_path):
+    for _ in range(3):
+        child = subprocess.Popen([sys.executable, "-c", CHECKPOINTS, tmp_path / "a"], stdout=subprocess.PIPE, text=True)
+        child.stdout.readline()
+        time.sleep(RNG.uniform(0.02, 0.1))
+        child.kill()
+        told = [int(line) for line in child.communicate()[0].splitlines()]
+        read = read_checkpoint(tmp_path / "a")
+        assert (read["a"] == read["k"]).all()
+        assert read["k"] >= max(told, default=1)
+
+
+def test_a_checkpoint_of_300_kilobytes_takes_less_than_three_milliseconds(tmp_path, monkeypatch):
+    """Beside the disk's own time; best of ten, so that a busy machine is forgiven."""
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+    state = {"blocks": [{"k": k, "cov": RNG.normal(size=(30, 25))} for k in range(50)]}
+    spent = []
+    for _ in range(10):
+        begin = time.perf_counter()
+        write_checkpoint(tmp_path / "a", state)
+        spent.append(time.perf_counter() - begin)
+    assert (tmp_path / "a").stat().st_size > 300_000
+    assert min(spent) < 3e-3
