@@ -1,0 +1,130 @@
+"""JSON lines with a log's columns as keys: one object per row.
+
+What a configuration says of a log's names and units holds for them too, so that the rows of a
+log, written as JSON lines, say what the log says.
+"""
+
+import numpy as np
+
+from rovgraph.config import Config
+from rovgraph.geometry import Array
+from rovgraph.live.message import GEODETIC, Message, Reading, readings
+from rovgraph.live.sources.lines import LineDecoder, Refused, json_number, json_object, shown
+from rovgraph.live.sources.source import Notify
+from rovgraph.log.reading import ACC_GAP
+from rovgraph.log.streams import LAT_LON, OPTIONAL, STREAMS, is_column
+from rovgraph.log.units import factors, near_miss
+
+ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
+UNKNOWN = 20  # unknown keys that are told apart
+
+_SENSOR = {c: sensor for sensor, columns in STREAMS.items() for c in columns if c not in OPTIONAL}
+_SENSOR |= dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl"}
+
+
+def json_lines(url: str, notify: Notify, config: Config) -> LineDecoder:
+    """Decoder of JSON lines.
+
+    Raises
+    ------
+    InputError : the configuration declares a unit that is unknown
+    """
+    return LineDecoder(JsonRow(url, notify, config).message, notify)
+
+
+class JsonRow:
+    """From a line to a message; what is wrong with a line leaves the lines after it alone.
+
+    Parameters
+    ----------
+    url : of the source
+    notify : takes complaints
+    config : for columns, units and the magnetometer's calibration
+
+    Raises
+    ------
+    InputError : the configuration declares a unit that is unknown
+    """
+
+    def __init__(self, url: str, notify: Notify, config: Config) -> None:
+        self._url = url
+        self._notify = notify
+        self._names = {theirs: ours for ours, theirs in config.columns.items()}
+        self._scale = factors(config.units, url)
+        self._mag = config.imu.mag.calibrated
+        self._unknown: set[str] = set()
+        self._acc: tuple[Array, float | None, float] | None = None  # the last one, its stamp and arrival
+
+    def message(self, line: bytes, arrival: float) -> Message | None:
+        """What a line says.
+
+        Raises
+        ------
+        Refused : the line is to be skipped
+        """
+        cells = self._cells(json_object(line))
+        stamp = cells.pop("time", None)
+        _check(cells)
+        alone = self._join(cells, stamp, arrival)
+        found = readings(cells)
+        lost = {_SENSOR[name] for name in cells if name in _SENSOR} - {r.sensor for r in found} - alone
+        if lost:
+            self._notify("incomplete", f"{', '.join(sorted(lost))}: not all of its columns are in the line")
+        found = tuple(Reading("mag", self._mag(r.values)) if r.sensor == "mag" else r for r in found)
+        return Message(self._url, arrival, stamp, found) if found else None
+
+    def _cells(self, row: dict[str, object]) -> dict[str, float]:
+        """Columns of a row that are known and filled, in SI."""
+        cells = {}
+        for key, value in row.items():
+            name = self._names.get(key, key)
+            if not is_column(name):
+                self._report(key)
+            elif value is not None:
+                cells[name] = json_number(key, value) * self._scale.get(name, 1.0)
+        return cells
+
+    def _report(self, key: str) -> None:
+        if key in self._unknown or len(self._unknown) < UNKNOWN:
+            self._unknown.add(key)
+            meant = near_miss(key, ())
+            hint = f"; if it is {meant}, rename it or map it under columns" if meant else ""
+            self._notify(f"unknown key {shown(key)}", f"the key {shown(key)} is ignored{hint}", once=True)
+        else:
+            self._notify("unknown key", "more keys are ignored", once=True)
+
+    def _join(self, cells: dict[str, float], stamp: float | None, arrival: float) -> set[str]:
+        """Give a rate the acceleration that came before it, where they come on separate lines.
+
+        Returns
+        -------
+        {"imu"} where half a sample stays alone, else nothing
+        """
+        with_acc, with_gyr = (all(name in cells for name in names) for names in (ACC, GYR))
+        if with_acc:
+            self._acc = np.array([cells[name] for name in ACC]), stamp, arrival
+            return set() if with_gyr else {"imu"} - {_SENSOR[n] for n in GYR if n in cells}
+        if with_gyr and not any(name in cells for name in ACC):
+            if self._acc is None or _age(self._acc[1:], stamp, arrival) > ACC_GAP:
+                self._notify("no acceleration", f"a rate without an acceleration of the last {ACC_GAP:g} s is left out")
+                return {"imu"}
+            cells.update(zip(ACC, self._acc[0].tolist(), strict=True))
+        return set()
+
+
+def _age(before: tuple[float | None, float], stamp: float | None, arrival: float) -> float:
+    """Time since an earlier line, by the stamps where both have one [s]."""
+    earlier, came = before
+    return abs(stamp - earlier) if stamp is not None and earlier is not None else abs(arrival - came)
+
+
+def _check(cells: dict[str, float]) -> None:
+    """Raise `Refused` for values that are finite and cannot be."""
+    if cells.get("dvl_valid", 1.0) not in (0.0, 1.0):
+        raise Refused("out of range", f"dvl_valid: {cells['dvl_valid']:g}, expected 0 or 1; the line is skipped")
+    lat, lon = (cells.get(name, 0.0) for name in LAT_LON)
+    if abs(lat) > 90.0 or abs(lon) > 360.0:
+        raise Refused("out of range", f"latitude {lat:g}, longitude {lon:g}, expected degrees; the line is skipped")
+    if all(cells.get(name) == 0.0 for name in LAT_LON):  # how a receiver without a fix says so
+        for name in LAT_LON:
+            del cells[name]

@@ -1,0 +1,218 @@
+"""From a URL to a source."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complaints
+from rovgraph.live.sources import waterlinked
+from rovgraph.live.sources.address import LOOPBACK, Address, one_of, parse_address, positive, whole
+from rovgraph.live.sources.json_lines import json_lines
+from rovgraph.live.sources.links import SerialLink, StandardInput, TcpLink, UdpLink
+from rovgraph.live.sources.mavlink import IMUS, MavlinkDecoder, Options
+from rovgraph.live.sources.nmea import nmea
+from rovgraph.live.sources.recordings import FileLink, TelemetryLog
+from rovgraph.live.sources.replay import log_replay
+from rovgraph.live.sources.source import Decoder, LinkSource, Notify, Source
+from rovgraph.log.units import nearest
+
+MAVLINK_BAUD, NMEA_BAUD = 115200, 4800
+DEVICES = ("/dev/", "COM")
+FORMS = {
+    "-": "-",
+    "tcp": "tcp://host:port",
+    "udp": "udp://[host]:port",
+    "waterlinked": "waterlinked://host[:port]",
+    "mavlink": "mavlink:udpin:host:port",
+    "nmea": "nmea:/dev/ttyUSB0",
+    "file": "file:log.csv",
+}
+
+_baud = whole(50, 4_000_000)
+
+
+def open_sources(
+    urls: Sequence[str],
+    complaints: Complaints | None = None,
+    config: Config | None = None,
+    speed: str = "1",
+) -> tuple[Source, ...]:
+    """Sources of URLs; see `open_source`.
+
+    Raises
+    ------
+    InputError : no URL, one of them is wrong, or stands there twice
+    """
+    if not urls:
+        raise InputError(f"expected at least one source, such as {', '.join(FORMS.values())}")
+    for url in urls:
+        if urls.count(url) > 1:
+            raise InputError(f"{url}: given twice; each source can be read once")
+    complaints = complaints or Complaints()
+    return tuple(open_source(url, complaints, config, speed) for url in urls)
+
+
+def open_source(
+    url: str,
+    complaints: Complaints | None = None,
+    config: Config | None = None,
+    speed: str = "1",
+) -> Source:
+    """The source of a URL; docs/online-sources.md says which there are.
+
+    Parameters
+    ----------
+    url : as a person gives it
+    complaints : where those of the source go
+    config : for columns, units, the magnetometer's calibration, declination and gravity
+    speed : of files, a number or "max"; their option ``speed`` goes before it
+
+    Raises
+    ------
+    InputError : a URL that is unknown or malformed, a file or port that cannot be opened, a library that is missing
+    """
+    address = parse_address(url)
+    if address.scheme == "" and address.place == "-":
+        address = Address(url, "-", "", address.options)
+    opener = _OPENERS.get(address.scheme)
+    if opener is None:
+        raise _unknown(address)
+    notify = partial((complaints or Complaints()).complain, url)
+    return opener(address, notify, config or Config(), pace_of(speed))
+
+
+def pace_of(speed: str) -> float:
+    """Recorded seconds per second of a speed: a number, or "max".
+
+    Raises
+    ------
+    InputError : it is neither
+    """
+    try:
+        return _pace(speed)
+    except ValueError as error:
+        raise InputError(f"speed: {speed!r}, {error}") from None
+
+
+def _pace(text: str) -> float:
+    if text == "max":
+        return math.inf
+    try:
+        return positive(text)
+    except ValueError:
+        raise ValueError("expected a number above 0, or max") from None
+
+
+def _unknown(address: Address) -> InputError:
+    """What to say of a URL of no known form, with the form that was probably meant."""
+    known = f"known are {', '.join(FORMS.values())}"
+    if Path(address.url).suffix.lower() == ".tlog":
+        meant = f"mavlink:{address.url}"
+    elif Path(address.url).is_file():
+        meant = f"file:{address.url}"
+    elif address.scheme in ("udpin", "tcpin", "udpout"):
+        meant = f"mavlink:udpin:{address.place.rpartition('udpin:')[2]}"
+    elif address.url.startswith(DEVICES):
+        meant = f"nmea:{address.url} or mavlink:{address.url}"
+    else:
+        meant = FORMS[nearest(address.scheme or address.url, FORMS)]
+    return InputError(f"{address.url}: no source of this form; was {meant} meant? {known}")
+
+
+def _standard_input(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+    address.take({})
+    return LinkSource(address.url, StandardInput(), json_lines(address.url, notify, config))
+
+
+def _network(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+    address.take({})
+    return _networked(address, notify, json_lines(address.url, notify, config), end=b"\n")
+
+
+def _waterlinked(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+    address.take({})
+    link = TcpLink(*address.host_port(default_port=waterlinked.PORT), notify)
+    return LinkSource(address.url, link, waterlinked.waterlinked(address.url, notify))
+
+
+def _file(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+    pace = address.take({"speed": _pace}).get("speed", pace)
+    return log_replay(address.url, address.place.removeprefix("//"), config, pace)
+
+
+def _nmea(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+    inner = address.inner()
+    if inner.scheme in ("tcp", "udp"):
+        address.take({})
+        return _networked(inner, notify, nmea(address.url, notify, config), end=b"\n")
+    if _is_device(address.place):
+        baud = address.take({"baud": _baud}).get("baud", NMEA_BAUD)
+        link = SerialLink(address.place, baud, notify)
+        return LinkSource(address.url, link, nmea(address.url, notify, config))
+    path = _existing(address)
+    pace = address.take({"speed": _pace}).get("speed", pace)
+    return LinkSource(address.url, FileLink(path), nmea(address.url, notify, config, recorded=True), pace=pace)
+
+
+def _mavlink(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+    inner = address.inner()
+    recorded = address.place.lower().endswith((".tlog", ".tlog.gz"))
+    serial = _is_device(address.place)
+    if not (recorded or serial or inner.scheme in ("tcp", "udp", "udpin")):
+        raise InputError(
+            f"{address.url}: expected mavlink:udpin:host:port, mavlink:tcp:host:port, mavlink:/dev/ttyACM0 "
+            "or mavlink:file.tlog; nothing is sent to a vehicle, so a connection that has to speak first is none"
+        )
+    options = address.take(
+        _MAVLINK_OPTIONS | ({"speed": _pace} if recorded else {}) | ({"baud": _baud} if serial else {})
+    )
+    pace, baud = options.pop("speed", pace), options.pop("baud", MAVLINK_BAUD)
+    decoder = MavlinkDecoder(address.url, notify, config, Options(**options))
+    if recorded:
+        return LinkSource(address.url, TelemetryLog(_existing(address)), decoder, pace=pace)
+    if serial:
+        device, _, rate = address.place.partition(",")  # as pymavlink has it
+        return LinkSource(address.url, SerialLink(device, int(rate) if rate.isdecimal() else baud, notify), decoder)
+    return _networked(inner, notify, decoder)
+
+
+_MAVLINK_OPTIONS = {
+    "system": whole(1, 255),
+    "component": whole(1, 255),
+    "imu": one_of(*IMUS),
+    "pressure": whole(1, 3),
+    "surface": positive,
+    "density": positive,
+}
+
+
+def _networked(inner: Address, notify: Notify, decoder: Decoder, end: bytes = b"") -> Source:
+    """A source over TCP, as a client, or over UDP, listening."""
+    if inner.scheme == "tcp":
+        return LinkSource(inner.url, TcpLink(*inner.host_port(), notify), decoder)
+    return LinkSource(inner.url, UdpLink(*inner.host_port(LOOPBACK), inner.url, end), decoder, lossy=True)
+
+
+def _is_device(place: str) -> bool:
+    return place.startswith(DEVICES)
+
+
+def _existing(address: Address) -> Path:
+    path = Path(address.place.removeprefix("//"))
+    if not path.is_file():
+        raise InputError(f"{address.url}: no such file {path}; expected a file, a device, {FORMS[address.scheme]}")
+    return path
+
+
+_OPENERS: dict[str, Callable[[Address, Notify, Config, float], Source]] = {
+    "-": _standard_input,
+    "tcp": _network,
+    "udp": _network,
+    "waterlinked": _waterlinked,
+    "mavlink": _mavlink,
+    "nmea": _nmea,
+    "file": _file,
+}

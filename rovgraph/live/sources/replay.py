@@ -1,0 +1,54 @@
+"""A log of ours, as if it came in now."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pymap3d
+
+from rovgraph.config import Config
+from rovgraph.geometry import Array
+from rovgraph.live.message import GEODETIC, Message, Reading
+from rovgraph.live.sources.source import paced
+from rovgraph.log import Log, read_log
+
+
+@dataclass(frozen=True)
+class LogReplay:
+    """A log's measurements in the order of time, one per message; stamps are the log's times."""
+
+    url: str
+    log: Log
+    pace: float
+    lossy: bool = False
+
+    def messages(self, stop: threading.Event) -> Iterator[Message]:
+        return paced(self._recorded(), self.pace, stop)
+
+    def _recorded(self) -> Iterator[Message]:
+        places = _geodetic(self.log)
+        for time, sensor, values, row in self.log.measurements():
+            place = places.get(row) if sensor == "fix" else None
+            reading = Reading(sensor, values) if place is None else Reading(GEODETIC, place)
+            yield Message(self.url, time, time, (reading,))
+
+
+def log_replay(url: str, path: str, config: Config, pace: float) -> LogReplay:
+    """Replay of a file, with the configuration's columns, units and calibration of the magnetometer.
+
+    Raises
+    ------
+    InputError : a file that cannot be worked with
+    """
+    return LogReplay(url, read_log(path, config.columns, config.units, config.imu.mag.calibrated), pace)
+
+
+def _geodetic(log: Log) -> dict[int, Array]:
+    """Line -> latitude, longitude, sd, where the log has its fixes in degrees, as a receiver gives them."""
+    if log.origin is None or "fix" not in log:
+        return {}
+    fix = log["fix"]
+    north, east, sd = fix.data.T
+    lat, lon, _ = pymap3d.ned2geodetic(north, east, 0.0, *log.origin, 0.0)
+    return dict(zip(fix.row.tolist(), np.column_stack([lat, lon, sd]), strict=True))
