@@ -29,6 +29,7 @@ _GROUP_TEXT = {
     "calibration": "calibration: held at the mean, or estimated",
     "vehicle": "vehicle: hydrodynamics, thesis (2.16)-(2.24)",
     "graph": "graph: how it is built and solved",
+    "online": "online: estimating as data arrive",
 }
 
 

@@ -21,6 +21,7 @@ from rovgraph.config.sections import (
     Graph,
     Heading,
     Imu,
+    Online,
     Section,
     Start,
     Triple,
@@ -44,6 +45,7 @@ class Config(Section):
     calibration: Calibration = Calibration()
     vehicle: Vehicle = Vehicle()
     graph: Graph = Graph()
+    online: Online = Online()
     columns: dict[str, str] = Field(default_factory=dict, description="rovgraph's column: the log's own name for it")
     units: dict[str, str] = Field(default_factory=dict, description="column or sensor: unit it is in, e.g. gyr: deg/s")
 

@@ -16,6 +16,7 @@ Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
+Stamped = Literal["imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "thruster"]
 HeadingSource = Literal["mag", "dvl", "ahrs"]
 
 
@@ -196,5 +197,16 @@ class Graph(Section):
     min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
     solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
     segment_s: Positive = Field(10.0, description="a calibration variable that walks has a new value this often")
-    lag_s: Positive = Field(5.0, description="window of an online estimate; without effect on a recorded log")
+    lag_s: Positive = Field(5.0, description="how late a measurement may come online; without effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
+
+
+class Online(Section):
+    """The online mode."""
+
+    hold_s: NotNegative = Field(
+        0.3, description="measurements wait this long for late ones; what is later than that costs more"
+    )
+    delay_s: dict[Stamped, float] = Field(
+        {}, description="sensor: how much older its measurements are than their stamps, e.g. dvl: 0.15"
+    )

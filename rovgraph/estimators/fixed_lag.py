@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import pairwise
 
 from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Used
 from rovgraph.estimators.initialise import Beginning
@@ -121,6 +122,11 @@ class FixedLag:
         self._back_to(self.marks[-1].taken - self._forgotten)
         self._go_on(self._newest - self.hold_s)
         return True
+
+    def oldest(self) -> Mark:
+        """The oldest mark that the filter can go on from: the last of those that came at once."""
+        ends = (a for a, b in pairwise(self.marks) if a.taken != b.taken)
+        return next(ends, self.marks[-1])
 
     def settle(self) -> None:
         """Forget the measurements that can be changed no more."""

@@ -5,6 +5,7 @@ and heading from whatever the log has; the gyro's bias from standing still, wher
 stands still. An explicit ``start`` goes before all of it.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,8 +49,13 @@ class Beginning:
     assumptions: list[str]
 
 
-def initialise(log: Log, config: Config) -> Beginning:
+def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Beginning:
     """Resolve everything that the configuration leaves to the log.
+
+    Parameters
+    ----------
+    log, config : the dive, or its first seconds
+    expected : streams that may still come, beside those of the log
 
     Raises
     ------
@@ -66,7 +72,9 @@ def initialise(log: Log, config: Config) -> Beginning:
     config = _resolve_noise(log, config, assumptions)
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
-    used = [s for s in ("dvl", "dvl_water", "depth", "fix") if s in log] + sources + _thrusters(log, config)
+    present = log.sensors | set(expected)
+    used = [s for s in ("dvl", "dvl_water", "depth", "fix") if s in present] + heading_sources(config, present)
+    used += _thrusters(log, config)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 

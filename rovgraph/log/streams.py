@@ -1,7 +1,7 @@
 """What a log is: one stream of measurements per sensor, in the order of time."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -118,6 +118,19 @@ class Log:
         columns = (a[order].tolist() for a in (time, which, index, row))
         for t, k, i, line in zip(*columns, strict=True):
             yield Measurement(t, names[k], data[k][i], line)
+
+
+def gathered(measurements: Iterable[Measurement], source: str, origin: tuple[float, float] | None = None) -> Log:
+    """A log of measurements in the order of time: the inverse of `Log.measurements`."""
+    rows: dict[str, list[Measurement]] = {}
+    for m in measurements:
+        rows.setdefault(m.sensor, []).append(m)
+    streams = {}
+    for sensor, own in rows.items():
+        columns = STREAMS.get(sensor) or tuple(f"thruster_{k + 1}" for k in range(len(own[0].values)))
+        time, line = np.array([m.time for m in own]), np.array([m.row for m in own], dtype=np.int64)
+        streams[sensor] = Stream(sensor, columns, time, np.array([m.values for m in own]), line)
+    return Log(source, streams, origin)
 
 
 def precedence(sensor: str) -> int:

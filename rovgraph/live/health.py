@@ -1,0 +1,64 @@
+"""How the sensors are, as the filter finds them."""
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rovgraph.estimators.fixed_lag import Mark
+from rovgraph.live.faults import Watch
+from rovgraph.live.solution import Event, SensorHealth
+
+REJECTED_S = 1.0  # a sensor is said to be rejected after as long
+
+
+@dataclass
+class Health:
+    """Counts and events of what was used and what was kept out.
+
+    Attributes
+    ----------
+    events : since it was last emptied
+    used, rejected : counts of measurements, by sensor, of keyframes that the lag has passed
+    """
+
+    events: list[Event] = field(default_factory=list)
+    used: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
+    _out: set[str] = field(default_factory=set)
+    _gap_until: float = -float("inf")
+
+    def passed(self, mark: Mark) -> None:
+        """Count a keyframe's measurements."""
+        for one in mark.used:
+            (self.used if one.weight > 0.0 else self.rejected)[one.attached.sensor] += 1
+
+    def step(self, marks: deque[Mark]) -> None:
+        """After a keyframe."""
+        newest = marks[-1]
+        time, gates = newest.interval.time, newest.gates
+        for sensor, since in gates.items():
+            if time - since > REJECTED_S and sensor not in self._out:
+                self._out.add(sensor)
+                self._say(time, sensor, "rejected", f"{sensor}: disagrees with the estimate for {time - since:.1f} s")
+        for sensor in self._out - gates.keys():
+            self._out.remove(sensor)
+            self._say(time, sensor, "readmitted", f"{sensor}: used again")
+        if newest.interval.bridged and time > self._gap_until:
+            self._say(time, "imu", "gap", "imu: samples are missing and are bridged")
+        if newest.interval.bridged:
+            self._gap_until = max(self._gap_until, time + 1.0)
+
+    def of(self, watches: Mapping[str, Watch], time: float) -> dict[str, SensorHealth]:
+        """All sensors at a time."""
+        return {
+            sensor: SensorHealth(
+                "rejected" if sensor in self._out and watch.state == "ok" else watch.state,
+                time - watch.time,
+                self.used[sensor],
+                self.rejected[sensor],
+            )
+            for sensor, watch in watches.items()
+        }
+
+    def _say(self, time: float, sensor: str, kind: str, text: str) -> None:
+        self.events.append(Event(time, sensor, kind, text))

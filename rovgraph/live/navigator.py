@@ -1,0 +1,236 @@
+"""From messages to navigation solutions: everything of the online mode but its connections.
+
+A message's time is reconciled, its readings are looked at for faults, and go to the engine.
+`Navigator.solution` carries the newest keyframe on to the present with the IMU.
+"""
+
+import time as host
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+import pymap3d
+
+from rovgraph.calibration import TABLE
+from rovgraph.config import Config
+from rovgraph.estimators.error_recursion import Gaussian
+from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
+from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.results import body_trajectory
+from rovgraph.geometry import Array
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.faults import Faults
+from rovgraph.live.health import Health
+from rovgraph.live.message import GEODETIC, Message, Reading
+from rovgraph.live.renewals import Renewals
+from rovgraph.live.solution import Event, Solution
+from rovgraph.live.startup import Startup
+from rovgraph.log import Measurement
+from rovgraph.state import POSE, VELOCITY
+
+SPACING_S = {"imu": 1e-3}  # least time between measurements of a sensor that are used
+OTHERS_SPACING_S = 0.02
+NO_GAP_IS_TOO_LONG_S = 1e9
+
+
+@dataclass
+class Navigator:
+    """Live estimate of one dive.
+
+    Attributes
+    ----------
+    config : what is believed of vehicle and sensors
+    patient : wait for what a second process computes, so that a replay can be repeated
+    renew : renew the filter in a second process
+    origin : latitude and longitude [deg] of north = east = 0, or None
+    clocks, faults, health : of the sources, and of the sensors
+    engine : None until the first seconds are over
+    time : of the newest measurement, or of the last `tick` [s]
+    passed : marks that the lag has passed, since they were last taken
+    left_out : (sensor or source, reason) -> count
+    """
+
+    config: Config
+    patient: bool = False
+    renew: bool = True
+    origin: tuple[float, float] | None = None
+    clocks: Clocks = field(default_factory=Clocks)
+    faults: Faults = field(default_factory=Faults)
+    health: Health = field(default_factory=Health)
+    engine: FixedLag | None = None
+    time: float = -np.inf
+    passed: list[Mark] = field(default_factory=list)
+    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
+        self._startup = Startup(self.config.model_copy(update={"imu": imu}), self.origin)
+        self._renewals: Renewals | None = None
+        self._events: list[Event] = []
+        self._newest: dict[str, float] = {}
+        self._distance, self._here = 0.0, np.full(3, np.nan)
+        self._arrival, self._update_s = 0.0, 0.0
+
+    @property
+    def waits_for(self) -> str:
+        """Why there is no estimate yet; empty where there is, or while the first seconds go by."""
+        return "" if self.engine is not None else self._startup.waits_for
+
+    def take(self, message: Message) -> float | None:
+        """Take a message; the time of its measurements [s], or None where that cannot be known."""
+        time = self.clocks.time(message)
+        while self.clocks.news:
+            clock, text = self.clocks.news.pop()
+            self._events.append(Event(self.time, clock, "clock", text))
+        if time is None:
+            self.left_out[message.source, "impossible stamp"] += 1
+            return None
+        self._arrival = message.arrival
+        for reading in message.readings:
+            measurement = self._measurement(time, reading)
+            if measurement is not None:
+                self._consider(measurement)
+        return time
+
+    def tick(self, time: float) -> None:
+        """Time goes on, with measurements or without."""
+        self.time = max(self.time, time)
+        self.faults.tick(self.time)
+
+    def finish(self) -> None:
+        """No more measurements: take what is held back."""
+        if self.engine is None and (beginning := self._startup.begin()) is not None:
+            self._begin(beginning)
+        if self.engine is not None:
+            self.engine.finish()
+        self.close()
+
+    def close(self) -> None:
+        """End the second process."""
+        if self._renewals is not None:
+            self._renewals.close()
+
+    def solution(self) -> Solution | None:
+        """Where the vehicle is now; None before the beginning."""
+        engine = self.engine
+        if engine is None or not engine.marks:
+            return None
+        interval, known = engine.ahead(self.time)
+        columns, arm = engine.recursion.error.columns, engine.beginning.config.imu.lever_arm_m
+        pose, velocity = (known.P[None, columns[v], columns[v]] for v in (POSE, VELOCITY))
+        t = body_trajectory([interval], known.state, arm, pose, velocity)
+        latitude, longitude = self._geodetic(t.p_n[0])
+        return Solution(
+            time=interval.time,
+            position=t.p_n[0],
+            velocity=t.v_n[0],
+            rpy=t.rpy[0],
+            position_sd=t.p_sd[0],
+            velocity_sd=t.v_sd[0],
+            rpy_sd=t.rpy_sd[0],
+            cov_north_east=float(t.cov_p[0, 0, 1]),
+            latitude=latitude,
+            longitude=longitude,
+            calibration=self._calibration(engine, known),
+            sensors=self.health.of(self.faults.watches, self.time),
+            events=self._take_events(),
+            distance=self._travelled(t.p_n[0]),
+            predicted_s=interval.time - engine.marks[-1].interval.time,
+            latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
+            update_s=self._update_s,
+        )
+
+    def _measurement(self, time: float, reading: Reading) -> Measurement | None:
+        """A reading as the engine takes it; None where the sensor has just been heard."""
+        sensor, values = reading
+        if sensor == GEODETIC:
+            if self.origin is None:
+                self.origin = self._startup.origin = (float(values[0]), float(values[1]))
+            north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
+            sensor, values = "fix", np.array([north, east, values[2]])
+        elif sensor == "mag":
+            values = self.config.imu.mag.calibrated(values[None])[0]
+        if sensor in self.config.online.delay_s:
+            time -= self.config.online.delay_s[sensor]
+        newest = self._newest.get(sensor, -np.inf)
+        if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
+            self.left_out[sensor, "more often than can be used"] += 1
+            return None
+        self._newest[sensor] = max(time, newest)
+        return Measurement(time, sensor, values, 0)
+
+    def _consider(self, m: Measurement) -> None:
+        """Give a measurement to the engine, unless it is none."""
+        self.time = max(self.time, m.time)
+        verdict = self.faults.look(m)
+        if verdict.retract_since is not None and self.engine is not None:
+            self.engine.retract(m.sensor, verdict.retract_since)
+        if not verdict.use:
+            self.left_out[m.sensor, self.faults.watches[m.sensor].state] += 1
+        elif self.engine is None:
+            if (beginning := self._startup.add(m)) is not None:
+                self._begin(beginning)
+        else:
+            self._feed(self.engine, m)
+
+    def _begin(self, beginning: Beginning) -> None:
+        """The first seconds are over."""
+        config = beginning.config
+        if self.renew:
+            self._renewals = Renewals(beginning, self.patient)
+        settled = self._renewals.take if self._renewals is not None else lambda measurements: None
+        self.engine = FixedLag(beginning, config.graph.lag_s, config.online.hold_s, self._pass, settled)
+        self._events += [Event(self.time, "start", "assumed", text) for text in beginning.assumptions]
+        for measurement in self._startup.measurements:
+            self._feed(self.engine, measurement)
+        self._startup.measurements = []
+
+    def _feed(self, engine: FixedLag, m: Measurement) -> None:
+        before, began = engine.marks[-1] if engine.marks else None, host.perf_counter()
+        outcome = engine.add(m)
+        if outcome != Taken.IN:
+            self.left_out[m.sensor, outcome.value] += 1
+        if engine.marks and engine.marks[-1] is not before:
+            if self._renewals is not None:
+                self._renewals.step(engine)
+            self.health.step(engine.marks)
+            self.faults.tick(self.time)
+            self._update_s = host.perf_counter() - began
+
+    def _pass(self, mark: Mark) -> None:
+        self.passed.append(mark)
+        self.health.passed(mark)
+
+    def _take_events(self) -> tuple[Event, ...]:
+        """All that happened since they were last taken."""
+        if self._renewals is not None:
+            self._events += [Event(self.time, "renewal", "lost", text) for text in self._renewals.news]
+            self._renewals.news = []
+        events = [*self._events, *self.faults.events, *self.health.events]
+        self._events, self.faults.events, self.health.events = [], [], []
+        return tuple(events)
+
+    def _calibration(self, engine: FixedLag, known: Gaussian) -> dict[str, tuple[float, float]]:
+        """Estimated calibration by label: value and sd."""
+        sd, columns = np.sqrt(np.diag(known.P)), engine.recursion.error.columns
+        return {
+            label: (float(value), float(own))
+            for name in engine.recursion.unknowns.estimated
+            for label, value, own in zip(
+                TABLE[name].labels, known.state.calibration[name].reshape(-1), sd[columns[name]], strict=True
+            )
+        }
+
+    def _geodetic(self, p_n: Array) -> tuple[float | None, float | None]:
+        if self.origin is None:
+            return None, None
+        latitude, longitude, _ = pymap3d.ned2geodetic(p_n[0], p_n[1], 0.0, *self.origin, 0.0)
+        return float(latitude), float(longitude)
+
+    def _travelled(self, p_n: Array) -> float:
+        """Distance over ground, in steps of a metre at least: less is noise."""
+        step = float(np.linalg.norm(p_n - self._here))
+        if not step < 1.0:
+            self._distance += step if np.isfinite(step) else 0.0
+            self._here = p_n
+        return self._distance

@@ -1,0 +1,68 @@
+"""When the filter is renewed by the second process."""
+
+from dataclasses import dataclass, field
+
+from rovgraph.errors import InputError
+from rovgraph.estimators.fixed_lag import FixedLag
+from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.refiner import Refiner, due_times
+from rovgraph.log import Measurement
+
+
+@dataclass
+class Renewals:
+    """Asks the second process for better estimates, and hands them to the filter.
+
+    Attributes
+    ----------
+    beginning : of the dive
+    patient : wait for an answer, so that a replay can be repeated
+    news : what went wrong, one line each, since it was last emptied
+    """
+
+    beginning: Beginning
+    patient: bool
+    news: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._refiner: Refiner | None = Refiner(self.beginning)
+        self._due = due_times()
+        self._start: float | None = None
+
+    def take(self, measurements: list[Measurement]) -> None:
+        """Hand on what is settled."""
+        if self._refiner is not None:
+            self._refiner.take(measurements)
+
+    def step(self, engine: FixedLag) -> None:
+        """After a keyframe of the engine."""
+        refiner = self._refiner
+        if refiner is None:
+            return
+        if self._start is None:
+            self._start = engine.marks[0].interval.time
+        try:
+            if not refiner.asked and engine.marks[-1].interval.time - self._start >= self._due[0]:
+                self._ask(refiner, engine)
+            if refiner.asked and (answer := refiner.answer(wait=self.patient)) is not None:
+                if engine.adopt(*answer):
+                    self._due.pop(0)
+                else:
+                    self._ask(refiner, engine)  # the lag has passed that keyframe; the next answer comes at once
+        except InputError as error:
+            self.news.append(str(error))
+            self.close()
+        if not self._due:
+            self.close()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._refiner is not None:
+            self._refiner.close()
+            self._refiner = None
+
+    @staticmethod
+    def _ask(refiner: Refiner, engine: FixedLag) -> None:
+        """For the oldest keyframe that the filter can go on from."""
+        engine.settle()
+        refiner.ask(engine.oldest().interval.index)

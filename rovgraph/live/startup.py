@@ -1,0 +1,59 @@
+"""The first seconds: what an estimator has to know before it can begin."""
+
+from dataclasses import dataclass, field
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.estimators.fixed_lag import place
+from rovgraph.estimators.initialise import HEADING_WITHIN_S, WINDOW_S, Beginning, initialise
+from rovgraph.log import Measurement
+from rovgraph.log.streams import gathered
+
+MARGIN_S = 0.5  # beyond the window, for data that come late
+AGAIN_S = 1.0  # between attempts
+LATER = {"dvl", "dvl_water", "depth", "fix"}  # sensors that may have their first measurement later
+COMPASSES = {"ahrs", "dvl_heading"}  # these too, where the configuration names its heading sources
+
+
+@dataclass
+class Startup:
+    """Collects measurements until a dive can begin.
+
+    Attributes
+    ----------
+    config : as the user gave it
+    origin : latitude and longitude [deg] of north = east = 0, or None
+    waits_for : why it has not begun, one line; empty while the first seconds go by
+    """
+
+    config: Config
+    origin: tuple[float, float] | None = None
+    waits_for: str = ""
+    measurements: list[Measurement] = field(default_factory=list)
+    _next: float | None = None
+
+    def add(self, measurement: Measurement) -> Beginning | None:
+        """Take a measurement; the beginning of the dive, once it is known."""
+        self.measurements.append(measurement)
+        if measurement.sensor != "imu":
+            return None
+        if self._next is None:
+            self._next = measurement.time + WINDOW_S + MARGIN_S
+        if measurement.time < self._next:
+            return None
+        self._next = measurement.time + AGAIN_S
+        return self.begin()
+
+    def begin(self) -> Beginning | None:
+        """The beginning from what is there, or None; then `waits_for` says why."""
+        self.measurements.sort(key=place)
+        imu = [m.time for m in self.measurements if m.sensor == "imu"]
+        if imu:
+            first = imu[-1] - HEADING_WITHIN_S
+            self.measurements = [m for m in self.measurements if m.time >= first]
+        expected = LATER | (COMPASSES if self.config.heading.sources is not None else set())
+        try:
+            return initialise(gathered(self.measurements, "so far", self.origin), self.config, expected)
+        except InputError as error:
+            self.waits_for = str(error)
+            return None
