@@ -45,7 +45,7 @@ def test_zeros_of_a_vehicle_that_stands_still_are_used():
 def test_a_lost_bottom_lock_is_said_once():
     faults = Faults()
     faults.look(moving(0.0))
-    assert not any(faults.look(ping(0.2 * k, np.nan, np.nan, np.nan, valid=0.0)).use for k in range(1, 10))
+    assert not any(faults.look(ping(0.2 * k, np.nan, np.nan, np.nan, valid=0.0)).use for k in range(1, 20))
     assert kinds(faults) == ["no lock"]
 
 

@@ -43,15 +43,17 @@ class ErrorStateFilter:
     beginning : of `rovgraph.estimators.initialise.initialise`
     renew_at : times since the start at which the dive so far is solved as a graph, and the filter
         goes on from there [s]
+    learn_noise : of the IMU, from its newest samples
     filtered : Gaussian of each keyframe so far, from all data up to it
     """
 
     beginning: Beginning
     renew_at: tuple[float, ...] = ()
+    learn_noise: bool = False
 
     def __post_init__(self) -> None:
         b = self.beginning
-        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
+        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=self.learn_noise)
         self.intervals: list[Interval] = []
         self.recursion = ErrorStateRecursion(b)
         self.error = self.recursion.error

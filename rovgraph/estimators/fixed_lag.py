@@ -65,6 +65,7 @@ class FixedLag:
     lag_s : how late a measurement may be against the newest of the IMU [s]
     hold_s : how long measurements are held back before they are taken; later ones cost more [s]
     passed : called with each `Mark` that the lag has passed, for good
+    learn_noise : of the IMU, from its newest samples
     settled : called with measurements, in order, that nothing can come before any more
     """
 
@@ -73,6 +74,7 @@ class FixedLag:
     hold_s: float
     passed: Callable[[Mark], None] = lambda mark: None
     settled: Callable[[list[Measurement]], None] = lambda measurements: None
+    learn_noise: bool = False
     marks: deque[Mark] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
@@ -190,4 +192,4 @@ class FixedLag:
 
     def _fresh(self) -> Assembler:
         b = self.beginning
-        return Assembler(b.config, b.instruments, b.start.state.bias[0])
+        return Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=self.learn_noise)

@@ -33,13 +33,16 @@ class Refiner:
     ----------
     beginning : the dive's
     renew_at : times since the start at which the dive so far is solved as a graph [s]
+    learn_noise : of the IMU, as the first filter does
     """
 
-    def __init__(self, beginning: Beginning, renew_at: tuple[float, ...] = RENEW_AT_S) -> None:
+    def __init__(
+        self, beginning: Beginning, renew_at: tuple[float, ...] = RENEW_AT_S, learn_noise: bool = False
+    ) -> None:
         context = multiprocessing.get_context("spawn")
         self._work: Any = context.Queue()  # with a thread that feeds it, so that no one waits here
         self._answers, theirs = context.Pipe(duplex=False)
-        self._process = companion(_refine, beginning, renew_at, self._work, theirs)
+        self._process = companion(_refine, beginning, renew_at, learn_noise, self._work, theirs)
         theirs.close()
         self._asked: int | None = None
 
@@ -82,9 +85,11 @@ class Refiner:
         self._answers.close()
 
 
-def _refine(beginning: Beginning, renew_at: tuple[float, ...], work: Any, answers: Connection) -> None:
+def _refine(
+    beginning: Beginning, renew_at: tuple[float, ...], learn_noise: bool, work: Any, answers: Connection
+) -> None:
     """What the process does."""
-    estimator = ErrorStateFilter(beginning, renew_at)
+    estimator = ErrorStateFilter(beginning, renew_at, learn_noise)
     while True:
         item = work.get()
         if isinstance(item, int):

@@ -23,6 +23,7 @@ from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.aiding import Aiding
+from rovgraph.graph.noise_floor import NoiseFloor
 from rovgraph.graph.preintegration import (
     BRIDGE_ACC,
     BRIDGE_GYR,
@@ -109,17 +110,21 @@ class Assembler:
     instruments : the sensors in use, by stream
     bias : ndarray, shape (6,), for preintegration; may be renewed between intervals
     left_out : (sensor, reason) -> count of measurements that never reach the graph
+    learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
     """
 
     config: Config
     instruments: dict[str, Instrument]
     bias: Array
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
+    learn_noise: bool = False
 
     def __post_init__(self) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
         noise = self.config.imu.noise
-        self._params = preintegration_params(self.config, noise.acc, noise.gyr)
+        self._noise = np.array([noise.acc, noise.gyr])
+        self._floor = NoiseFloor(self._noise)
+        self._params = preintegration_params(self.config, *self._noise)
         self._bridge = preintegration_params(self.config, BRIDGE_ACC, BRIDGE_GYR)
         self._imu: list[tuple[float, Array]] = []
         self._waiting: list[Measurement] = []
@@ -161,6 +166,7 @@ class Assembler:
         """One that goes on by itself from here."""
         twin = copy(self)
         twin._imu, twin._waiting, twin._between = self._imu[:], self._waiting[:], self._between[:]
+        twin._floor = self._floor.copy()
         twin._periods, twin.left_out = self._periods[:], self.left_out.copy()
         if self._aiding is not None:
             twin._aiding = self._aiding.copy(twin.left_out)
@@ -290,13 +296,21 @@ class Assembler:
 
     def _params_for(self, samples: Array) -> gtsam.PreintegrationCombinedParams:
         """The believed noise, or where a knock shakes the samples far more, what they show."""
-        noise = self.config.imu.noise
         if len(samples) < 3:
             return self._params
-        acc, gyr = np.sqrt((scatter(samples[:, 0], samples[:, 1:]) ** 2).reshape(-1, 2, 3).mean(axis=(0, 2)))
-        if acc < KNOCK * noise.acc and gyr < KNOCK * noise.gyr:
+        odd = scatter(samples[:, 0], samples[:, 1:])
+        if self.learn_noise:
+            self._floor.take(odd)
+            self._raise(self._floor.densities())
+        seen = np.sqrt((odd**2).reshape(-1, 2, 3).mean(axis=(0, 2)))
+        if (seen < KNOCK * self._noise).all():
             return self._params
-        return preintegration_params(self.config, max(acc, noise.acc), max(gyr, noise.gyr))
+        return preintegration_params(self.config, *np.maximum(seen, self._noise))
+
+    def _raise(self, noise: Array) -> None:
+        """Take other noise densities, where they differ enough to matter."""
+        if np.abs(noise / self._noise - 1.0).max() > 0.05:
+            self._noise, self._params = noise, preintegration_params(self.config, *noise)
 
     def _rate_for(self, m: Measurement, samples: Array) -> tuple[Array, float]:
         """The rate, for those instruments that it reaches: by a lever arm, or by the motion of a turning body."""
@@ -320,11 +334,11 @@ class Assembler:
         t, rate = t[first:last] - time, samples[first:last, 4:]
         step = float(t[-1] - t[0]) / max(len(t) - 1, 1)
         if len(t) < 2:
-            return rate[0], self.config.imu.noise.gyr
+            return rate[0], float(self._noise[1])
         weights = np.linalg.pinv(np.vander(t / HALF_WINDOW_S, degree + 1))[-1]
         if step > self._longest_step:
             return weights @ rate, BRIDGE_GYR
-        return weights @ rate, self.config.imu.noise.gyr * math.sqrt(float(weights @ weights) / step)
+        return weights @ rate, float(self._noise[1]) * math.sqrt(float(weights @ weights) / step)
 
     def _attach(self, m: Measurement, motion: Snapshot, rate_b: Array, rate_sd: float) -> Attached:
         instrument = self.instruments[m.sensor]

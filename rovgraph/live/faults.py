@@ -19,6 +19,7 @@ from rovgraph.log import Measurement
 SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
 MOVED = 0.1  # speed of a vehicle that does not stop within a ping [m/s]
 RECENT_S = 5.0
+TELL_S = 2.0  # a ping without bottom lock is not worth an event
 FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
 TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
 HEADINGS = {"ahrs", "dvl_heading", "mag"}
@@ -45,9 +46,13 @@ class Watch:
     Attributes
     ----------
     state : "ok", "silent", "frozen", "no lock"
+    entered : when it came into that state [s]
+    told : the state that an event has told of, if it is not "ok"
     """
 
     state: str = "ok"
+    entered: float = 0.0
+    told: str = ""
     time: float = -np.inf
     period: float = 0.0
     values: Array | None = None
@@ -96,7 +101,7 @@ class Faults:
         for sensor, watch in self.watches.items():
             quiet = time - watch.time
             if watch.state != "silent" and quiet > max(SILENT_S, SILENT_PERIODS * watch.period):
-                watch.state = "silent"
+                watch.state = watch.told = "silent"
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))
 
     def _turn(self, m: Measurement, watch: Watch) -> None:
@@ -121,11 +126,14 @@ class Faults:
 
     def _verdict(self, m: Measurement, watch: Watch, state: str, text: str) -> Verdict:
         before, watch.state = watch.state, state
+        if before != state:
+            watch.entered = m.time
         if state == "ok":
-            if before != "ok":
+            if watch.told:
                 self.events.append(Event(m.time, m.sensor, "back", f"{m.sensor}: measures again"))
+            watch.told = ""
             return Verdict()
-        if before == state:
-            return Verdict(use=False)
-        self.events.append(Event(m.time, m.sensor, state, f"{m.sensor}: {text}; left out"))
-        return Verdict(False, watch.since if state == "frozen" else None)
+        if watch.told != state and (state == "frozen" or m.time - watch.entered >= TELL_S):
+            watch.told = state
+            self.events.append(Event(m.time, m.sensor, state, f"{m.sensor}: {text}; left out"))
+        return Verdict(False, watch.since if state == "frozen" and before != state else None)

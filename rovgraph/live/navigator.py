@@ -28,8 +28,8 @@ from rovgraph.live.startup import Startup
 from rovgraph.log import Measurement
 from rovgraph.state import POSE, VELOCITY
 
-SPACING_S = {"imu": 1e-3}  # least time between measurements of a sensor that are used
-OTHERS_SPACING_S = 0.02
+SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
+OTHERS_SPACING_S = 0.005
 NO_GAP_IS_TOO_LONG_S = 1e9
 
 
@@ -179,7 +179,9 @@ class Navigator:
         if self.renew:
             self._renewals = Renewals(beginning, self.patient)
         settled = self._renewals.take if self._renewals is not None else lambda measurements: None
-        self.engine = FixedLag(beginning, config.graph.lag_s, config.online.hold_s, self._pass, settled)
+        self.engine = FixedLag(
+            beginning, config.graph.lag_s, config.online.hold_s, self._pass, settled, learn_noise=True
+        )
         self._events += [Event(self.time, "start", "assumed", text) for text in beginning.assumptions]
         for measurement in self._startup.measurements:
             self._feed(self.engine, measurement)

@@ -25,7 +25,7 @@ class Renewals:
     news: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._refiner: Refiner | None = Refiner(self.beginning)
+        self._refiner: Refiner | None = Refiner(self.beginning, learn_noise=True)
         self._due = due_times()
         self._start: float | None = None
 
