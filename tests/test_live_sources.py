@@ -2,7 +2,6 @@
 
 import dataclasses
 import gzip
-import json
 import math
 import os
 import signal
@@ -18,6 +17,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from wire import (
+    ARRIVAL,
+    Heard,
+    autopilot,
+    decoded,
+    gps,
+    highres_imu,
+    packed,
+    pressure2,
+    raw_imu,
+    report,
+    scaled_imu2,
+    sentence,
+    vision,
+)
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
@@ -28,42 +44,21 @@ from rovgraph.live.sources import Source, links, open_source, open_sources
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.lines import LONGEST
 from rovgraph.live.sources.links import StandardInput
-from rovgraph.live.sources.mavlink import MavlinkDecoder, Options
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.preferred import PATIENCE_S
-from rovgraph.live.sources.source import Chunk, Decoder, LinkSource, paced
+from rovgraph.live.sources.source import LinkSource, paced
 from rovgraph.live.sources.waterlinked import waterlinked
 from rovgraph.log import read_log
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(__file__).parents[2] / "shared" / "data"
 TLOG = DATA / "ardusub" / "ardusub_small.tlog.gz"
-ARRIVAL = 1_700_000_000.0
 IMU = '"acc_x": 1, "acc_y": 2, "acc_z": -9.8, "gyr_x": 0.1, "gyr_y": 0.2, "gyr_z": 0.3'
-
-mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega", reason="needs the extra online")
-pynmea2 = pytest.importorskip("pynmea2", reason="needs the extra online")
-
-
-class Heard:
-    """Complaints of a test, by kind."""
-
-    def __init__(self) -> None:
-        self.kinds: Counter[str] = Counter()
-        self.texts: list[str] = []
-
-    def __call__(self, kind: str, text: str, once: bool = False) -> None:
-        self.kinds[kind] += 1
-        self.texts.append(text)
 
 
 @pytest.fixture
 def heard() -> Heard:
     return Heard()
-
-
-def decoded(decoder: Decoder, *data: bytes, arrival: float = ARRIVAL) -> list[Message]:
-    return [message for part in data for message in decoder.feed(Chunk(part, arrival))]
 
 
 def by_sensor(messages: list[Message]) -> dict[str, list[np.ndarray]]:
@@ -460,26 +455,6 @@ def test_a_serial_port_is_read_and_a_lost_one_tried_again(impatient):
 # Water Linked
 
 
-def report(**changes: object) -> bytes:
-    velocity = {
-        "time": 106.4,
-        "vx": 0.5,
-        "vy": -0.1,
-        "vz": 0.02,
-        "fom": 0.004,
-        "covariance": [[1e-6, 0, 0], [0, 2e-6, 0], [0, 0, 9e-6]],
-        "altitude": 1.5,
-        "transducers": [{"id": i, "velocity": 0.1, "distance": 1.6, "beam_valid": True} for i in range(4)],
-        "velocity_valid": True,
-        "status": 0,
-        "format": "json_v3.1",
-        "type": "velocity",
-        "time_of_validity": 1_638_191_471_563_017,
-        "time_of_transmission": 1_638_191_471_752_336,
-    } | changes
-    return json.dumps({k: v for k, v in velocity.items() if v is not ...}).encode() + b"\r\n"
-
-
 def test_a_velocity_report_becomes_a_ping_with_its_altitude(heard):
     (message,) = decoded(waterlinked("w", heard), report())
     assert message.stamp == pytest.approx(1638191471.563017, abs=1e-6)
@@ -558,41 +533,6 @@ def test_the_port_of_a_dvl_need_not_be_written():
 
 
 # MAVLink
-
-
-def packed(message, system: int = 1, component: int = 1) -> bytes:
-    return message.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=component))
-
-
-def raw_imu(usec: int = 5_000_000, acc=(10, -20, -1000), gyr=(1, 2, 3), mag=(200, 0, -400)) -> object:
-    return mavlink.MAVLink_raw_imu_message(usec, *acc, *gyr, *mag)
-
-
-def scaled_imu2(ms: int = 5000, acc=(1, 1, -1000), mag=(1, 1, 1)) -> object:
-    return mavlink.MAVLink_scaled_imu2_message(ms, *acc, 0, 0, 0, *mag)
-
-
-def highres_imu(fields: int = 0x1FF) -> object:
-    return mavlink.MAVLink_highres_imu_message(
-        6_000_000, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.0, -0.4, 0, 0, 0, 0, fields
-    )
-
-
-def pressure2(ms: int = 1000, hpa: float = 1013.25) -> object:
-    return mavlink.MAVLink_scaled_pressure2_message(ms, hpa, 0.0, 1000)
-
-
-def gps(usec: int = 7_000_000, fix_type: int = 3, lat: int = 583000000, lon: int = 151000000, **more: int) -> object:
-    eph = more.pop("eph", 150)
-    return mavlink.MAVLink_gps_raw_int_message(usec, fix_type, lat, lon, 0, eph, 65535, 0, 0, 9, **more)
-
-
-def vision(confidence: float = 90.0, dt: int = 100_000, usec: int = 9_000_000) -> object:
-    return mavlink.MAVLink_vision_position_delta_message(usec, dt, [0, 0, 0], [0.05, -0.01, 0.0], confidence)
-
-
-def autopilot(heard: Heard, config: Config | None = None, **options: object) -> MavlinkDecoder:
-    return MavlinkDecoder("m", heard, config or Config(), Options(**options))
 
 
 def test_raw_imu_is_in_milli_g_milliradians_and_milligauss(heard):
@@ -721,7 +661,6 @@ def test_noise_costs_no_good_message(heard):
 
 def test_a_vehicle_is_heard_over_udp():
     source = open_source(f"mavlink:udpin:127.0.0.1:{free_port()}")
-    mavutil = pytest.importorskip("pymavlink.mavutil")
     sender = mavutil.mavlink_connection(f"udpout:127.0.0.1:{source.link.port}", source_system=1, source_component=1)
     sender.mav.heartbeat_send(12, 3, 0, 0, 0)
     sender.mav.attitude_send(2500, 0.1, 0.2, 0.3, 0, 0, 0)
@@ -758,10 +697,6 @@ def test_a_real_telemetry_log_is_read_whole(real_tlog):
 
 
 # NMEA
-
-
-def sentence(body: str) -> bytes:
-    return f"${body}*{pynmea2.NMEASentence.checksum(body):02X}\r\n".encode()
 
 
 DECLINED = Config.model_validate({"environment": {"declination_deg": 4.5}})

@@ -81,7 +81,7 @@ class JsonRow:
             if not is_column(name):
                 self._report(key)
             elif value is not None:
-                cells[name] = json_number(key, value) * self._scale.get(name, 1.0)
+                cells[name] = json_number(key, value, self._scale.get(name, 1.0))
         return cells
 
     def _report(self, key: str) -> None:

@@ -102,8 +102,8 @@ def json_object(line: bytes) -> dict[str, Any]:
     return value
 
 
-def json_number(name: str, value: object) -> float:
-    """A number of a JSON object.
+def json_number(name: str, value: object, scale: float = 1.0) -> float:
+    """A number of a JSON object, times a scale.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def json_number(name: str, value: object) -> float:
         kind = {bool: "boolean", str: "string", type(None): "null"}.get(type(value), "nested value")
         raise Refused(kind, f"{name}: {shown(json.dumps(value))}, expected a number; the line is skipped")
     try:
-        number = float(value)
+        number = scale * float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):

@@ -45,6 +45,7 @@ class Frames:
         if self._rest:
             self._bad()
         self._rest.clear()
+        self._sane = True
 
     def messages(self, data: bytes) -> Iterator[Any]:
         """Messages that are complete now."""
@@ -71,15 +72,15 @@ class Frames:
     def _decoded(self, start: int, end: int) -> Any:
         """The message between two places, or None.
 
-        One of a kind unknown to the dialect is believed if another begins behind it: it has no checksum
-        that could be checked.
+        One of a kind unknown to the dialect has no checksum that could be checked; it is believed between
+        two that are known.
         """
         try:
             message = self._parser.decode(self._rest[start:end])
         except Exception:  # whatever a library of others meets in bytes of others
             return None
         if message.get_type().startswith("UNKNOWN"):
-            return message if end == len(self._rest) or self._rest[end] in (V1, V2) else None
+            return message if self._sane and (end == len(self._rest) or self._rest[end] in (V1, V2)) else None
         return message
 
     def _next_marker(self, start: int) -> int:

@@ -14,7 +14,7 @@ from rovgraph.live.sources.source import Notify
 
 PORT = 16171
 FORMAT = "json_v3"  # minor versions, as json_v3.1, only add to it
-IGNORED = frozenset({"position_local", "response"})
+IGNORED = ("position_local", "response")
 
 
 def waterlinked(url: str, notify: Notify) -> LineDecoder:
