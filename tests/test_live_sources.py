@@ -267,10 +267,16 @@ def test_names_and_units_of_the_configuration_hold_for_lines_too(heard):
     assert messages[0].stamp is None
 
 
-def test_the_magnetometer_is_calibrated(heard):
-    config = Config.model_validate({"imu": {"mag": {"centre": [1, 2, 3], "matrix": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}}})
-    messages = decoded(json_lines("-", heard, config), b'{"mag_x": 2, "mag_y": 2, "mag_z": 2}\n')
-    np.testing.assert_allclose(only(messages)[1].values, [2.0, 0.0, -1.0])
+def test_magnetometers_stay_raw_in_every_source(heard, tmp_path):
+    """The navigator calibrates them: a source that did would do it a second time."""
+    config = Config.model_validate({"imu": {"mag": {"centre": [1, 2, 3]}}})
+    lines = decoded(json_lines("-", heard, config), b'{"mag_x": 20, "mag_y": 0, "mag_z": -40}\n')
+    vehicle = decoded(autopilot(heard, config), packed(raw_imu(mag=(200, 0, -400))))
+    path = tmp_path / "log.csv"
+    path.write_text("time,mag_x,mag_y,mag_z\n1,20,0,-40\n")
+    log = list(open_source(f"file:{path}?speed=max", config=config).messages(threading.Event()))
+    for messages in (lines, vehicle, log):
+        np.testing.assert_allclose(by_sensor(messages)["mag"], [[20.0, 0.0, -40.0]])
 
 
 @pytest.mark.parametrize(

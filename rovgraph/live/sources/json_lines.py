@@ -8,7 +8,7 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.geometry import Array
-from rovgraph.live.message import GEODETIC, Message, Reading, readings
+from rovgraph.live.message import GEODETIC, Message, readings
 from rovgraph.live.sources.lines import LineDecoder, Refused, json_number, json_object, shown
 from rovgraph.live.sources.source import Notify
 from rovgraph.log.reading import ACC_GAP
@@ -39,7 +39,7 @@ class JsonRow:
     ----------
     url : of the source
     notify : takes complaints
-    config : for columns, units and the magnetometer's calibration
+    config : for columns and units
 
     Raises
     ------
@@ -51,7 +51,6 @@ class JsonRow:
         self._notify = notify
         self._names = {theirs: ours for ours, theirs in config.columns.items()}
         self._scale = factors(config.units, url)
-        self._mag = config.imu.mag.calibrated
         self._unknown: set[str] = set()
         self._acc: tuple[Array, float | None, float] | None = None  # the last one, its stamp and arrival
 
@@ -70,7 +69,6 @@ class JsonRow:
         lost = {_SENSOR[name] for name in cells if name in _SENSOR} - {r.sensor for r in found} - alone
         if lost:
             self._notify("incomplete", f"{', '.join(sorted(lost))}: not all of its columns are in the line")
-        found = tuple(Reading("mag", self._mag(r.values)) if r.sensor == "mag" else r for r in found)
         return Message(self._url, arrival, stamp, found) if found else None
 
     def _cells(self, row: dict[str, object]) -> dict[str, float]:

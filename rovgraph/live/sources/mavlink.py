@@ -58,7 +58,7 @@ class MavlinkDecoder:
     ----------
     url : of the source
     notify : takes complaints
-    config : for the magnetometer's calibration, declination and gravity
+    config : for declination and gravity
     options : of the URL
 
     Raises
@@ -75,7 +75,6 @@ class MavlinkDecoder:
         self._surface = options.surface
         self._density_gravity = options.density * config.environment.gravity_mps2
         self._declination = np.deg2rad(config.environment.declination_deg)
-        self._mag = config.imu.mag.calibrated
         self._imus = Preferred(IMUS if options.imu is None else (options.imu,), notify)
         self._fix_time: int | None = None
         pressure = "SCALED_PRESSURE" + (str(options.pressure) if options.pressure > 1 else "")
@@ -128,7 +127,6 @@ class MavlinkDecoder:
         found = _highres_imu(message) if kind == "HIGHRES_IMU" else _scaled_imu(message)
         if not any(r.sensor == "imu" for r in found) or not self._imus.takes(kind, arrival):
             return None
-        found = [Reading("mag", self._mag(r.values)) if r.sensor == "mag" else r for r in found]
         usec = 1e3 * message.time_boot_ms if kind == "SCALED_IMU2" else message.time_usec
         return self._said_usec(arrival, usec, *found)
 

@@ -67,7 +67,7 @@ def open_source(
     ----------
     url : as a person gives it
     complaints : where those of the source go
-    config : for columns, units, the magnetometer's calibration, declination and gravity
+    config : for columns, units, declination and gravity
     speed : of files, a number or "max"; their option ``speed`` goes before it
 
     Raises

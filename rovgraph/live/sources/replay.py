@@ -35,13 +35,15 @@ class LogReplay:
 
 
 def log_replay(url: str, path: str, config: Config, pace: float) -> LogReplay:
-    """Replay of a file, with the configuration's columns, units and calibration of the magnetometer.
+    """Replay of a file, with the configuration's columns and units.
+
+    The magnetometer's samples stay raw, as those of other sources: the navigator calibrates them.
 
     Raises
     ------
     InputError : a file that cannot be worked with
     """
-    return LogReplay(url, read_log(path, config.columns, config.units, config.imu.mag.calibrated), pace)
+    return LogReplay(url, read_log(path, config.columns, config.units), pace)
 
 
 def _geodetic(log: Log) -> dict[int, Array]:
