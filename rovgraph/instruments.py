@@ -33,6 +33,7 @@ class Instrument:
     components : names of the components, dim of them
     rate_gain : ndarray, shape (dim, 3), how an error of the measured rate [rad/s] enters:
         through the DVL's lever arm, at the nominal mounting
+    lateness : name of the calibration variable that says how late its stamps are, or None
     """
 
     model: SensorModel
@@ -42,6 +43,13 @@ class Instrument:
     readmit_s: float
     components: tuple[str, ...]
     rate_gain: Array
+    lateness: str | None = None
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        """Calibration variables that its measurements depend on."""
+        own = self.model.calibration
+        return own if self.lateness is None else (*own, self.lateness)
 
 
 def heading_sources(config: Config, available: set[str]) -> list[str]:
@@ -89,7 +97,8 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
         if isinstance(model, DvlVelocity):
             gain = mount_matrix(config.dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
         limits = section.gate_sd, section.readmit_s  # type: ignore[attr-defined]
-        return Instrument(model, spread, section.loss, *limits, components, gain)  # type: ignore[attr-defined]
+        late = "dvl_time_offset" if model.sensor.startswith("dvl") else None
+        return Instrument(model, spread, section.loss, *limits, components, gain, late)  # type: ignore[attr-defined]
 
     dvl, water = (DvlVelocity(arm(config.dvl.lever_arm_m), sensor) for sensor in ("dvl", "dvl_water"))
     compass = CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination)

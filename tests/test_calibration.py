@@ -15,7 +15,7 @@ from rovgraph.state import DIMENSION
 
 
 def test_every_variable_is_named_by_a_measurement_model():
-    named = {name for i in instruments(Config()).values() for name in i.model.calibration}
+    named = {name for i in instruments(Config()).values() for name in i.calibration}
     assert named == set(TABLE)
 
 
@@ -24,7 +24,7 @@ def test_every_variable_belongs_to_a_sensor_that_names_it():
     for name, variable in TABLE.items():
         assert variable.sensors
         for sensor in variable.sensors:
-            assert name in sensors[sensor].model.calibration
+            assert name in sensors[sensor].calibration
 
 
 def test_the_manual_says_of_every_variable_what_it_is_and_what_shows_it():

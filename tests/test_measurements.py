@@ -12,7 +12,7 @@ from test_sensors import CONFIG, SENSORS, random_state
 from rovgraph.calibration import TABLE
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
-from rovgraph.geometry import exp_rotation
+from rovgraph.geometry import Array, exp_rotation
 from rovgraph.graph.assembly import Attached
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.measurements import (
@@ -24,11 +24,15 @@ from rovgraph.graph.measurements import (
     whitening,
 )
 from rovgraph.graph.preintegration import Snapshot
+from rovgraph.graph.track import KNOT_S, Track
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.state import DIMENSION, State, propagate
 
 N, STEP = 4, 1e-6
 WALKS = {name: 0.1 if name in {"hard_iron", "field_scale", "dvl_yaw"} else 0.0 for name in TABLE}
+
+
+_STILL = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
 
 def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Block, State]:
@@ -40,11 +44,27 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         bias = state.bias[k] + 0.05 * rng.standard_normal(6)
         turn = exp_rotation(0.2 * rng.standard_normal(3))
         motion = Snapshot(0.1 + 0.05 * k, turn, 0.3 * rng.standard_normal(3), 0.1 * rng.standard_normal(3))
-        motion = motion if moving else Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
+        motion = motion if moving else _STILL
         rate, z = rng.standard_normal(3), rng.standard_normal(instrument.model.dim)
         sd = instrument.sd * rng.uniform(0.5, 2.0, instrument.model.dim)
-        attached.append(Attached(sensor, k, k // 2, 0.2 * k, 10 + k, z, sd, rate, 0.01, motion, bias))
+        track = track_of(motion, bias, rng) if instrument.lateness else None
+        attached.append(Attached(sensor, k, k // 2, 0.2 * k, 10 + k, z, sd, rate, 0.01, motion, bias, track))
     return make_block(attached, instrument, 9.81, Unknowns(state.calibration, WALKS)), state
+
+
+def track_of(motion: Snapshot, bias: Array, rng: np.random.Generator) -> Track:
+    """A lively motion around a stamp."""
+    lag = KNOT_S * np.arange(-60, 61)
+    turn, dv, dp, rate = (wave(lag, rng) for _ in range(4))
+    knots = [
+        Snapshot(motion.dt - t, motion.dR @ exp_rotation(a), motion.dv + v, motion.dp + p)
+        for t, a, v, p in zip(lag, turn, dv, dp, strict=True)
+    ]
+    return Track.of(_STILL, knots, lag, rate, bias)
+
+
+def wave(time: Array, rng: np.random.Generator) -> Array:
+    return np.sin(2.0 * time[:, None] + rng.uniform(0, 6, 3)) * rng.standard_normal(3)
 
 
 def values_of(state: State, unknowns: Unknowns) -> gtsam.Values:
@@ -158,8 +178,10 @@ def test_whitening_takes_in_the_noise_of_the_rate_at_the_lever_arm():
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_block_predicts_at_the_measurements_own_time(sensor):
     block, state = block_of(sensor)
+    block = replace(block, track=None)
     there = propagate(state, block.motion, block.gravity)
     expected = block.instrument.model.predict(there, block.rate_b)[0]
+    np.testing.assert_allclose(block.predicted(state), expected, atol=1e-12)
     np.testing.assert_allclose(block.predict(state)[0], expected, atol=1e-12)
     resting = replace(block, motion=replace(block.motion, dt=0 * block.motion.dt))
     assert resting.at_keyframes and not block.at_keyframes

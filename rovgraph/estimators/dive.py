@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from rovgraph.config import Config
-from rovgraph.estimators.error_state import PROGRESS_EVERY, RENEW_AT_S, replay
+from rovgraph.estimators.error_state import PROGRESS_EVERY, RENEW_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning, initialise
@@ -89,7 +89,9 @@ def assemble(log: Log, beginning: Beginning) -> BatchSmoother:
 def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
     progress("smoothing", 0.1)
     if batch.beginning.config.graph.solver == "isam2":
-        return batch.solve(run(batch.intervals, batch.beginning, progress))
+        solver = run(batch.intervals, batch.beginning, progress)
+        anew = batch.placed_anew(solver.latest().calibration)
+        return batch.solve(solver) if anew is None else anew.solve(run(anew.intervals, anew.beginning, progress))
     return batch.solve()
 
 
@@ -99,7 +101,14 @@ def _filtered(log: Log, beginning: Beginning) -> Estimate:
 
 def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:
     filtering = partial(progress, "filtering")
-    return replay(batch.intervals, batch.beginning, RENEW_AT_S, filtering).solve()
+    if not batch.measurements:
+        return replay(batch.intervals, batch.beginning, RENEW_AT_S, filtering).solve()
+    estimator = ErrorStateFilter(batch.beginning, RENEW_AT_S)  # learns how late they are while they come
+    for k, measurement in enumerate(batch.measurements):
+        if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:
+            filtering(k / len(batch.measurements))
+    estimator.finish()
+    return estimator.solve()
 
 
 def run(intervals: Sequence[Interval], beginning: Beginning, progress: Progress = no_progress) -> IncrementalEstimator:

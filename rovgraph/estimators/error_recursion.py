@@ -175,6 +175,10 @@ class ErrorStateRecursion:
         if any(a.motion.dt for a in attached):
             there, F = propagate_with_jacobian(there, motions(attached), self.beginning.config.environment.gravity_mps2)
         for k, a in enumerate(attached):
+            if a.track is not None:  # its stamp may be late: it has a motion of its own
+                own, jacobians = self.block([a]).linearize(state)
+                linear.append((own[0], self.error.matrix(jacobians)[0]))
+                continue
             instrument = self.beginning.instruments[a.sensor]
             predicted, jacobians = instrument.model.predict(there.at(slice(k, k + 1)), a.rate_b[None])
             H = self.error.matrix(jacobians)[0]

@@ -89,6 +89,7 @@ class ErrorStateFilter:
         if self._renewals and interval.time - self.intervals[0].time >= self._renewals[0]:
             self._renewals.pop(0)
             self.filtered[-1] = self._renewed()
+        self.assembler.stamps.assume(self.latest().calibration)
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""

@@ -12,7 +12,7 @@ from rovgraph.geometry import Array, cross, rotate, skew, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.measurements import Block
 from rovgraph.sensors import innovation
-from rovgraph.state import State, propagate
+from rovgraph.state import State
 from rovgraph.trajectory import Trajectory
 
 _XYZ = ("_x", "_y", "_z")
@@ -111,10 +111,8 @@ def residual_frame(
     """
     frames = []
     for sensor, block in blocks.items():
-        here = keyframes[sensor]
-        model = block.instrument.model
-        predicted, _ = model.predict(propagate(here, block.motion, block.gravity), block.rate_b)
-        nu = innovation(model, block.z, predicted)
+        predicted = block.predicted(keyframes[sensor])
+        nu = innovation(block.instrument.model, block.z, predicted)
         normalised = np.einsum("nij,nj->ni", block.W, nu)
         sd = np.sqrt(np.diagonal(np.linalg.inv(transpose(block.W) @ block.W), axis1=1, axis2=2))
         for k, component in enumerate(block.instrument.components):

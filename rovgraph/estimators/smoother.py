@@ -1,6 +1,6 @@
 """Batch smoothing of a whole dive."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from rovgraph.estimators.results import (
     calibration_history,
     residual_frame,
 )
+from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.batch import (
     Problem,
@@ -28,8 +29,13 @@ from rovgraph.graph.batch import (
     solution_at,
     solve,
 )
+from rovgraph.graph.stamps import Stamps
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY
+
+MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
+PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
+CENTRED_REACH_S = 0.1  # around the lateness that was found
 
 
 @dataclass
@@ -39,17 +45,24 @@ class BatchSmoother:
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
+    stamps : how late they are; None = as the configuration believes
+    intervals : the dive, as far as it has been taken
+    measurements : the same as they came, kept where their lateness is estimated
     """
 
     beginning: Beginning
+    stamps: Stamps | None = None
 
     def __post_init__(self) -> None:
         b = self.beginning
-        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
+        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], assumed=self.stamps)
         self.intervals: list[Interval] = []
+        self.measurements: list[Measurement] = []
 
     def add(self, measurement: Measurement) -> list[Interval]:
         """Take a measurement; times must not decrease."""
+        if self.assembler.stamps.lags:
+            self.measurements.append(measurement)
         done = self.assembler.add(measurement)
         self.intervals += done
         return done
@@ -69,12 +82,35 @@ class BatchSmoother:
             the batch solver's
         """
         b = self.beginning
-        problem = make_problem(self.intervals, b.start, b.config, beliefs(b.config), b.instruments)
-        if incremental is None:
-            solution = solve(problem, make_values(problem, dead_reckon(self.intervals, b, problem.unknowns.fixed)))
-        else:
-            solution = solution_at(problem, incremental.engine.values())
-        return _estimate(problem, solution, b, self.intervals)
+        if incremental is not None:
+            problem = make_problem(self.intervals, b.start, b.config, beliefs(b.config), b.instruments)
+            return _estimate(problem, solution_at(problem, incremental.engine.values()), b, self.intervals)
+        dive, calibration = self, None
+        for _ in range(MAX_PLACINGS):
+            problem = make_problem(dive.intervals, b.start, b.config, beliefs(b.config), b.instruments)
+            states = dead_reckon(dive.intervals, b, problem.unknowns.fixed)
+            solution = solve(problem, make_values(problem, states, calibration))
+            found = problem.states(solution.values).calibration
+            anew = dive.placed_anew(found)
+            if anew is None:
+                break
+            dive, calibration = anew, {name: value.reshape(-1, value.shape[-1])[-1] for name, value in found.items()}
+        return _estimate(problem, solution, b, dive.intervals)
+
+    def placed_anew(self, calibration: Mapping[str, Array]) -> "BatchSmoother | None":
+        """The same dive with its measurements where late stamps were found to belong; None = they are there already.
+
+        Parameters
+        ----------
+        calibration : name -> ndarray, shape (dim,) or (n, dim), what was found
+        """
+        if self.assembler.stamps.off(calibration) < PLACED_WITHIN_S:
+            return None
+        anew = BatchSmoother(self.beginning, self.assembler.stamps.centred(calibration, CENTRED_REACH_S))
+        for measurement in self.measurements:
+            anew.add(measurement)
+        anew.finish()
+        return anew
 
     def dead_reckoning(self) -> Estimate:
         """Dead reckoning over the same intervals: the baseline."""

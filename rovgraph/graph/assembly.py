@@ -10,10 +10,11 @@ longer than that, and counting each sample would make the estimate too sure of i
 """
 
 import math
+from bisect import insort
 from collections import Counter
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from typing import cast
 
 import gtsam
@@ -33,6 +34,8 @@ from rovgraph.graph.preintegration import (
     preintegration_params,
     scatter,
 )
+from rovgraph.graph.stamps import Placed, Stamps
+from rovgraph.graph.track import Track, track_around
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
 from rovgraph.model_aiding import ModelAiding
@@ -59,6 +62,7 @@ class Attached:
     rate_b, rate_sd : ndarray, shape (3,), float: measured rate, bias still in it [rad/s]
     motion : Snapshot from the keyframe to the measurement
     bias : ndarray, shape (6,), that the motion was integrated with
+    track : Track of one stamp, where stamps may be late
     """
 
     sensor: str
@@ -72,6 +76,7 @@ class Attached:
     rate_sd: float
     motion: Snapshot
     bias: Array
+    track: Track | None = None
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,8 @@ class Assembler:
     bias : ndarray, shape (6,), for preintegration; may be renewed between intervals
     left_out : (sensor, reason) -> count of measurements that never reach the graph
     learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
+    assumed : how late stamps are; None = as the configuration believes
+    stamps : the same
     """
 
     config: Config
@@ -118,8 +125,9 @@ class Assembler:
     bias: Array
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
     learn_noise: bool = False
+    assumed: InitVar[Stamps | None] = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, assumed: Stamps | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
         noise = self.config.imu.noise
         self._noise = np.array([noise.acc, noise.gyr])
@@ -127,15 +135,17 @@ class Assembler:
         self._params = preintegration_params(self.config, *self._noise)
         self._bridge = preintegration_params(self.config, BRIDGE_ACC, BRIDGE_GYR)
         self._imu: list[tuple[float, Array]] = []
-        self._waiting: list[Measurement] = []
+        self._waiting: list[Placed] = []
         self._aiding: Aiding | None = None
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
         self._segment, self._segment_start = -1, -np.inf
-        self._between: list[Measurement] = []
+        self._between: list[Placed] = []
         self._periods: list[float] = []
         self._longest_step = np.inf
+        self.stamps = assumed or Stamps.of(self.config, self.instruments)
+        self._around = HALF_WINDOW_S + self.stamps.span
 
     def add(self, measurement: Measurement) -> list[Interval]:
         """Take a measurement; times must not decrease.
@@ -153,14 +163,14 @@ class Assembler:
                 if self._aiding is not None:
                     self._aiding.add(measurement)
             elif self._admissible(measurement):
-                self._waiting.append(measurement)
+                insort(self._waiting, self.stamps.placed(measurement), key=_time)
             return []
         self._take_sample(measurement)
         done: list[Interval] = []
         if self._index < 0:
             self._before_first(measurement.time)
             done.append(self._close(measurement.time, None))
-        return done + self._take_until(measurement.time - HALF_WINDOW_S)
+        return done + self._take_until(measurement.time - self._around)
 
     def copy(self) -> "Assembler":
         """One that goes on by itself from here."""
@@ -168,6 +178,7 @@ class Assembler:
         twin._imu, twin._waiting, twin._between = self._imu[:], self._waiting[:], self._between[:]
         twin._floor = self._floor.copy()
         twin._periods, twin.left_out = self._periods[:], self.left_out.copy()
+        twin.stamps = self.stamps.copy()
         if self._aiding is not None:
             twin._aiding = self._aiding.copy(twin.left_out)
         return twin
@@ -256,25 +267,25 @@ class Assembler:
             done.append(self._close(self._start + gap, None))
         return done
 
-    def _close(self, time: float, ping: Measurement | None) -> Interval:
+    def _close(self, time: float, ping: Placed | None) -> Interval:
         """Make a keyframe at ``time`` and the interval that leads to it."""
-        samples = np.array([[t, *values] for t, values in self._imu])
+        every = np.array([[t, *values] for t, values in self._imu])
+        samples = every[_first(every, self._start) :]
         pim, bridged = None, False
         attached: list[Attached] = []
         if self._index >= 0:
-            pim, bridged, attached = self._integrate(samples, time)
+            pim, bridged, attached = self._integrate(samples, every, time)
         self._index, self._start, self._between = self._index + 1, time, []
         if time - self._segment_start >= self.config.graph.segment_s:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._rate(samples, time)
         if ping is not None:
-            attached.append(self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd))
-        keep = max(int(np.searchsorted(samples[:, 0], time - HALF_WINDOW_S, side="right")) - 1, 0)
-        self._imu = self._imu[keep:]
+            attached += self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd, every)
+        self._imu = self._imu[_first(every, time, self._around) :]
         return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, bridged, attached)
 
     def _integrate(
-        self, samples: Array, time: float
+        self, samples: Array, every: Array, time: float
     ) -> tuple[gtsam.PreintegratedCombinedMeasurements, bool, list[Attached]]:
         taken, seen = [], set()
         for m in self._between:
@@ -285,13 +296,13 @@ class Assembler:
         bridged = bool(np.diff(samples[:, 0]).max() > self._longest_step)
         if self._aiding is not None and not bridged:
             aiding = self._aiding.between(self._start, time, samples, lambda t: self._rate(samples, t)[0])
-            taken = sorted(taken + aiding, key=lambda m: m.time)
+            taken = sorted(taken + [Placed(*m, m.time) for m in aiding], key=_time)
         stops = np.array([m.time for m in taken])
         params = self._bridge if bridged else self._params_for(samples)
         pim, motions = preintegrate(params, self.bias, samples, self._start, stops, time)
-        attached = [
-            self._attach(m, motion, *self._rate_for(m, samples)) for m, motion in zip(taken, motions, strict=True)
-        ]
+        attached: list[Attached] = []
+        for m, motion in zip(taken, motions, strict=True):
+            attached += self._attach(m, motion, *self._rate_for(m, samples), every)
         return pim, bridged, attached
 
     def _params_for(self, samples: Array) -> gtsam.PreintegrationCombinedParams:
@@ -312,7 +323,7 @@ class Assembler:
         if np.abs(noise / self._noise - 1.0).max() > 0.05:
             self._noise, self._params = noise, preintegration_params(self.config, *noise)
 
-    def _rate_for(self, m: Measurement, samples: Array) -> tuple[Array, float]:
+    def _rate_for(self, m: Placed, samples: Array) -> tuple[Array, float]:
         """The rate, for those instruments that it reaches: by a lever arm, or by the motion of a turning body."""
         reached = m.sensor == "thruster" or self.instruments[m.sensor].rate_gain.any()
         return self._rate(samples, m.time) if reached else (np.zeros(3), 0.0)
@@ -340,8 +351,16 @@ class Assembler:
             return weights @ rate, BRIDGE_GYR
         return weights @ rate, float(self._noise[1]) * math.sqrt(float(weights @ weights) / step)
 
-    def _attach(self, m: Measurement, motion: Snapshot, rate_b: Array, rate_sd: float) -> Attached:
+    def _attach(self, m: Placed, motion: Snapshot, rate_b: Array, rate_sd: float, every: Array) -> list[Attached]:
+        """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``."""
         instrument = self.instruments[m.sensor]
+        lag = self.stamps.lag(m.sensor)
+        track = None
+        if lag is not None:
+            track = track_around(m.stamp, lag, every, self._start, (self._params, self.bias), self._longest_step)
+        if lag is not None and track is None:
+            self.left_out[m.sensor, f"calibration.{instrument.lateness} reaches beyond the IMU's samples"] += 1
+            return []
         dim = instrument.model.dim
         z, sd = m.values[:dim], instrument.sd
         if m.sensor == "dvl":
@@ -353,4 +372,14 @@ class Assembler:
             sd = sd / math.sqrt(m.values[3])
         if m.sensor == "fix" and np.isfinite(m.values[2]):
             sd = np.full(dim, m.values[2])
-        return Attached(m.sensor, self._index, self._segment, m.time, m.row, z, sd, rate_b, rate_sd, motion, self.bias)
+        place = (m.sensor, self._index, self._segment, m.time, m.row)
+        return [Attached(*place, z, sd, rate_b, rate_sd, motion, self.bias, track)]
+
+
+def _time(m: Placed) -> float:
+    return m.time
+
+
+def _first(samples: Array, time: float, before: float = HALF_WINDOW_S) -> int:
+    """Index of the sample from which on a time and what is up to ``before`` it are covered."""
+    return max(int(np.searchsorted(samples[:, 0], time - before, side="right")) - 1, 0)

@@ -22,6 +22,7 @@ from scipy.special import chdtri
 from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import Attached
 from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.track import Track
 from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
@@ -44,7 +45,8 @@ class Block:
     rate_b : ndarray, shape (n, 3), measured rate, bias still in it [rad/s]
     motion : Delta, n, from the keyframe to the measurement
     gravity : [m/s^2]
-    unknowns : the calibration variables that are estimated, of those that the model has
+    unknowns : the calibration variables that are estimated, of those that the instrument has
+    track : along which the motion goes on to where a stamp that may be late belongs, or None
     """
 
     instrument: Instrument
@@ -58,6 +60,7 @@ class Block:
     motion: Delta
     gravity: float
     unknowns: Unknowns
+    track: Track | None = None
 
     def __len__(self) -> int:
         return len(self.z)
@@ -78,15 +81,19 @@ class Block:
     @cached_property
     def at_keyframes(self) -> bool:
         """All measurements are at their keyframes: there is no motion to reckon with."""
-        return not self.motion.dt.any()
+        return self.track is None and not self.motion.dt.any()
 
     def predict(self, state: State) -> tuple[Array, Jacobians]:
         """Predicted measurements, shape (n, dim), and Jacobians by the keyframes' variables."""
         model = self.instrument.model
         if self.at_keyframes:
             return model.predict(state, self.rate_b)
-        there, F = propagate_with_jacobian(state, self.motion, self.gravity)
-        predicted, H = model.predict(there, self.rate_b)
+        motion, rate_b = self._placed(state)
+        there, F = propagate_with_jacobian(state, motion, self.gravity)
+        predicted, H = model.predict(there, rate_b)
+        if self.track is not None and self.instrument.lateness is not None:
+            by = self.track.by_lateness(self._late(state), state, there, H, self.gravity)
+            H = H | {self.instrument.lateness: by}
         stacked = np.zeros((len(self), predicted.shape[1], 15))
         for variable, columns in _COLUMNS.items():
             if variable in H:
@@ -94,11 +101,24 @@ class Block:
         stacked = stacked @ F
         return predicted, H | {variable: stacked[..., columns] for variable, columns in _COLUMNS.items()}
 
+    def predicted(self, state: State) -> Array:
+        """Predicted measurements alone, shape (n, dim)."""
+        motion, rate_b = self._placed(state)
+        there = state if self.at_keyframes else propagate(state, motion, self.gravity)
+        return self.instrument.model.predict(there, rate_b)[0]
+
     def innovations(self, state: State) -> Array:
         """Measured minus predicted, shape (n, dim); ``state`` is at each one's keyframe."""
-        there = state if self.at_keyframes else propagate(state, self.motion, self.gravity)
-        predicted, _ = self.instrument.model.predict(there, self.rate_b)
-        return innovation(self.instrument.model, self.z, predicted)
+        return innovation(self.instrument.model, self.z, self.predicted(state))
+
+    def _placed(self, state: State) -> tuple[Delta, Array]:
+        """The motion to where each measurement was valid, and the rate there."""
+        return (self.motion, self.rate_b) if self.track is None else self.track.placed(self._late(state))
+
+    def _late(self, state: State) -> Array:
+        """How late each stamp is, shape (n,) [s]."""
+        assert self.instrument.lateness is not None
+        return np.broadcast_to(state.calibration[self.instrument.lateness][..., 0], len(self))
 
     def linearize(self, state: State) -> tuple[Array, Jacobians]:
         """Whitened innovations and Jacobians at ``state`` (that of each keyframe).
@@ -148,7 +168,7 @@ class Block:
         """Some of the measurements."""
         arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name in _PER_MEASUREMENT}
         motion = Delta(*(getattr(self.motion, f.name)[index] for f in fields(Delta)))
-        return replace(self, **arrays, motion=motion)
+        return replace(self, **arrays, motion=motion, track=self.track and self.track.at(index))
 
 
 _PER_MEASUREMENT = ("keyframe", "segment", "time", "row", "z", "W", "rate_b")
@@ -167,7 +187,9 @@ def make_block(
 
     W = whitening(instrument, stack("sd"), stack("rate_sd"))
     arrays = (stack("keyframe"), stack("segment"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
-    return Block(instrument, *arrays, motions(attached), gravity, unknowns.of(instrument.model.calibration))
+    tracks = [a.track for a in attached if a.track is not None]
+    track = Track.stack(tracks) if tracks else None
+    return Block(instrument, *arrays, motions(attached), gravity, unknowns.of(instrument.calibration), track)
 
 
 def motions(attached: Sequence[Attached]) -> Delta:

@@ -174,9 +174,10 @@ def _inertial(sample: _Sampler, motion: Motion, bias: Array) -> pd.DataFrame:
 
 
 def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
-    """DVL velocity, its validity and its compass, one row per ping."""
+    """DVL velocity, its validity and its compass, one row per ping, stamped as late as the DVL's stamps are."""
     truth, rng = sample.truth, sample.rng
-    motion = path.motion(sample.epochs(path, 1.0 / truth.dvl_rate, truth.dvl_jitter))
+    stamps = sample.epochs(path, 1.0 / truth.dvl_rate, truth.dvl_jitter)
+    motion = path.motion(np.clip(stamps - sample.calibration["dvl_time_offset"], 0.0, path.duration))
     velocity = sample.exact("dvl", motion)
     if sample.covariances is None:
         noise, speed = None, np.linalg.norm(velocity, axis=1)[:, None]
@@ -187,10 +188,10 @@ def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
         velocity = velocity + noise[:, :3]
     wrong = (rng.uniform(size=len(motion)) < truth.outlier_share) & truth.noise
     velocity[wrong] += truth.outlier_size * rng.standard_normal((int(wrong.sum()), 3))
-    frame = _frame(motion.time, DVL_COLUMNS, velocity)
+    frame = _frame(stamps, DVL_COLUMNS, velocity)
     lost = np.zeros(len(motion), bool)
     for begin, end in truth.dropouts:
-        lost |= (motion.time >= begin) & (motion.time <= end)
+        lost |= (stamps >= begin) & (stamps <= end)
     frame.loc[lost, DVL_COLUMNS] = np.nan
     frame["dvl_valid"] = pd.array(np.where(lost, 0, 1), dtype="Int64")
     if noise is None:

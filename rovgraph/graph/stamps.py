@@ -1,0 +1,97 @@
+"""Stamps that may be late, and where on the time line a measurement is put for that.
+
+A measurement stands at its stamp less the lateness that is assumed; what remains until the
+lateness that is estimated is bridged by a `Track`. So the assumption need not be right, but the
+nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. The
+assumption may be renewed while measurements come.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rovgraph.config import Config, beliefs
+from rovgraph.geometry import Array
+from rovgraph.graph.track import KNOT_S
+from rovgraph.instruments import Instrument
+from rovgraph.log import Measurement
+
+REACH_SD = 4.0  # of the prior, that a lateness may be off
+
+
+class Placed(NamedTuple):
+    """A `rovgraph.log.Measurement` at the time where it is put; ``stamp`` is the time that it came with [s]."""
+
+    time: float
+    sensor: str
+    values: Array
+    row: int
+    stamp: float
+
+
+@dataclass
+class Stamps:
+    """How late the stamps of a set of instruments are.
+
+    Attributes
+    ----------
+    variable : sensor -> name of the calibration variable
+    lags : variable that is estimated -> ndarray, shape (K,), lateness that is reckoned with, ascending by
+        `rovgraph.graph.track.KNOT_S` [s]
+    assumed : variable -> lateness by which measurements are put earlier [s]
+    """
+
+    variable: dict[str, str]
+    lags: dict[str, Array]
+    assumed: dict[str, float]
+
+    @staticmethod
+    def of(config: Config, instruments: Mapping[str, Instrument]) -> "Stamps":
+        """Stamps as the configuration believes them to be."""
+        variable = {sensor: i.lateness for sensor, i in instruments.items() if i.lateness is not None}
+        priors = {name: belief for name, belief in beliefs(config).items() if name in variable.values()}
+        assumed = {name: float(belief.mean[0]) for name, belief in priors.items()}
+        lags = {name: around(assumed[name], REACH_SD * b.sd) for name, b in priors.items() if b.estimate}
+        return Stamps(variable, lags, assumed)
+
+    def copy(self) -> "Stamps":
+        """One that goes on by itself from here."""
+        return replace(self, assumed=dict(self.assumed))
+
+    @property
+    def span(self) -> float:
+        """How far measurements may lie from their stamps, and from the places that they were put to [s]."""
+        every = np.concatenate([[0.0], *self.lags.values(), list(self.assumed.values())])
+        return float(np.ptp(every))
+
+    def placed(self, m: Measurement) -> Placed:
+        """A measurement where it is assumed to belong."""
+        late = self.assumed.get(self.variable.get(m.sensor, ""), 0.0)
+        return Placed(m.time - late, m.sensor, m.values, m.row, m.time)
+
+    def lag(self, sensor: str) -> Array | None:
+        """Lateness that is reckoned with for a sensor, shape (K,) [s]; None where it is not estimated."""
+        return self.lags.get(self.variable.get(sensor, ""))
+
+    def assume(self, calibration: Mapping[str, Array]) -> None:
+        """Renew the assumption, as far as it was reckoned with."""
+        for name, lag in self.lags.items():
+            self.assumed[name] = float(np.clip(np.mean(calibration[name]), lag[0], lag[-1]))
+
+    def off(self, calibration: Mapping[str, Array]) -> float:
+        """How far the assumption lies from estimates, at most [s]."""
+        return max((float(np.abs(calibration[n] - self.assumed[n]).mean()) for n in self.lags), default=0.0)
+
+    def centred(self, calibration: Mapping[str, Array], reach: float) -> "Stamps":
+        """Stamps that are about as late as was estimated, shape (n, 1) or (1,) each, within ``reach`` [s]."""
+        assumed = self.assumed | {name: float(np.mean(calibration[name])) for name in self.lags}
+        lags = {name: around(assumed[name], reach + float(np.ptp(calibration[name]))) for name in self.lags}
+        return Stamps(self.variable, lags, assumed)
+
+
+def around(middle: float, reach: float) -> Array:
+    """Knots that cover what lies within ``reach`` of ``middle``, shape (K,)."""
+    count = 2 + int(np.ceil(reach / KNOT_S))  # the rate's arcs need a knot more at either end
+    return np.asarray(middle + KNOT_S * np.arange(-count, count + 1))
