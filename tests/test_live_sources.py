@@ -418,9 +418,10 @@ def test_a_host_that_is_not_there_is_complained_of_until_it_is(impatient):
     assert complaints.counts[source.url, "unreachable"] >= 2
 
 
-def test_a_name_that_does_not_resolve_is_complained_of(impatient):
+@pytest.mark.parametrize("host", ["no-such-host.invalid", "a..b", "x" * 70])
+def test_a_name_that_does_not_resolve_is_complained_of(host, impatient):
     said = []
-    source = open_source("tcp://no-such-host.invalid:9", Complaints(lambda *line: said.append(line)))
+    source = open_source(f"tcp://{host}:9", Complaints(lambda *line: said.append(line)))
     assert take(source, 1, within=0.3) == []
     assert [kind for _, kind, _ in said] == ["unreachable"]
 
@@ -844,13 +845,13 @@ def test_a_replay_at_a_speed_takes_its_time_and_stops_when_told(tmp_path):
     path = csv(tmp_path / "log.csv", rows=11)  # 1 s
     begin = time.monotonic()
     messages = list(open_source(f"file:{path}?speed=4").messages(threading.Event()))
-    assert 0.25 <= time.monotonic() - begin < 0.6
+    assert 0.25 <= time.monotonic() - begin < 0.9
     assert messages[0].arrival == 100.0
     stop = threading.Event()
     threading.Timer(0.2, stop.set).start()
     begin = time.monotonic()
     live = list(open_source(f"file:{path}?speed=1").messages(stop))
-    assert time.monotonic() - begin < 0.7
+    assert time.monotonic() - begin < 0.9
     assert 0 < len(live) < len(messages)
 
 

@@ -60,9 +60,13 @@ class TcpLink:
                         yield chunk
                     if not stop.is_set():
                         self._notify("disconnected", "the other side has closed the connection; trying again")
-            except OSError as error:
-                self._notify("unreachable", f"{error.strerror or error}; trying again")
+            except (OSError, UnicodeError) as error:  # the latter of a name that cannot be one
+                self._notify("unreachable", f"{_reason(error)}; trying again")
             retry.wait(stop)
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)
 
 
 def connected(host: str, port: int, stop: threading.Event) -> socket.socket:
@@ -141,9 +145,9 @@ class UdpLink:
             self._socket = socket.socket(family, kind, protocol)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
             self._socket.bind(address)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise InputError(
-                f"{url}: cannot listen at {host}:{port} ({error.strerror}); "
+                f"{url}: cannot listen at {host}:{port} ({_reason(error)}); "
                 "does another program, or another source, listen there already?"
             ) from None
         self._socket.settimeout(STOP_S)
@@ -215,7 +219,7 @@ class SerialLink:
                     for chunk in _read(port, stop):
                         retry.reset()
                         yield chunk
-            except (OSError, ValueError) as error:  # a SerialException is an OSError
+            except Exception as error:  # what a port that is unplugged raises differs between systems
                 self._notify("unreachable", f"{error}; trying again")
             retry.wait(stop)
 
