@@ -9,6 +9,7 @@ from rovgraph.estimators.error_state import ErrorStateFilter
 from rovgraph.estimators.fixed_lag import FixedLag, Taken
 from rovgraph.estimators.initialise import Beginning, initialise
 from rovgraph.estimators.refiner import Refiner
+from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.log import Measurement
 
 LAG, HOLD = 5.0, 0.3
@@ -107,6 +108,24 @@ def test_prediction_ahead_grows_uncertain_and_beyond_the_imu_more_so(beginning, 
     newest = max(m.time for m in measurements[:2500] if m.sensor == "imu")
     sd = [np.sqrt(np.diag(engine.ahead(t)[1].P)[6:9]).max() for t in (mark.interval.time, newest, newest + 3.0)]
     assert sd[0] < sd[1] < 0.1 * sd[2]
+
+
+def test_restored_from_its_state_it_goes_on_as_if_nothing_had_happened(tmp_path, beginning, measurements, reference):
+    cut = 2500
+    before = FixedLag(beginning, LAG, HOLD)
+    for m in measurements[:cut]:
+        before.add(m)
+    write_checkpoint(tmp_path / "state", before.state())
+    known: list[Gaussian] = []
+    after = FixedLag(beginning, LAG, HOLD, passed=lambda mark: known.append(mark.known))
+    after.restore(read_checkpoint(tmp_path / "state"))
+    for t in (before.marks[-1].interval.time, measurements[cut - 1].time):
+        np.testing.assert_allclose(after.ahead(t)[1].P, before.ahead(t)[1].P, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(after.ahead(t)[1].state.p_n, before.ahead(t)[1].state.p_n, atol=1e-9)
+    for m in measurements[cut:]:
+        after.add(m)
+    after.finish()
+    same(known[-20:], reference.filtered[-20:], 1e-9)
 
 
 def test_memory_does_not_grow(beginning, measurements):

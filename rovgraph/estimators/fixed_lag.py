@@ -8,16 +8,21 @@ long as nothing is later than the lag; and nothing older than that is kept.
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import pairwise
+from typing import Any
+
+import numpy as np
 
 from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Used
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement
+from rovgraph.log.packing import pack, unpack
 from rovgraph.log.streams import precedence
+from rovgraph.state import State
 
 
 class Taken(StrEnum):
@@ -137,6 +142,37 @@ class FixedLag:
         del self._record[:old]
         self._forgotten += old
         self._taken -= old
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on elsewhere, as plain values and arrays; not before the first keyframe."""
+        mark = self.oldest()
+        known, interval = mark.known, mark.interval
+        return {
+            "keyframe": [interval.index, interval.time, interval.segment, interval.rate_sd],
+            "rate_b": interval.rate_b,
+            "R_nb": known.state.R_nb,
+            "p_n": known.state.p_n,
+            "v_n": known.state.v_n,
+            "bias": known.state.bias,
+            "calibration": {name: np.asarray(value) for name, value in known.state.calibration.items()},
+            "P": known.P,
+            "gates": mark.gates,
+            "assembler": mark.assembler.state(),
+            "record": pack(self._record[mark.taken - self._forgotten :]),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from where another stood."""
+        index, time, segment, rate_sd = state["keyframe"]
+        interval = Interval(index, time, segment, state["rate_b"], rate_sd, None, False, [])
+        here = State(*(state[name] for name in ("R_nb", "p_n", "v_n", "bias", "calibration")))
+        assembler = self._fresh()
+        assembler.restore(state["assembler"])
+        self.marks = deque([Mark(interval, Gaussian(here, state["P"]), state["gates"], [], assembler, 0)])
+        self._record, self._forgotten, self._taken = [], 0, 0
+        self._back_to(0)
+        for measurement in unpack(state["record"]):
+            self.add(measurement)
 
     @property
     def _settled(self) -> int:

@@ -24,21 +24,25 @@ class Aiding:
     ----------
     model : ModelAiding
     left_out : (sensor, reason) -> count, of pieces that give no measurement
+
+    Attributes
+    ----------
+    signals : those that may still act
     """
 
     def __init__(self, model: ModelAiding, left_out: Counter[tuple[str, str]]) -> None:
         self.model, self.left_out = model, left_out
-        self._signals: list[Measurement] = []
+        self.signals: list[Measurement] = []
 
     def copy(self, left_out: Counter[tuple[str, str]]) -> "Aiding":
         """One that goes on by itself from here."""
         twin = Aiding(self.model, left_out)
-        twin._signals = self._signals[:]
+        twin.signals = self.signals[:]
         return twin
 
     def add(self, signal: Measurement) -> None:
         """Take the signals of one epoch."""
-        self._signals.append(signal)
+        self.signals.append(signal)
 
     def between(self, begin: float, end: float, samples: Array, rate: Callable[[float], Array]) -> list[Measurement]:
         """Measurements of "thruster" between two keyframes, each at the middle of its piece.
@@ -59,13 +63,13 @@ class Aiding:
             self._piece(float(t0), float(t1), samples, (w1 - w0) / (t1 - t0))
             for t0, t1, w0, w1 in zip(edges[:-1], edges[1:], rates[:-1], rates[1:], strict=True)
         ]
-        acting = sum(m.time <= end - self.model.memory for m in self._signals)
-        self._signals = self._signals[max(acting - 1, 0) :]
+        acting = sum(m.time <= end - self.model.memory for m in self.signals)
+        self.signals = self.signals[max(acting - 1, 0) :]
         return [piece for piece in pieces if piece is not None]
 
     def _piece(self, begin: float, end: float, samples: Array, alpha_b: Array) -> Measurement | None:
         inside = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
-        signals = [m for m in self._signals if m.time <= end]
+        signals = [m for m in self.signals if m.time <= end]
         if not (len(inside) and signals):
             return None
         if signals[0].time > begin - self.model.memory:

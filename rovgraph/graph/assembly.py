@@ -12,10 +12,10 @@ longer than that, and counting each sample would make the estimate too sure of i
 import math
 from bisect import insort
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import InitVar, dataclass, field
-from typing import cast
+from typing import Any, cast
 
 import gtsam
 import numpy as np
@@ -34,10 +34,11 @@ from rovgraph.graph.preintegration import (
     preintegration_params,
     scatter,
 )
-from rovgraph.graph.stamps import Placed, Stamps
+from rovgraph.graph.stamps import Placed, Stamps, pack_placed, unpack_placed
 from rovgraph.graph.track import Track, track_around
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
+from rovgraph.log.packing import pack, unpack
 from rovgraph.model_aiding import ModelAiding
 from rovgraph.state import State
 
@@ -182,6 +183,34 @@ class Assembler:
         if self._aiding is not None:
             twin._aiding = self._aiding.copy(twin.left_out)
         return twin
+
+    def state(self) -> dict[str, Any]:
+        """Where it stands, as plain values and arrays."""
+        return {
+            "imu": np.array([[t, *values] for t, values in self._imu]).reshape(-1, 7),
+            "waiting": pack_placed(self._waiting),
+            "between": pack_placed(self._between),
+            "assumed": self.stamps.assumed,
+            "signals": pack(self._aiding.signals if self._aiding is not None else []),
+            "at": [self._index, self._start, self._segment, self._segment_start],
+            "periods": list(self._periods),
+            "floor": self._floor.state(),
+            "bias": self.bias,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from where another stood."""
+        self._imu = [(row[0], np.array(row[1:])) for row in state["imu"].tolist()]
+        self._waiting, self._between = unpack_placed(state["waiting"]), unpack_placed(state["between"])
+        self.stamps.assumed.update(state["assumed"])
+        if self._aiding is not None:
+            self._aiding.signals = unpack(state["signals"])
+        self._index, self._start, self._segment, self._segment_start = state["at"]
+        self._periods, self.bias = list(state["periods"]), state["bias"]
+        self._longest_step = GAP_PERIODS * float(np.median(self._periods)) if self._periods else np.inf
+        self._floor.restore(state["floor"])
+        if self.learn_noise:
+            self._raise(self._floor.densities())
 
     def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> Interval:
         """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.

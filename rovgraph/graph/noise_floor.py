@@ -31,6 +31,15 @@ class NoiseFloor:
         """One that goes on by itself from here."""
         return NoiseFloor(self.believed, self._recent.copy())
 
+    def state(self) -> Array:
+        """What it remembers, shape (n, 2)."""
+        return np.array(self._recent).reshape(-1, 2)
+
+    def restore(self, state: Array) -> None:
+        """Remember what another did."""
+        self._recent.clear()
+        self._recent.extend(state)
+
     def take(self, odd: Array) -> None:
         """Take an interval's scatter, shape (m, 6), of `rovgraph.graph.preintegration.scatter`."""
         self._recent.append(1.4826 * np.median(np.abs(odd), axis=0).reshape(2, 3).mean(axis=1))

@@ -6,9 +6,9 @@ nearer it is, the less of the IMU's noise lies between a measurement and its key
 assumption may be renewed while measurements come.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rovgraph.geometry import Array
 from rovgraph.graph.track import KNOT_S
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
+from rovgraph.log.packing import pack, unpack
 
 REACH_SD = 4.0  # of the prior, that a lateness may be off
 
@@ -29,6 +30,17 @@ class Placed(NamedTuple):
     values: Array
     row: int
     stamp: float
+
+
+def pack_placed(placed: Sequence[Placed]) -> dict[str, Any]:
+    """As arrays."""
+    return {"measurements": pack([Measurement(*p[:4]) for p in placed]), "stamps": [p.stamp for p in placed]}
+
+
+def unpack_placed(packed: Mapping[str, Any]) -> list[Placed]:
+    """The inverse of `pack_placed`."""
+    both = zip(unpack(packed["measurements"]), packed["stamps"], strict=True)
+    return [Placed(*m, stamp) for m, stamp in both]
 
 
 @dataclass
