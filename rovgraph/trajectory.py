@@ -112,11 +112,17 @@ class Trajectory:
         frame["cov_north_east"] = self.cov_p[:, 0, 1]
         return frame
 
-    def write_csv(self, path: Path) -> None:
-        """Write the columns of the contract that are known; time to the millisecond's tenth."""
+    def write_csv(self, path: Path, more: bool = False) -> None:
+        """Write the columns of the contract that are known; time to the millisecond's tenth.
+
+        Parameters
+        ----------
+        path : the file
+        more : rows for the end of a file that has the same columns
+        """
         frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
         frame["time"] = frame["time"].map("{:.4f}".format)
-        frame.to_csv(path, index=False, float_format="%.7g")
+        frame.to_csv(path, mode="a" if more else "w", header=not more, index=False, float_format="%.7g")
 
     def write_tum(self, path: Path) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes."""

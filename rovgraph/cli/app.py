@@ -13,6 +13,7 @@ from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
 from rovgraph.cli.evaluate import evaluate
+from rovgraph.cli.online import online
 from rovgraph.cli.simulate import simulate
 from rovgraph.cli.smooth import smooth
 from rovgraph.errors import DataWarning, InputError
@@ -25,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _command in (smooth, evaluate, compare, check, config, simulate):
+for _command in (smooth, online, evaluate, compare, check, config, simulate):
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 

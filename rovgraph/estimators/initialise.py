@@ -5,8 +5,9 @@ and heading from whatever the log has; the gyro's bias from standing still, wher
 stands still. An explicit ``start`` goes before all of it.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,25 @@ class Beginning:
     instruments: dict[str, Instrument]
     start: Start
     assumptions: list[str]
+
+    def state(self) -> dict[str, Any]:
+        """What `restored` makes it of again, as plain values and arrays."""
+        start = self.start
+        return {
+            "config": self.config.model_dump(mode="json"),
+            "sensors": list(self.instruments),
+            "start": {name: getattr(start, name) for name in ("rpy_sd", "p_sd", "v_sd", "bias_sd")},
+            "at": {name: getattr(start.state, name) for name in ("R_nb", "p_n", "v_n", "bias")},
+            "assumptions": self.assumptions,
+        }
+
+
+def restored(state: Mapping[str, Any]) -> Beginning:
+    """A beginning from its `Beginning.state`."""
+    config = Config.model_validate(state["config"])
+    sensors = instruments(config, config.imu.lever_arm_m)
+    start = Start(State(**state["at"]), **state["start"])
+    return Beginning(config, {s: sensors[s] for s in state["sensors"]}, start, list(state["assumptions"]))
 
 
 def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Beginning:

@@ -12,7 +12,9 @@ was set: it is shifted, so that time goes on.
 """
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from rovgraph.live.message import Message
 
@@ -80,7 +82,8 @@ class Clocks:
         if self.trust and message.stamp is not None:
             return message.stamp
         if message.stamp is None:
-            return message.arrival - (self._base.delay.value if self._base and self._base.delay.pieces else 0.0)
+            now = self.now(message.arrival)
+            return message.arrival if now is None else now
         clock = self._clocks.setdefault(
             (message.source, message.clock), _Clock(f"{message.source} {message.clock}".strip())
         )
@@ -93,6 +96,30 @@ class Clocks:
         stamp = message.stamp + clock.shift  # it may have been set
         clock.delay.add(message.arrival, message.arrival - stamp)
         return stamp + self._correction(clock)
+
+    def now(self, host: float) -> float | None:
+        """The estimator's time at a time of the host's clock; None before the IMU has been heard."""
+        return None if self._base is None else host - self._base.delay.value
+
+    def state(self) -> dict[str, Any]:
+        """What it has learnt of the clocks, as plain values."""
+        return {
+            "base": None if self._base is None else self._base.name,
+            "clocks": [
+                {**vars(clock), "source": list(key), "delay": [list(p) for p in clock.delay.pieces], "odd": []}
+                for key, clock in self._clocks.items()
+            ],
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Know what another has learnt."""
+        for known in state["clocks"]:
+            delay = _LeastDelay()
+            delay.pieces.extend((arrival, least) for arrival, least in known["delay"])
+            clock = _Clock(known["name"], delay, known["shift"], known["apart"])
+            self._clocks[known["source"][0], known["source"][1]] = clock
+            if clock.name == state["base"]:
+                self._base = clock
 
     def _correction(self, clock: _Clock) -> float:
         if clock is self._base or self._base is None:

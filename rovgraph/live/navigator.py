@@ -6,7 +6,9 @@ A message's time is reconciled, its readings are looked at for faults, and go to
 
 import time as host
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pymap3d
@@ -15,7 +17,7 @@ from rovgraph.calibration import TABLE
 from rovgraph.config import Config
 from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
-from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.initialise import Beginning, restored
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
@@ -25,7 +27,7 @@ from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.renewals import Renewals
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.startup import Startup
-from rovgraph.log import Measurement
+from rovgraph.log import Log, Measurement
 from rovgraph.state import POSE, VELOCITY
 
 SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
@@ -48,6 +50,7 @@ class Navigator:
     time : of the newest measurement, or of the last `tick` [s]
     passed : marks that the lag has passed, since they were last taken
     left_out : (sensor or source, reason) -> count
+    updates, update_s : count of updates of the filter, and the time that the newest took [s]
     """
 
     config: Config
@@ -61,6 +64,8 @@ class Navigator:
     time: float = -np.inf
     passed: list[Mark] = field(default_factory=list)
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
+    updates: int = 0
+    update_s: float = 0.0
 
     def __post_init__(self) -> None:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
@@ -69,28 +74,40 @@ class Navigator:
         self._events: list[Event] = []
         self._newest: dict[str, float] = {}
         self._distance, self._here = 0.0, np.full(3, np.nan)
-        self._arrival, self._update_s = 0.0, 0.0
+        self._arrival = 0.0
 
     @property
     def waits_for(self) -> str:
         """Why there is no estimate yet; empty where there is, or while the first seconds go by."""
         return "" if self.engine is not None else self._startup.waits_for
 
-    def take(self, message: Message) -> float | None:
-        """Take a message; the time of its measurements [s], or None where that cannot be known."""
+    def take(self, message: Message) -> list[tuple[float, tuple[Reading, ...]]]:
+        """Take a message; its readings with their times [s], and none where those cannot be known."""
         time = self.clocks.time(message)
         while self.clocks.news:
             clock, text = self.clocks.news.pop()
             self._events.append(Event(self.time, clock, "clock", text))
         if time is None:
             self.left_out[message.source, "impossible stamp"] += 1
-            return None
+            return []
         self._arrival = message.arrival
-        for reading in message.readings:
-            measurement = self._measurement(time, reading)
-            if measurement is not None:
+        delays = self.config.online.delay_s
+        if not delays:
+            rows = [(time, message.readings)]
+        else:
+            rows = [(time - delays.get(r.sensor, 0.0), (r,)) for r in message.readings]  # type: ignore[call-overload]
+        for at, own in rows:
+            for reading in own:
+                if (measurement := self._measurement(at, reading)) is not None:
+                    self._consider(measurement)
+        return rows
+
+    def replay(self, log: Log) -> None:
+        """Take what had been received before, on the estimator's clock."""
+        known = self.engine.marks[0].interval.time if self.engine is not None else -np.inf
+        for measurement in log.measurements():
+            if measurement.time > known:
                 self._consider(measurement)
-        return time
 
     def tick(self, time: float) -> None:
         """Time goes on, with measurements or without."""
@@ -137,8 +154,34 @@ class Navigator:
             distance=self._travelled(t.p_n[0]),
             predicted_s=interval.time - engine.marks[-1].interval.time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
-            update_s=self._update_s,
+            update_s=self.update_s,
         )
+
+    def state(self) -> dict[str, Any] | None:
+        """All that is needed to go on after a crash, as plain values and arrays; None before the beginning."""
+        if self.engine is None or not self.engine.marks:
+            return None
+        return {
+            "beginning": self.engine.beginning.state(),
+            "engine": self.engine.state(),
+            "clocks": self.clocks.state(),
+            "origin": self.origin,
+            "time": self.time,
+            "travelled": [self._distance, *self._here.tolist()],
+            "used": dict(self.health.used),
+            "rejected": dict(self.health.rejected),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from where another stood; the filter is not renewed any more."""
+        self.origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1])
+        self.renew = False
+        self._begin(restored(state["beginning"]), state["engine"])
+        self.clocks.restore(state["clocks"])
+        self.time = state["time"]
+        self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
+        self.health.used.update(state["used"])
+        self.health.rejected.update(state["rejected"])
 
     def _measurement(self, time: float, reading: Reading) -> Measurement | None:
         """A reading as the engine takes it; None where the sensor has just been heard."""
@@ -148,10 +191,6 @@ class Navigator:
                 self.origin = self._startup.origin = (float(values[0]), float(values[1]))
             north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
             sensor, values = "fix", np.array([north, east, values[2]])
-        elif sensor == "mag":
-            values = self.config.imu.mag.calibrated(values[None])[0]
-        if sensor in self.config.online.delay_s:
-            time -= self.config.online.delay_s[sensor]
         newest = self._newest.get(sensor, -np.inf)
         if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
             self.left_out[sensor, "more often than can be used"] += 1
@@ -173,8 +212,8 @@ class Navigator:
         else:
             self._feed(self.engine, m)
 
-    def _begin(self, beginning: Beginning) -> None:
-        """The first seconds are over."""
+    def _begin(self, beginning: Beginning, state: Mapping[str, Any] | None = None) -> None:
+        """The first seconds are over, or an estimate goes on from its state."""
         config = beginning.config
         if self.renew:
             self._renewals = Renewals(beginning, self.patient)
@@ -182,6 +221,9 @@ class Navigator:
         self.engine = FixedLag(
             beginning, config.graph.lag_s, config.online.hold_s, self._pass, settled, learn_noise=True
         )
+        if state is not None:
+            self.engine.restore(state)
+            return
         self._events += [Event(self.time, "start", "assumed", text) for text in beginning.assumptions]
         for measurement in self._startup.measurements:
             self._feed(self.engine, measurement)
@@ -197,7 +239,7 @@ class Navigator:
                 self._renewals.step(engine)
             self.health.step(engine.marks)
             self.faults.tick(self.time)
-            self._update_s = host.perf_counter() - began
+            self.updates, self.update_s = self.updates + 1, host.perf_counter() - began
 
     def _pass(self, mark: Mark) -> None:
         self.passed.append(mark)

@@ -11,7 +11,7 @@ from rovgraph.log.streams import gathered
 
 MARGIN_S = 0.5  # beyond the window, for data that come late
 AGAIN_S = 1.0  # between attempts
-LATER = {"dvl", "dvl_water", "depth", "fix"}  # sensors that may have their first measurement later
+LATER = {"dvl", "depth", "fix"}  # sensors that may have their first measurement later
 COMPASSES = {"ahrs", "dvl_heading"}  # these too, where the configuration names its heading sources
 
 

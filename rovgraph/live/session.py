@@ -1,0 +1,245 @@
+"""A run of the online mode: sources to a navigator, solutions to outputs, everything to disk."""
+
+import io
+import json
+import math
+import time as host
+from array import array
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+import pymap3d
+
+from rovgraph.config import Config, Mag
+from rovgraph.errors import InputError
+from rovgraph.live.checkpoint import read_checkpoint
+from rovgraph.live.complaints import Complaints
+from rovgraph.live.keeper import Keeper
+from rovgraph.live.message import Message
+from rovgraph.live.navigator import Navigator
+from rovgraph.live.recorder import Recorder
+from rovgraph.live.solution import Event, Solution
+from rovgraph.live.track import TrackFile, trajectory_of
+from rovgraph.log import log_from_frame
+from rovgraph.log.streams import Log
+
+RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
+CONFIG, EVENTS = "config.yaml", "events.jsonl"
+KEEP_S = 0.5  # of the host's time between checkpoints
+LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
+QUIET_S = 0.5  # without the IMU, after which time goes on by the host's clock
+
+
+class Receiver(Protocol):
+    """Takes solutions: an output, the status line."""
+
+    def send(self, solution: Solution) -> None: ...
+
+
+@dataclass
+class Files:
+    """What is on disk of a run, so that a crash loses no more than a second.
+
+    Parameters
+    ----------
+    folder : an existing one
+    config : as the user gave it
+    complaints : where trouble with the disk goes
+    resume : go on with what is there
+
+    Raises
+    ------
+    InputError : the folder cannot be written, or holds nothing to go on with
+    """
+
+    folder: Path
+    config: Config
+    complaints: Complaints
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        checkpoint = self.folder / CHECKPOINT
+        self.state: dict[str, Any] | None = None
+        until = -np.inf
+        if self.resume and not (self.folder / RECORDING).exists():
+            raise InputError(f"{self.folder}: nothing to resume, there is no {RECORDING}; leave out --resume")
+        if self.resume and checkpoint.exists():
+            self.state = read_checkpoint(checkpoint)
+            until = float(self.state["engine"]["keyframe"][1])
+        self.recorder = Recorder(self.folder / RECORDING, self.complaints.complain)
+        self.track = TrackFile(self.folder / TRACK, until)
+        self.keeper = Keeper(checkpoint, self.complaints.complain)
+        recorded = self.config.model_copy(update=_as_recorded(self.config))
+        (self.folder / CONFIG).write_text(recorded.to_yaml(), encoding="utf-8")
+        self._events = (self.folder / EVENTS).open("a", encoding="utf-8", buffering=1)
+        self._kept = host.monotonic()
+
+    def recorded(self, origin: tuple[float, float] | None) -> Log | None:
+        """The end of a recording that is resumed; None where it has no measurement.
+
+        Parameters
+        ----------
+        origin : latitude and longitude [deg] of north = east = 0, where it is known
+        """
+        try:
+            return log_from_frame(_last_rows(self.folder / RECORDING, origin), str(self.folder / RECORDING))
+        except InputError:
+            return None
+
+    def note(self, events: Iterable[Event]) -> None:
+        """Keep events."""
+        for event in events:
+            self._events.write(json.dumps(vars(event)) + "\n")
+
+    def keep(self, navigator: Navigator, now: bool = False) -> None:
+        """Put the track and a checkpoint on disk, if it is time to."""
+        if not now and host.monotonic() - self._kept < KEEP_S:
+            return
+        self._kept = host.monotonic()
+        engine = navigator.engine
+        if engine is None:
+            return
+        if navigator.passed:
+            arm = np.array(engine.beginning.config.imu.lever_arm_m)
+            try:
+                self.track.add(trajectory_of(navigator.passed, engine.recursion.error, arm))
+            except InputError as error:
+                self.complaints.complain(str(self.track.path), "disk", str(error))
+            navigator.passed = []
+        if (state := navigator.state()) is not None:
+            self.keeper.keep(state)
+
+    def close(self) -> None:
+        self.keeper.close()
+        self.recorder.close()
+        self._events.close()
+
+
+def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
+    """The newest rows of a recording; fixes relative to an origin."""
+    with path.open("rb") as file:
+        header = file.readline()
+        file.seek(max(len(header), path.stat().st_size - LAST_BYTES))
+        rows = file.read()
+    if len(header) + len(rows) < path.stat().st_size:
+        rows = rows[rows.index(b"\n") + 1 :]
+    frame = pd.read_csv(io.BytesIO(header + rows[: rows.rfind(b"\n") + 1]))
+    if origin is not None and frame["fix_lat"].notna().any():
+        lat, lon = frame.pop("fix_lat").to_numpy(float), frame.pop("fix_lon").to_numpy(float)
+        frame["fix_north"], frame["fix_east"], _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+    return frame
+
+
+def _as_recorded(config: Config) -> dict[str, Any]:
+    """What of a configuration has been applied to a recording already."""
+    imu = config.imu.model_copy(update={"mag": Mag()})
+    return {"columns": {}, "units": {}, "imu": imu, "online": config.online.model_copy(update={"delay_s": {}})}
+
+
+@dataclass
+class Session:
+    """Runs until the sources end or are closed.
+
+    Attributes
+    ----------
+    navigator : the estimate
+    outputs : where solutions go
+    rate_hz : of solutions
+    files : None = nothing is kept
+    complaints : what sources, outputs and disk complain of
+    solution : the newest
+    solutions : count
+    """
+
+    navigator: Navigator
+    outputs: Sequence[Receiver]
+    complaints: Complaints
+    rate_hz: float = 10.0
+    files: Files | None = None
+    solution: Solution | None = None
+    solutions: int = 0
+    _due: float = -math.inf
+    _watchers: list[Callable[[Solution], None]] = field(default_factory=list)
+    _took: "array[float]" = field(default_factory=lambda: array("f"))
+    _resumed: float = -math.inf
+
+    def watch(self, show: Callable[[Solution], None]) -> None:
+        """Have every solution shown."""
+        self._watchers.append(show)
+
+    def updates(self) -> dict[str, float]:
+        """Times that updates of the filter took [ms]."""
+        took = 1e3 * np.array(self._took or [0.0])
+        return {
+            "count": len(self._took),
+            "mean_ms": float(took.mean()),
+            "p99_ms": float(np.percentile(took, 99)),
+            "max_ms": float(took.max()),
+        }
+
+    def resume(self) -> None:
+        """Go on from the last checkpoint and what was recorded after it."""
+        assert self.files is not None
+        if self.files.state is not None:
+            self.navigator.restore(self.files.state)
+        recorded = self.files.recorded(self.navigator.origin)
+        if recorded is not None:
+            self.navigator.replay(recorded)
+        self._resumed = self.navigator.time
+
+    def run(self, feed: Iterable[Message | None]) -> None:
+        """Work off what the sources say."""
+        navigator, files = self.navigator, self.files
+        for message in feed:
+            if message is None:
+                self._wait()
+            elif not self._known(message):
+                self._take(message)
+            if navigator.time >= self._due:
+                self._send()
+            if files is not None:
+                files.keep(navigator)
+        navigator.finish()
+        self._send()
+        if files is not None:
+            files.keep(navigator, now=True)
+
+    def _known(self, message: Message) -> bool:
+        """Whether a recording that is read again says what had been received before a crash."""
+        return self.navigator.clocks.trust and message.stamp is not None and message.stamp <= self._resumed
+
+    def _take(self, message: Message) -> None:
+        before = self.navigator.updates
+        rows = self.navigator.take(message)
+        if self.navigator.updates > before:
+            self._took.append(self.navigator.update_s)
+        if not rows:
+            self.complaints.complain(message.source, "stamp", "a stamp seconds off from those before, left out")
+        if self.files is not None:
+            for time, readings in rows:
+                self.files.recorder.write(time, message.arrival, readings)
+
+    def _wait(self) -> None:
+        """Time goes on where nothing comes."""
+        now = self.navigator.clocks.now(host.time())
+        if now is not None and now - self.navigator.time > QUIET_S:
+            self.navigator.tick(now)
+        if self.navigator.waits_for:
+            self.complaints.complain("start", "waiting", self.navigator.waits_for)
+
+    def _send(self) -> None:
+        solution = self.navigator.solution()
+        if solution is None:
+            return
+        self._due = (math.floor(self.navigator.time * self.rate_hz + 1e-6) + 1) / self.rate_hz
+        self.solution, self.solutions = solution, self.solutions + 1
+        if self.files is not None:
+            self.files.note(solution.events)
+        for output in self.outputs:
+            output.send(solution)
+        for show in self._watchers:
+            show(solution)

@@ -1,0 +1,73 @@
+"""The filtered trajectory, written while it grows."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.estimators.error_vector import ErrorVector
+from rovgraph.estimators.fixed_lag import Mark
+from rovgraph.estimators.results import body_trajectory
+from rovgraph.geometry import Array
+from rovgraph.state import POSE, VELOCITY, stack_states
+from rovgraph.trajectory import Trajectory
+
+
+def trajectory_of(marks: Sequence[Mark], error: ErrorVector, lever_arm_m: Array) -> Trajectory:
+    """The body's origin at keyframes, at least one.
+
+    Parameters
+    ----------
+    marks : of the filter
+    error : layout of their covariances
+    lever_arm_m : ndarray, shape (3,), of the IMU
+    """
+    P = np.array([mark.known.P for mark in marks])
+    pose, velocity = (P[:, error.columns[v], error.columns[v]] for v in (POSE, VELOCITY))
+    states = stack_states([mark.known.state for mark in marks])
+    return body_trajectory([mark.interval for mark in marks], states, lever_arm_m, pose, velocity)
+
+
+class TrackFile:
+    """A trajectory CSV that rows are added to.
+
+    Parameters
+    ----------
+    path : new, or to go on with
+    until : keep rows of an older file up to this time [s]; the rest comes again
+
+    Raises
+    ------
+    InputError : the file cannot be written
+    """
+
+    def __init__(self, path: Path, until: float = -np.inf) -> None:
+        self.path = path
+        kept: list[str] = []
+        with _one_line(path):
+            if path.exists() and np.isfinite(until):
+                lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+                kept = [x for x in lines[1:] if x.endswith("\n") and float(x.split(",", 1)[0]) < until - 5e-5]
+                kept = lines[:1] + kept if kept else []
+            partial = path.with_name(f".{path.name}.partial")
+            partial.write_text("".join(kept), encoding="utf-8")
+            partial.replace(path)
+        self._begun = bool(kept)
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Add epochs, later than those before."""
+        with _one_line(self.path):
+            trajectory.write_csv(self.path, more=self._begun)
+        self._begun = True
+
+
+@contextlib.contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); free some space or choose another --out"
+        ) from None
