@@ -221,14 +221,17 @@ class Assembler:
         time : [s]
         state : State of one epoch, of the newest keyframe
         """
-        twin = self.copy()
-        twin._between = []
-        for sample in samples:
-            twin._take_sample(sample)
-        if time - twin._imu[-1][0] > twin._longest_step:
+        rows = [(t, *values) for t, values in self._imu]
+        rows += [(m.time, *self._R_bs @ m.values[:3], *self._R_bs @ m.values[3:6]) for m in samples]
+        if time - rows[-1][0] > self._longest_step:
             force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
-            twin._imu.append((time, np.concatenate([force, np.zeros(3)]) + state.bias[0]))
-        return twin._close(time, None)
+            rows.append((time, *np.concatenate([force, np.zeros(3)]) + state.bias[0]))
+        imu = np.array(rows)
+        bridged = bool(np.diff(imu[:, 0]).max() > self._longest_step)
+        params = self._bridge if bridged else self._params
+        pim, _ = preintegrate(params, self.bias, imu, self._start, np.empty(0), time)
+        rate_b, rate_sd = self._rate(imu, time)
+        return Interval(self._index + 1, time, self._segment, rate_b, rate_sd, pim, bridged, [])
 
     def _take_until(self, time: float) -> list[Interval]:
         """Place what has waited for the IMU up to a time."""

@@ -42,11 +42,12 @@ class NoiseFloor:
 
     def take(self, odd: Array) -> None:
         """Take an interval's scatter, shape (m, 6), of `rovgraph.graph.preintegration.scatter`."""
-        self._recent.append(1.4826 * np.median(np.abs(odd), axis=0).reshape(2, 3).mean(axis=1))
+        middle = np.sort(np.abs(odd), axis=0)[len(odd) // 2]
+        self._recent.append(1.4826 * middle.reshape(2, 3).mean(axis=1))
 
     def densities(self) -> Array:
         """Noise densities to go on with, shape (2,); blind to knocks."""
         if len(self._recent) < ENOUGH:
             return self.believed
-        seen = np.median(self._recent, axis=0)
+        seen = np.sort(self._recent, axis=0)[len(self._recent) // 2]
         return np.where(seen > NOISIER * self.believed, seen, self.believed)

@@ -55,7 +55,7 @@ class Watch:
     told: str = ""
     time: float = -np.inf
     period: float = 0.0
-    values: Array | None = None
+    values: bytes = b""
     since: float = 0.0  # of the first of equal values
     equal: int = 0
     turned: Array = field(default_factory=lambda: np.zeros(3))  # meanwhile [rad]
@@ -78,17 +78,17 @@ class Faults:
     def look(self, m: Measurement) -> Verdict:
         """Whether a measurement is one."""
         watch = self.watches.setdefault(m.sensor, Watch())
-        repeated = watch.values is not None and np.array_equal(m.values, watch.values, equal_nan=True)
-        if repeated:
+        values = m.values.tobytes()
+        if values == watch.values:
             watch.equal += 1
         else:
             watch.equal, watch.since, watch.turned = 1, m.time, np.zeros(3)
         if m.sensor == "imu":
             self._turn(m, watch)
-        if np.isfinite(watch.time):
+        if watch.time > -np.inf:
             step = m.time - watch.time
             watch.period = step if not watch.period else watch.period + 0.05 * (step - watch.period)
-        watch.time, watch.values = max(m.time, watch.time), m.values
+        watch.time, watch.values = max(m.time, watch.time), values
         if m.sensor == "dvl":
             return self._ping(m, watch)
         frozen = watch.equal >= FROZEN.get(m.sensor, np.inf) or (
