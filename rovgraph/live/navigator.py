@@ -107,7 +107,10 @@ class Navigator:
         known = self.engine.marks[0].interval.time if self.engine is not None else -np.inf
         for measurement in log.measurements():
             if measurement.time > known:
-                self._consider(measurement)
+                values = measurement.values
+                if measurement.sensor == "mag":
+                    values = self.config.imu.mag.calibrated(values[None])[0]
+                self._consider(measurement._replace(values=values))
 
     def tick(self, time: float) -> None:
         """Time goes on, with measurements or without."""
@@ -191,6 +194,8 @@ class Navigator:
                 self.origin = self._startup.origin = (float(values[0]), float(values[1]))
             north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
             sensor, values = "fix", np.array([north, east, values[2]])
+        elif sensor == "mag":
+            values = self.config.imu.mag.calibrated(values[None])[0]
         newest = self._newest.get(sensor, -np.inf)
         if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
             self.left_out[sensor, "more often than can be used"] += 1

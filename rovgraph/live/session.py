@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pymap3d
 
-from rovgraph.config import Config, Mag
+from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.live.checkpoint import read_checkpoint
 from rovgraph.live.complaints import Complaints
@@ -136,8 +136,7 @@ def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
 
 def _as_recorded(config: Config) -> dict[str, Any]:
     """What of a configuration has been applied to a recording already."""
-    imu = config.imu.model_copy(update={"mag": Mag()})
-    return {"columns": {}, "units": {}, "imu": imu, "online": config.online.model_copy(update={"delay_s": {}})}
+    return {"columns": {}, "units": {}, "online": config.online.model_copy(update={"delay_s": {}})}
 
 
 @dataclass
