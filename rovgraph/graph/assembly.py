@@ -236,9 +236,8 @@ class Assembler:
     def _take_until(self, time: float) -> list[Interval]:
         """Place what has waited for the IMU up to a time."""
         done: list[Interval] = []
-        ready = [m for m in self._waiting if m.time <= time]
-        self._waiting = self._waiting[len(ready) :]
-        for m in ready:
+        while self._waiting and self._waiting[0].time <= time:
+            m = self._waiting.pop(0)
             done += self._silence(m.time)
             if m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
                 done.append(self._close(m.time, m))
@@ -282,8 +281,7 @@ class Assembler:
             if len(self._periods) < 50:
                 self._periods.append(period)
                 self._longest_step = GAP_PERIODS * float(np.median(self._periods))
-        rotated = np.concatenate([self._R_bs @ m.values[:3], self._R_bs @ m.values[3:6]])
-        self._imu.append((m.time, rotated))
+        self._imu.append((m.time, (m.values[:6].reshape(2, 3) @ self._R_bs.T).ravel()))
 
     def _before_first(self, time: float) -> None:
         """Nothing can be placed before the first IMU sample."""
@@ -301,7 +299,8 @@ class Assembler:
 
     def _close(self, time: float, ping: Placed | None) -> Interval:
         """Make a keyframe at ``time`` and the interval that leads to it."""
-        every = np.array([[t, *values] for t, values in self._imu])
+        times, values = zip(*self._imu, strict=True)
+        every = np.column_stack([times, np.array(values)])
         samples = every[_first(every, self._start) :]
         pim, bridged = None, False
         attached: list[Attached] = []
@@ -378,7 +377,8 @@ class Assembler:
         step = float(t[-1] - t[0]) / max(len(t) - 1, 1)
         if len(t) < 2:
             return rate[0], float(self._noise[1])
-        weights = np.linalg.pinv(np.vander(t / HALF_WINDOW_S, degree + 1))[-1]
+        powers = np.vander(t / HALF_WINDOW_S, degree + 1)
+        weights = np.linalg.solve(powers.T @ powers, powers.T)[-1]
         if step > self._longest_step:
             return weights @ rate, BRIDGE_GYR
         return weights @ rate, float(self._noise[1]) * math.sqrt(float(weights @ weights) / step)

@@ -103,7 +103,7 @@ def preintegrate(
     inside = t[(t > start) & (t < end)]
     grid = np.unique(np.concatenate([[start], inside, stops, [end]]))
     middle, dt = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
-    signal = np.column_stack([np.interp(middle, t, column) for column in imu[:, 1:].T])
+    signal = _between(imu, middle)
     acc, gyr = signal[:, :3], signal[:, 3:]
     acc = acc + 0.5 * dt[:, None] * cross(gyr - bias[3:], acc - bias[:3])
 
@@ -115,6 +115,15 @@ def preintegrate(
         if k + 1 in wanted:
             taken[k + 1] = _snapshot(pim)
     return pim, [taken[k] for k in np.searchsorted(grid, stops).tolist()]
+
+
+def _between(imu: Array, time: Array) -> Array:
+    """The samples, linear in between and held beyond the ends; shape (k, 6)."""
+    t, samples = imu[:, 0], imu[:, 1:]
+    after = np.minimum(np.maximum(t.searchsorted(time), 1), len(t) - 1)
+    before = after - 1
+    share = np.minimum(np.maximum((time - t[before]) / (t[after] - t[before]), 0.0), 1.0)
+    return np.asarray(samples[before] + share[:, None] * (samples[after] - samples[before]))
 
 
 def _snapshot(pim: gtsam.PreintegratedCombinedMeasurements) -> Snapshot:
