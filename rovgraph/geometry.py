@@ -4,11 +4,14 @@ Everything here takes and returns NumPy arrays. ``(..., 3)`` and ``(..., 3, 3)``
 that any leading axes broadcast.
 """
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+Coefficient = TypeVar("Coefficient", float, Array)
 
 
 def wrap_angle(angle: ArrayLike) -> Array:
@@ -156,9 +159,11 @@ def exp_and_right_jacobian(rotvec: Array) -> tuple[Array, Array]:
 _EYE = np.eye(3)
 
 
-def _rodrigues(rotvec: Array) -> tuple[Array, Array, Array]:
-    """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3 of the angle a, shapes (..., 1, 1)."""
+def _rodrigues(rotvec: Array) -> tuple[Array, Array, Array] | tuple[float, float, float]:
+    """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3 of the angle a, shapes (..., 1, 1) or none."""
     square = rotvec[..., None, :] @ rotvec[..., :, None]
+    if square.size == 1 and square.item() < _SMALL:  # plain floats, at a third of the time
+        return _series(square.item())
     if square.size and square.max() < _SMALL:  # the series are exact to rounding, the closed forms are not
         return _series(square)
     small = square < _SMALL
@@ -171,7 +176,7 @@ def _rodrigues(rotvec: Array) -> tuple[Array, Array, Array]:
 _SMALL = 1e-4  # square of an angle
 
 
-def _series(square: Array) -> tuple[Array, Array, Array]:
+def _series(square: Coefficient) -> tuple[Coefficient, Coefficient, Coefficient]:
     return (
         1.0 - square * (1.0 / 6.0 - square / 120.0),
         0.5 - square * (1.0 / 24.0 - square / 720.0),

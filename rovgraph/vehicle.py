@@ -151,7 +151,7 @@ class Hydrodynamics:
         by = {
             "velocity": H["velocity"] - skew(w_b) * self.mass,
             "rate": skew(momentum),
-            "force": np.broadcast_to(np.eye(3), (*drag.shape, 3)),
+            "force": _diagonal(np.ones_like(drag)),
             "drag": H["drag"],
         }
         a = inverse * (force_b + drag - cross(w_b, momentum))
@@ -182,7 +182,7 @@ class Hydrodynamics:
         by = {
             "rate": H["rate"] + skew(spin) - skew(w_b) * self.inertia,
             "down": np.broadcast_to(by_down, (*drag.shape, 3)),
-            "moment": np.broadcast_to(np.eye(3), (*drag.shape, 3)),
+            "moment": _diagonal(np.ones_like(drag)),
             "turning_drag": H["turning_drag"],
         }
         alpha = inverse * (moment_b + drag + righting - cross(w_b, spin))
@@ -209,7 +209,6 @@ class Hydrodynamics:
 
 def _drag(v: Array, linear: Array, quadratic: Array, change: Array, names: tuple[str, str]) -> tuple[Array, Jacobians]:
     """Drag of each axis by itself, and its derivatives by the motion and by relative changes."""
-    change = np.broadcast_to(change, (*v.shape[:-1], 6))
     first, second = -linear * v, -quadratic * np.abs(v) * v
     scaled = (1.0 + change[..., :3]) * linear, (1.0 + change[..., 3:]) * quadratic
     by_motion = -scaled[0] - 2.0 * scaled[1] * np.abs(v)
@@ -220,4 +219,7 @@ def _drag(v: Array, linear: Array, quadratic: Array, change: Array, names: tuple
 
 def _diagonal(v: Array) -> Array:
     """Diagonal matrices, shape (..., 3, 3)."""
-    return np.asarray(v[..., None] * np.eye(3))
+    return np.asarray(v[..., None] * _EYE)
+
+
+_EYE = np.eye(3)

@@ -145,11 +145,14 @@ class Block:
         weight = loss_and_weight(r, self.instrument.loss)[1]
         root = np.sqrt(weight)[:, None]
         r, H = r * root, {v: h * root[..., None] for v, h in H.items()}
-        jacobians, unit = list(H.values()), gtsam.noiseModel.Unit.Create(r.shape[1])
-        for k in np.flatnonzero(gate).tolist():
-            terms = [(j, h[k]) for j, h in zip(self.keys[k], jacobians, strict=True)]
-            # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
-            graph.push_back(gtsam.GaussianConditional(terms, 1, r[k], unit))
+        unit = gtsam.noiseModel.Unit.Create(r.shape[1])
+        for keys, jacobians, own, inside in zip(
+            self.keys, zip(*H.values(), strict=True), r, gate.tolist(), strict=True
+        ):
+            if inside:
+                terms = list(zip(keys, jacobians, strict=True))
+                # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
+                graph.push_back(gtsam.GaussianConditional(terms, 1, own, unit))
 
     def custom_factor(self, k: int = 0) -> gtsam.CustomFactor:
         """Measurement ``k`` as a nonlinear factor that calls back into `linearize`."""

@@ -132,15 +132,16 @@ class Recursion:
         s = self.setup
         model, z, R = s.imu, s.samples[epoch], s.R_imu
         assert model is not None
-        used = len(z) if self._complete[epoch] else 6
+        if not self._complete[epoch]:
+            z, R = z[:6], R[:6, :6]
 
         def innovate(x: Array) -> Linearized:
             h, H = model(x, epoch)
             if self.true_motion is not None:
                 H = model(self.true_motion.state(self.time, x), epoch)[1]
-            return z[:used] - h[:used], H[:used]
+            return z - h[: len(z)], H[: len(z)]
 
-        result = self._update(innovate, R[:used, :used])
+        result = self._update(innovate, R)
         if epoch % KEEP_EVERY == 0:
             self.imu.keep(epoch, *result)
 
