@@ -131,6 +131,18 @@ def test_process_noise_is_that_of_noisy_samples():
     assert (np.abs(found - np.eye(15)) < 4.5 * sd).all()
 
 
+def test_all_measurements_of_a_keyframe_together_are_linearised_as_each_alone(estimator):
+    interval = max(estimator.intervals, key=lambda i: len({a.sensor for a in i.attached}))
+    state = estimator.filtered[interval.index].state
+    assert len(interval.attached) > 2
+    assert any(a.motion.dt for a in interval.attached)
+    together = estimator.recursion.linearize(state, interval.attached)
+    for attached, (r, H) in zip(interval.attached, together, strict=True):
+        alone, jacobians = estimator.recursion.block([attached]).linearize(state)
+        np.testing.assert_allclose(r, alone[0], atol=1e-9)
+        np.testing.assert_allclose(H, estimator.error.matrix(jacobians)[0], atol=1e-9)
+
+
 # coordinates of the error
 
 
