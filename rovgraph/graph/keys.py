@@ -11,6 +11,8 @@ from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY
 
 _LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b"} | {v.name: v.letter for v in TABLE.values()}
 _FIRST = {variable: int(gtsam.symbol(letter, 0)) for variable, letter in _LETTER.items()}
+_INDICES = 1 << 56  # of a letter
+_STATES = {_FIRST[variable] // _INDICES for variable in DIMENSION}
 
 
 def key(variable: str, index: int = 0) -> int:
@@ -22,6 +24,12 @@ def key(variable: str, index: int = 0) -> int:
     index : keyframe; for a calibration variable that walks its segment, else 0
     """
     return _FIRST[variable] + index  # consecutive, as gtsam.symbol makes them
+
+
+def state_index(key: int) -> tuple[bool, int]:
+    """Whether a key is of a keyframe's state, and the index of its keyframe, else of its segment."""
+    letter, index = divmod(key, _INDICES)
+    return letter in _STATES, index
 
 
 def key_name(key: int) -> str:

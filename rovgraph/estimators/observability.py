@@ -1,0 +1,111 @@
+"""What a dive says of the calibration: information, and a verdict on every component.
+
+Everything is in units of the prior's sd: with D the information that the data add, the
+covariance of the calibration is (1 + D)^-1 and an sd of 1 is the prior repeated.
+
+A graph is linearised where its noisy estimate lies. A velocity that is constant in truth
+trembles in the estimate, the graph takes the trembling for accelerations, and these seem to
+show the DVL's misalignment and scale: along a straight line it claims to know what cannot be
+known. What noise adds is found by adding as much again (simulation extrapolation; Cook and
+Stefanski 1994): noise of the states is drawn from the graph's own posterior, put onto the
+estimate with both signs, and what the information gains by that is taken off once.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rovgraph.calibration import TABLE, Belief
+from rovgraph.geometry import Array
+from rovgraph.graph.batch import Problem, Solution
+from rovgraph.graph.information import knowledge, noise_of_states
+
+# sd after the dive over sd before. Below 0.3 more than nine tenths of the variance are gone and
+# the data outweigh the prior ten to one, so a wrong prior does no harm. Above 0.8 the data have less
+# than 0.6 of the prior's weight: what they say is mostly the prior repeated, and no estimate to act upon.
+OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE = 0.3, 0.8
+OBSERVABLE, WEAK, UNOBSERVABLE = "observable", "weak", "unobservable"
+DECEIVED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale")  # by noise: multiplied by the velocity in what is measured
+DOUBTFUL_ABOVE = 0.15  # an sd of these below it is not noise: half an hour straight ahead takes it to 0.43
+
+
+def verdict(ratio: float) -> str:
+    """What an sd, as a part of the prior's, means."""
+    if ratio > UNOBSERVABLE_ABOVE:
+        return UNOBSERVABLE
+    return OBSERVABLE if ratio < OBSERVABLE_BELOW else WEAK
+
+
+def data_information(covariance: Array, prior_sd: Array) -> Array:
+    """What the data add to the prior, in units of its sd.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., c, c), after the dive
+    prior_sd : ndarray, shape (c,)
+    """
+    relative = covariance / np.outer(prior_sd, prior_sd)
+    return np.linalg.inv(relative) - np.eye(len(prior_sd))
+
+
+def relative_covariance(information: Array) -> Array:
+    """Covariance after the dive in units of the prior's sd; ``information`` has shape (..., c, c)."""
+    return np.linalg.inv(np.eye(information.shape[-1]) + information)
+
+
+def prior_sd(problem: Problem, beliefs: Mapping[str, Belief], segment: int, segment_s: float) -> Array:
+    """sd of the estimated calibration before any data, shape (c,); what walks has walked to a segment.
+
+    Parameters
+    ----------
+    problem, beliefs : of the dive
+    segment, segment_s : of time, and its length [s]
+    """
+    sds = []
+    for name, walk in problem.unknowns.walks.items():
+        walked = np.hypot(beliefs[name].sd, walk * np.sqrt(segment * segment_s))
+        sds.append(np.full(TABLE[name].dim, walked))
+    return np.concatenate(sds)
+
+
+def without_noise(
+    problem: Problem, solution: Solution, keyframes: Sequence[int], information: Array, sd: Array
+) -> Array:
+    """Information without what noise in the estimate pretends.
+
+    Parameters
+    ----------
+    problem, solution : the dive
+    keyframes : at which the information was found, m
+    information : ndarray, shape (m, c, c), of the data, linearised at the solution
+    sd : ndarray, shape (m, c), of the prior
+    """
+    noise = noise_of_states(problem, solution.values, solution.gates)
+    more = np.zeros_like(information)
+    for sign in (1.0, -1.0):
+        moved = solution.values.retract(noise.scale(sign))
+        noisier = knowledge(problem, moved, solution.gates, keyframes).calibration
+        more += 0.5 * np.array([data_information(P, s) for P, s in zip(noisier, sd, strict=True)])
+    value, axes = np.linalg.eigh(2.0 * information - more)
+    return np.asarray((axes * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
+
+
+def relative_sd(problem: Problem, solution: Solution, sd: Mapping[str, Array], prior: Mapping[str, Array]) -> Array:
+    """sd of the calibration at the end as a part of the prior's, shape (c,), without what noise pretends.
+
+    That is looked for only where it could change a verdict.
+
+    Parameters
+    ----------
+    problem, solution : the dive
+    sd, prior : name -> ndarray, shape (dim,), sd after and before, of the estimated variables in their order
+    """
+    before = np.concatenate(list(prior.values()))
+    ratio = np.concatenate(list(sd.values())) / before
+    at_stake = np.concatenate([np.full(len(own), name in DECEIVED) for name, own in sd.items()])
+    if not (at_stake & (ratio > DOUBTFUL_ABOVE) & (ratio <= UNOBSERVABLE_ABOVE)).any():
+        return ratio
+    end = [problem.count - 1]
+    seen = data_information(knowledge(problem, solution.values, solution.gates, end).calibration, before)
+    own = without_noise(problem, solution, end, seen, before[None])
+    return np.sqrt(np.diagonal(relative_covariance(own), axis1=1, axis2=2))[0]

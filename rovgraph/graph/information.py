@@ -1,0 +1,133 @@
+"""What the data up to a time say of the calibration, from the graph's own information matrix.
+
+The dive is eliminated piece by piece in the order of time, by QR. What is left of a piece are
+conditionals of its last keyframe and of the calibration; they go into the next piece as factors.
+So every piece ends with the exact joint covariance given all data so far, every factor
+linearised at the same values, and the whole costs one elimination.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.calibration import TABLE
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.graph.batch import Gates, Problem, indeterminate
+from rovgraph.graph.keys import key, state_index
+from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known at m keyframes, from all data up to each.
+
+    Attributes
+    ----------
+    keyframe : ndarray of int, shape (m,)
+    covariance : ndarray, shape (m, 9 + c, 9 + c), joint of the newest bias (6), of the first
+        keyframe's attitude (3), body axes, and of the calibration (c) in the order of
+        `Problem.unknowns`, of what walks the newest value
+    """
+
+    keyframe: NDArray[np.int64]
+    covariance: Array
+
+    @property
+    def calibration(self) -> Array:
+        """Covariance of the calibration alone, shape (m, c, c)."""
+        return self.covariance[:, OTHERS:, OTHERS:]
+
+
+OTHERS = 9  # components of a joint covariance before those of the calibration
+
+
+def knowledge(problem: Problem, values: gtsam.Values, gates: Gates, keyframes: Sequence[int]) -> Knowledge:
+    """What is known from the data up to each of some keyframes.
+
+    Parameters
+    ----------
+    problem, values, gates : the dive, and where to linearise it
+    keyframes : increasing, the first beyond 0
+
+    Raises
+    ------
+    InputError : the data do not determine some variable, which is named
+    """
+    left, joint = gtsam.GaussianFactorGraph(), []
+    for end, piece in zip(keyframes, _pieces(problem, problem.linearize(values, gates), keyframes), strict=True):
+        piece.push_back(left)
+        last = [key(v, end) for v in (POSE, VELOCITY, BIAS)]
+        last += [key(POSE, 0), *_calibration(problem, int(problem.segment[end]))]
+        left, root = eliminate(piece, last)
+        joint.append(root @ root.T)
+    P = np.array(joint)
+    begin = DIMENSION[POSE] + DIMENSION[VELOCITY]
+    rows = np.r_[begin : begin + 9, begin + 12 : P.shape[1]]  # without the first position
+    return Knowledge(np.array(keyframes), P[:, rows[:, None], rows])
+
+
+def eliminate(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> tuple[gtsam.GaussianFactorGraph, Array]:
+    """All but the last keys eliminated.
+
+    Returns
+    -------
+    left : what is known of the last keys, as factors
+    root : ndarray, shape (d, d), square root of their joint covariance, in their order
+    """
+    net = _sequential(linear, last)
+    left, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    for i, one in enumerate(last, net.size() - len(last)):
+        left.push_back(net.at(i))
+        order.push_back(one)
+    return left, np.linalg.inv(np.linalg.qr(left.jacobian(order)[0], mode="r"))
+
+
+def noise_of_states(problem: Problem, values: gtsam.Values, gates: Gates, seed: int = 1) -> gtsam.VectorValues:
+    """A draw of the error that the data's noise leaves in the states, calibration held.
+
+    Parameters
+    ----------
+    problem, values, gates : the dive, and where to linearise it
+    seed : of the draw
+    """
+    segments = range(int(problem.segment[-1]) + 1)
+    held = list(dict.fromkeys(one for s in segments for one in _calibration(problem, s)))
+    net, rng = _sequential(problem.linearize(values, gates), held), np.random.default_rng(seed)
+    white, first_held = gtsam.VectorValues(), net.size() - len(held)
+    for i in range(net.size()):
+        rows = net.at(i).rows()
+        white.insert(net.at(i).firstFrontalKey(), rng.standard_normal(rows) if i < first_held else np.zeros(rows))
+    return net.backSubstitute(white)
+
+
+def _sequential(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> gtsam.GaussianBayesNet:
+    """All eliminated one by one, by QR, the last keys at the end in their order."""
+    ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(last), True)
+    try:
+        return linear.eliminateSequential(ordering, gtsam.EliminateQR)
+    except RuntimeError as error:
+        raise InputError(indeterminate(error)) from None
+
+
+def _calibration(problem: Problem, segment: int) -> list[int]:
+    return [problem.unknowns.key(name, segment) for name in problem.unknowns.estimated]
+
+
+def _pieces(
+    problem: Problem, linear: gtsam.GaussianFactorGraph, ends: Sequence[int]
+) -> list[gtsam.GaussianFactorGraph]:
+    """Factors by the piece of the dive that they complete, the last keyframe of each in ``ends``; later ones left out."""
+    begins = np.searchsorted(problem.segment, np.arange(int(problem.segment[-1]) + 1))  # first keyframe of a segment
+    pieces = [gtsam.GaussianFactorGraph() for _ in ends]
+    newest = []
+    for k in range(linear.size()):
+        own = [state_index(one) for one in linear.at(k).keys()]  # noqa: SIM118
+        newest.append(max(i if state else begins[i] for state, i in own))
+    for k, piece in enumerate(np.searchsorted(ends, newest).tolist()):
+        if piece < len(pieces):
+            pieces[piece].push_back(linear.at(k))
+    return pieces
