@@ -41,6 +41,7 @@ class CalibrationEstimate:
     label, unit, about : from the table of calibration variables
     estimated : False = held at its mean
     value, sd, prior_mean, prior_sd : [unit]; sd is 0 where held
+    verdict : observable, weak or unobservable; empty where held, or not known
     """
 
     label: str
@@ -51,6 +52,7 @@ class CalibrationEstimate:
     sd: float
     prior_mean: float
     prior_sd: float
+    verdict: str = ""
 
 
 @dataclass(frozen=True)

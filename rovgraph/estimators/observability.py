@@ -45,27 +45,30 @@ def data_information(covariance: Array, prior_sd: Array) -> Array:
     prior_sd : ndarray, shape (c,)
     """
     relative = covariance / np.outer(prior_sd, prior_sd)
-    return np.linalg.inv(relative) - np.eye(len(prior_sd))
+    return np.asarray(np.linalg.inv(relative) - np.eye(len(prior_sd)))
 
 
 def relative_covariance(information: Array) -> Array:
     """Covariance after the dive in units of the prior's sd; ``information`` has shape (..., c, c)."""
-    return np.linalg.inv(np.eye(information.shape[-1]) + information)
+    return np.asarray(np.linalg.inv(np.eye(information.shape[-1]) + information))
 
 
-def prior_sd(problem: Problem, beliefs: Mapping[str, Belief], segment: int, segment_s: float) -> Array:
-    """sd of the estimated calibration before any data, shape (c,); what walks has walked to a segment.
+def prior_sd(problem: Problem, beliefs: Mapping[str, Belief], segment: int, segment_s: float) -> dict[str, Array]:
+    """sd of the estimated calibration before any data; what walks has walked to a segment.
 
     Parameters
     ----------
     problem, beliefs : of the dive
     segment, segment_s : of time, and its length [s]
+
+    Returns
+    -------
+    dict : name -> ndarray, shape (dim,)
     """
-    sds = []
-    for name, walk in problem.unknowns.walks.items():
-        walked = np.hypot(beliefs[name].sd, walk * np.sqrt(segment * segment_s))
-        sds.append(np.full(TABLE[name].dim, walked))
-    return np.concatenate(sds)
+    return {
+        name: np.full(TABLE[name].dim, np.hypot(beliefs[name].sd, walk * np.sqrt(segment * segment_s)))
+        for name, walk in problem.unknowns.walks.items()
+    }
 
 
 def without_noise(
@@ -90,22 +93,28 @@ def without_noise(
     return np.asarray((axes * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
 
-def relative_sd(problem: Problem, solution: Solution, sd: Mapping[str, Array], prior: Mapping[str, Array]) -> Array:
-    """sd of the calibration at the end as a part of the prior's, shape (c,), without what noise pretends.
+def relative_sd(
+    problem: Problem, solution: Solution, sd: Mapping[str, Array], prior: Mapping[str, Array]
+) -> dict[str, Array]:
+    """sd of the calibration at the end as a part of the prior's, without what noise pretends.
 
     That is looked for only where it could change a verdict.
 
     Parameters
     ----------
     problem, solution : the dive
-    sd, prior : name -> ndarray, shape (dim,), sd after and before, of the estimated variables in their order
+    sd, prior : name -> ndarray, shape (dim,), sd after and before, of the estimated variables
+
+    Returns
+    -------
+    dict : name -> ndarray, shape (dim,)
     """
-    before = np.concatenate(list(prior.values()))
-    ratio = np.concatenate(list(sd.values())) / before
-    at_stake = np.concatenate([np.full(len(own), name in DECEIVED) for name, own in sd.items()])
-    if not (at_stake & (ratio > DOUBTFUL_ABOVE) & (ratio <= UNOBSERVABLE_ABOVE)).any():
+    ratio = {name: sd[name] / prior[name] for name in problem.unknowns.estimated}
+    at_stake = [r for name in DECEIVED if name in ratio for r in ratio[name]]
+    if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
-    end = [problem.count - 1]
+    end, before = [problem.count - 1], np.concatenate([prior[name] for name in ratio])
     seen = data_information(knowledge(problem, solution.values, solution.gates, end).calibration, before)
-    own = without_noise(problem, solution, end, seen, before[None])
-    return np.sqrt(np.diagonal(relative_covariance(own), axis1=1, axis2=2))[0]
+    own = relative_covariance(without_noise(problem, solution, end, seen, before[None]))[0]
+    parts = np.split(np.sqrt(np.diag(own)), np.cumsum([len(r) for r in ratio.values()])[:-1])
+    return dict(zip(ratio, parts, strict=True))

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
+from rovgraph.estimators.observability import verdict
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.measurements import Block
@@ -61,6 +62,7 @@ def calibration_estimates(
     sensors: Sequence[str],
     values: Mapping[str, Array],
     covariance: Mapping[str, Array],
+    relative_sd: Mapping[str, Array] | None = None,
 ) -> list[CalibrationEstimate]:
     """One entry per component of every variable of a sensor that is used.
 
@@ -70,6 +72,8 @@ def calibration_estimates(
     sensors : in use
     values : name -> ndarray, shape (dim,)
     covariance : name -> ndarray, shape (dim, dim), of those that were estimated
+    relative_sd : name -> ndarray, shape (dim,), sd as a part of the prior's, where it is known better than
+        from ``covariance``
     """
     out = []
     for name, belief in beliefs.items():
@@ -80,7 +84,9 @@ def calibration_estimates(
         for k, label in enumerate(belief.variable.labels):
             v = belief.variable
             numbers = (float(values[name][k]), float(sd[k]), float(belief.mean[k]), belief.sd if estimated else 0.0)
-            out.append(CalibrationEstimate(label, v.unit, v.about, estimated, *numbers))
+            ratio = float(sd[k]) / belief.sd if relative_sd is None or not estimated else float(relative_sd[name][k])
+            known = verdict(ratio) if estimated else ""
+            out.append(CalibrationEstimate(label, v.unit, v.about, estimated, *numbers, known))
     return out
 
 

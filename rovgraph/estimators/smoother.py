@@ -1,6 +1,6 @@
 """Batch smoothing of a whole dive."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.observability import prior_sd, relative_sd
 from rovgraph.estimators.results import (
     bias_histories,
     body_trajectory,
@@ -36,6 +37,21 @@ from rovgraph.state import BIAS, POSE, VELOCITY
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
 PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
 CENTRED_REACH_S = 0.1  # around the lateness that was found
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The graph of a dive, solved.
+
+    Attributes
+    ----------
+    intervals, problem : the dive, each measurement where it belongs
+    solution : its optimum
+    """
+
+    intervals: list[Interval]
+    problem: Problem
+    solution: Solution
 
 
 @dataclass
@@ -81,10 +97,14 @@ class BatchSmoother:
         incremental : has the same dive, without a lag; its optimum is taken instead of
             the batch solver's
         """
+        return _estimate(self.optimum(incremental), self.beginning)
+
+    def optimum(self, incremental: IncrementalEstimator | None = None) -> Optimum:
+        """The graph of the dive and its optimum; ``incremental`` as in `solve`."""
         b = self.beginning
         if incremental is not None:
             problem = make_problem(self.intervals, b.start, b.config, beliefs(b.config), b.instruments)
-            return _estimate(problem, solution_at(problem, incremental.engine.values()), b, self.intervals)
+            return Optimum(self.intervals, problem, solution_at(problem, incremental.engine.values()))
         dive, calibration = self, None
         for _ in range(MAX_PLACINGS):
             problem = make_problem(dive.intervals, b.start, b.config, beliefs(b.config), b.instruments)
@@ -95,7 +115,7 @@ class BatchSmoother:
             if anew is None:
                 break
             dive, calibration = anew, {name: value.reshape(-1, value.shape[-1])[-1] for name, value in found.items()}
-        return _estimate(problem, solution, b, dive.intervals)
+        return Optimum(dive.intervals, problem, solution)
 
     def placed_anew(self, calibration: Mapping[str, Array]) -> "BatchSmoother | None":
         """The same dive with its measurements where late stamps were found to belong; None = they are there already.
@@ -121,8 +141,9 @@ class BatchSmoother:
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
 
 
-def _estimate(problem: Problem, solution: Solution, b: Beginning, intervals: Sequence[Interval]) -> Estimate:
+def _estimate(optimum: Optimum, b: Beginning) -> Estimate:
     """The optimum with its marginal covariances."""
+    intervals, problem, solution = optimum.intervals, optimum.problem, optimum.solution
     tree, n = marginals(problem, solution), problem.count
     states = problem.states(solution.values)
     trajectory = body_trajectory(
@@ -141,14 +162,18 @@ def _estimate(problem: Problem, solution: Solution, b: Beginning, intervals: Seq
         segment = problem.segment[rows] if walk else np.zeros_like(rows)
         P = covariances(tree, name, int(segment[-1]) + 1)
         value = np.broadcast_to(states.calibration[name], (n, P.shape[1]))[rows]
-        sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))[segment]
-        history[name] = calibration_history(name, trajectory.time[rows], value, sd)
+        spread = np.sqrt(np.diagonal(P, axis1=1, axis2=2))[segment]
+        history[name] = calibration_history(name, trajectory.time[rows], value, spread)
         final[name], known[name] = value[-1], P[-1]
+    priors = beliefs(b.config)
+    sd = {name: np.sqrt(np.diag(P)) for name, P in known.items()}
+    before = prior_sd(problem, priors, int(problem.segment[-1]), b.config.graph.segment_s)
+    relative = relative_sd(problem, solution, sd, before)
     here = {sensor: states.at(block.keyframe) for sensor, block in problem.blocks.items()}
     return Estimate(
         "smoothed",
         trajectory,
-        calibration_estimates(beliefs(b.config), list(problem.blocks), final, known),
+        calibration_estimates(priors, list(problem.blocks), final, known, relative),
         history,
         residual_frame(problem.blocks, here, solution.weights),
         {

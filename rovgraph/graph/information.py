@@ -13,7 +13,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.calibration import TABLE
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Gates, Problem, indeterminate
@@ -120,7 +119,7 @@ def _calibration(problem: Problem, segment: int) -> list[int]:
 def _pieces(
     problem: Problem, linear: gtsam.GaussianFactorGraph, ends: Sequence[int]
 ) -> list[gtsam.GaussianFactorGraph]:
-    """Factors by the piece of the dive that they complete, the last keyframe of each in ``ends``; later ones left out."""
+    """Factors by the piece of the dive that they complete; ``ends`` are the last keyframes of each."""
     begins = np.searchsorted(problem.segment, np.arange(int(problem.segment[-1]) + 1))  # first keyframe of a segment
     pieces = [gtsam.GaussianFactorGraph() for _ in ends]
     newest = []

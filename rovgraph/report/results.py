@@ -142,7 +142,7 @@ def calibration_frame(estimates: Sequence[Estimate]) -> pd.DataFrame:
     """Rows of calibration.csv: one per estimate and scalar component, angles in degrees."""
     columns = [
         "estimate", "label", "unit", "estimated", "value", "sd", "prior_mean", "prior_sd",
-        "moved", "moved_in_prior_sd", "narrowing", "about",
+        "moved", "moved_in_prior_sd", "narrowing", "verdict", "about",
     ]  # fmt: skip
     rows = []
     for estimate in estimates:
@@ -152,8 +152,8 @@ def calibration_frame(estimates: Sequence[Estimate]) -> pd.DataFrame:
             moved = value - mean
             believed = prior_sd if prior_sd > 0 else np.nan
             relative = (moved / believed, narrowing(c))
-            row = (estimate.kind, c.label, unit, c.estimated, value, sd, mean, prior_sd, moved, *relative, c.about)
-            rows.append(row)
+            row = (estimate.kind, c.label, unit, c.estimated, value, sd, mean, prior_sd, moved, *relative)
+            rows.append((*row, c.verdict, c.about))
     return pd.DataFrame(rows, columns=pd.Index(columns))
 
 
@@ -226,7 +226,13 @@ def _calibration_numbers(entry: CalibrationEstimate) -> dict[str, Any]:
     factor, unit = shown(entry.unit)
     tail = key_suffix(unit)
     numbers = {name + tail: factor * getattr(entry, name) for name in ("value", "sd", "prior_mean", "prior_sd")}
-    return {"estimated": entry.estimated, **numbers, "narrowing": narrowing(entry), "about": entry.about}
+    return {
+        "estimated": entry.estimated,
+        **numbers,
+        "narrowing": narrowing(entry),
+        "verdict": entry.verdict or None,
+        "about": entry.about,
+    }
 
 
 def _residual_frame(estimate: Estimate) -> pd.DataFrame:

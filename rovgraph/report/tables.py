@@ -9,10 +9,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
+from rovgraph.estimators.observability import UNOBSERVABLE
 from rovgraph.report.results import main_first, narrowing
 from rovgraph.report.units import plus_minus, shown
-
-HARDLY = 0.8  # an sd narrowed less than to this part of the prior's is the prior repeated
 
 
 def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> Table:
@@ -57,13 +56,13 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
         caption_justify="left",
         box=SIMPLE_HEAD,
     )
-    for heading in ("variable", "value ± sd", "prior ± sd", "sd narrowed to"):
-        table.add_column(heading, justify="left" if heading == "variable" else "right")
+    for heading in ("variable", "value ± sd", "prior ± sd", "sd narrowed to", "verdict"):
+        table.add_column(heading, justify="left" if heading in ("variable", "verdict") else "right")
     for entry in sorted(main.calibration, key=lambda e: not e.estimated):
         tail = f" [{shown(entry.unit)[1]}]" if entry.unit != "1" else ""
         table.add_row(escape(entry.label + tail), *_calibration_cells(entry), style="" if entry.estimated else "dim")
-    if any(narrowing(e) > HARDLY for e in main.calibration):
-        table.caption = "hardly: this dive says little about it, the value is mostly the prior"
+    if any(e.verdict == UNOBSERVABLE for e in main.calibration):
+        table.caption = "unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)"
     return table
 
 
@@ -78,16 +77,14 @@ def duration(seconds: float | None) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
 
-def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str]:
+def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:
     factor = shown(entry.unit)[0]
     value, sd, mean, prior_sd = (factor * x for x in (entry.value, entry.sd, entry.prior_mean, entry.prior_sd))
     if not entry.estimated:
-        return plus_minus(value, 0.0), "", "held"
+        return plus_minus(value, 0.0), "", "held", ""
     ratio = narrowing(entry)
     narrowed = "unknown" if not np.isfinite(ratio) else f"{100 * ratio:.2g} %"
-    if ratio > HARDLY:
-        narrowed = f"hardly, {100 * ratio:.0f} %"
-    return plus_minus(value, sd), plus_minus(mean, prior_sd), narrowed
+    return plus_minus(value, sd), plus_minus(mean, prior_sd), narrowed, entry.verdict
 
 
 def _number(value: float | None) -> float:

@@ -1,0 +1,213 @@
+"""What of the calibration a dive can show: what ``rovgraph observe`` does.
+
+From the graph's own information matrix: states are marginalised exactly, by QR, and what
+noise in the estimate pretends is taken off (`rovgraph.estimators.observability`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rovgraph.calibration import TABLE, Variable
+from rovgraph.config import Config, beliefs
+from rovgraph.errors import InputError
+from rovgraph.estimators.dive import assemble
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.observability import (
+    data_information,
+    prior_sd,
+    relative_covariance,
+    verdict,
+    without_noise,
+)
+from rovgraph.estimators.smoother import Optimum
+from rovgraph.geometry import Array
+from rovgraph.graph.information import OTHERS, knowledge
+from rovgraph.log import Log
+from rovgraph.studies.choices import known_variable
+
+Progress = Callable[[str, float], None]
+TIMES = 30  # at which the sd is told
+FEWEST_KEYFRAMES = 20
+OTHER_LABELS = (
+    "acc_bias_x", "acc_bias_y", "acc_bias_z", "gyr_bias_x", "gyr_bias_y", "gyr_bias_z",
+    "start_roll", "start_pitch", "start_heading",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What a dive shows of its calibration; c scalar components that are estimated.
+
+    Attributes
+    ----------
+    labels, variables : c, names of the components, and the rows of the table they belong to
+    prior_sd : ndarray, shape (c,), before the dive [unit of each]
+    claimed_sd : ndarray, shape (c,), after it as the graph has it, linearised at its noisy estimate
+    information : ndarray, shape (c, c), that the data add to the prior, in units of the prior's sd,
+        without what noise pretends
+    correlation : ndarray, shape (c, c + 9), of the components with each other, then with the last
+        bias (accelerometer, gyro; body axes) and the start's roll, pitch and heading
+    time : ndarray, shape (m,), since the start of the dive [s]
+    relative : ndarray, shape (m, c), sd given the data up to then, as a part of the prior's
+    """
+
+    labels: tuple[str, ...]
+    variables: tuple[Variable, ...]
+    prior_sd: Array
+    claimed_sd: Array
+    information: Array
+    correlation: Array
+    time: Array
+    relative: Array
+
+    @property
+    def covariance(self) -> Array:
+        """Of the calibration after the dive, shape (c, c) [units of the components]."""
+        return relative_covariance(self.information) * np.outer(self.prior_sd, self.prior_sd)
+
+    @property
+    def ratio(self) -> Array:
+        """sd after the dive over sd before, shape (c,)."""
+        return np.sqrt(np.diag(relative_covariance(self.information)))
+
+    @property
+    def sd(self) -> Array:
+        """sd after the dive, shape (c,) [unit of each]."""
+        return self.ratio * self.prior_sd
+
+    @property
+    def bits(self) -> Array:
+        """Information gained on each component, shape (c,)."""
+        return np.asarray(-np.log2(self.ratio))
+
+    @property
+    def joint_bits(self) -> float:
+        """Information gained on all of them together."""
+        return joint_bits(self.information)
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Of each component: observable, weak or unobservable."""
+        return [verdict(ratio) for ratio in self.ratio.tolist()]
+
+    def correlated(self, beyond: float = 0.5) -> list[tuple[str, str, float]]:
+        """Pairs with their correlation, the strongest first."""
+        names, c = (*self.labels, *OTHER_LABELS), len(self.labels)
+        pairs = [(i, j) for i in range(c) for j in range(i + 1, len(names)) if abs(self.correlation[i, j]) > beyond]
+        pairs.sort(key=lambda p: -abs(self.correlation[p]))
+        return [(names[i], names[j], float(self.correlation[i, j])) for i, j in pairs]
+
+
+def joint_bits(information: Array) -> float:
+    """Information gained on all components together; ``information`` in units of the prior's sd."""
+    return float(0.5 * np.linalg.slogdet(np.eye(len(information)) + information)[1] / np.log(2.0))
+
+
+def observe(
+    log: Log, config: Config, also: Sequence[str] = (), progress: Progress = lambda what, done: None
+) -> Observability:
+    """What a recorded dive shows of the calibration.
+
+    Parameters
+    ----------
+    log, config : the dive, and what is believed of vehicle and sensors
+    also : calibration variables to estimate beside those of the configuration
+    progress : called now and then
+
+    Raises
+    ------
+    InputError : an unknown variable, one whose sensor is not in use, none at all; too short a log
+    """
+    for name in also:
+        known_variable(name)
+    dive = solved(log, estimating(config, also), progress)
+    missing = set(also) - set(dive.problem.unknowns.estimated)
+    if missing:
+        name = min(missing)
+        needed = " or ".join(TABLE[name].sensors)
+        raise InputError(f"{log.source}: {name} cannot be estimated, no {needed} in use; take it out of --estimate")
+    return examined(dive, config=estimating(config, also), progress=progress)
+
+
+def estimating(config: Config, also: Sequence[str]) -> Config:
+    """A configuration that estimates some variables more."""
+    entries = {name: getattr(config.calibration, name).model_copy(update={"estimate": True}) for name in also}
+    return config.model_copy(update={"calibration": config.calibration.model_copy(update=entries)})
+
+
+def solved(log: Log, config: Config, progress: Progress = lambda what, done: None) -> Optimum:
+    """The graph of a dive and its optimum.
+
+    Raises
+    ------
+    InputError : too short a log, nothing to estimate
+    """
+    progress("smoothing", 0.1)
+    batch = assemble(log, initialise(log, config))
+    if len(batch.intervals) < FEWEST_KEYFRAMES:
+        raise InputError(
+            f"{log.source}: {len(batch.intervals)} keyframes say nothing about calibration, "
+            f"{FEWEST_KEYFRAMES} are the fewest; take a longer log"
+        )
+    dive = batch.optimum()
+    if not dive.problem.unknowns.estimated:
+        raise InputError(
+            f"{log.source}: no calibration variable is estimated; give --estimate, or estimate: true in calibration"
+        )
+    return dive
+
+
+def examined(
+    dive: Optimum, config: Config, noisy: bool = True, progress: Progress = lambda what, done: None
+) -> Observability:
+    """What a solved dive shows of the calibration.
+
+    Parameters
+    ----------
+    dive, config : of `solved`
+    noisy : take off what noise in the estimate pretends
+    progress : called now and then
+    """
+    problem, solution = dive.problem, dive.solution
+    progress("information", 0.6)
+    ends = np.unique(np.linspace(0, problem.count - 1, TIMES + 1).round().astype(int)[1:]).tolist()
+    known = knowledge(problem, solution.values, solution.gates, ends)
+    priors = beliefs(config)
+    walked = [prior_sd(problem, priors, s, config.graph.segment_s) for s in problem.segment[ends].tolist()]
+    before = np.array([np.concatenate(list(sd.values())) for sd in walked])
+    seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
+    progress("information", 0.7)
+    own = without_noise(problem, solution, ends, seen, before) if noisy else seen
+    variables = tuple(TABLE[name] for name in problem.unknowns.estimated for _ in TABLE[name].labels)
+    labels = tuple(label for name in problem.unknowns.estimated for label in TABLE[name].labels)
+    begin = dive.intervals[0].time
+    relative = np.sqrt(np.diagonal(relative_covariance(own), axis1=1, axis2=2))
+    return Observability(
+        labels,
+        variables,
+        before[-1],
+        np.sqrt(np.diag(known.calibration[-1])),
+        own[-1],
+        _correlation(known.covariance[-1], relative_covariance(own[-1]) * np.outer(before[-1], before[-1])),
+        np.array([dive.intervals[end].time - begin for end in ends]),
+        relative * before / before[-1],
+    )
+
+
+def _correlation(joint: Array, calibration: Array) -> Array:
+    """Of the calibration with itself and with others, shape (c, c + others).
+
+    Parameters
+    ----------
+    joint : ndarray, covariance of others and calibration, as the graph has it
+    calibration : ndarray, shape (c, c), covariance without what noise pretends: what the others
+        depend on the calibration stays, given that
+    """
+    own, other = slice(OTHERS, None), slice(0, OTHERS)
+    slope = np.linalg.solve(joint[own, own], joint[own, other]).T
+    spread = joint[other, other] + slope @ (calibration - joint[own, own]) @ slope.T
+    both = np.concatenate([calibration, calibration @ slope.T], axis=1)
+    sd = np.sqrt(np.concatenate([np.diag(calibration), np.diag(spread)]))
+    return np.asarray(both / np.outer(sd[: len(calibration)], sd))
