@@ -20,6 +20,7 @@ from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.robust_update import normalised_squared, robust_update
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Attached, Interval
+from rovgraph.graph.coasting import BLIND_S, coasted, coasting
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import Block, make_block, motions, whitening
@@ -154,9 +155,14 @@ class ErrorStateRecursion:
     def predict(self, interval: Interval, before: Gaussian) -> Step:
         """The next keyframe, from the IMU alone; calibration walks."""
         assert interval.pim is not None
+        duration = interval.pim.deltaTij()
         state = predict(interval, before.state)
-        F, Q = np.eye(self.error.size), self._walk * interval.pim.deltaTij()
-        F[:15, :15], Q[:15, :15] = transition(interval, before.state, state)
+        F, Q = np.eye(self.error.size), self._walk * duration
+        if interval.bridged and duration > BLIND_S:
+            state = coasted(before.state, state, duration)
+            F[:15, :15], Q[:15, :15] = coasting(before.state, state, duration, before.P)
+        else:
+            F[:15, :15], Q[:15, :15] = transition(interval, before.state, state)
         P = F @ before.P @ F.T + Q
         return Step(F, Q, Gaussian(state, 0.5 * (P + P.T)))
 
