@@ -1,15 +1,29 @@
 """The folder of a run of the online mode, before it and after."""
 
+import contextlib
 import json
 import shutil
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rovgraph.config import Config
     from rovgraph.live.session import Session
 
 
-def prepared(out: Path, force: bool, resume: bool) -> None:
+def configured(config: Path | None, out: Path | None, resume: bool) -> "Config":
+    """The configuration of a run; where one goes on and none is given, that of the run before."""
+    from rovgraph.config import load_config
+    from rovgraph.live.session import SETTINGS
+
+    if resume and config is None and out is not None and (out / SETTINGS).is_file():
+        config = out / SETTINGS
+    return load_config(config)
+
+
+def prepared(out: Path, force: bool, resume: bool, sources: Sequence[str]) -> None:
     """Make the folder, or see that it can be gone on with.
 
     Raises
@@ -20,24 +34,28 @@ def prepared(out: Path, force: bool, resume: bool) -> None:
     from rovgraph.report.folder import check_writable
 
     if resume:
-        if not out.is_dir():
-            raise InputError(f"{out}: nothing to resume, there is no such folder; leave out --resume")
         return
+    for url in sources:
+        if _file(url).is_relative_to(out.resolve()):
+            raise InputError(f"{url}: lies in {out}, which would be replaced; choose another --out")
     check_writable(out, force)
-    if out.exists():
-        shutil.rmtree(out)
-    out.mkdir(parents=True)
+    try:
+        if out.exists():
+            shutil.rmtree(out)
+        out.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made ({error.strerror}); choose another --out") from None
     _write_summary(out, {"state": "running"})
+
+
+def unfinished(out: Path | None) -> None:
+    """Say in the folder that no estimate was made."""
+    if out is not None:
+        _write_summary(out, {"state": "no estimate"})
 
 
 def finished(out: Path, session: "Session", refine: bool) -> None:
     """Write the summary, and smooth what was recorded."""
-    import sys
-
-    from rovgraph.cli.smooth import smooth
-    from rovgraph.errors import InputError
-    from rovgraph.live.session import CONFIG, RECORDING
-
     solution, navigator = session.solution, session.navigator
     assert solution is not None
     _write_summary(
@@ -55,18 +73,43 @@ def finished(out: Path, session: "Session", refine: bool) -> None:
             "updates": session.updates(),
         },
     )
-    if not refine:
-        return
-    print("smoothing what was recorded", file=sys.stderr)
+    if refine:
+        _smooth(out)
+    _note(f"results in {out}")
+
+
+def _smooth(out: Path) -> None:
+    """What was recorded, into a folder beside it; standard output is for solutions."""
+    from rovgraph.cli.smooth import smooth
+    from rovgraph.errors import InputError
+    from rovgraph.live.session import CONFIG, RECORDING
+
+    _note("smoothing what was recorded; Ctrl-C leaves it out")
     try:
-        smooth(out / RECORDING, out / CONFIG, out / "smoothed", force=True)
+        with contextlib.redirect_stdout(sys.stderr):
+            smooth(out / RECORDING, out / CONFIG, out / "smoothed", force=True)
     except InputError as error:
-        print(f"not smoothed: {error}", file=sys.stderr)
+        _note(f"not smoothed: {error}")
+    except KeyboardInterrupt:
+        _note("not smoothed: interrupted")
+
+
+def _note(text: str) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def _file(url: str) -> Path:
+    """The file of a URL, if it is one of a file."""
+    return Path(url.partition(":")[2].partition("?")[0]).resolve()
 
 
 def _write_summary(out: Path, content: dict[str, Any]) -> None:
     from rovgraph.report.folder import STAMP, SUMMARY
 
     partial = out / f".{SUMMARY}.partial"
-    partial.write_text(json.dumps({**STAMP, "kind": "online", **content}, indent=2) + "\n", encoding="utf-8")
-    partial.replace(out / SUMMARY)
+    try:
+        partial.write_text(json.dumps({**STAMP, "kind": "online", **content}, indent=2) + "\n", encoding="utf-8")
+        partial.replace(out / SUMMARY)
+    except OSError as error:
+        _note(f"{out / SUMMARY}: cannot be written ({error.strerror}); free some space")

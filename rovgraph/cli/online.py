@@ -2,9 +2,12 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from rovgraph.live.solution import Solution
 
 
 class Engine(StrEnum):
@@ -34,11 +37,10 @@ def online(
 
     Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:127.0.0.1:14550 --out dive
     """
-    import signal
     import sys
 
-    from rovgraph.cli.live_folder import finished, prepared
-    from rovgraph.config import load_config
+    from rovgraph.cli.ending import ended_by_signals
+    from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
     from rovgraph.errors import InputError
     from rovgraph.live.clocks import Clocks
     from rovgraph.live.complaints import Complaints
@@ -51,37 +53,51 @@ def online(
 
     if resume and out is None:
         raise InputError("--resume needs the folder to go on with, --out")
-
-    def say(source: str, kind: str, text: str) -> None:
-        print(f"{source}: {kind}: {text}", file=sys.stderr)
-
-    settings, complaints = load_config(config), Complaints(say)
-    feed = Feed(open_sources(sources, complaints, settings, speed), complaints)
-    recorded = feed.recorded
+    settings, complaints = configured(config, out, resume), Complaints(_say)
+    opened = open_sources(sources, complaints, settings, speed)
+    if resume and any(source.pace == 1.0 for source in opened):
+        raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
+    feed = Feed(opened, complaints)
     wanted = output if output is not None else ([] if sys.stdout.isatty() else ["-"])
-    outputs = [open_output(url, complaints.complain, patient=recorded) for url in wanted]
+    outputs = [open_output(url, complaints.complain, patient=feed.recorded) for url in wanted]
     files = None
     if out is not None:
-        prepared(out, force, resume)
+        prepared(out, force, resume, sources)
         files = Files(out, settings, complaints, resume)
-    navigator = Navigator(settings, patient=recorded, clocks=Clocks(trust=recorded))
+    navigator = Navigator(settings, patient=feed.recorded, clocks=Clocks(trust=feed.replayed))
     session = Session(navigator, outputs, complaints, rate, files)
-    signal.signal(signal.SIGINT, lambda *_: feed.close())
-    signal.signal(signal.SIGTERM, lambda *_: feed.close())
-    try:
-        with StatusLine() as status:
-            session.watch(status.show)
-            if resume:
-                session.resume()
-            session.run(feed)
-    finally:
-        navigator.close()
-        for each in outputs:
-            each.close()
-        if files is not None:
-            files.close()
+    with ended_by_signals(feed.close):
+        try:
+            with StatusLine() as status:
+                session.watch(status.show)
+                if not status.shown:
+                    session.watch(_tell)
+                if resume:
+                    session.resume()
+                session.run(feed)
+        finally:
+            navigator.close()
+            for each in outputs:
+                each.close()
+            if files is not None:
+                files.close()
     if session.solution is None:
+        unfinished(out)
         raise InputError(f"no estimate was made: {navigator.waits_for or 'no measurement of an IMU came'}")
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     if out is not None:
         finished(out, session, refine)
+
+
+def _say(source: str, kind: str, text: str) -> None:
+    """A line for a person, wherever that person has gone."""
+    import contextlib
+    import sys
+
+    with contextlib.suppress(OSError, ValueError):
+        print(f"{source}: {kind}: {text}", file=sys.stderr, flush=True)
+
+
+def _tell(solution: "Solution") -> None:
+    """Events, where nothing else shows them."""
+    for event in solution.events:
+        _say(f"{event.time:.1f} s: {event.source}", event.kind, event.text)

@@ -45,6 +45,11 @@ class Feed:
         """Whether all sources are files that are read as fast as they are taken."""
         return all(source.pace == math.inf for source in self._sources)
 
+    @property
+    def replayed(self) -> bool:
+        """Whether all arrivals are recorded ones, so that nothing has to do with the host's clock."""
+        return all(source.pace not in (None, 1.0) for source in self._sources)
+
     def __iter__(self) -> Iterator[Message | None]:
         """Messages in the order of arrival; None whenever nothing came for `TICK_S`."""
         return self._merged() if self.recorded else self._arriving()

@@ -86,7 +86,7 @@ class Navigator:
         time = self.clocks.time(message)
         while self.clocks.news:
             clock, text = self.clocks.news.pop()
-            self._events.append(Event(self.time, clock, "clock", text))
+            self.say(clock, "clock", text)
         if time is None:
             self.left_out[message.source, "impossible stamp"] += 1
             return []
@@ -104,6 +104,8 @@ class Navigator:
 
     def replay(self, log: Log) -> None:
         """Take what had been received before, on the estimator's clock."""
+        if self.origin is None:
+            self.origin = self._startup.origin = log.origin
         known = self.engine.marks[0].interval.time if self.engine is not None else -np.inf
         for measurement in log.measurements():
             if measurement.time > known:
@@ -111,6 +113,10 @@ class Navigator:
                 if measurement.sensor == "mag":
                     values = self.config.imu.mag.calibrated(values[None])[0]
                 self._consider(measurement._replace(values=values))
+
+    def say(self, source: str, kind: str, text: str) -> None:
+        """Have the next solution tell of an event."""
+        self._events.append(Event(self.time, source, kind, text))
 
     def tick(self, time: float) -> None:
         """Time goes on, with measurements or without."""
@@ -123,6 +129,7 @@ class Navigator:
             self._begin(beginning)
         if self.engine is not None:
             self.engine.finish()
+            self.engine.marks.extend(self.passed[-1:])  # for a last solution
         self.close()
 
     def close(self) -> None:
@@ -207,6 +214,8 @@ class Navigator:
         """Give a measurement to the engine, unless it is none."""
         self.time = max(self.time, m.time)
         verdict = self.faults.look(m)
+        if m.sensor != "imu":  # whose silence is seen by others that go on
+            self.faults.tick(self.time)
         if verdict.retract_since is not None and self.engine is not None:
             self.engine.retract(m.sensor, verdict.retract_since)
         if not verdict.use:
@@ -229,7 +238,10 @@ class Navigator:
         if state is not None:
             self.engine.restore(state)
             return
-        self._events += [Event(self.time, "start", "assumed", text) for text in beginning.assumptions]
+        for text in beginning.assumptions:
+            self.say("start", "assumed", text)
+        for text in self._startup.doubts:
+            self.say("start", "warning", text)
         for measurement in self._startup.measurements:
             self._feed(self.engine, measurement)
         self._startup.measurements = []
@@ -253,7 +265,8 @@ class Navigator:
     def _take_events(self) -> tuple[Event, ...]:
         """All that happened since they were last taken."""
         if self._renewals is not None:
-            self._events += [Event(self.time, "renewal", "lost", text) for text in self._renewals.news]
+            for text in self._renewals.news:
+                self.say("renewal", "lost", text)
             self._renewals.news = []
         events = [*self._events, *self.faults.events, *self.health.events]
         self._events, self.faults.events, self.health.events = [], [], []

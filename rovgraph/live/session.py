@@ -16,6 +16,7 @@ import pymap3d
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
+from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.live.checkpoint import read_checkpoint
 from rovgraph.live.complaints import Complaints
 from rovgraph.live.keeper import Keeper
@@ -28,8 +29,9 @@ from rovgraph.log import log_from_frame
 from rovgraph.log.streams import Log
 
 RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
-CONFIG, EVENTS = "config.yaml", "events.jsonl"
+CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  # of the recording; of the run
 KEEP_S = 0.5  # of the host's time between checkpoints
+UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
 LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
 QUIET_S = 0.5  # without the IMU, after which time goes on by the host's clock
 
@@ -62,6 +64,8 @@ class Files:
     resume: bool = False
 
     def __post_init__(self) -> None:
+        if self.resume and not self.folder.is_dir():
+            raise InputError(f"{self.folder}: nothing to resume, there is no such folder; leave out --resume")
         checkpoint = self.folder / CHECKPOINT
         self.state: dict[str, Any] | None = None
         until = -np.inf
@@ -74,8 +78,11 @@ class Files:
         self.track = TrackFile(self.folder / TRACK, until)
         self.keeper = Keeper(checkpoint, self.complaints.complain)
         recorded = self.config.model_copy(update=_as_recorded(self.config))
-        (self.folder / CONFIG).write_text(recorded.to_yaml(), encoding="utf-8")
-        self._events = (self.folder / EVENTS).open("a", encoding="utf-8", buffering=1)
+        try:
+            (self.folder / CONFIG).write_text(recorded.to_yaml(), encoding="utf-8")
+            (self.folder / SETTINGS).write_text(self.config.to_yaml(), encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be written ({error.strerror}); free some space") from None
         self._kept = host.monotonic()
 
     def recorded(self, origin: tuple[float, float] | None) -> Log | None:
@@ -92,8 +99,15 @@ class Files:
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""
-        for event in events:
-            self._events.write(json.dumps(vars(event)) + "\n")
+        lines = "".join(json.dumps(vars(event)) + "\n" for event in events)
+        if not lines:
+            return
+        path = self.folder / EVENTS
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(lines)
+        except OSError as error:
+            self.complaints.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
 
     def keep(self, navigator: Navigator, now: bool = False) -> None:
         """Put the track and a checkpoint on disk, if it is time to."""
@@ -103,20 +117,32 @@ class Files:
         engine = navigator.engine
         if engine is None:
             return
-        if navigator.passed:
-            arm = np.array(engine.beginning.config.imu.lever_arm_m)
-            try:
-                self.track.add(trajectory_of(navigator.passed, engine.recursion.error, arm))
-            except InputError as error:
-                self.complaints.complain(str(self.track.path), "disk", str(error))
-            navigator.passed = []
-        if (state := navigator.state()) is not None:
+        written = self._add(navigator, engine)
+        if written and (state := navigator.state()) is not None:  # a checkpoint may not be ahead of the track
             self.keeper.keep(state)
+
+    def _add(self, navigator: Navigator, engine: FixedLag) -> bool:
+        """Add to the track what the lag has passed, if the disk takes it."""
+        if not navigator.passed:
+            return True
+        arm = np.array(engine.beginning.config.imu.lever_arm_m)
+        try:
+            self.track.add(trajectory_of(navigator.passed, engine.recursion.error, arm))
+        except InputError as error:
+            self.complaints.complain(str(self.track.path), "disk", str(error))
+            del navigator.passed[:-UNWRITTEN]
+            return False
+        navigator.passed = []
+        return True
+
+    def finish(self, navigator: Navigator) -> None:
+        """Put the end of the track on disk; the checkpoint stays where it was, from there one may go on."""
+        if navigator.engine is not None:
+            self._add(navigator, navigator.engine)
 
     def close(self) -> None:
         self.keeper.close()
         self.recorder.close()
-        self._events.close()
 
 
 def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
@@ -189,6 +215,7 @@ class Session:
         if recorded is not None:
             self.navigator.replay(recorded)
         self._resumed = self.navigator.time
+        self.navigator.say("start", "resumed", f"goes on from what was received up to {self._resumed:.1f} s")
 
     def run(self, feed: Iterable[Message | None]) -> None:
         """Work off what the sources say."""
@@ -202,10 +229,12 @@ class Session:
                 self._send()
             if files is not None:
                 files.keep(navigator)
+        if files is not None:
+            files.keep(navigator, now=True)
         navigator.finish()
         self._send()
         if files is not None:
-            files.keep(navigator, now=True)
+            files.finish(navigator)
 
     def _known(self, message: Message) -> bool:
         """Whether a recording that is read again says what had been received before a crash."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from rovgraph.check.values import angles, gravity, turn_rates
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.fixed_lag import place
@@ -24,12 +25,14 @@ class Startup:
     config : as the user gave it
     origin : latitude and longitude [deg] of north = east = 0, or None
     waits_for : why it has not begun, one line; empty while the first seconds go by
+    doubts : what looks wrong with the first seconds, one line each
     """
 
     config: Config
     origin: tuple[float, float] | None = None
     waits_for: str = ""
     measurements: list[Measurement] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
     _next: float | None = None
 
     def add(self, measurement: Measurement) -> Beginning | None:
@@ -52,8 +55,12 @@ class Startup:
             first = imu[-1] - HEADING_WITHIN_S
             self.measurements = [m for m in self.measurements if m.time >= first]
         expected = LATER | (COMPASSES if self.config.heading.sources is not None else set())
+        log = gathered(self.measurements, "so far", self.origin)
         try:
-            return initialise(gathered(self.measurements, "so far", self.origin), self.config, expected)
+            beginning = initialise(log, self.config, expected)
         except InputError as error:
             self.waits_for = str(error)
             return None
+        findings = [finding for check in (gravity, turn_rates, angles) for finding in check(log, self.config)]
+        self.doubts = [f"{finding.sensor}: {finding.text}" for finding in findings if finding.level != "ok"]
+        return beginning

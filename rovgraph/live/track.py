@@ -1,6 +1,7 @@
 """The filtered trajectory, written while it grows."""
 
 import contextlib
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -57,9 +58,14 @@ class TrackFile:
         self._begun = bool(kept)
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add epochs, later than those before."""
+        """Add epochs, later than those before: all of them, or where the disk is full none."""
         with _one_line(self.path):
-            trajectory.write_csv(self.path, more=self._begun)
+            size = self.path.stat().st_size
+            try:
+                trajectory.write_csv(self.path, more=self._begun)
+            except OSError:
+                os.truncate(self.path, size)
+                raise
         self._begun = True
 
 

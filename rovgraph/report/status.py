@@ -40,6 +40,11 @@ class StatusLine:
             )
             self._live.start()
 
+    @property
+    def shown(self) -> bool:
+        """Whether there is a terminal to draw on."""
+        return self._live is not None
+
     def show(self, solution: Solution) -> None:
         """Keep a solution for the next drawing."""
         self._events = (*self._events, *solution.events)[-NEWEST:]
