@@ -157,6 +157,7 @@ print("MODULES", *sys.modules)
     [
         [],
         ["smooth"],
+        ["online"],
         ["evaluate"],
         ["compare"],
         ["check"],

@@ -1,0 +1,171 @@
+"""Live dives for the tests: measurements through a `Navigator`, and a vehicle that serves its data over TCP."""
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from dives import Simulated, true_at
+
+from rovgraph.geometry import Array
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.message import Message, Reading
+from rovgraph.live.navigator import Navigator
+from rovgraph.live.session import QUIET_S
+from rovgraph.live.solution import Solution
+from rovgraph.log import STREAMS, Measurement
+
+Alter = Callable[[Measurement], Iterable[Measurement]]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What a navigator said of a simulated dive."""
+
+    case: Simulated
+    navigator: Navigator
+    solutions: list[Solution]
+
+    @property
+    def time(self) -> Array:
+        return np.array([s.time for s in self.solutions])
+
+    @property
+    def errors(self) -> Array:
+        """Of the horizontal position, shape (n, 2) [m]."""
+        return (np.array([s.position for s in self.solutions]) - true_at(self.case, self.time).p_n)[:, :2]
+
+    @property
+    def sd(self) -> Array:
+        return np.array([s.position_sd for s in self.solutions])[:, :2]
+
+    def events(self, source: str) -> list[str]:
+        return [e.kind for s in self.solutions for e in s.events if e.source == source]
+
+    def sd_at(self, time: float) -> float:
+        return float(np.linalg.norm(self.sd[np.searchsorted(self.time, time)]))
+
+
+def navigator(case: Simulated, trust: bool = True) -> Navigator:
+    return Navigator(case.config, patient=True, renew=False, clocks=Clocks(trust=trust))
+
+
+def flown(case: Simulated, alter: Alter = lambda m: [m], rate: float = 4.0) -> Flight:
+    """A dive whose measurements arrive at once, each changed, left out or repeated on its way."""
+    nav, solutions, due = navigator(case), [], -np.inf
+    for measurement in case.log.measurements():
+        for m in alter(measurement):
+            while nav.time + QUIET_S < m.time and nav.engine is not None:  # as a session does
+                nav.tick(nav.time + QUIET_S)
+                solutions += [s for s in [nav.solution()] if s is not None]
+            nav.take(message(m))
+        solution = nav.solution() if nav.time >= due else None
+        if solution is not None:
+            solutions.append(solution)
+            due = nav.time + 1.0 / rate
+    nav.finish()
+    return Flight(case, nav, solutions + [s for s in [nav.solution()] if s is not None])
+
+
+def message(m: Measurement, arrival: float | None = None, stamp: float | None = None, source: str = "sim") -> Message:
+    return Message(
+        source,
+        m.time if arrival is None else arrival,
+        m.time if stamp is None else stamp,
+        (Reading(m.sensor, m.values),),
+    )
+
+
+def row(m: Measurement) -> bytes:
+    """A measurement as a JSON line."""
+    cells = dict(zip(STREAMS[m.sensor], m.values.tolist(), strict=True))
+    return json.dumps({"time": m.time, **{k: v for k, v in cells.items() if v == v}}).encode() + b"\n"
+
+
+@dataclass
+class Vehicle:
+    """Serves lines over TCP, each when its time has come, to whoever is connected then.
+
+    What comes while nobody listens is lost, as it is on board.
+
+    Parameters
+    ----------
+    lines : (time since the start [s], line), in order
+    speed : seconds of the dive per second
+    """
+
+    lines: list[tuple[float, bytes]]
+    speed: float = 1.0
+    sent: float = -np.inf  # time of the newest line that a client took
+    done: threading.Event = field(default_factory=threading.Event)
+
+    def __post_init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.settimeout(0.05)
+        self.port = self._listener.getsockname()[1]
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+
+    @property
+    def url(self) -> str:
+        return f"tcp://127.0.0.1:{self.port}"
+
+    def _serve(self) -> None:
+        client, begin, k = None, None, 0
+        while not self._stop.is_set():
+            if client is None:
+                with suppress(TimeoutError):
+                    client = self._listener.accept()[0]
+                    begin = time.monotonic() if begin is None else begin
+            if begin is None:
+                continue
+            until = self.speed * (time.monotonic() - begin)
+            first = k
+            while k < len(self.lines) and self.lines[k][0] <= until:
+                k += 1
+            if client is not None and k > first:
+                try:
+                    client.sendall(b"".join(line for _, line in self.lines[first:k]))
+                    self.sent = self.lines[k - 1][0]
+                except OSError:
+                    client = None
+            if k == len(self.lines):
+                self.done.set()
+            time.sleep(0.01)
+        if client is not None:
+            client.close()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(5.0)
+        self._listener.close()
+
+
+@contextmanager
+def vehicle(lines: list[tuple[float, bytes]], speed: float = 1.0) -> Iterator[Vehicle]:
+    server = Vehicle(lines, speed)
+    server._thread.start()
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def turned(m: Measurement, angle: float) -> Measurement:
+    """A compass beside steel: what it says, turned about the vertical [rad]."""
+    values = m.values.copy()
+    if m.sensor == "mag":
+        c, s = np.cos(angle), np.sin(angle)
+        values[:2] = c * values[0] - s * values[1], s * values[0] + c * values[1]
+    else:
+        values[0] += angle
+    return m._replace(values=values)
+
+
+def counted(summary: Mapping[str, list[list[object]]], key: str) -> dict[str, int]:
+    """Counts of a summary by kind, over all sources."""
+    return {str(kind): int(str(count)) for *_, kind, count in summary[key]}

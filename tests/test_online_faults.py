@@ -1,0 +1,184 @@
+"""Faults, late data and foreign clocks on simulated dives: said, honest while they last, and recovered from.
+
+Bounds on errors are in sd of the solution: 4, which one dive in thousands exceeds by chance.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from dives import Simulated, falcon, simulated, true_at
+from live import Flight, flown, message, navigator, turned
+
+from rovgraph.live.navigator import Navigator
+from rovgraph.log import Measurement
+
+AT = 20.0  # when something fails
+SETTLED_S = 8.0  # from when on solutions are looked at
+HONEST_SD, JUMP_SD = 4.0, 3.0
+COMPASSES = ("mag", "ahrs", "dvl_heading")
+
+
+@pytest.fixture(scope="module")
+def case() -> Simulated:
+    return simulated(falcon(), 48.0, seed=1, dvl_rate=4.0)
+
+
+def during(m: Measurement, seconds: float, *sensors: str) -> bool:
+    return AT <= m.time < AT + seconds and (not sensors or m.sensor in sensors)
+
+
+def honest(flight: Flight) -> None:
+    """Errors within the sd, and no step of the solution that the sd before it did not allow."""
+    settled = flight.time > SETTLED_S
+    assert (np.abs(flight.errors) / flight.sd)[settled].max() < HONEST_SD
+    steps = np.abs(np.diff(flight.errors, axis=0)) / flight.sd[:-1]
+    assert steps[settled[1:]].max() < JUMP_SD
+
+
+def grown(flight: Flight, until: float, times: float) -> None:
+    assert flight.sd_at(until) > times * flight.sd_at(AT - 1.0)
+
+
+def test_a_dvl_that_is_silent_for_20_s(case):
+    flight = flown(case, lambda m: [] if during(m, 20.0, "dvl") else [m])
+    assert flight.events("dvl") == ["silent", "back"]
+    honest(flight)
+    grown(flight, AT + 19.0, 3.0)
+
+
+def test_zeros_of_a_dvl_that_lost_the_bottom_for_10_s(case):
+    lost = np.array([0.0, 0.0, 0.0, 1.0, np.nan])
+    flight = flown(case, lambda m: [m._replace(values=lost) if during(m, 10.0, "dvl") else m])
+    assert flight.events("dvl") == ["no lock", "back"]
+    assert flight.navigator.left_out["dvl", "no lock"] == 40
+    honest(flight)
+    grown(flight, AT + 9.0, 1.5)
+
+
+def test_a_ping_that_is_repeated_for_5_s(case):
+    last = next(m for m in case.log.measurements() if m.sensor == "dvl" and m.time > AT - 0.3)
+    flight = flown(case, lambda m: [m._replace(values=last.values) if during(m, 5.0, "dvl") else m])
+    assert flight.events("dvl") == ["frozen", "back"]
+    honest(flight)
+
+
+def test_compasses_beside_steel_for_20_s(case):
+    flight = flown(case, lambda m: [turned(m, np.deg2rad(30.0)) if during(m, 20.0, *COMPASSES) else m])
+    assert flight.events("mag") == ["rejected", "readmitted"]
+    honest(flight)
+
+
+def test_an_imu_that_is_silent_for_5_s_while_the_dvl_goes_on(case):
+    flight = flown(case, lambda m: [] if during(m, 5.0, "imu") else [m])
+    assert flight.events("imu") == ["silent", "back", "gap"]
+    honest(flight)
+    grown(flight, AT + 4.5, 3.0)
+
+
+@pytest.mark.parametrize("seconds", [5.0, 12.0])
+def test_a_link_over_which_everything_comes_and_that_is_interrupted(case, seconds):
+    flight = flown(case, lambda m: [] if during(m, seconds) else [m])
+    assert {"silent", "back"} <= set(flight.events("dvl"))
+    honest(flight)
+    assert flight.sd_at(AT + seconds + 1.0) > 5.0 * flight.sd_at(AT - 1.0)
+    after = flight.time > AT + seconds + 5.0
+    assert np.linalg.norm(flight.errors[after], axis=1).max() < 0.5 * seconds, "faster than the vehicle"
+
+
+def test_pings_that_are_outliers_for_less_than_the_dvl_is_kept_out(case):
+    rng = np.random.default_rng(3)
+
+    def wrong(m: Measurement) -> list[Measurement]:
+        if not during(m, 1.5, "dvl"):
+            return [m]
+        return [m._replace(values=np.array([*rng.uniform(-2.0, 2.0, 3), 1.0, np.nan]))]
+
+    flight = flown(case, wrong)
+    honest(flight)
+    assert "rejected" in flight.events("dvl") or flight.navigator.health.rejected["dvl"] >= 5
+
+
+def test_every_other_ping_an_outlier_for_10_s(case):
+    rng = np.random.default_rng(4)
+
+    def wrong(m: Measurement) -> list[Measurement]:
+        if not during(m, 10.0, "dvl") or rng.random() < 0.5:
+            return [m]
+        return [m._replace(values=np.array([*rng.uniform(-2.0, 2.0, 3), 1.0, np.nan]))]
+
+    honest(flown(case, wrong))
+
+
+def test_a_flood_is_thinned_out_and_the_estimate_is_the_same(case):
+    """Each sample a hundred times within its period."""
+    nav = navigator(case)
+    plain = navigator(case)
+    for m in case.log.measurements():
+        if m.time > 10.0:
+            break
+        plain.take(message(m))
+        for k in range(100 if m.sensor == "imu" else 1):
+            nav.take(message(m._replace(time=m.time + 1e-6 * k)))
+    assert nav.left_out["imu", "more often than can be used"] == 99 * 1001
+    assert nav.updates == plain.updates
+    same(nav, plain, 1e-6)
+
+
+def same(a: Navigator, b: Navigator, atol: float) -> None:
+    one, other = a.solution(), b.solution()
+    np.testing.assert_allclose(one.position, other.position, atol=atol)
+    np.testing.assert_allclose(one.rpy, other.rpy, atol=atol)
+    np.testing.assert_allclose(one.position_sd, other.position_sd, rtol=1e-3)
+
+
+def arriving(case: Simulated, late: dict[str, float], until: float) -> list[tuple[float, Measurement]]:
+    """Measurements by their arrival, some sensors' later than the others'."""
+    found = [(m.time + late.get(m.sensor, 0.0), m) for m in case.log.measurements() if m.time < until]
+    return sorted(found, key=lambda pair: pair[0])
+
+
+@pytest.mark.parametrize("late", [0.2, 3.0])
+def test_a_dvl_whose_pings_arrive_late_is_used_at_their_own_time(case, late):
+    in_order, delayed = navigator(case, trust=False), navigator(case, trust=False)
+    for nav, pairs in ((in_order, arriving(case, {}, 16.0)), (delayed, arriving(case, {"dvl": late}, 16.0))):
+        for arrival, m in pairs:
+            nav.take(message(m, arrival=1.7e9 + arrival))
+        nav.finish()
+    assert not delayed.left_out
+    same(delayed, in_order, 1e-6)
+
+
+def test_a_dvl_with_a_clock_of_its_own_is_put_on_that_of_the_imu(case):
+    nav, kinds = navigator(case, trust=False), []
+    for arrival, m in arriving(case, {}, 25.0):
+        source, ahead = ("dvl", 5e8) if m.sensor == "dvl" else ("imu", 0.0)
+        nav.take(message(m, arrival=1.7e9 + arrival + 0.002, stamp=m.time + ahead, source=source))
+        if abs(m.time - 15.0) < 0.005:
+            kinds += [e.kind for e in nav.solution().events]
+    assert kinds.count("clock") == 1
+    assert not nav.left_out
+    solution = nav.solution()
+    error = solution.position - true_at(case, np.array([solution.time])).p_n[0]
+    assert (np.abs(error) < HONEST_SD * solution.position_sd)[:2].all()
+
+
+def test_stamps_of_1970_and_of_the_future_are_left_out(case):
+    nav, plain = navigator(case, trust=False), navigator(case, trust=False)
+    for k, (arrival, m) in enumerate(arriving(case, {}, 20.0)):
+        plain.take(message(m, arrival=1.7e9 + arrival))
+        stamp = m.time
+        if k % 200 == 150 and m.time > 8.0 and m.sensor == "imu":
+            stamp = 0.0 if k % 400 < 200 else 4e9
+        nav.take(message(m, arrival=1.7e9 + arrival, stamp=stamp + 1e6 * (stamp == m.time)))
+        assert nav.clocks.odd == nav.left_out["sim", "impossible stamp"]
+    assert nav.clocks.odd > 3
+    a, b = nav.solution(), plain.solution()
+    np.testing.assert_allclose(a.position, b.position, atol=3.0 * b.position_sd.max())
+
+
+def test_events_of_a_dive_without_faults_are_those_of_its_start(case):
+    flight = flown(case)
+    assert {e.source for s in flight.solutions for e in s.events} == {"start"}
+    assert all(b > a for a, b in pairwise(flight.time[:-1]))
+    honest(flight)
