@@ -363,7 +363,10 @@ def _came_of(attempt: Callable[[], str]) -> str:
 DIP_DEG, SCALE, CHANGE_S = 6.0, 0.12, 20.0
 BELIEVED: dict[str, Row] = {
     "fixed": {"field_dip": {"estimate": False}, "field_scale": {"estimate": False}},
-    "constant": {"field_dip": {"estimate": True}, "field_scale": {"estimate": True}},
+    "constant": {
+        "field_dip": {"estimate": True, "walk_deg": 0.0},
+        "field_scale": {"estimate": True, "walk": 0.0},
+    },
     "walking": {
         "field_dip": {"estimate": True, "walk_deg": 0.5},
         "field_scale": {"estimate": True, "walk": 0.01},

@@ -4,7 +4,18 @@ from functools import cache
 
 import numpy as np
 import pytest
-from dives import Simulated, batch, changed, falcon, incremental, position_errors, renewed, rms, simulated, started
+from dives import (
+    Simulated,
+    batch,
+    changed,
+    falcon,
+    incremental,
+    position_errors,
+    renewed,
+    rms,
+    simulated,
+    started,
+)
 
 from rovgraph.calibration import TABLE
 from rovgraph.estimators.estimate import Estimate
@@ -24,7 +35,7 @@ TRUTH: dict[str, list[float]] = {
     "current": [0.1, -0.15],
 }
 HELD = {"field_dip": {"estimate": False}, "field_scale": {"estimate": False}}  # what soft iron is told from
-SECONDS, PINGS = 75.0, 3.0  # [s], [Hz]
+SECONDS, PINGS = 80.0, 3.0  # [s], [Hz]
 REQUIRED_S = 0.02  # of a DVL's time offset
 OFFSET = "dvl_time_offset"
 
@@ -61,7 +72,8 @@ def test_a_lively_dive_shows_the_variable_among_all_others(kind, name):
 
 def late(offset: float, sd: float, seconds: float = 50.0, noise: bool = False) -> Simulated:
     """A dive with late stamps, and a configuration that expects them to be off by ``sd``."""
-    config = falcon(calibration={OFFSET: {"estimate": True, "sd": sd}})
+    others = {name: {"estimate": False} for name in TABLE}
+    config = falcon(calibration=others | {OFFSET: {"estimate": True, "sd": sd}})
     truth = {OFFSET: np.array([offset])}
     return simulated(config, seconds, seed=2, noise=noise, calibration=truth, dvl_rate=PINGS)
 

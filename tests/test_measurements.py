@@ -24,6 +24,7 @@ from rovgraph.graph.measurements import (
     whitening,
 )
 from rovgraph.graph.preintegration import Snapshot
+from rovgraph.graph.scale import felt
 from rovgraph.graph.track import KNOT_S, Track
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.state import DIMENSION, State, propagate
@@ -48,7 +49,8 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         rate, z = rng.standard_normal(3), rng.standard_normal(instrument.model.dim)
         sd = instrument.sd * rng.uniform(0.5, 2.0, instrument.model.dim)
         track = track_of(motion, bias, rng) if instrument.lateness else None
-        attached.append(Attached(sensor, k, k // 2, 0.2 * k, 10 + k, z, sd, rate, 0.01, motion, bias, track))
+        S = felt(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
+        attached.append(Attached(sensor, k, k // 2, 0.2 * k, 10 + k, z, sd, rate, 0.01, motion, bias, track, S))
     return make_block(attached, instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 
 
@@ -178,7 +180,7 @@ def test_whitening_takes_in_the_noise_of_the_rate_at_the_lever_arm():
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_block_predicts_at_the_measurements_own_time(sensor):
     block, state = block_of(sensor)
-    block = replace(block, track=None)
+    block = replace(block, track=None, felt=None)
     there = propagate(state, block.motion, block.gravity)
     expected = block.instrument.model.predict(there, block.rate_b)[0]
     np.testing.assert_allclose(block.predicted(state), expected, atol=1e-12)

@@ -24,6 +24,7 @@ from rovgraph.graph.coasting import BLIND_S, coasted, coasting
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import Block, make_block, motions, whitening
+from rovgraph.graph.scale import COLUMNS, SCALES
 from rovgraph.graph.transition import transition
 from rovgraph.sensors import Position, SensorModel, innovation
 from rovgraph.state import VELOCITY, State, propagate_with_jacobian
@@ -163,6 +164,9 @@ class ErrorStateRecursion:
             F[:15, :15], Q[:15, :15] = coasting(before.state, state, duration, before.P)
         else:
             F[:15, :15], Q[:15, :15] = transition(interval, before.state, state)
+        if interval.felt is not None:
+            for name in set(SCALES) & set(self.error.columns):  # they move as the bias does, but for itself
+                F[:9, self.error.columns[name]] = F[:9, 9:15] @ interval.felt[:, COLUMNS[name]]
         P = F @ before.P @ F.T + Q
         return Step(F, Q, Gaussian(state, 0.5 * (P + P.T)))
 
@@ -181,7 +185,7 @@ class ErrorStateRecursion:
         if any(a.motion.dt for a in attached):
             there, F = propagate_with_jacobian(there, motions(attached), self.beginning.config.environment.gravity_mps2)
         for k, a in enumerate(attached):
-            if a.track is not None:  # its stamp may be late: it has a motion of its own
+            if a.track is not None or a.felt is not None:  # by a motion of its own, or more than the model knows
                 own, jacobians = self.block([a]).linearize(state)
                 linear.append((own[0], self.error.matrix(jacobians)[0]))
                 continue

@@ -97,7 +97,7 @@ class IncrementalEstimator:
         else:
             before = self.latest()
             state = predict(interval, before)
-            factors = motion(interval)
+            factors = motion(interval, self.unknowns)
             P = self._covariances[-1]
             grown = partial(self._predicted_covariances, interval)
             known = {index - 1: _Known(before, lambda: P), index: _Known(state, grown)}

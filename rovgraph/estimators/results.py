@@ -77,7 +77,7 @@ def calibration_estimates(
     """
     out = []
     for name, belief in beliefs.items():
-        if not set(belief.variable.sensors) & set(sensors):
+        if not set(belief.variable.sensors) & {*sensors, "imu"}:
             continue
         estimated = name in covariance
         sd = np.sqrt(np.diag(covariance[name])) if estimated else np.zeros(belief.variable.dim)

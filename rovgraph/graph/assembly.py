@@ -20,7 +20,7 @@ from typing import Any, cast
 import gtsam
 import numpy as np
 
-from rovgraph.config import Config, mount_matrix
+from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.aiding import Aiding
@@ -34,6 +34,7 @@ from rovgraph.graph.preintegration import (
     preintegration_params,
     scatter,
 )
+from rovgraph.graph.scale import felt, wanted
 from rovgraph.graph.stamps import Placed, Stamps, pack_placed, unpack_placed
 from rovgraph.graph.track import Track, track_around
 from rovgraph.instruments import Instrument
@@ -64,6 +65,7 @@ class Attached:
     motion : Snapshot from the keyframe to the measurement
     bias : ndarray, shape (6,), that the motion was integrated with
     track : Track of one stamp, where stamps may be late
+    felt : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
     """
 
     sensor: str
@@ -78,6 +80,7 @@ class Attached:
     motion: Snapshot
     bias: Array
     track: Track | None = None
+    felt: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,7 @@ class Interval:
     pim : preintegrated motion, None for the first keyframe
     bridged : there was a gap in the IMU
     attached : measurements at the keyframe itself, and between the keyframe before and it
+    felt : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
     """
 
     index: int
@@ -104,6 +108,7 @@ class Interval:
     pim: gtsam.PreintegratedCombinedMeasurements | None
     bridged: bool
     attached: list[Attached]
+    felt: Array | None = None
 
 
 @dataclass
@@ -146,6 +151,7 @@ class Assembler:
         self._periods: list[float] = []
         self._longest_step = np.inf
         self.stamps = assumed or Stamps.of(self.config, self.instruments)
+        self._scaled = wanted(beliefs(self.config))
         self._around = HALF_WINDOW_S + self.stamps.span
 
     def add(self, measurement: Measurement) -> list[Interval]:
@@ -306,6 +312,7 @@ class Assembler:
         attached: list[Attached] = []
         if self._index >= 0:
             pim, bridged, attached = self._integrate(samples, every, time)
+        before = self._start
         self._index, self._start, self._between = self._index + 1, time, []
         if time - self._segment_start >= self.config.graph.segment_s:
             self._segment, self._segment_start = self._segment + 1, time
@@ -313,7 +320,8 @@ class Assembler:
         if ping is not None:
             attached += self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd, every)
         self._imu = self._imu[_first(every, time, self._around) :]
-        return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, bridged, attached)
+        scaled = self._felt(samples, before, time) if pim is not None else None
+        return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, bridged, attached, scaled)
 
     def _integrate(
         self, samples: Array, every: Array, time: float
@@ -405,7 +413,16 @@ class Assembler:
         if m.sensor == "fix" and np.isfinite(m.values[2]):
             sd = np.full(dim, m.values[2])
         place = (m.sensor, self._index, self._segment, m.time, m.row)
-        return [Attached(*place, z, sd, rate_b, rate_sd, motion, self.bias, track)]
+        scaled = self._felt(every, self._start, m.time)
+        return [Attached(*place, z, sd, rate_b, rate_sd, motion, self.bias, track, scaled)]
+
+    def _felt(self, samples: Array, begin: float, end: float) -> Array | None:
+        """The IMU's mean signal as scale errors feel it, where there may be any."""
+        if not self._scaled:
+            return None
+        time = np.linspace(begin, end, 21)
+        signal = np.array([np.interp(time, samples[:, 0], column).mean() for column in samples[:, 1:].T])
+        return felt(signal - self.bias, self._R_bs)
 
 
 def _time(m: Placed) -> float:

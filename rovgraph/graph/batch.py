@@ -142,7 +142,7 @@ def make_problem(
     wanted = unknowns(beliefs, attached)
     factors = priors(start, beliefs, wanted)
     for interval in intervals:
-        factors += motion(interval)
+        factors += motion(interval, wanted)
     for segment in range(1, intervals[-1].segment + 1):
         factors += drift(wanted, segment, config.graph.segment_s)
     native = gtsam.NonlinearFactorGraph()

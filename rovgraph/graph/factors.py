@@ -13,6 +13,7 @@ from rovgraph.calibration import Belief
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.scale import SCALES, biased, scaled_factor
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 Factor = gtsam.NonlinearFactor
@@ -57,13 +58,22 @@ def priors(start: Start, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> l
     ]
 
 
-def motion(interval: Interval) -> list[Factor]:
+def motion(interval: Interval, unknowns: Unknowns) -> list[Factor]:
     """The IMU's factor between the keyframe before and the one that ends the interval."""
     if interval.pim is None:
         return []
+    if interval.felt is None:
+        return [unscaled(interval)]
+    keys = {name: unknowns.key(name, interval.segment) for name in SCALES if name in unknowns.walks}
+    return [scaled_factor(unscaled(interval), interval.felt, unknowns.fixed, keys)]
+
+
+def unscaled(interval: Interval) -> gtsam.CombinedImuFactor:
+    """GTSAM's own factor of an interval with motion, which knows no scales."""
+    assert interval.pim is not None
     i, j = interval.index - 1, interval.index
     before, after = (key(POSE, i), key(VELOCITY, i)), (key(POSE, j), key(VELOCITY, j))
-    return [gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)]
+    return gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)
 
 
 def drift(unknowns: Unknowns, segment: int, segment_s: float) -> list[Factor]:
@@ -90,7 +100,8 @@ def predict(interval: Interval, state: State) -> State:
     state : State of one epoch, of the keyframe before
     """
     assert interval.pim is not None
-    bias = gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
+    felt = state if interval.felt is None else biased(state, interval.felt[None])
+    bias = gtsam.imuBias.ConstantBias(felt.bias[0, :3], felt.bias[0, 3:])
     before = gtsam.NavState(gtsam.Rot3(state.R_nb[0]), state.p_n[0], state.v_n[0])
     after = interval.pim.predict(before, bias)
     return replace(state, R_nb=after.attitude().matrix()[None], p_n=after.position()[None], v_n=after.velocity()[None])

@@ -75,6 +75,6 @@ class Unknowns:
 
 def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
     """Calibration variables to be estimated: asked for, and a sensor that shows them is in use."""
-    present = set(sensors)
+    present = {*sensors, "imu"}
     wanted = {n: b.walk for n, b in beliefs.items() if b.estimate and present & set(b.variable.sensors)}
     return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted)

@@ -22,6 +22,7 @@ from scipy.special import chdtri
 from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import Attached
 from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.scale import COLUMNS, SCALES, biased
 from rovgraph.graph.track import Track
 from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
@@ -47,6 +48,7 @@ class Block:
     gravity : [m/s^2]
     unknowns : the calibration variables that are estimated, of those that the instrument has
     track : along which the motion goes on to where a stamp that may be late belongs, or None
+    felt : ndarray, shape (n, 6, 6), of `rovgraph.graph.scale`, or None where the IMU's scale is exact
     """
 
     instrument: Instrument
@@ -61,6 +63,7 @@ class Block:
     gravity: float
     unknowns: Unknowns
     track: Track | None = None
+    felt: Array | None = None
 
     def __len__(self) -> int:
         return len(self.z)
@@ -85,6 +88,14 @@ class Block:
 
     def predict(self, state: State) -> tuple[Array, Jacobians]:
         """Predicted measurements, shape (n, dim), and Jacobians by the keyframes' variables."""
+        if self.felt is not None:
+            predicted, H = self._predict(biased(state, self.felt))
+            by_bias = H[BIAS] @ self.felt if BIAS in H else np.zeros((*predicted.shape, 6))
+            return predicted, H | {name: by_bias[..., COLUMNS[name]] for name in SCALES}
+        return self._predict(state)
+
+    def _predict(self, state: State) -> tuple[Array, Jacobians]:
+        """The same, for an IMU without scale errors."""
         model = self.instrument.model
         if self.at_keyframes:
             return model.predict(state, self.rate_b)
@@ -103,6 +114,8 @@ class Block:
 
     def predicted(self, state: State) -> Array:
         """Predicted measurements alone, shape (n, dim)."""
+        if self.felt is not None:
+            state = biased(state, self.felt)
         motion, rate_b = self._placed(state)
         there = state if self.at_keyframes else propagate(state, motion, self.gravity)
         return self.instrument.model.predict(there, rate_b)[0]
@@ -171,7 +184,8 @@ class Block:
         """Some of the measurements."""
         arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name in _PER_MEASUREMENT}
         motion = Delta(*(getattr(self.motion, f.name)[index] for f in fields(Delta)))
-        return replace(self, **arrays, motion=motion, track=self.track and self.track.at(index))
+        track, felt = self.track and self.track.at(index), None if self.felt is None else self.felt[index]
+        return replace(self, **arrays, motion=motion, track=track, felt=felt)
 
 
 _PER_MEASUREMENT = ("keyframe", "segment", "time", "row", "z", "W", "rate_b")
@@ -192,7 +206,9 @@ def make_block(
     arrays = (stack("keyframe"), stack("segment"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
     tracks = [a.track for a in attached if a.track is not None]
     track = Track.stack(tracks) if tracks else None
-    return Block(instrument, *arrays, motions(attached), gravity, unknowns.of(instrument.calibration), track)
+    scaled = attached[0].felt is not None
+    own = unknowns.of((*instrument.calibration, *(SCALES if scaled else ())))
+    return Block(instrument, *arrays, motions(attached), gravity, own, track, stack("felt") if scaled else None)
 
 
 def motions(attached: Sequence[Attached]) -> Delta:

@@ -8,7 +8,8 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Interval
-from rovgraph.graph.factors import motion
+from rovgraph.graph.factors import unscaled
+from rovgraph.graph.scale import biased
 from rovgraph.graph.values import insert_state
 from rovgraph.state import State
 
@@ -30,10 +31,11 @@ def transition(interval: Interval, before: State, after: State) -> tuple[Array, 
     """
     i, j = interval.index - 1, interval.index
     values = gtsam.Values()
+    if interval.felt is not None:
+        before, after = biased(before, interval.felt[None]), biased(after, interval.felt[None])
     insert_state(values, i, before)
     insert_state(values, j, after)
-    (factor,) = motion(interval)
-    A, _ = factor.linearize(values).jacobian()  # pose and velocity of i and of j, bias of i and of j
+    A, _ = unscaled(interval).linearize(values).jacobian()  # pose and velocity of i and of j, bias of i and of j
     noise = np.linalg.inv(A[:, _AFTER])
     return -noise @ A[:, _BEFORE], noise @ noise.T
 

@@ -157,7 +157,9 @@ def _frame(time: Array, columns: list[str], values: Array) -> pd.DataFrame:
 def _inertial(sample: _Sampler, motion: Motion, bias: Array) -> pd.DataFrame:
     """Accelerometer, gyro and magnetometer, one row per sample."""
     truth, rng, n = sample.truth, sample.rng, len(motion)
-    values = to_imu_axes(specific_force_and_rate(motion, truth.config) + bias, truth.config)
+    signal = specific_force_and_rate(motion, truth.config)
+    scale = np.concatenate([sample.calibration["acc_scale"], sample.calibration["gyr_scale"]])
+    values = to_imu_axes(signal + bias, truth.config) + scale * to_imu_axes(signal, truth.config)
     if truth.vibration is not None:
         values[:, :3] += truth.vibration.at(motion.time, rng)
     if sample.covariances is None:
