@@ -163,6 +163,8 @@ print("MODULES", *sys.modules)
         ["check"],
         ["config"],
         ["simulate"],
+        ["observe"],
+        ["plan"],
         ["calibrate"],
         ["calibrate", "magnetometer"],
         ["calibrate", "noise"],

@@ -13,7 +13,9 @@ from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
 from rovgraph.cli.evaluate import evaluate
+from rovgraph.cli.observe import observe
 from rovgraph.cli.online import online
+from rovgraph.cli.plan import plan
 from rovgraph.cli.simulate import simulate
 from rovgraph.cli.smooth import smooth
 from rovgraph.errors import DataWarning, InputError
@@ -26,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-for _command in (smooth, online, evaluate, compare, check, config, simulate):
+for _command in (smooth, online, evaluate, compare, observe, plan, check, config, simulate):
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 

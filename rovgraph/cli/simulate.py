@@ -16,7 +16,7 @@ def simulate(
         str,
         typer.Argument(
             help="Driven through thrusters: vattern, docking, excited, tank, stationary. "
-            "Motions as such: falcon, lawnmower, square, circle, figure8, straight.",
+            "Motions as such: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral.",
             show_default=False,
         ),
     ],

@@ -87,6 +87,20 @@ def _ring(radius: float, sign: float) -> Array:
     return np.column_stack([radius * np.sin(angle), sign * radius * (1.0 - np.cos(angle)), np.full(73, 5.0)])
 
 
+def _accelerate_and_stop() -> Route:
+    """3 m ahead, a stop, 3 m astern, a stop; the heading stays."""
+    return Route.of([(0, 0, 5), (3, 0, 5), (0, 0, 5)], pause=[0, 4, 4], crab=[0.0, -np.pi])
+
+
+def _spiral() -> Route:
+    """Two turns that widen and go down, two that narrow and come up."""
+    angle = np.linspace(0.0, 8.0 * np.pi, 289)
+    share = 0.5 - 0.5 * np.cos(0.25 * angle)
+    radius, depth = 2.0 + 4.0 * share, 4.0 + 4.0 * share
+    points = np.column_stack([radius * np.sin(angle), 2.0 - radius * np.cos(angle), depth])
+    return Route.of(points)
+
+
 def _lawnmower() -> Route:
     """Six lanes of 25 m, 4 m apart, and back to the beginning."""
     lanes = [(n, 4.0 * i, 8.0) for i in range(6) for n in ((0, 25) if i % 2 == 0 else (25, 0))]
@@ -133,5 +147,7 @@ SCENARIOS: dict[str, Scenario] = {
     "circle": _endless(Route.of(_ring(5.0, 1.0)), 0.4),
     "figure8": _endless(Route.of(np.vstack([_ring(5.0, 1.0), _ring(5.0, -1.0)[1:]])), 0.4),
     "straight": _straight,
+    "accelerate-and-stop": _endless(_accelerate_and_stop(), 0.4),
+    "spiral": _endless(_spiral(), 0.4),
     "vattern": _once(_vattern(), 0.3),
 }

@@ -1,20 +1,72 @@
-"""Names of calibration that a person gives to a study."""
+"""What a person gives to a study of the calibration: names, goals, what is known already."""
 
 import difflib
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
 
-from rovgraph.calibration import TABLE, Variable
+import numpy as np
+
+from rovgraph.calibration import TABLE
 from rovgraph.errors import InputError
+from rovgraph.studies.plan import Known
 
 
-def known_variable(name: str) -> Variable:
-    """A calibration variable by name.
+def listed(text: str | None) -> list[str]:
+    """Names that are separated by commas, each once."""
+    return list(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))
+
+
+def goals(texts: Sequence[str]) -> dict[str, float]:
+    """Label of a component -> sd that is wanted, of such as ``dvl_yaw=1deg`` and ``dvl_scale=0.002``.
 
     Raises
     ------
-    InputError : there is none of that name, the nearest is told
+    InputError : no such component, no positive number, degrees for what is no angle or the reverse
     """
-    if name in TABLE:
-        return TABLE[name]
-    near = difflib.get_close_matches(name, TABLE, 1)
-    hint = f", did you mean {near[0]}?" if near else ""
-    raise InputError(f"unknown calibration variable {name!r}{hint} (known: {', '.join(TABLE)})")
+    return dict(_goal(text) for text in texts)
+
+
+def _goal(text: str) -> tuple[str, float]:
+    label, _, number = text.partition("=")
+    label = label.strip()
+    variable = next((v for v in TABLE.values() if label in v.labels), None)
+    if variable is None:
+        every = [known for v in TABLE.values() for known in v.labels]
+        near = difflib.get_close_matches(label, every, 1)
+        raise InputError(f"goal {text!r}: unknown component {label!r}" + (f", did you mean {near[0]}?" if near else ""))
+    number, degrees = number.strip(), number.strip().endswith("deg")
+    try:
+        sd = float(number.removesuffix("deg"))
+    except ValueError:
+        sd = math.nan
+    if not (math.isfinite(sd) and sd > 0.0) or degrees != variable.angular:
+        raise InputError(
+            f"goal {text!r}: expected {label}=" + ("1deg" if variable.angular else f"0.01 [{variable.unit}]")
+        )
+    return label, math.radians(sd) if degrees else sd
+
+
+def read_known(path: Path) -> Known:
+    """What the ``observability.json`` of a dive says.
+
+    Raises
+    ------
+    InputError : no such file, or not one of ``rovgraph observe``
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        components = content["components"]
+        covariance = np.array(content["covariance"], float)
+        sd = np.array([components[label]["prior_sd"] for label in components], float)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{path}: no observability.json of rovgraph observe") from None
+    square = covariance.shape == (len(sd), len(sd)) and len(sd) > 0
+    if not (
+        square and np.isfinite(covariance).all() and (np.linalg.eigvalsh(covariance) > 0.0).all() and (sd > 0).all()
+    ):
+        raise InputError(f"{path}: its covariance is none; make it anew with rovgraph observe")
+    return Known(tuple(components), covariance, sd)

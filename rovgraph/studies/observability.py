@@ -4,6 +4,7 @@ From the graph's own information matrix: states are marginalised exactly, by QR,
 noise in the estimate pretends is taken off (`rovgraph.estimators.observability`).
 """
 
+import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -25,7 +26,6 @@ from rovgraph.estimators.smoother import Optimum
 from rovgraph.geometry import Array
 from rovgraph.graph.information import OTHERS, knowledge
 from rovgraph.log import Log
-from rovgraph.studies.choices import known_variable
 
 Progress = Callable[[str, float], None]
 TIMES = 30  # at which the sd is told
@@ -120,19 +120,28 @@ def observe(
     ------
     InputError : an unknown variable, one whose sensor is not in use, none at all; too short a log
     """
-    for name in also:
-        known_variable(name)
-    dive = solved(log, estimating(config, also), progress)
+    config = estimating(config, also)
+    dive = solved(log, config, progress)
     missing = set(also) - set(dive.problem.unknowns.estimated)
     if missing:
         name = min(missing)
         needed = " or ".join(TABLE[name].sensors)
         raise InputError(f"{log.source}: {name} cannot be estimated, no {needed} in use; take it out of --estimate")
-    return examined(dive, config=estimating(config, also), progress=progress)
+    return examined(dive, config, progress=progress)
 
 
 def estimating(config: Config, also: Sequence[str]) -> Config:
-    """A configuration that estimates some variables more."""
+    """A configuration that estimates some variables more.
+
+    Raises
+    ------
+    InputError : an unknown variable
+    """
+    for name in also:
+        if name not in TABLE:
+            near = difflib.get_close_matches(name, TABLE, 1)
+            hint = f", did you mean {near[0]}?" if near else ""
+            raise InputError(f"unknown calibration variable {name!r}{hint} (known: {', '.join(TABLE)})")
     entries = {name: getattr(config.calibration, name).model_copy(update={"estimate": True}) for name in also}
     return config.model_copy(update={"calibration": config.calibration.model_copy(update=entries)})
 

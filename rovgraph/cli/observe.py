@@ -1,0 +1,53 @@
+"""``rovgraph observe``: what of the calibration can be known from a dive."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+WIDE = 150  # columns of a file or a pipe, which has no width of its own
+
+
+def observe(
+    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: observed-LOG")] = None,
+    estimate: Annotated[
+        str | None, typer.Option(help="calibration variables to estimate too, separated by commas")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+) -> None:
+    """What a dive shows of every calibration variable, when it did, and what is missing.
+
+    Example: rovgraph observe log.csv --config vehicle.yaml --estimate dvl_yaw,dvl_scale
+    """
+    from rich.console import Console
+
+    from rovgraph import check
+    from rovgraph.cli.progress import progress_bar
+    from rovgraph.config import load_config
+    from rovgraph.log import read_log
+    from rovgraph.report.figure_observability import draw_observability
+    from rovgraph.report.folder import check_writable, results_folder
+    from rovgraph.report.observability import observability_table, words, write_observability
+    from rovgraph.studies.choices import listed
+    from rovgraph.studies.observability import estimating
+    from rovgraph.studies.observability import observe as library
+
+    out = Path("observed-" + log.name.split(".")[0]) if out is None else out
+    settings, also = load_config(config), listed(estimate)
+    check_writable(out, force)
+    dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
+    check.warn(dive_log, settings)
+    with progress_bar() as progress:
+        seen = library(check.without_frozen_pings(dive_log), settings, also, progress)
+    with results_folder(out, force) as folder:
+        draw_observability(folder, seen)
+        write_observability(folder, seen, estimating(settings, also), {"log": str(log), "estimate": also})
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDE)
+    console.print(observability_table(seen, f"what {log.name} shows"))
+    for sentence in words(seen):
+        console.print(sentence, highlight=False, markup=False)
+    console.print(f"results in {out}", highlight=False, markup=False)

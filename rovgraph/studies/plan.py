@@ -1,0 +1,196 @@
+"""What to drive to know the calibration: what ``rovgraph plan`` does.
+
+The information of a dive depends on where it is linearised, not on the noise that comes. So a
+manoeuvre is driven without noise by a vehicle with the believed sensors, the graph is
+linearised there, and what is known already is added.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.log import log_from_frame
+from rovgraph.simulate import Path, Truth, scenario, simulate
+from rovgraph.studies.manoeuvres import Manoeuvre
+from rovgraph.studies.observability import Observability, examined, joint_bits, solved
+from rovgraph.workers import cores, in_workers
+
+MOST_COLUMNS = 6  # of a table, where no goal says what matters
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """How often the sensors will measure.
+
+    Attributes
+    ----------
+    imu_rate, dvl_rate : [Hz]
+    fix_interval : [s], None = no position fixes
+    """
+
+    imu_rate: float = 100.0
+    dvl_rate: float = 5.6
+    fix_interval: float | None = None
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of some components already.
+
+    Attributes
+    ----------
+    labels : c
+    covariance : ndarray, shape (c, c), data and prior together [units of the components]
+    prior_sd : ndarray, shape (c,), of the prior in it
+    """
+
+    labels: tuple[str, ...]
+    covariance: Array
+    prior_sd: Array
+
+    @staticmethod
+    def nothing() -> "Known":
+        """No component."""
+        return Known((), np.zeros((0, 0)), np.zeros(0))
+
+    def information(self, labels: Sequence[str], sd: Array) -> Array:
+        """What its data say of some components, shape (c, c), in units of ``sd``; what it also knew is marginalised."""
+        both = [(labels.index(name), k) for k, name in enumerate(self.labels) if name in labels]
+        out = np.zeros((len(labels), len(labels)))
+        if both:
+            there, here = (np.array(column) for column in zip(*both, strict=True))
+            own = np.linalg.inv(self.covariance[np.ix_(here, here)]) - np.diag(self.prior_sd[here] ** -2)
+            out[np.ix_(there, there)] = own * np.outer(sd[there], sd[there])
+        return out
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a manoeuvre would show.
+
+    Attributes
+    ----------
+    manoeuvre : which
+    sd : ndarray, shape (c,), after it, with what is known before [unit of each]
+    bits : information it adds
+    """
+
+    manoeuvre: Manoeuvre
+    sd: Array
+    bits: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Manoeuvres, the best first.
+
+    Attributes
+    ----------
+    labels, units : c, of the calibration
+    before : ndarray, shape (c,), sd as known before [unit of each]
+    goals : label -> sd that is wanted [its unit]
+    ranked : predictions
+    scores : of each, largest sd over its goal; without goals minus the bits
+    duration : of each manoeuvre [s]
+    """
+
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    before: Array
+    goals: dict[str, float]
+    ranked: list[Prediction]
+    scores: list[float]
+    duration: float
+
+    @property
+    def told(self) -> list[int]:
+        """Components worth a column: those of the goals, else those that the best manoeuvre shows most of."""
+        if self.goals:
+            return [self.labels.index(name) for name in self.goals]
+        return sorted(np.argsort(self.ranked[0].sd / self.before)[:MOST_COLUMNS].tolist())
+
+    def path(self) -> Path:
+        """That of the best manoeuvre."""
+        best = self.ranked[0].manoeuvre
+        return scenario(best.name, self.duration, best.speed)
+
+
+def plan(
+    config: Config,
+    candidates: Sequence[Manoeuvre],
+    duration: float,
+    known: Known | None = None,
+    goals: Mapping[str, float] | None = None,
+    sensors: Sensors | None = None,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Plan:
+    """Rank manoeuvres by what they would show of the calibration.
+
+    Parameters
+    ----------
+    config : what is believed of vehicle and sensors, and what is to be estimated
+    candidates : the manoeuvres
+    duration : of each [s]
+    known : from dives before
+    goals : label -> sd that is wanted [its unit]
+    sensors : how often they measure
+    progress : called with the share that is done
+
+    Raises
+    ------
+    InputError : no manoeuvre, nothing to estimate, a goal for what is not estimated
+    """
+    if not candidates:
+        raise InputError("no manoeuvres to choose from; give --manoeuvres")
+    goals, known = dict(goals or {}), known or Known.nothing()
+    work = partial(predicted, config=config, duration=duration, sensors=sensors or Sensors())
+    seen = in_workers(work, candidates, min(cores(), len(candidates)), progress)
+    labels = seen[0].labels
+    strange = [name for name in goals if name not in labels]
+    if strange:
+        raise InputError(
+            f"goal {strange[0]}: it is not estimated; estimate: true in calibration, or one of {', '.join(labels)}"
+        )
+    already = known.information(labels, seen[0].prior_sd)
+    predictions = [_with(already, one, candidate) for one, candidate in zip(seen, candidates, strict=True)]
+    wanted = {labels.index(name): sd for name, sd in goals.items()}
+    score = [max(p.sd[i] / sd for i, sd in wanted.items()) if wanted else -p.bits for p in predictions]
+    order = np.argsort(score, kind="stable").tolist()
+    return Plan(
+        labels,
+        tuple(v.unit for v in seen[0].variables),
+        _sd(already, seen[0].prior_sd),
+        goals,
+        [predictions[i] for i in order],
+        [float(score[i]) for i in order],
+        duration,
+    )
+
+
+def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: Sensors) -> Observability:
+    """What a manoeuvre would show by itself."""
+    ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
+    own = config.model_copy(update={"columns": {}, "units": {}})
+    truth = Truth(
+        own, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
+        fix_interval=sensors.fix_interval, ahrs_rate=ahrs,
+    )  # fmt: skip
+    path = scenario(manoeuvre.name, duration, manoeuvre.speed)
+    dive = simulate(path, truth, np.random.default_rng(0))
+    log = log_from_frame(dive.log_frame, str(manoeuvre))
+    return examined(solved(log, own), own, noisy=False)
+
+
+def _with(already: Array, seen: Observability, manoeuvre: Manoeuvre) -> Prediction:
+    together = already + seen.information
+    return Prediction(manoeuvre, _sd(together, seen.prior_sd), joint_bits(together) - joint_bits(already))
+
+
+def _sd(information: Array, prior_sd: Array) -> Array:
+    """sd after information in units of the prior's sd."""
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.eye(len(prior_sd)) + information))) * prior_sd)
