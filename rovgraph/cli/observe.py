@@ -35,7 +35,8 @@ def observe(
     from rovgraph.studies.observability import observe as library
 
     out = Path("observed-" + log.name.split(".")[0]) if out is None else out
-    settings, also = load_config(config), listed(estimate)
+    also = listed(estimate)
+    settings = estimating(load_config(config), also)
     check_writable(out, force)
     dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
     check.warn(dive_log, settings)
@@ -43,7 +44,7 @@ def observe(
         seen = library(check.without_frozen_pings(dive_log), settings, also, progress)
     with results_folder(out, force) as folder:
         draw_observability(folder, seen)
-        write_observability(folder, seen, estimating(settings, also), {"log": str(log), "estimate": also})
+        write_observability(folder, seen, settings, {"log": str(log), "estimate": also})
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)

@@ -11,11 +11,11 @@ from functools import partial
 
 import numpy as np
 
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import log_from_frame
-from rovgraph.simulate import Path, Truth, scenario, simulate
+from rovgraph.simulate import CALM, Path, Style, Truth, scenario, simulate
 from rovgraph.studies.manoeuvres import Manoeuvre
 from rovgraph.studies.observability import Observability, examined, joint_bits, solved
 from rovgraph.workers import cores, in_workers
@@ -117,7 +117,7 @@ class Plan:
     def path(self) -> Path:
         """That of the best manoeuvre."""
         best = self.ranked[0].manoeuvre
-        return scenario(best.name, self.duration, best.speed)
+        return path_of(best, self.duration)
 
 
 def plan(
@@ -148,14 +148,11 @@ def plan(
     if not candidates:
         raise InputError("no manoeuvres to choose from; give --manoeuvres")
     goals, known = dict(goals or {}), known or Known.nothing()
+    _check(goals, [label for b in beliefs(config).values() if b.estimate for label in b.variable.labels])
     work = partial(predicted, config=config, duration=duration, sensors=sensors or Sensors())
     seen = in_workers(work, candidates, min(cores(), len(candidates)), progress)
     labels = seen[0].labels
-    strange = [name for name in goals if name not in labels]
-    if strange:
-        raise InputError(
-            f"goal {strange[0]}: it is not estimated; estimate: true in calibration, or one of {', '.join(labels)}"
-        )
+    _check(goals, labels)
     already = known.information(labels, seen[0].prior_sd)
     predictions = [_with(already, one, candidate) for one, candidate in zip(seen, candidates, strict=True)]
     wanted = {labels.index(name): sd for name, sd in goals.items()}
@@ -172,6 +169,18 @@ def plan(
     )
 
 
+def _check(goals: Mapping[str, float], estimated: Sequence[str]) -> None:
+    """Refuse a goal for what is not estimated."""
+    for name in goals:
+        if name not in estimated:
+            raise InputError(f"goal {name}: it is not estimated (estimated: {', '.join(estimated)}); give --estimate")
+
+
+def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
+    """A manoeuvre in calm water: what waves would teach nobody can promise."""
+    return scenario(manoeuvre.name, duration, manoeuvre.speed, Style(waves=CALM))
+
+
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: Sensors) -> Observability:
     """What a manoeuvre would show by itself."""
     ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
@@ -180,8 +189,7 @@ def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: Se
         own, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
         fix_interval=sensors.fix_interval, ahrs_rate=ahrs,
     )  # fmt: skip
-    path = scenario(manoeuvre.name, duration, manoeuvre.speed)
-    dive = simulate(path, truth, np.random.default_rng(0))
+    dive = simulate(path_of(manoeuvre, duration), truth, np.random.default_rng(0))
     log = log_from_frame(dive.log_frame, str(manoeuvre))
     return examined(solved(log, own), own, noisy=False)
 
