@@ -37,6 +37,7 @@ def online(
 
     Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:127.0.0.1:14550 --out dive
     """
+    import signal
     import sys
 
     from rovgraph.cli.ending import ended_by_signals
@@ -63,9 +64,11 @@ def online(
     files = None
     if out is not None:
         prepared(out, force, resume, sources)
-        files = Files(out, settings, complaints, resume)
-    navigator = Navigator(settings, patient=feed.recorded, clocks=Clocks(trust=feed.replayed))
+        files = Files(out, settings, complaints, resume, anew=engine is Engine.isam2)
+    navigator = Navigator(settings, feed.recorded, smooth=engine is Engine.isam2, clocks=Clocks(trust=feed.replayed))
     session = Session(navigator, outputs, complaints, rate, files)
+    if hasattr(signal, "SIGUSR1"):
+        signal.signal(signal.SIGUSR1, lambda *_: session.want_smoothed())
     with ended_by_signals(feed.close):
         try:
             with StatusLine() as status:

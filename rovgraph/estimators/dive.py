@@ -91,7 +91,7 @@ def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
     if batch.beginning.config.graph.solver == "isam2":
         solver = run(batch.intervals, batch.beginning, progress)
         anew = batch.placed_anew(solver.latest().calibration)
-        return batch.solve(solver) if anew is None else anew.solve(run(anew.intervals, anew.beginning, progress))
+        return (solver if anew is None else run(anew.intervals, anew.beginning, progress)).solve()
     return batch.solve()
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from rovgraph.config import beliefs
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.observability import prior_sd, relative_sd
 from rovgraph.estimators.results import (
@@ -27,7 +26,6 @@ from rovgraph.graph.batch import (
     make_problem,
     make_values,
     marginals,
-    solution_at,
     solve,
 )
 from rovgraph.graph.stamps import Stamps
@@ -89,22 +87,13 @@ class BatchSmoother:
         self.intervals += done
         return done
 
-    def solve(self, incremental: IncrementalEstimator | None = None) -> Estimate:
-        """The smoothed trajectory with its uncertainty.
+    def solve(self) -> Estimate:
+        """The smoothed trajectory with its uncertainty."""
+        return smoothed(self.optimum(), self.beginning)
 
-        Parameters
-        ----------
-        incremental : has the same dive, without a lag; its optimum is taken instead of
-            the batch solver's
-        """
-        return _estimate(self.optimum(incremental), self.beginning)
-
-    def optimum(self, incremental: IncrementalEstimator | None = None) -> Optimum:
-        """The graph of the dive and its optimum; ``incremental`` as in `solve`."""
+    def optimum(self) -> Optimum:
+        """The graph of the dive and its optimum."""
         b = self.beginning
-        if incremental is not None:
-            problem = make_problem(self.intervals, b.start, b.config, beliefs(b.config), b.instruments)
-            return Optimum(self.intervals, problem, solution_at(problem, incremental.engine.values()))
         dive, calibration = self, None
         for _ in range(MAX_PLACINGS):
             problem = make_problem(dive.intervals, b.start, b.config, beliefs(b.config), b.instruments)
@@ -141,7 +130,7 @@ class BatchSmoother:
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
 
 
-def _estimate(optimum: Optimum, b: Beginning) -> Estimate:
+def smoothed(optimum: Optimum, b: Beginning) -> Estimate:
     """The optimum with its marginal covariances."""
     intervals, problem, solution = optimum.intervals, optimum.problem, optimum.solution
     tree, n = marginals(problem, solution), problem.count

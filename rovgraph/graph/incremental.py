@@ -13,34 +13,34 @@ import numpy as np
 
 from rovgraph.calibration import TABLE
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array
 from rovgraph.graph.batch import indeterminate
 from rovgraph.graph.keys import Unknowns, key
-from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, State
+from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 # Changes beyond which iSAM2 relinearises a variable. Positions and velocities too: the IMU's
 # factor multiplies them with the attitude.
 THRESHOLDS = {
-    "x": [0.002, 0.002, 0.002, 0.005, 0.005, 0.005],  # [rad, m]
-    "v": [0.005, 0.005, 0.005],  # [m/s]
-    "b": [0.002] * 6,  # [m/s^2, rad/s]
+    "x": [0.02, 0.02, 0.02, 1.0, 1.0, 1.0],  # [rad, m]
+    "v": [0.05, 0.05, 0.05],  # [m/s]
+    "b": [0.01] * 6,  # [m/s^2, rad/s]
 }
-CALIBRATION_THRESHOLD = 0.002  # [rad, 1]
-WILDFIRE = 1e-5  # change of an estimate below which it is not propagated
+CALIBRATION_THRESHOLD = 0.01  # [rad, 1]
+FINE, RELINEARISATIONS = 0.01, 3  # part of the thresholds, and updates, for the last estimate
+WILDFIRE = 1e-2  # change of an estimate below which it is not propagated
 
 
-def isam2_params() -> gtsam.ISAM2Params:
-    """Parameters of the engine."""
+def isam2_params(part: float = 1.0) -> gtsam.ISAM2Params:
+    """Parameters of the engine, with a part of the thresholds."""
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.relinearizeSkip = 1
     params.findUnusedFactorSlots = True
-    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(part * WILDFIRE))
     thresholds = gtsam.ISAM2ThresholdMap()
     for letter, changes in THRESHOLDS.items():
-        thresholds.insert((letter, np.array(changes)))
+        thresholds.insert((letter, part * np.array(changes)))
     for variable in TABLE.values():
-        thresholds.insert((variable.letter, np.full(variable.dim, CALIBRATION_THRESHOLD)))
+        thresholds.insert((variable.letter, np.full(variable.dim, part * CALIBRATION_THRESHOLD)))
     params.setRelinearizeThreshold(thresholds)
     return params
 
@@ -57,17 +57,23 @@ class Incremental:
         self._unknowns = unknowns
         self._engine = gtsam.ISAM2(isam2_params())
         self._theta = self._engine.getLinearizationPoint()
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
-    def update(self, factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values) -> None:
-        """Add a step's factors and the initial values of its new variables.
+    def add(self, factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values) -> None:
+        """Have factors, and the initial values of their new variables, wait for the next update."""
+        for factor in factors:
+            self._graph.add(factor)
+        self._values.insert(values)
+
+    def update(self) -> None:
+        """Take what has been added.
 
         Raises
         ------
         InputError : the data do not determine some variable, which is named
         """
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in factors:
-            graph.add(factor)
+        graph, values = self._graph, self._values
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         try:
             self._engine.update(graph, values)
         except RuntimeError as error:
@@ -87,14 +93,13 @@ class Incremental:
             {**unknowns.fixed, **calibration},
         )
 
-    def covariances(self, index: int, segment: int, names: Iterable[str]) -> dict[str, Array]:
-        """Marginal covariances of a keyframe's state variables, and of the calibration variables ``names``."""
-        keys = {v: key(v, index) for v in DIMENSION}
-        keys |= {name: self._unknowns.key(name, segment) for name in names}
-        joint = self._engine.jointMarginalCovariance(list(keys.values()))  # one sweep for all of them
-        return {v: np.asarray(joint.at(k, k)) for v, k in keys.items()}
-
     def values(self) -> gtsam.Values:
-        """Estimates of all variables."""
-        values: gtsam.Values = self._engine.calculateEstimate()
-        return values
+        """Estimates of all variables, relinearised until they rest; the tree itself stays as it is."""
+        values = self._engine.calculateBestEstimate()
+        fine = gtsam.ISAM2(isam2_params(FINE))
+        _theta = fine.getLinearizationPoint()
+        fine.update(self._engine.getFactorsUnsafe(), values)
+        for _ in range(RELINEARISATIONS):
+            fine.update()
+        best: gtsam.Values = fine.calculateBestEstimate()
+        return best

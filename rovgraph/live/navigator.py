@@ -17,6 +17,7 @@ from rovgraph.calibration import TABLE
 from rovgraph.config import Config
 from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
+from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning, restored
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import Array
@@ -44,8 +45,10 @@ class Navigator:
     config : what is believed of vehicle and sensors
     patient : wait for what a second process computes, so that a replay can be repeated
     renew : renew the filter in a second process
+    smooth : have iSAM2 smooth the whole dive as it goes
     origin : latitude and longitude [deg] of north = east = 0, or None
     clocks, faults, health : of the sources, and of the sensors
+    isam2 : the smoother, where it was asked for
     engine : None until the first seconds are over
     time : of the newest measurement, or of the last `tick` [s]
     passed : marks that the lag has passed, since they were last taken
@@ -56,11 +59,13 @@ class Navigator:
     config: Config
     patient: bool = False
     renew: bool = True
+    smooth: bool = False
     origin: tuple[float, float] | None = None
     clocks: Clocks = field(default_factory=Clocks)
     faults: Faults = field(default_factory=Faults)
     health: Health = field(default_factory=Health)
     engine: FixedLag | None = None
+    isam2: IncrementalEstimator | None = None
     time: float = -np.inf
     passed: list[Mark] = field(default_factory=list)
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -229,6 +234,8 @@ class Navigator:
     def _begin(self, beginning: Beginning, state: Mapping[str, Any] | None = None) -> None:
         """The first seconds are over, or an estimate goes on from its state."""
         config = beginning.config
+        if self.smooth:
+            self.isam2 = IncrementalEstimator(beginning)
         if self.renew:
             self._renewals = Renewals(beginning, self.patient)
         settled = self._renewals.take if self._renewals is not None else lambda measurements: None
@@ -260,6 +267,8 @@ class Navigator:
 
     def _pass(self, mark: Mark) -> None:
         self.passed.append(mark)
+        if self.isam2 is not None:
+            self.isam2.take(mark.interval, mark.known, mark.used)
         self.health.passed(mark)
 
     def _take_events(self) -> tuple[Event, ...]:

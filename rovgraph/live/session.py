@@ -16,6 +16,7 @@ import pymap3d
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
+from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.live.checkpoint import read_checkpoint
 from rovgraph.live.complaints import Complaints
@@ -25,11 +26,12 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.live.recorder import Recorder
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.track import TrackFile, trajectory_of
-from rovgraph.log import log_from_frame
+from rovgraph.log import log_from_frame, read_log
 from rovgraph.log.streams import Log
 
 RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
 CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  # of the recording; of the run
+SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
 LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
@@ -52,6 +54,7 @@ class Files:
     config : as the user gave it
     complaints : where trouble with the disk goes
     resume : go on with what is there
+    anew : from the recording alone, not from the checkpoint
 
     Raises
     ------
@@ -62,6 +65,7 @@ class Files:
     config: Config
     complaints: Complaints
     resume: bool = False
+    anew: bool = False
 
     def __post_init__(self) -> None:
         if self.resume and not self.folder.is_dir():
@@ -71,7 +75,7 @@ class Files:
         until = -np.inf
         if self.resume and not (self.folder / RECORDING).exists():
             raise InputError(f"{self.folder}: nothing to resume, there is no {RECORDING}; leave out --resume")
-        if self.resume and checkpoint.exists():
+        if self.resume and checkpoint.exists() and not self.anew:
             self.state = read_checkpoint(checkpoint)
             until = float(self.state["engine"]["keyframe"][1])
         self.recorder = Recorder(self.folder / RECORDING, self.complaints.complain)
@@ -97,6 +101,13 @@ class Files:
         except InputError:
             return None
 
+    def all_recorded(self) -> Log | None:
+        """All of a recording that is resumed; None where it has no measurement."""
+        try:
+            return read_log(self.folder / RECORDING)
+        except InputError:
+            return None
+
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""
         lines = "".join(json.dumps(vars(event)) + "\n" for event in events)
@@ -108,6 +119,12 @@ class Files:
                 file.write(lines)
         except OSError as error:
             self.complaints.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
+
+    def write_smoothed(self, estimate: Estimate) -> None:
+        """Put a smoothed track on disk, in place of an older one."""
+        partial = self.folder / f".{SMOOTHED}.partial"
+        estimate.trajectory.write_csv(partial)
+        partial.replace(self.folder / SMOOTHED)
 
     def keep(self, navigator: Navigator, now: bool = False) -> None:
         """Put the track and a checkpoint on disk, if it is time to."""
@@ -191,10 +208,21 @@ class Session:
     _watchers: list[Callable[[Solution], None]] = field(default_factory=list)
     _took: "array[float]" = field(default_factory=lambda: array("f"))
     _resumed: float = -math.inf
+    _wanted: bool = False
 
     def watch(self, show: Callable[[Solution], None]) -> None:
         """Have every solution shown."""
         self._watchers.append(show)
+
+    def want_smoothed(self) -> None:
+        """Ask for the smoothed track so far; from a signal's handler."""
+        self._wanted = True
+
+    def write_smoothed(self) -> None:
+        """The whole smoothed track so far to disk, where iSAM2 has it."""
+        isam2 = self.navigator.isam2
+        if self.files is not None and isam2 is not None and isam2.updated > 0:
+            self.files.write_smoothed(isam2.solve())
 
     def updates(self) -> dict[str, float]:
         """Times that updates of the filter took [ms]."""
@@ -209,9 +237,12 @@ class Session:
     def resume(self) -> None:
         """Go on from the last checkpoint and what was recorded after it."""
         assert self.files is not None
-        if self.files.state is not None:
-            self.navigator.restore(self.files.state)
-        recorded = self.files.recorded(self.navigator.origin)
+        if self.navigator.smooth:
+            recorded = self.files.all_recorded()  # iSAM2 needs all of it
+        else:
+            if self.files.state is not None:
+                self.navigator.restore(self.files.state)
+            recorded = self.files.recorded(self.navigator.origin)
         if recorded is not None:
             self.navigator.replay(recorded)
         self._resumed = self.navigator.time
@@ -229,12 +260,16 @@ class Session:
                 self._send()
             if files is not None:
                 files.keep(navigator)
+            if self._wanted:
+                self._wanted = False
+                self.write_smoothed()
         if files is not None:
             files.keep(navigator, now=True)
         navigator.finish()
         self._send()
         if files is not None:
             files.finish(navigator)
+            self.write_smoothed()
 
     def _known(self, message: Message) -> bool:
         """Whether a recording that is read again says what had been received before a crash."""
