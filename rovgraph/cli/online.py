@@ -37,10 +37,9 @@ def online(
 
     Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:127.0.0.1:14550 --out dive
     """
-    import signal
     import sys
 
-    from rovgraph.cli.ending import ended_by_signals
+    from rovgraph.cli.ending import asked_by_signal, ended_by_signals
     from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
     from rovgraph.errors import InputError
     from rovgraph.live.clocks import Clocks
@@ -67,8 +66,7 @@ def online(
         files = Files(out, settings, complaints, resume, anew=engine is Engine.isam2)
     navigator = Navigator(settings, feed.recorded, smooth=engine is Engine.isam2, clocks=Clocks(trust=feed.replayed))
     session = Session(navigator, outputs, complaints, rate, files)
-    if hasattr(signal, "SIGUSR1"):
-        signal.signal(signal.SIGUSR1, lambda *_: session.want_smoothed())
+    asked_by_signal(session.want_smoothed)
     with ended_by_signals(feed.close):
         try:
             with StatusLine() as status:
