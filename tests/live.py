@@ -96,11 +96,15 @@ class Vehicle:
     ----------
     lines : (time since the start [s], line), in order
     speed : seconds of the dive per second
+    hang_up : when it closes the connection, once [s of the dive]
     """
 
     lines: list[tuple[float, bytes]]
     speed: float = 1.0
+    hang_up: float = np.inf
     sent: float = -np.inf  # time of the newest line that a client took
+    clients: int = 0  # that have come so far
+    told: float = 0.0  # how much of the dive the newest of them was told [s]
     done: threading.Event = field(default_factory=threading.Event)
 
     def __post_init__(self) -> None:
@@ -115,15 +119,20 @@ class Vehicle:
         return f"tcp://127.0.0.1:{self.port}"
 
     def _serve(self) -> None:
-        client, begin, k = None, None, 0
+        client, begin, since, k = None, None, 0.0, 0
         while not self._stop.is_set():
             if client is None:
                 with suppress(TimeoutError):
                     client = self._listener.accept()[0]
                     begin = time.monotonic() if begin is None else begin
+                    since, self.told = self.speed * (time.monotonic() - begin), 0.0
+                    self.clients += 1
             if begin is None:
                 continue
             until = self.speed * (time.monotonic() - begin)
+            if client is not None and until > self.hang_up:
+                client.close()
+                client, self.hang_up = None, np.inf
             first = k
             while k < len(self.lines) and self.lines[k][0] <= until:
                 k += 1
@@ -131,6 +140,7 @@ class Vehicle:
                 try:
                     client.sendall(b"".join(line for _, line in self.lines[first:k]))
                     self.sent = self.lines[k - 1][0]
+                    self.told = self.sent - since
                 except OSError:
                     client = None
             if k == len(self.lines):
@@ -146,8 +156,8 @@ class Vehicle:
 
 
 @contextmanager
-def vehicle(lines: list[tuple[float, bytes]], speed: float = 1.0) -> Iterator[Vehicle]:
-    server = Vehicle(lines, speed)
+def vehicle(lines: list[tuple[float, bytes]], speed: float = 1.0, hang_up: float = np.inf) -> Iterator[Vehicle]:
+    server = Vehicle(lines, speed, hang_up)
     server._thread.start()
     try:
         yield server

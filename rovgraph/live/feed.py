@@ -55,7 +55,7 @@ class Feed:
         return self._merged() if self.recorded else self._arriving()
 
     def close(self) -> None:
-        """End the iteration and let the threads end; from any thread, more than once."""
+        """End the iteration after what has come, and let the threads end; from any thread, more than once."""
         self._stop.set()
 
     def __enter__(self) -> Self:
@@ -84,6 +84,15 @@ class Feed:
                 running -= 1
             else:
                 yield message
+        yield from self._left()
+
+    def _left(self) -> Iterator[Message]:
+        """What had come before it was closed."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                message = self._queue.get_nowait()
+                if message is not None:
+                    yield message
 
     def _run(self, source: Source) -> None:
         """In a source's thread: what it says into the queue, and at last that it has ended."""

@@ -50,4 +50,4 @@ class Keeper:
             try:
                 write_checkpoint(self._path, state)
             except InputError as error:
-                self._complain(str(self._path), "disk", str(error))
+                self._complain(str(self._path), "disk", str(error).removeprefix(f"{self._path}: "))

@@ -146,7 +146,8 @@ class Files:
         try:
             self.track.add(trajectory_of(navigator.passed, engine.recursion.error, arm))
         except InputError as error:
-            self.complaints.complain(str(self.track.path), "disk", str(error))
+            path = str(self.track.path)
+            self.complaints.complain(path, "disk", str(error).removeprefix(f"{path}: "))
             del navigator.passed[:-UNWRITTEN]
             return False
         navigator.passed = []
