@@ -15,6 +15,7 @@ import pymap3d
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
+from rovgraph.errors import InputError
 from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
 from rovgraph.estimators.incremental import IncrementalEstimator
@@ -268,7 +269,11 @@ class Navigator:
     def _pass(self, mark: Mark) -> None:
         self.passed.append(mark)
         if self.isam2 is not None:
-            self.isam2.take(mark.interval, mark.known, mark.used)
+            try:
+                self.isam2.take(mark.interval, mark.known, mark.used)
+            except InputError as error:  # the filter goes on without it
+                self.isam2 = None
+                self.say("isam2", "lost", str(error))
         self.health.passed(mark)
 
     def _take_events(self) -> tuple[Event, ...]:

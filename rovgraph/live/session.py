@@ -122,9 +122,12 @@ class Files:
 
     def write_smoothed(self, estimate: Estimate) -> None:
         """Put a smoothed track on disk, in place of an older one."""
-        partial = self.folder / f".{SMOOTHED}.partial"
-        estimate.trajectory.write_csv(partial)
-        partial.replace(self.folder / SMOOTHED)
+        path, partial = self.folder / SMOOTHED, self.folder / f".{SMOOTHED}.partial"
+        try:
+            estimate.trajectory.write_csv(partial)
+            partial.replace(path)
+        except OSError as error:
+            self.complaints.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
 
     def keep(self, navigator: Navigator, now: bool = False) -> None:
         """Put the track and a checkpoint on disk, if it is time to."""
