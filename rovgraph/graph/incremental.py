@@ -79,6 +79,10 @@ class Incremental:
         except RuntimeError as error:
             raise InputError(indeterminate(error)) from None
 
+    def copy_values(self) -> None:
+        """Let the bindings copy all values for each callback, as they do by themselves: to measure what that costs."""
+        del self._theta
+
     def state(self, index: int, segment: int) -> State:
         """Estimate of a keyframe, as a `State` of one epoch, calibration included."""
         engine, unknowns = self._engine, self._unknowns

@@ -83,6 +83,11 @@ class Navigator:
         self._arrival = 0.0
 
     @property
+    def waited(self) -> float:
+        """Time waited for the second process, as only a replay does that is faster than it [s]."""
+        return 0.0 if self._renewals is None else self._renewals.waited
+
+    @property
     def waits_for(self) -> str:
         """Why there is no estimate yet; empty where there is, or while the first seconds go by."""
         return "" if self.engine is not None else self._startup.waits_for
@@ -260,11 +265,12 @@ class Navigator:
         if outcome != Taken.IN:
             self.left_out[m.sensor, outcome.value] += 1
         if engine.marks and engine.marks[-1] is not before:
+            waited = 0.0
             if self._renewals is not None:
-                self._renewals.step(engine)
+                waited = self._renewals.step(engine)
             self.health.step(engine.marks)
             self.faults.tick(self.time)
-            self.updates, self.update_s = self.updates + 1, host.perf_counter() - began
+            self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
 
     def _pass(self, mark: Mark) -> None:
         self.passed.append(mark)

@@ -1,8 +1,10 @@
 """When the filter is renewed by the second process."""
 
+import time as host
 from dataclasses import dataclass, field
 
 from rovgraph.errors import InputError
+from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.refiner import Refiner, due_times
@@ -18,11 +20,13 @@ class Renewals:
     beginning : of the dive
     patient : wait for an answer, so that a replay can be repeated
     news : what went wrong, one line each, since it was last emptied
+    waited : for answers, which only a replay does that is faster than the second process [s]
     """
 
     beginning: Beginning
     patient: bool
     news: list[str] = field(default_factory=list)
+    waited: float = 0.0
 
     def __post_init__(self) -> None:
         self._refiner: Refiner | None = Refiner(self.beginning, learn_noise=True)
@@ -34,17 +38,17 @@ class Renewals:
         if self._refiner is not None:
             self._refiner.take(measurements)
 
-    def step(self, engine: FixedLag) -> None:
-        """After a keyframe of the engine."""
-        refiner = self._refiner
+    def step(self, engine: FixedLag) -> float:
+        """After a keyframe of the engine; the time waited for answers, as only a fast replay does [s]."""
+        before, refiner = self.waited, self._refiner
         if refiner is None:
-            return
+            return 0.0
         if self._start is None:
             self._start = engine.marks[0].interval.time
         try:
             if not refiner.asked and engine.marks[-1].interval.time - self._start >= self._due[0]:
                 self._ask(refiner, engine)
-            if refiner.asked and (answer := refiner.answer(wait=self.patient)) is not None:
+            if refiner.asked and (answer := self._answer(refiner)) is not None:
                 if engine.adopt(*answer):
                     self._due.pop(0)
                 else:
@@ -54,6 +58,13 @@ class Renewals:
             self.close()
         if not self._due:
             self.close()
+        return self.waited - before
+
+    def _answer(self, refiner: Refiner) -> tuple[int, Gaussian] | None:
+        began = host.perf_counter()
+        answer = refiner.answer(wait=self.patient)
+        self.waited += host.perf_counter() - began
+        return answer
 
     def close(self) -> None:
         """End the process."""

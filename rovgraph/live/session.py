@@ -199,6 +199,7 @@ class Session:
     complaints : what sources, outputs and disk complain of
     solution : the newest
     solutions : count
+    took : times of the filter's updates [s]
     """
 
     navigator: Navigator
@@ -210,7 +211,7 @@ class Session:
     solutions: int = 0
     _due: float = -math.inf
     _watchers: list[Callable[[Solution], None]] = field(default_factory=list)
-    _took: "array[float]" = field(default_factory=lambda: array("f"))
+    took: "array[float]" = field(default_factory=lambda: array("f"))
     _resumed: float = -math.inf
     _wanted: bool = False
 
@@ -230,9 +231,9 @@ class Session:
 
     def updates(self) -> dict[str, float]:
         """Times that updates of the filter took [ms]."""
-        took = 1e3 * np.array(self._took or [0.0])
+        took = 1e3 * np.array(self.took or [0.0])
         return {
-            "count": len(self._took),
+            "count": len(self.took),
             "mean_ms": float(took.mean()),
             "p99_ms": float(np.percentile(took, 99)),
             "max_ms": float(took.max()),
@@ -283,7 +284,7 @@ class Session:
         before = self.navigator.updates
         rows = self.navigator.take(message)
         if self.navigator.updates > before:
-            self._took.append(self.navigator.update_s)
+            self.took.append(self.navigator.update_s)
         if not rows:
             self.complaints.complain(message.source, "stamp", "a stamp seconds off from those before, left out")
         if self.files is not None:

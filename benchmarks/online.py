@@ -1,0 +1,172 @@
+"""The online mode: does it keep up? Figures are in benchmarks/README.md.
+
+python benchmarks/online.py engine fixed-lag --seconds 3600
+python benchmarks/online.py engine isam2 --seconds 3600
+python benchmarks/online.py callbacks --seconds 600
+python benchmarks/online.py agreement
+python benchmarks/online.py shuffled
+python benchmarks/online.py log LOG --config CONFIG --reference REFERENCE --after 600
+"""
+
+import argparse
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rovgraph.config import load_config
+from rovgraph.estimators.dive import assemble, smooth
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
+from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.estimators.initialise import initialise
+from rovgraph.evaluate import evaluate, read_reference
+from rovgraph.geometry import log_rotation, transpose
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.complaints import Complaints
+from rovgraph.live.message import Message, Reading
+from rovgraph.live.navigator import Navigator
+from rovgraph.live.session import Session
+from rovgraph.live.solution import Solution
+from rovgraph.live.track import trajectory_of
+from rovgraph.log import Log, log_from_frame, read_log
+from rovgraph.simulate import Choices, simulated
+from rovgraph.simulate.named import falcon
+
+SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
+RATE_HZ = 10.0
+
+
+def messages(log: Log, order: np.ndarray | None = None) -> Iterator[Message]:
+    """What a file says, at once; in another order where one is given."""
+    measurements = list(log.measurements())
+    for k in range(len(measurements)) if order is None else order.tolist():
+        m = measurements[k]
+        yield Message("file", m.time, m.time, (Reading(m.sensor, m.values),))
+
+
+def resident_mb() -> float:
+    """Memory of this process now [MB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def engine(kind: str, seconds: float, seed: int) -> None:
+    """A dive at full speed: what an update takes, and whether time and memory grow."""
+    dive, config = simulated("lawnmower", seed, falcon(), Choices(duration=seconds))
+    log = log_from_frame(dive.log_frame)
+    del dive
+    navigator = Navigator(config, patient=True, smooth=kind == "isam2", clocks=Clocks(trust=True))
+    session = Session(navigator, [], Complaints(), RATE_HZ)
+    begin, memory = float(log["imu"].time[0]), {}
+
+    def watch(solution: Solution) -> None:
+        navigator.passed.clear()  # with --out it goes to a file
+        memory[int(4 * (solution.time - begin) / seconds)] = resident_mb()
+
+    session.watch(watch)
+    began = time.perf_counter()
+    session.run(messages(log))
+    wall = time.perf_counter() - began
+    ms = 1e3 * np.array(session.took)
+    quarters = [float(part.mean()) for part in np.array_split(ms, 4)]
+    print(f"{kind}: {seconds:.0f} s in {wall:.1f} s, {seconds / wall:.0f} times real time; {len(ms)} updates")
+    print(f"update: mean {ms.mean():.2f} ms, p99 {np.percentile(ms, 99):.1f} ms, max {ms.max():.0f} ms")
+    print(f"mean by quarter: {np.round(quarters, 2)} ms; the last is {quarters[3] / quarters[1]:.2f} times the second")
+    print(f"waited for the second process, as only a replay does: {navigator.waited:.1f} s")
+    print(f"longest: {np.sort(ms)[-10:].round()} ms")
+    print(f"memory: {memory[1]:.0f} MB at half, {memory[3]:.0f} MB at the end, {memory[3] / memory[1] - 1:+.1%}")
+
+
+def callbacks(seconds: float, seed: int) -> None:
+    """iSAM2 over the first minutes, and the same graph whose callbacks each get a copy of all values."""
+    dive, config = simulated("lawnmower", seed, falcon(), Choices(duration=seconds))
+    log = log_from_frame(dive.log_frame)
+    beginning = initialise(log, config)
+    batch = assemble(log, beginning)
+    recursion, gates, known, passages = ErrorStateRecursion(beginning), {}, None, []
+    for interval in batch.intervals:
+        passages.append(recursion.through(interval, known, gates))
+        known = passages[-1].filtered
+    for kept in (True, False):
+        isam2 = IncrementalEstimator(beginning)
+        if not kept:
+            isam2.engine.copy_values()
+        began = time.process_time()
+        for interval, passage in zip(batch.intervals, passages, strict=True):
+            isam2.take(interval, passage.filtered, passage.used)
+        how = "kept" if kept else "copied for each callback"
+        print(f"linearisation point {how}: {time.process_time() - began:.1f} s of CPU", flush=True)
+
+
+def agreement() -> None:
+    """iSAM2's last trajectory against the batch smoother's, on the dive that ships."""
+    config = load_config(SHIPPED / "config.yaml")
+    log = read_log(SHIPPED / "log.csv.gz", config.columns, config.units, config.imu.mag.calibrated)
+    isam2 = config.model_copy(update={"graph": config.graph.model_copy(update={"solver": "isam2"})})
+    a, b = (smooth(log, c, "smoothed").estimates[0].trajectory for c in (config, isam2))
+    apart = np.linalg.norm(a.p_n - b.p_n, axis=1).max()
+    turned = np.rad2deg(np.linalg.norm(log_rotation(transpose(a.R_nb) @ b.R_nb), axis=1).max())
+    print(f"iSAM2 and batch differ by at most {1e3 * apart:.2f} mm and {turned:.4f} deg")
+
+
+def shuffled(seed: int) -> None:
+    """The shipped dive with arrivals shuffled within 300 ms."""
+    config = load_config(SHIPPED / "config.yaml")
+    log = read_log(SHIPPED / "log.csv.gz", config.columns, config.units)
+    stamps = np.array([m.time for m in log.measurements()])
+    order = np.argsort(stamps + np.random.default_rng(seed).uniform(0.0, 0.3, len(stamps)))
+    ends = []
+    for o in (None, order):
+        navigator = Navigator(config, patient=True, clocks=Clocks(trust=True))
+        for message in messages(log, o):
+            navigator.take(message)
+        navigator.finish()
+        known = navigator.passed[-1].known
+        ends.append((known.state.p_n[0], known.P[3:6, 3:6]))
+    print(f"final position differs by {1e3 * np.linalg.norm(ends[0][0] - ends[1][0]):.6f} mm")
+
+
+def recorded(path: Path, config_path: Path, reference: Path, after: float) -> None:
+    """A recorded dive at full speed."""
+    config = load_config(config_path)
+    log = read_log(path, config.columns, config.units)
+    navigator = Navigator(config, patient=True, clocks=Clocks(trust=True))
+    session = Session(navigator, [], Complaints(), RATE_HZ)
+    began = time.perf_counter()
+    session.run(messages(log))
+    wall = time.perf_counter() - began
+    assert navigator.engine is not None
+    arm = np.array(config.imu.lever_arm_m)
+    trajectory = trajectory_of(navigator.passed, navigator.engine.recursion.error, arm)
+    result = evaluate(trajectory, read_reference(reference), start=after)
+    seconds = float(log["imu"].time[-1] - log["imu"].time[0])
+    print(f"{seconds:.0f} s in {wall:.1f} s, {seconds / wall:.0f} times real time")
+    print(result)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["engine", "callbacks", "agreement", "shuffled", "log"])
+    parser.add_argument("which", nargs="?", default="fixed-lag", help="fixed-lag or isam2; or a log")
+    parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--reference", type=Path)
+    parser.add_argument("--after", type=float, default=0.0, help="errors are taken from this long after the start [s]")
+    given = parser.parse_args()
+    if given.what == "engine":
+        engine(given.which, given.seconds, given.seed)
+    elif given.what == "callbacks":
+        callbacks(given.seconds, given.seed)
+    elif given.what == "agreement":
+        agreement()
+    elif given.what == "shuffled":
+        shuffled(given.seed)
+    else:
+        recorded(Path(given.which), given.config, given.reference, given.after)
+
+
+if __name__ == "__main__":
+    main()
