@@ -40,9 +40,8 @@ RATE_HZ = 10.0
 
 def messages(log: Log, order: np.ndarray | None = None) -> Iterator[Message]:
     """What a file says, at once; in another order where one is given."""
-    measurements = list(log.measurements())
-    for k in range(len(measurements)) if order is None else order.tolist():
-        m = measurements[k]
+    measurements = log.measurements() if order is None else map(list(log.measurements()).__getitem__, order.tolist())
+    for m in measurements:
         yield Message("file", m.time, m.time, (Reading(m.sensor, m.values),))
 
 
@@ -52,13 +51,13 @@ def resident_mb() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
-def engine(kind: str, seconds: float, seed: int) -> None:
+def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
     """A dive at full speed: what an update takes, and whether time and memory grow."""
     dive, config = simulated("lawnmower", seed, falcon(), Choices(duration=seconds))
     log = log_from_frame(dive.log_frame)
     del dive
     navigator = Navigator(config, patient=True, smooth=kind == "isam2", clocks=Clocks(trust=True))
-    session = Session(navigator, [], Complaints(), RATE_HZ)
+    session = Session(navigator, [], Complaints(), rate)
     begin, memory = float(log["imu"].time[0]), {}
 
     def watch(solution: Solution) -> None:
@@ -71,7 +70,8 @@ def engine(kind: str, seconds: float, seed: int) -> None:
     wall = time.perf_counter() - began
     ms = 1e3 * np.array(session.took)
     quarters = [float(part.mean()) for part in np.array_split(ms, 4)]
-    print(f"{kind}: {seconds:.0f} s in {wall:.1f} s, {seconds / wall:.0f} times real time; {len(ms)} updates")
+    print(f"{kind}, {rate:g} solutions a second, {len(ms)} updates")
+    print(f"{seconds:.0f} s in {wall:.1f} s, {seconds / wall:.0f} times real time")
     print(f"update: mean {ms.mean():.2f} ms, p99 {np.percentile(ms, 99):.1f} ms, max {ms.max():.0f} ms")
     print(f"mean by quarter: {np.round(quarters, 2)} ms; the last is {quarters[3] / quarters[1]:.2f} times the second")
     print(f"waited for the second process, as only a replay does: {navigator.waited:.1f} s")
@@ -151,13 +151,14 @@ def main() -> None:
     parser.add_argument("what", choices=["engine", "callbacks", "agreement", "shuffled", "log"])
     parser.add_argument("which", nargs="?", default="fixed-lag", help="fixed-lag or isam2; or a log")
     parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument("--rate", type=float, default=RATE_HZ, help="solutions a second of the dive")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--config", type=Path)
     parser.add_argument("--reference", type=Path)
     parser.add_argument("--after", type=float, default=0.0, help="errors are taken from this long after the start [s]")
     given = parser.parse_args()
     if given.what == "engine":
-        engine(given.which, given.seconds, given.seed)
+        engine(given.which, given.seconds, given.seed, given.rate)
     elif given.what == "callbacks":
         callbacks(given.seconds, given.seed)
     elif given.what == "agreement":

@@ -227,12 +227,14 @@ class Assembler:
         time : [s]
         state : State of one epoch, of the newest keyframe
         """
-        rows = [(t, *values) for t, values in self._imu]
-        rows += [(m.time, *self._R_bs @ m.values[:3], *self._R_bs @ m.values[3:6]) for m in samples]
-        if time - rows[-1][0] > self._longest_step:
+        times, values = zip(*self._imu, strict=True)
+        imu = np.column_stack([times, np.array(values)])
+        if samples:
+            later = np.array([m.values[:6] for m in samples]).reshape(-1, 3) @ self._R_bs.T
+            imu = np.vstack([imu, np.column_stack([[m.time for m in samples], later.reshape(-1, 6)])])
+        if time - imu[-1, 0] > self._longest_step:
             force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
-            rows.append((time, *np.concatenate([force, np.zeros(3)]) + state.bias[0]))
-        imu = np.array(rows)
+            imu = np.vstack([imu, [time, *np.concatenate([force, np.zeros(3)]) + state.bias[0]]])
         bridged = bool(np.diff(imu[:, 0]).max() > self._longest_step)
         params = self._bridge if bridged else self._params
         pim, _ = preintegrate(params, self.bias, imu, self._start, np.empty(0), time)

@@ -14,7 +14,7 @@ import numpy as np
 import pymap3d
 
 from rovgraph.calibration import TABLE
-from rovgraph.config import Config
+from rovgraph.config import Config, Mag
 from rovgraph.errors import InputError
 from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
@@ -81,6 +81,7 @@ class Navigator:
         self._newest: dict[str, float] = {}
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival = 0.0
+        self._mag = None if self.config.imu.mag == Mag() else self.config.imu.mag
 
     @property
     def waited(self) -> float:
@@ -122,7 +123,7 @@ class Navigator:
             if measurement.time > known:
                 values = measurement.values
                 if measurement.sensor == "mag":
-                    values = self.config.imu.mag.calibrated(values[None])[0]
+                    values = self._calibrated(values)
                 self._consider(measurement._replace(values=values))
 
     def say(self, source: str, kind: str, text: str) -> None:
@@ -213,13 +214,17 @@ class Navigator:
             north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
             sensor, values = "fix", np.array([north, east, values[2]])
         elif sensor == "mag":
-            values = self.config.imu.mag.calibrated(values[None])[0]
+            values = self._calibrated(values)
         newest = self._newest.get(sensor, -np.inf)
         if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
             self.left_out[sensor, "more often than can be used"] += 1
             return None
         self._newest[sensor] = max(time, newest)
         return Measurement(time, sensor, values, 0)
+
+    def _calibrated(self, field: Array) -> Array:
+        """A sample of the magnetometer, shape (3,), as the configuration's calibration has it."""
+        return field if self._mag is None else self._mag.calibrated(field[None])[0]
 
     def _consider(self, m: Measurement) -> None:
         """Give a measurement to the engine, unless it is none."""

@@ -1,5 +1,6 @@
 """A run of the online mode: sources to a navigator, solutions to outputs, everything to disk."""
 
+import gc
 import io
 import json
 import math
@@ -256,12 +257,13 @@ class Session:
     def run(self, feed: Iterable[Message | None]) -> None:
         """Work off what the sources say."""
         navigator, files = self.navigator, self.files
+        gc.freeze()  # or the collector looks through libraries and recordings now and then, for a tenth of a second
         for message in feed:
             if message is None:
                 self._wait()
             elif not self._known(message):
                 self._take(message)
-            if navigator.time >= self._due:
+            if navigator.engine is not None and navigator.time >= self._due:
                 self._send()
             if files is not None:
                 files.keep(navigator)
