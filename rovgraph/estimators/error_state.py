@@ -6,7 +6,7 @@ keyframe is corrected as measurements come. The smoother goes back over the filt
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Step, Used
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.renewal import renewed
 from rovgraph.estimators.results import (
     bias_histories,
     body_trajectory,
@@ -23,7 +24,6 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Interval
-from rovgraph.graph.batch import make_problem, make_values, newest_covariance, solve
 from rovgraph.graph.measurements import Block
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY, State, stack_states
@@ -88,7 +88,8 @@ class ErrorStateFilter:
         self.intervals.append(interval)
         if self._renewals and interval.time - self.intervals[0].time >= self._renewals[0]:
             self._renewals.pop(0)
-            self.filtered[-1] = self._renewed()
+            states = stack_states([known.state for known in self.filtered])
+            self.filtered[-1] = renewed(self.recursion, self.intervals, states)
         self.assembler.stamps.assume(self.latest().calibration)
 
     def solve(self) -> Estimate:
@@ -114,19 +115,6 @@ class ErrorStateFilter:
         for interval in intervals:
             self.step(interval)
         return intervals
-
-    def _renewed(self) -> Gaussian:
-        """The newest keyframe as the graph of the dive so far has it, every factor linearised at the optimum."""
-        b, before = self.beginning, self.filtered[-1]
-        problem = make_problem(self.intervals, b.start, b.config, self.recursion.beliefs, b.instruments)
-        states = stack_states([known.state for known in self.filtered])
-        solution = solve(problem, make_values(problem, states, before.state.calibration))
-        newest = problem.states(solution.values).at([problem.count - 1])
-        calibration = {name: value.reshape(-1) for name, value in newest.calibration.items()}
-        known = [np.arange(15)] + [np.r_[self.error.columns[name]] for name in problem.unknowns.estimated]
-        P = self.recursion.start().P  # of what no sensor has shown yet
-        P[np.ix_(np.concatenate(known), np.concatenate(known))] = newest_covariance(problem, solution)
-        return Gaussian(replace(newest, calibration=calibration), P)
 
     def _back(self, departed: Gaussian, step: Step, following: Gaussian) -> Gaussian:
         """The smoothed state of a keyframe, given that of the one after it."""

@@ -12,9 +12,12 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.error_recursion import Gaussian
-from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
+from rovgraph.estimators.dead_reckoning import dead_reckon
+from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian
+from rovgraph.estimators.error_state import RENEW_AT_S
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.renewal import renewed
+from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement
 from rovgraph.workers import companion
 
@@ -55,6 +58,10 @@ class Refiner:
         self._asked = index
         self._work.put(index)
 
+    def served(self) -> None:
+        """Say that the answer was of use: there is nothing more to do until the next renewal."""
+        self._work.put(None)
+
     @property
     def asked(self) -> bool:
         """Whether an answer is still to come."""
@@ -85,15 +92,51 @@ class Refiner:
         self._answers.close()
 
 
+class _Renewed:
+    """What the process does: it solves the dive at each time of renewal, and filters on from there until it is done."""
+
+    def __init__(self, beginning: Beginning, renew_at: Sequence[float], learn_noise: bool) -> None:
+        b = beginning
+        self._assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=learn_noise)
+        self._recursion = ErrorStateRecursion(b)
+        self._renewals = list(renew_at)
+        self._intervals: list[Interval] = []
+        self._known: list[Gaussian] = []  # of the newest keyframes, since the last renewal
+        self._gates: Gates = {}
+
+    def add(self, measurement: Measurement) -> None:
+        for interval in self._assembler.add(measurement):
+            self._intervals.append(interval)
+            if self._renewals and interval.time - self._intervals[0].time >= self._renewals[0]:
+                self._renewals.pop(0)
+                self._known, self._gates = [self._solved()], {}
+            elif self._known:
+                self._known.append(self._recursion.through(interval, self._known[-1], self._gates).filtered)
+
+    def known(self, index: int) -> Gaussian:
+        """The estimate of a keyframe since the last renewal."""
+        return self._known[index - len(self._intervals)]
+
+    def rest(self) -> None:
+        """Filter no more until the next renewal."""
+        self._known = []
+
+    def _solved(self) -> Gaussian:
+        b, recursion = self._recursion.beginning, self._recursion
+        return renewed(recursion, self._intervals, dead_reckon(self._intervals, b, recursion.unknowns.fixed))
+
+
 def _refine(
     beginning: Beginning, renew_at: tuple[float, ...], learn_noise: bool, work: Any, answers: Connection
 ) -> None:
-    """What the process does."""
-    estimator = ErrorStateFilter(beginning, renew_at, learn_noise)
+    """Work off what the first process sends: measurements, the index of a keyframe, None = the answer served."""
+    dive = _Renewed(beginning, renew_at, learn_noise)
     while True:
         item = work.get()
-        if isinstance(item, int):
-            answers.send(estimator.filtered[item])
-            continue
-        for measurement in item:
-            estimator.add(measurement)
+        if item is None:
+            dive.rest()
+        elif isinstance(item, int):
+            answers.send(dive.known(item))
+        else:
+            for measurement in item:
+                dive.add(measurement)

@@ -51,6 +51,7 @@ class Renewals:
             if refiner.asked and (answer := self._answer(refiner)) is not None:
                 if engine.adopt(*answer):
                     self._due.pop(0)
+                    refiner.served()
                 else:
                     self._ask(refiner, engine)  # the lag has passed that keyframe; the next answer comes at once
         except InputError as error:
