@@ -48,12 +48,14 @@ class Watch:
     state : "ok", "silent", "frozen", "no lock"
     entered : when it came into that state [s]
     told : the state that an event has told of, if it is not "ok"
+    time, heard : of its newest measurement, and what time it was when it came [s]
     """
 
     state: str = "ok"
     entered: float = 0.0
     told: str = ""
     time: float = -np.inf
+    heard: float = -np.inf
     period: float = 0.0
     values: bytes = b""
     since: float = 0.0  # of the first of equal values
@@ -73,6 +75,7 @@ class Faults:
 
     watches: dict[str, Watch] = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
+    _now: float = -np.inf
     _speeds: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=3))
 
     def look(self, m: Measurement) -> Verdict:
@@ -88,7 +91,8 @@ class Faults:
         if watch.time > -np.inf:
             step = m.time - watch.time
             watch.period = step if not watch.period else watch.period + 0.05 * (step - watch.period)
-        watch.time, watch.values = max(m.time, watch.time), values
+        self._now = max(self._now, m.time)
+        watch.time, watch.heard, watch.values = max(m.time, watch.time), self._now, values
         if m.sensor == "dvl":
             return self._ping(m, watch)
         frozen = watch.equal >= FROZEN.get(m.sensor, np.inf) or (
@@ -99,7 +103,7 @@ class Faults:
     def tick(self, time: float) -> None:
         """Note sensors that have said nothing for too long."""
         for sensor, watch in self.watches.items():
-            quiet = time - watch.time
+            quiet = time - watch.heard  # what comes late all the time is not silent
             if watch.state != "silent" and quiet > max(SILENT_S, SILENT_PERIODS * watch.period):
                 watch.state = watch.told = "silent"
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))

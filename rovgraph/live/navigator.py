@@ -188,7 +188,6 @@ class Navigator:
             "engine": self.engine.state(),
             "clocks": self.clocks.state(),
             "origin": self.origin,
-            "time": self.time,
             "travelled": [self._distance, *self._here.tolist()],
             "used": dict(self.health.used),
             "rejected": dict(self.health.rejected),
@@ -200,7 +199,7 @@ class Navigator:
         self.renew = False
         self._begin(restored(state["beginning"]), state["engine"])
         self.clocks.restore(state["clocks"])
-        self.time = state["time"]
+        self.time = state["engine"]["keyframe"][1]  # what was received since is read again
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
