@@ -35,11 +35,13 @@ class IncrementalEstimator:
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
+    update_s : of the dive, between updates of iSAM2 [s]
     intervals : the dive, as far as it has been taken
     updated : newest keyframe that iSAM2 has, -1 = none
     """
 
     beginning: Beginning
+    update_s: float = UPDATE_S
 
     def __post_init__(self) -> None:
         b = self.beginning
@@ -91,7 +93,7 @@ class IncrementalEstimator:
                 factors.append(block.custom_factor())
         self.engine.add(factors, values)
         self.intervals.append(interval)
-        if interval.time - self.intervals[max(self.updated, 0)].time >= UPDATE_S:
+        if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
             self.update()
 
     def update(self) -> None:
