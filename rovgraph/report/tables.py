@@ -58,11 +58,15 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
     )
     for heading in ("variable", "value ± sd", "prior ± sd", "sd narrowed to", "verdict"):
         table.add_column(heading, justify="left" if heading in ("variable", "verdict") else "right")
-    for entry in sorted(main.calibration, key=lambda e: not e.estimated):
+    silent = [e for e in main.calibration if not e.estimated and e.value == 0.0]
+    told = [e for e in main.calibration if e not in silent]
+    for entry in sorted(told, key=lambda e: not e.estimated):
         tail = f" [{shown(entry.unit)[1]}]" if entry.unit != "1" else ""
         table.add_row(escape(entry.label + tail), *_calibration_cells(entry), style="" if entry.estimated else "dim")
+    notes = [f"held at 0: {', '.join(e.label for e in silent)}"] if silent else []
     if any(e.verdict == UNOBSERVABLE for e in main.calibration):
-        table.caption = "unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)"
+        notes.append("unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)")
+    table.caption = "\n".join(notes) or None
     return table
 
 
