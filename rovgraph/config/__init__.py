@@ -5,7 +5,29 @@
 all keys, `beliefs` gives the calibration variables of `rovgraph.calibration` their priors.
 """
 
-from rovgraph.config.reading import Config, beliefs, describe, load_config, mount_matrix, parse_config
+from rovgraph.config.reading import (
+    Config,
+    beliefs,
+    describe,
+    load_config,
+    mount_matrix,
+    parse_config,
+    parse_model,
+    read_yaml,
+    yaml_text,
+)
 from rovgraph.config.sections import ImuNoise, Mag
 
-__all__ = ["Config", "ImuNoise", "Mag", "beliefs", "describe", "load_config", "mount_matrix", "parse_config"]
+__all__ = [
+    "Config",
+    "ImuNoise",
+    "Mag",
+    "beliefs",
+    "describe",
+    "load_config",
+    "mount_matrix",
+    "parse_config",
+    "parse_model",
+    "read_yaml",
+    "yaml_text",
+]

@@ -4,7 +4,7 @@ import difflib
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
@@ -30,6 +30,8 @@ from rovgraph.config.sections import (
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, matrix_from_rpy
 
+Model = TypeVar("Model", bound=BaseModel)
+
 
 class Config(Section):
     """What an estimator believes; see docs/configuration.md for all keys."""
@@ -51,12 +53,17 @@ class Config(Section):
 
     def to_yaml(self) -> str:
         """The effective configuration, every key written out."""
-        stream = io.StringIO()
-        yaml = YAML(typ="safe", pure=True)
-        yaml.default_flow_style, yaml.width = None, 4096
-        yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-        yaml.dump(self.model_dump(mode="json"), stream)
-        return stream.getvalue()
+        return yaml_text(self.model_dump(mode="json"))
+
+
+def yaml_text(data: dict[str, Any]) -> str:
+    """Keys and values as YAML."""
+    stream = io.StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style, yaml.width = None, 4096
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.dump(data, stream)
+    return stream.getvalue()
 
 
 def mount_matrix(rpy_deg: Triple) -> Array:
@@ -101,18 +108,29 @@ def load_config(path: Path | str | None = None) -> Config:
     InputError : no such file, no YAML, an unknown key (with the nearest known one), a
         value of the wrong kind
     """
-    if path is None:
-        return Config()
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a configuration ({_reason(error)})") from None
-    return parse_config(text, str(path))
+    return Config() if path is None else parse_model(Config, read_yaml(Path(path)), str(path))
 
 
 def parse_config(text: str, source: str = "configuration") -> Config:
     """Parse YAML text; ``source`` names it in messages."""
+    return parse_model(Config, _parse_yaml(text, source), source)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Keys and values of a YAML file.
+
+    Raises
+    ------
+    InputError : no such file, no YAML, no keys and values
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a configuration ({_reason(error)})") from None
+    return _parse_yaml(text, str(path))
+
+
+def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     try:
         data = YAML(typ="safe", pure=True).load(text)
     except YAMLError as error:
@@ -121,33 +139,42 @@ def parse_config(text: str, source: str = "configuration") -> Config:
         problem = str(getattr(error, "problem", None) or "cannot be parsed").splitlines()[0]
         raise InputError(f"{source}{where}: no valid YAML ({problem})") from None
     if data is None:
-        data = {}
+        return {}
     if not isinstance(data, dict):
         raise InputError(f"{source}: expected keys and values at the top, found a {type(data).__name__}")
+    return data
+
+
+def parse_model(model: type[Model], data: dict[str, Any], source: str) -> Model:
+    """What keys and values say, by a model that knows all of its keys; ``source`` names them in messages.
+
+    Raises
+    ------
+    InputError : an unknown key (with the nearest known one), a value of the wrong kind
+    """
     try:
-        return Config.model_validate(data)
+        return model.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{source}: " + "; ".join(_complaint(e) for e in error.errors())) from None
+        raise InputError(f"{source}: " + "; ".join(_complaint(e, model) for e in error.errors())) from None
 
 
 def _reason(error: OSError | UnicodeDecodeError) -> str:
     return error.strerror or str(error) if isinstance(error, OSError) else "not UTF-8 text"
 
 
-def _known_keys(location: tuple[int | str, ...]) -> list[str]:
+def _known_keys(location: tuple[int | str, ...], model: Any) -> list[str]:
     """Keys that are known beside the one at ``location``; a number in it stands for an item of a list."""
-    model: Any = Config
     for part in location[:-1]:
         model = get_args(model)[0] if isinstance(part, int) else model.model_fields[part].annotation
     return list(model.model_fields)
 
 
-def _complaint(error: Any) -> str:
+def _complaint(error: Any, model: type[BaseModel]) -> str:
     """One validation error as a phrase that names key, problem and remedy."""
     location = error["loc"]
     key = ".".join(str(part) for part in location)
     if error["type"] == "extra_forbidden":
-        known = _known_keys(location)
+        known = _known_keys(location, model)
         near = difflib.get_close_matches(str(location[-1]), known, 1, cutoff=0.0)
         return f"unknown key {key}, nearest known key is {'.'.join([*map(str, location[:-1]), near[0]])}"
     return f"{key}: {error['msg'][0].lower()}{error['msg'][1:]} (found {error['input']!r})"
