@@ -1,0 +1,184 @@
+"""Where the runs of a study are made: on this machine, or on a Dask cluster.
+
+On one machine a pool of processes is all that is needed; it is at hand without another
+library, starts in a second and uses no ports. What a pool lacks is done here: when one of its
+processes is killed, it breaks as a whole and is made anew. A cluster's scheduler does that by
+itself, so for more than one machine there is Dask, and nothing of it is repeated here.
+"""
+
+import contextlib
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+import rovgraph
+from rovgraph.errors import DataWarning, InputError
+from rovgraph.workers import cores, starting, workers
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+Finished = Callable[[Any, Any], None]  # a task; its result, or the error
+
+RETRIES = 2  # of a task that raised, or whose process was killed
+CONNECT_S = 5.0  # to a scheduler
+WORKERS_S = 30.0  # for the first worker to join it
+
+
+class Engine(Protocol):
+    """Calls a function with every task, elsewhere, and ``finished`` here with what came of each.
+
+    A task that raises, or whose process dies, is tried again; after `RETRIES` of that
+    ``finished`` is given the error.
+    """
+
+    def each(self, function: Callable[[Task], Result], tasks: Sequence[Task], finished: Finished) -> None: ...
+
+
+@dataclass(frozen=True)
+class Local:
+    """Processes on this machine.
+
+    Attributes
+    ----------
+    jobs : how many, None = one per core
+    """
+
+    jobs: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None and self.jobs < 1:
+            raise InputError(f"{self.jobs} jobs: at least 1 is expected")
+
+    def each(self, function: Callable[[Task], Result], tasks: Sequence[Task], finished: Finished) -> None:
+        """As `Engine`: after a process was killed, what it may have had at hand goes first, each by itself."""
+        jobs, failures = self.jobs or cores(), dict.fromkeys(range(len(tasks)), 0)  # of what is not finished yet
+        work = _Work(function, tasks, finished, failures)
+        while failures:
+            for suspect in work.in_pool(list(failures), jobs):
+                while suspect in failures:
+                    work.in_pool([suspect], 1)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Tasks, and how often each that is left has failed; what is finished is taken out of ``failures``."""
+
+    function: Callable[[Any], Any]
+    tasks: Sequence[Any]
+    finished: Finished
+    failures: dict[int, int]
+
+    def in_pool(self, chosen: Sequence[int], jobs: int) -> list[int]:
+        """Try each of some tasks once; those that may have killed a process are returned."""
+        lost = []
+        with workers(min(jobs, len(chosen))) as pool:
+            with starting():
+                futures = {pool.submit(self.function, self.tasks[i]): i for i in chosen}
+            for future in as_completed(futures):
+                try:
+                    result = future.result()
+                except BrokenProcessPool:
+                    lost.append(futures[future])
+                except Exception as error:
+                    self._failed(futures[future], error)
+                else:
+                    self._end(futures[future], result)
+        return self._killed(sorted(lost)[:jobs]) if lost else []
+
+    def _killed(self, at_hand: list[int]) -> list[int]:
+        """A pool takes tasks in their order, so the first of the lost ones were at hand."""
+        message = "a worker process was killed (out of memory?); what it had at hand is made again"
+        warnings.warn(message, DataWarning, stacklevel=4)
+        if len(at_hand) == 1:
+            self._failed(at_hand[0], RuntimeError("its process was killed again and again (out of memory?)"))
+        return at_hand
+
+    def _failed(self, task: int, error: BaseException) -> None:
+        self.failures[task] += 1
+        if self.failures[task] > RETRIES:
+            self._end(task, error)
+
+    def _end(self, task: int, result: Any) -> None:
+        del self.failures[task]
+        self.finished(self.tasks[task], result)
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A Dask cluster that is running already; its workers need this version of rovgraph.
+
+    Attributes
+    ----------
+    address : of the scheduler, such as ``tcp://host:8786``
+    """
+
+    address: str
+
+    def each(self, function: Callable[[Task], Result], tasks: Sequence[Task], finished: Finished) -> None:
+        """As `Engine`.
+
+        Raises
+        ------
+        InputError : Dask is not installed; no scheduler, no workers, another version; the scheduler was lost
+        """
+        with self._client() as client:
+            from distributed import as_completed as as_they_come
+
+            waiting = {client.submit(function, task, retries=RETRIES, pure=False): (task, 0) for task in tasks}
+            coming = as_they_come(list(waiting), loop=client.loop)
+            for future in coming:
+                task, lost = waiting.pop(future)
+                if future.status != "cancelled":
+                    finished(task, future.exception() if future.status == "error" else future.result())
+                    continue
+                self._check_alive(client)
+                if lost == RETRIES:
+                    finished(task, RuntimeError(f"the cluster lost it {RETRIES + 1} times"))
+                    continue
+                again = client.submit(function, task, retries=RETRIES, pure=False)
+                waiting[again] = (task, lost + 1)
+                coming.add(again)
+
+    @contextlib.contextmanager
+    def _client(self) -> Iterator[Any]:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise InputError(
+                "--scheduler needs Dask, which is not installed; pip install 'rovgraph[studies]'"
+            ) from None
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said in a line of ours
+        try:
+            client = Client(self.address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(f"{self.address}: no Dask scheduler answers there ({reason})") from None
+        with client:
+            self._check_workers(client)
+            yield client
+
+    def _check_workers(self, client: Any) -> None:
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_S)
+        except TimeoutError:
+            raise InputError(f"{self.address}: no worker joined this scheduler in {WORKERS_S:.0f} s") from None
+        try:
+            versions = set(client.run(own_version).values())
+        except Exception as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(f"{self.address}: its workers cannot load rovgraph ({reason})") from None
+        if strange := versions - {own_version()}:
+            raise InputError(f"{self.address}: a worker has rovgraph {min(strange)}, here it is {own_version()}")
+
+    def _check_alive(self, client: Any) -> None:
+        if client.status != "running":
+            raise InputError(f"{self.address}: the scheduler was lost; give --resume when it is back")
+
+
+def own_version() -> str:
+    """Of rovgraph where this is called."""
+    return rovgraph.__version__
