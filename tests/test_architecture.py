@@ -168,6 +168,8 @@ print("MODULES", *sys.modules)
         ["calibrate"],
         ["calibrate", "magnetometer"],
         ["calibrate", "noise"],
+        ["study"],
+        ["study", "misalignment"],
     ],
 )
 def test_help_loads_nothing_heavy(command):

@@ -18,6 +18,7 @@ from rovgraph.cli.online import online
 from rovgraph.cli.plan import plan
 from rovgraph.cli.simulate import simulate
 from rovgraph.cli.smooth import smooth
+from rovgraph.cli.study import study
 from rovgraph.errors import DataWarning, InputError
 
 app = typer.Typer(
@@ -31,6 +32,7 @@ app = typer.Typer(
 for _command in (smooth, online, evaluate, compare, observe, plan, check, config, simulate):
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(study, name="study")
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:

@@ -1,0 +1,70 @@
+"""``rovgraph study``: many simulated dives, to see what can be known."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+study = typer.Typer(help="Monte Carlo: what can be known, over many simulated dives.", no_args_is_help=True)
+
+WIDE = 170  # columns of a file or a pipe, which has no width of its own
+
+
+@study.callback()
+def _study() -> None:
+    """Keep ``misalignment`` a command of its own, though it is the only one."""
+
+
+@study.command()
+def misalignment(
+    config: Annotated[Path, typer.Option("--config", "-c", help="the study (YAML), see docs/studies.md")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder", show_default=False)] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with what is in the results folder")] = False,
+    only: Annotated[str | None, typer.Option(help="one cell, by the beginning of its id")] = None,
+    jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="of a Dask cluster, such as tcp://host:8786")] = None,
+    show: Annotated[bool, typer.Option("--list", help="show the cells and their ids, and run nothing")] = False,
+) -> None:
+    """What can be known of the DVL's misalignment, and whether what the estimators say of it is true.
+
+    Example: rovgraph study misalignment --config configs/studies/quick.yaml --out quick
+    """
+    import time
+
+    from rich.console import Console
+
+    from rovgraph.cli.progress import progress_bar
+    from rovgraph.errors import InputError
+    from rovgraph.report.figure_study import draw_study
+    from rovgraph.report.study import plan_table, study_table, write_study
+    from rovgraph.studies.engines import Cluster, Local
+    from rovgraph.studies.misalignment import chosen, open_results, read_study
+    from rovgraph.studies.misalignment import study as library
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDE)
+    plan = read_study(config)
+    cells = chosen(plan, only)
+    if show:
+        console.print(plan_table(plan))
+        return
+    if out is None:
+        raise InputError("--out is needed: a folder for the results")
+    if scheduler is not None and jobs is not None:
+        raise InputError("--jobs goes without --scheduler; a cluster has as many workers as it has")
+    engine = Local(jobs) if scheduler is None else Cluster(scheduler)
+    results = open_results(out, plan, resume)
+    began = time.perf_counter()
+    try:
+        with progress_bar() as progress:
+            tables = library(plan, results, cells, engine, lambda done: progress("making dives", done))
+    except KeyboardInterrupt:
+        console.print(f"interrupted; {out} keeps every run that was made, --resume goes on", highlight=False)
+        raise typer.Exit(130) from None
+    write_study(out, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
+    draw_study(out, tables)
+    console.print(study_table(tables))
+    for row in tables.runs.dropna(subset="failure").drop_duplicates("cell").itertuples():
+        console.print(f"{row.cell} failed in run {row.run}: {row.failure}", highlight=False, markup=False)
+    console.print(f"results in {out}", highlight=False, markup=False)
