@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def errand(task):
-    """A number's square; 2 kills its process the first time, 9 each time, 5 raises once, 7 each time; marks in a folder."""
+    """A number's square, with a folder for marks; 2 kills its process once, 9 always, 5 raises once, 7 always."""
     number, marks = task
     mark = Path(marks) / str(number)
     again = mark.exists()
