@@ -128,6 +128,15 @@ def test_only_the_estimate_asked_for_is_written(tmp_path, monkeypatch, short, co
     assert written == {f"trajectory_{which}.csv", "trajectory_dead_reckoning.csv"}
 
 
+def test_a_configuration_beside_the_log_that_is_not_given_is_pointed_out(monkeypatch, capsys, tmp_path, short):
+    shutil.copy(SHIPPED / "config.yaml", tmp_path / "config.yaml")
+    log = save(short, tmp_path / "log.csv")
+    assert run(monkeypatch, "smooth", log, "-o", tmp_path / "out", *FAST) == 0
+    assert "config.yaml lies beside the log and is not used" in capsys.readouterr().err
+    assert run(monkeypatch, "smooth", log, "-c", tmp_path / "config.yaml", "-o", tmp_path / "again", *FAST) == 0
+    assert "beside the log" not in capsys.readouterr().err
+
+
 def test_a_missing_file_is_one_line(monkeypatch, capsys, tmp_path):
     assert run(monkeypatch, "smooth", tmp_path / "none.csv", "-o", tmp_path / "out") == 2
     assert "none.csv" in one_line(capsys)

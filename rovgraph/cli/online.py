@@ -39,6 +39,7 @@ def online(
     """
     import sys
 
+    from rovgraph.cli.beside import warn_of_unused
     from rovgraph.cli.ending import asked_by_signal, ended_by_signals
     from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
     from rovgraph.errors import InputError
@@ -54,6 +55,7 @@ def online(
     if resume and out is None:
         raise InputError("--resume needs the folder to go on with, --out")
     settings, complaints = configured(config, out, resume), Complaints(_say)
+    warn_of_unused(config, *(url for url in sources if url.startswith("file:") and not resume))
     opened = open_sources(sources, complaints, settings, speed)
     if resume and any(source.pace == 1.0 for source in opened):
         raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")

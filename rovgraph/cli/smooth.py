@@ -32,6 +32,7 @@ def smooth(
     from rich.console import Console
 
     from rovgraph import check
+    from rovgraph.cli.beside import warn_of_unused
     from rovgraph.cli.progress import progress_bar
     from rovgraph.config import load_config
     from rovgraph.estimators.dive import smooth as smooth_dive
@@ -42,6 +43,7 @@ def smooth(
 
     out = Path("results-" + log.name.split(".")[0]) if out is None else out
     settings = load_config(config)
+    warn_of_unused(config, log)
     check_writable(out, force)
     began = time.perf_counter()
     dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
