@@ -35,7 +35,7 @@ from rovgraph.simulate import Choices, simulated
 from rovgraph.simulate.named import falcon
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
-RATE_HZ = 10.0
+RATE_HZ = 5.0  # the command's default
 
 
 def messages(log: Log, order: np.ndarray | None = None) -> Iterator[Message]:

@@ -185,7 +185,7 @@ def online(seed: int, seconds: float) -> list[Row]:
         estimate = ESTIMATORS["graph-smoothed-a"](case.log, config)
         for entry in estimate.calibration:
             variable = next((v for v in TABLE.values() if entry.label in v.labels), None)
-            if variable is None or variable.sensor != "thruster":
+            if variable is None or "thruster" not in variable.sensors:
                 continue
             error = entry.value - case.calibration[variable.name][variable.labels.index(entry.label)]
             rows.append(

@@ -140,7 +140,8 @@ def test_memory_does_not_grow(beginning, measurements):
 
 def test_a_renewal_of_the_second_process_makes_it_the_renewed_filter(case, beginning, measurements):
     renewed = fed(ErrorStateFilter(beginning, (5.0, 10.0, 20.0)), case.log)
-    refiner = Refiner(beginning, (5.0, 10.0, 20.0))
+    refiner = Refiner((5.0, 10.0, 20.0))
+    refiner.begin(beginning)
     try:
         known: list[Gaussian] = []
         engine = FixedLag(beginning, LAG, HOLD, passed=lambda m: known.append(m.known), settled=refiner.take)

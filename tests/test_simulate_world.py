@@ -275,7 +275,7 @@ def test_secrets_of_a_lake_are_in_truth_json(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["vatern"], "known: circle, docking"),
+        (["vatern"], "circle, docking, excited"),
         (["vattern", "--variant", "9"], "it has 1, 2, 3"),
         (["vattern", "--dropout", "9"], "two times"),
         (["vattern", "--dropout", "9:3"], "two times"),

@@ -24,7 +24,7 @@ def online(
     output: Annotated[
         list[str] | None, typer.Option("--output", help="where solutions go; default: - unless on a terminal")
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.01, max=200.0, help="solutions per second")] = 10.0,
+    rate: Annotated[float, typer.Option(min=0.01, max=200.0, help="solutions per second")] = 5.0,
     speed: Annotated[str, typer.Option(help="of files: 1, 10, max")] = "1",
     engine: Annotated[Engine, typer.Option(help="fixed-lag for missions without end, isam2 for all of the track")] = (
         Engine.fixed_lag

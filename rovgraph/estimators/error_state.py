@@ -45,6 +45,7 @@ class ErrorStateFilter:
         goes on from there [s]
     learn_noise : of the IMU, from its newest samples
     filtered : Gaussian of each keyframe so far, from all data up to it
+    newest_used : measurements of the newest step
     """
 
     beginning: Beginning
@@ -63,6 +64,7 @@ class ErrorStateFilter:
         self._steps: list[Step] = []
         self._used: dict[str, list[Used]] = {}
         self._gates: Gates = {}
+        self.newest_used: list[Used] = []
 
     def add(self, measurement: Measurement) -> list[Interval]:
         """Take a measurement; times must not decrease."""
@@ -83,6 +85,7 @@ class ErrorStateFilter:
             self._departed.append(passage.departed)
             self._steps.append(passage.step)
         self.filtered.append(passage.filtered)
+        self.newest_used = passage.used
         for used in passage.used:
             self._used.setdefault(used.attached.sensor, []).append(used)
         self.intervals.append(interval)

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Used
+from rovgraph.config import beliefs
+from rovgraph.estimators.error_recursion import Gaussian, Used
+from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.smoother import Optimum, smoothed
@@ -45,14 +47,12 @@ class IncrementalEstimator:
 
     def __post_init__(self) -> None:
         b = self.beginning
-        self.recursion = ErrorStateRecursion(b)
-        self.beliefs = {name: _stiff(belief) for name, belief in self.recursion.beliefs.items()}
+        self.beliefs = {name: _stiff(belief) for name, belief in beliefs(b.config).items()}
         self.unknowns = unknowns(self.beliefs, b.instruments)
         self.engine = Incremental(self.unknowns)
         self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
         self.intervals: list[Interval] = []
-        self._gates: Gates = {}
-        self._known: Gaussian | None = None
+        self._filter: ErrorStateFilter | None = None
         self.updated = -1
 
     def add(self, measurement: Measurement) -> list[Interval]:
@@ -66,10 +66,11 @@ class IncrementalEstimator:
         return done
 
     def step(self, interval: Interval) -> None:
-        """Take an interval by way of its own filter."""
-        passage = self.recursion.through(interval, self._known, self._gates)
-        self._known = passage.filtered
-        self.take(interval, passage.filtered, passage.used)
+        """Take an interval by way of a filter of its own."""
+        if self._filter is None:
+            self._filter = ErrorStateFilter(self.beginning, RENEW_AT_S)
+        self._filter.step(interval)
+        self.take(interval, self._filter.filtered[-1], self._filter.newest_used)
 
     def take(self, interval: Interval, known: Gaussian, used: Sequence[Used]) -> None:
         """Take a keyframe of a filter.

@@ -21,7 +21,7 @@ from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement
 from rovgraph.workers import companion
 
-DUE_LATER, DUE_AFTER_S = 0.25, 5.0  # a renewal is due this part of its time later, and this much more
+DUE_LATER, DUE_AFTER_S = 0.4, 5.0  # a renewal is due this part of its time later, and this much more
 
 
 def due_times(renew_at: Sequence[float] = RENEW_AT_S) -> list[float]:
@@ -30,24 +30,25 @@ def due_times(renew_at: Sequence[float] = RENEW_AT_S) -> list[float]:
 
 
 class Refiner:
-    """The other process.
+    """The other process, which is started at once and takes a second or two until it can work.
 
     Parameters
     ----------
-    beginning : the dive's
     renew_at : times since the start at which the dive so far is solved as a graph [s]
     learn_noise : of the IMU, as the first filter does
     """
 
-    def __init__(
-        self, beginning: Beginning, renew_at: tuple[float, ...] = RENEW_AT_S, learn_noise: bool = False
-    ) -> None:
+    def __init__(self, renew_at: tuple[float, ...] = RENEW_AT_S, learn_noise: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
         self._work: Any = context.Queue()  # with a thread that feeds it, so that no one waits here
         self._answers, theirs = context.Pipe(duplex=False)
-        self._process = companion(_refine, beginning, renew_at, learn_noise, self._work, theirs)
+        self._process = companion(_refine, renew_at, learn_noise, self._work, theirs)
         theirs.close()
         self._asked: int | None = None
+
+    def begin(self, beginning: Beginning) -> None:
+        """The beginning of the dive, before all else."""
+        self._work.put(beginning)
 
     def take(self, measurements: Sequence[Measurement]) -> None:
         """Hand on measurements, in order."""
@@ -103,12 +104,14 @@ class _Renewed:
         self._intervals: list[Interval] = []
         self._known: list[Gaussian] = []  # of the newest keyframes, since the last renewal
         self._gates: Gates = {}
+        self._made = self._served = 0
 
     def add(self, measurement: Measurement) -> None:
         for interval in self._assembler.add(measurement):
             self._intervals.append(interval)
             if self._renewals and interval.time - self._intervals[0].time >= self._renewals[0]:
                 self._renewals.pop(0)
+                self._made += 1
                 self._known, self._gates = [self._solved()], {}
             elif self._known:
                 self._known.append(self._recursion.through(interval, self._known[-1], self._gates).filtered)
@@ -118,19 +121,19 @@ class _Renewed:
         return self._known[index - len(self._intervals)]
 
     def rest(self) -> None:
-        """Filter no more until the next renewal."""
-        self._known = []
+        """An answer was of use: filter no more until the next renewal, unless that has been made already."""
+        self._served += 1
+        if self._served >= self._made:
+            self._known = []
 
     def _solved(self) -> Gaussian:
         b, recursion = self._recursion.beginning, self._recursion
         return renewed(recursion, self._intervals, dead_reckon(self._intervals, b, recursion.unknowns.fixed))
 
 
-def _refine(
-    beginning: Beginning, renew_at: tuple[float, ...], learn_noise: bool, work: Any, answers: Connection
-) -> None:
+def _refine(renew_at: tuple[float, ...], learn_noise: bool, work: Any, answers: Connection) -> None:
     """Work off what the first process sends: measurements, the index of a keyframe, None = the answer served."""
-    dive = _Renewed(beginning, renew_at, learn_noise)
+    dive = _Renewed(work.get(), renew_at, learn_noise)
     while True:
         item = work.get()
         if item is None:

@@ -76,7 +76,7 @@ class Navigator:
     def __post_init__(self) -> None:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._startup = Startup(self.config.model_copy(update={"imu": imu}), self.origin)
-        self._renewals: Renewals | None = None
+        self._renewals = Renewals(self.patient) if self.renew else None
         self._events: list[Event] = []
         self._newest: dict[str, float] = {}
         self._distance, self._here = 0.0, np.full(3, np.nan)
@@ -196,7 +196,8 @@ class Navigator:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood; the filter is not renewed any more."""
         self.origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1])
-        self.renew = False
+        self.close()
+        self._renewals = None
         self._begin(restored(state["beginning"]), state["engine"])
         self.clocks.restore(state["clocks"])
         self.time = state["engine"]["keyframe"][1]  # what was received since is read again
@@ -246,8 +247,8 @@ class Navigator:
         config = beginning.config
         if self.smooth:
             self.isam2 = IncrementalEstimator(beginning)
-        if self.renew:
-            self._renewals = Renewals(beginning, self.patient)
+        if self._renewals is not None:
+            self._renewals.begin(beginning)
         settled = self._renewals.take if self._renewals is not None else lambda measurements: None
         self.engine = FixedLag(
             beginning, config.graph.lag_s, config.online.hold_s, self._pass, settled, learn_noise=True

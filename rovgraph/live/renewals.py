@@ -17,21 +17,24 @@ class Renewals:
 
     Attributes
     ----------
-    beginning : of the dive
     patient : wait for an answer, so that a replay can be repeated
     news : what went wrong, one line each, since it was last emptied
     waited : for answers, which only a replay does that is faster than the second process [s]
     """
 
-    beginning: Beginning
     patient: bool
     news: list[str] = field(default_factory=list)
     waited: float = 0.0
 
     def __post_init__(self) -> None:
-        self._refiner: Refiner | None = Refiner(self.beginning, learn_noise=True)
+        self._refiner: Refiner | None = Refiner(learn_noise=True)
         self._due = due_times()
         self._start: float | None = None
+
+    def begin(self, beginning: Beginning) -> None:
+        """The beginning of the dive, before all else."""
+        if self._refiner is not None:
+            self._refiner.begin(beginning)
 
     def take(self, measurements: list[Measurement]) -> None:
         """Hand on what is settled."""

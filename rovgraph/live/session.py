@@ -36,6 +36,7 @@ SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
 LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
+COLLECT = (50_000, 20, 50)  # thresholds of the collector: next to nothing here is cyclic
 QUIET_S = 0.5  # without the IMU, after which time goes on by the host's clock
 
 
@@ -258,6 +259,7 @@ class Session:
         """Work off what the sources say."""
         navigator, files = self.navigator, self.files
         gc.freeze()  # or the collector looks through libraries and recordings now and then, for a tenth of a second
+        gc.set_threshold(*COLLECT)
         for message in feed:
             if message is None:
                 self._wait()
