@@ -11,7 +11,6 @@ updates it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,25 +31,7 @@ from rovgraph.state import VELOCITY, State, propagate_with_jacobian
 
 RETURN_SD = 3.0  # a sensor that was kept out for long returns with an innovation within this many sd
 
-AGREE, OFTEN = 0.5, 3  # part by which rejected measurements that are alike may differ, and how many running
-
-
-class KeptOut(NamedTuple):
-    """A sensor that is being kept out.
-
-    Attributes
-    ----------
-    since : its first measurement that was rejected [s]
-    moved : by how much the newest one shows what the sensor sees to be elsewhere
-    alike : how many running, before it, showed about the same
-    """
-
-    since: float
-    moved: tuple[float, ...] = ()
-    alike: int = 0
-
-
-Gates = dict[str, KeptOut]
+Gates = dict[str, float]  # sensor that is being kept out -> since when [s]
 
 
 @dataclass(frozen=True)
@@ -220,26 +201,14 @@ class ErrorStateRecursion:
     def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
         """Whether a measurement lies within its gate."""
         instrument = self.beginning.instruments[a.sensor]
-        gate, out = instrument.gate_sd, gates.get(a.sensor)
-        if out is not None and a.time - out.since > instrument.readmit_s:
+        gate, since = instrument.gate_sd, gates.get(a.sensor)
+        if since is not None and a.time - since > instrument.readmit_s:
             gate = RETURN_SD
         if gate is not None and nis > gate**2:
-            gates.setdefault(a.sensor, KeptOut(a.time))
+            gates.setdefault(a.sensor, a.time)
             return False
         gates.pop(a.sensor, None)
         return True
-
-    def _doubted(self, before: Gaussian, a: Attached, r: Array, H: Array, gates: Gates) -> Gaussian:
-        """The estimate in doubt, where a sensor says the same again and again that does not agree with it."""
-        instrument = self.beginning.instruments[a.sensor]
-        since, last, alike = gates[a.sensor]
-        seen = self._seen(instrument.model, before.state)
-        moved = np.asarray(np.linalg.lstsq(H @ seen, r)[0], dtype=float)
-        again = len(last) == len(moved) and np.linalg.norm(moved - last) < AGREE * np.linalg.norm(moved)
-        gates[a.sensor] = KeptOut(since, tuple(moved.tolist()), alike + 1 if again else 0)
-        if a.time - since <= instrument.readmit_s or gates[a.sensor].alike < OFTEN:
-            return before
-        return replace(before, P=doubted(before.P, moved, seen))
 
     def _seen(self, model: SensorModel, state: State) -> Array:
         """Directions of the error that a sensor sees, shape (size, k): velocity, or turn and shift along n's axes."""
@@ -266,7 +235,9 @@ class ErrorStateRecursion:
                 admitted.append((a, nis))
             else:
                 used.append(Used(a, before.state, nis, 0.0))
-                before = self._doubted(before, a, own_r, own_H, gates)
+                if a.time - gates[a.sensor] > instrument.readmit_s:
+                    seen = self._seen(instrument.model, before.state)
+                    before = replace(before, P=doubted(before.P, own_r, own_H, seen))
         if not admitted:
             return before
         delta, P, weights = robust_update(before.P, r, H, losses)
@@ -275,7 +246,7 @@ class ErrorStateRecursion:
         return Gaussian(state, basis @ P @ basis.T)
 
 
-def doubted(P: Array, moved: Array, seen: Array) -> Array:
+def doubted(P: Array, r: Array, H: Array, seen: Array) -> Array:
     """The covariance after something that no model knows has moved what a sensor sees, by as much as it shows.
 
     As a knock does to the velocity, without doubt about anything else.
@@ -283,7 +254,8 @@ def doubted(P: Array, moved: Array, seen: Array) -> Array:
     Parameters
     ----------
     P : ndarray, shape (size, size)
-    moved : ndarray, shape (k,)
+    r, H : whitened innovation and Jacobian of a rejected measurement, shapes (dim,) and (dim, size)
     seen : ndarray, shape (size, k), directions of the error that the sensor sees
     """
+    moved = np.linalg.lstsq(H @ seen, r)[0]
     return np.asarray(P + float(moved @ moved) * seen @ seen.T)

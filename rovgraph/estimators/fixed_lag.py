@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, KeptOut, Used
+from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Used
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement
@@ -156,7 +156,7 @@ class FixedLag:
             "bias": known.state.bias,
             "calibration": {name: np.asarray(value) for name, value in known.state.calibration.items()},
             "P": known.P,
-            "gates": {sensor: [since, list(moved), alike] for sensor, (since, moved, alike) in mark.gates.items()},
+            "gates": mark.gates,
             "assembler": mark.assembler.state(),
             "record": pack(self._record[mark.taken - self._forgotten :]),
         }
@@ -166,12 +166,9 @@ class FixedLag:
         index, time, segment, rate_sd = state["keyframe"]
         interval = Interval(index, time, segment, state["rate_b"], rate_sd, None, False, [])
         here = State(*(state[name] for name in ("R_nb", "p_n", "v_n", "bias", "calibration")))
-        gates = {
-            sensor: KeptOut(since, tuple(moved), alike) for sensor, (since, moved, alike) in state["gates"].items()
-        }
         assembler = self._fresh()
         assembler.restore(state["assembler"])
-        self.marks = deque([Mark(interval, Gaussian(here, state["P"]), gates, [], assembler, 0)])
+        self.marks = deque([Mark(interval, Gaussian(here, state["P"]), state["gates"], [], assembler, 0)])
         self._record, self._forgotten, self._taken = [], 0, 0
         self._back_to(0)
         for measurement in unpack(state["record"]):

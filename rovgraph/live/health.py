@@ -36,7 +36,7 @@ class Health:
         """After a keyframe."""
         newest = marks[-1]
         time, gates = newest.interval.time, newest.gates
-        for sensor, (since, *_) in gates.items():
+        for sensor, since in gates.items():
             if time - since > REJECTED_S and sensor not in self._out:
                 self._out.add(sensor)
                 self._say(time, sensor, "rejected", f"{sensor}: disagrees with the estimate for {time - since:.1f} s")
