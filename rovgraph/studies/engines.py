@@ -151,7 +151,7 @@ class Cluster:
             raise InputError(
                 "--scheduler needs Dask, which is not installed; pip install 'rovgraph[studies]'"
             ) from None
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said in a line of ours
+        _hush("distributed", "tornado", "asyncio")
         try:
             client = Client(self.address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
@@ -177,6 +177,13 @@ class Cluster:
     def _check_alive(self, client: Any) -> None:
         if client.status != "running":
             raise InputError(f"{self.address}: the scheduler was lost; give --resume when it is back")
+
+
+def _hush(*libraries: str) -> None:
+    """Keep libraries from logging what we say in a line of our own, tracebacks among it."""
+    for name in [*libraries, *logging.root.manager.loggerDict]:
+        if name.split(".")[0] in libraries:
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def own_version() -> str:
