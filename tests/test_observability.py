@@ -6,7 +6,7 @@ import sys
 import gtsam
 import numpy as np
 import pytest
-from dives import batch, changed, kept, simulated
+from dives import batch, changed, kept, simulated, true_at
 
 from rovgraph.calibration import TABLE
 from rovgraph.cli import app
@@ -142,6 +142,20 @@ def test_the_smoother_tells_what_it_could_not_see():
     entries = {c.label: c for c in batch(steady(ONE_COMPASS)[1], ONE_COMPASS).solve().calibration}
     assert entries["dvl_yaw"].verdict == UNOBSERVABLE
     assert entries["dvl_scale"].verdict == ""  # held
+
+
+def test_what_is_held_keeps_its_doubt_in_the_track():
+    """The covariance of a considered variable: that of the track with it known, and its prior carried through."""
+    case, log = steady(ONE_COMPASS)
+    held = batch(log, ONE_COMPASS).solve()
+    assert held.summary["held_at_prior"] == ["dvl_yaw"]
+    entry = next(c for c in held.calibration if c.label == "dvl_yaw")
+    assert (entry.value, entry.sd) == (entry.prior_mean, pytest.approx(entry.prior_sd))
+    fixed = batch(log, changed(ONE_COMPASS, calibration={"dvl_yaw": {"estimate": False}})).solve()
+    np.testing.assert_allclose(held.trajectory.p_n, fixed.trajectory.p_n, atol=0.02)
+    doubt = np.sqrt(held.trajectory.cov_p[-1, 1, 1] - fixed.trajectory.cov_p[-1, 1, 1])
+    gone = np.linalg.norm(true_at(case, held.trajectory.time).p_n[[0, -1]].T @ [-1.0, 1.0])
+    assert doubt == pytest.approx(np.deg2rad(5.0) * gone, rel=0.05)  # 5 degrees across the way that was gone
 
 
 def test_figure8_with_fixes_and_unbiased_heading_shows_the_misalignment():

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
+from rovgraph.estimators.considered import Marginals, considered, deceptive, holding
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
@@ -22,10 +24,8 @@ from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.batch import (
     Problem,
     Solution,
-    covariances,
     make_problem,
     make_values,
-    marginals,
     solve,
 )
 from rovgraph.graph.stamps import Stamps
@@ -131,38 +131,38 @@ class BatchSmoother:
 
 
 def smoothed(optimum: Optimum, b: Beginning) -> Estimate:
-    """The optimum with its marginal covariances."""
-    intervals, problem, solution = optimum.intervals, optimum.problem, optimum.solution
-    tree, n = marginals(problem, solution), problem.count
-    states = problem.states(solution.values)
+    """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
+    intervals, priors = optimum.intervals, beliefs(b.config)
+    known, relative = _marginals(optimum, b, priors)
+    problem, solution = known.problem, known.solution
+    n, states = problem.count, problem.states(solution.values)
     trajectory = body_trajectory(
         intervals,
         states,
         b.config.imu.lever_arm_m,
-        covariances(tree, POSE, n),
-        covariances(tree, VELOCITY, n),
+        known.covariances(POSE, n),
+        known.covariances(VELOCITY, n),
     )
-    bias_sd = np.sqrt(np.diagonal(covariances(tree, BIAS, n), axis1=1, axis2=2))
+    bias_sd = np.sqrt(np.diagonal(known.covariances(BIAS, n), axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd)
-    final, known = dict(problem.unknowns.fixed), {}
-    begun = np.flatnonzero(np.diff(problem.segment)) + 1
+    final, spread = dict(problem.unknowns.fixed), {name: np.diag(sd**2) for name, sd in known.held.items()}
+    ends, begun = np.array([0, n - 1]), np.flatnonzero(np.diff(problem.segment)) + 1
     for name, walk in problem.unknowns.walks.items():
-        rows = np.concatenate([[0], begun, [n - 1]]) if walk else np.array([0, n - 1])
+        rows = np.concatenate([[0], begun, [n - 1]]) if walk else ends
         segment = problem.segment[rows] if walk else np.zeros_like(rows)
-        P = covariances(tree, name, int(segment[-1]) + 1)
+        P = known.covariances(name, int(segment[-1]) + 1)
         value = np.broadcast_to(states.calibration[name], (n, P.shape[1]))[rows]
-        spread = np.sqrt(np.diagonal(P, axis1=1, axis2=2))[segment]
-        history[name] = calibration_history(name, trajectory.time[rows], value, spread)
-        final[name], known[name] = value[-1], P[-1]
-    priors = beliefs(b.config)
-    sd = {name: np.sqrt(np.diag(P)) for name, P in known.items()}
-    before = prior_sd(problem, priors, int(problem.segment[-1]), b.config.graph.segment_s)
-    relative = relative_sd(problem, solution, sd, before)
+        sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))[segment]
+        history[name] = calibration_history(name, trajectory.time[rows], value, sd)
+        final[name], spread[name] = value[-1], P[-1]
+    for name, sd in known.held.items():
+        both = np.tile(final[name], (2, 1)), np.tile(sd, (2, 1))
+        history[name] = calibration_history(name, trajectory.time[ends], *both)
     here = {sensor: states.at(block.keyframe) for sensor, block in problem.blocks.items()}
     return Estimate(
         "smoothed",
         trajectory,
-        calibration_estimates(priors, list(problem.blocks), final, known, relative),
+        calibration_estimates(priors, list(problem.blocks), final, spread, relative),
         history,
         residual_frame(problem.blocks, here, solution.weights),
         {
@@ -171,5 +171,21 @@ def smoothed(optimum: Optimum, b: Beginning) -> Estimate:
             "iterations": solution.iterations,
             "converged": solution.converged,
             "bridged_intervals": sum(i.bridged for i in intervals),
+            "held_at_prior": list(known.held),
         },
     )
+
+
+def _marginals(optimum: Optimum, b: Beginning, priors: Mapping[str, Belief]) -> tuple[Marginals, dict[str, Array]]:
+    """Covariances, and the sd of the calibration as a part of the prior's, without what noise pretends."""
+    problem, solution = optimum.problem, optimum.solution
+    known = Marginals.of(problem, solution)
+    sd = {name: np.sqrt(np.diag(known.newest(name, walk))) for name, walk in problem.unknowns.walks.items()}
+    before = prior_sd(problem, priors, int(problem.segment[-1]), b.config.graph.segment_s)
+    relative = relative_sd(problem, solution, sd, before)
+    claimed = {name: sd[name] / before[name] for name in sd}
+    names = deceptive(problem, claimed, relative)
+    if not names:
+        return known, relative
+    without = make_problem(optimum.intervals, b.start, b.config, holding(priors, names), b.instruments)
+    return considered(problem, solution, without, priors), relative

@@ -103,6 +103,39 @@ def noise_of_states(problem: Problem, values: gtsam.Values, gates: Gates, seed: 
     return net.backSubstitute(white)
 
 
+def sensitivity(problem: Problem, values: gtsam.Values, gates: Gates, names: Sequence[str]) -> dict[int, Array]:
+    """How the optimum of all else moves with calibration variables that are given.
+
+    Parameters
+    ----------
+    problem, values, gates : the dive, the variables in it, and where to linearise
+    names : of constant variables, k components together
+
+    Returns
+    -------
+    dict : key -> ndarray, shape (dim, k), derivative of the optimum
+    """
+    given = [key(name) for name in names]
+    net = _sequential(problem.linearize(values, gates), given)
+    others = net.size() - len(given)
+    root, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    for i, one in enumerate(given, others):
+        root.push_back(net.at(i))
+        order.push_back(one)
+    R, ends = root.jacobian(order)[0], np.cumsum([net.at(i).rows() for i in range(others, net.size())])[:-1]
+    columns: dict[int, list[Array]] = {net.at(i).firstFrontalKey(): [] for i in range(others)}
+    for unit in R.T:  # what the given variables' own rows say where one component is 1, all others 0
+        rhs = gtsam.VectorValues()
+        for i in range(others):
+            rhs.insert(net.at(i).firstFrontalKey(), np.zeros(net.at(i).rows()))
+        for one, own in zip(given, np.split(unit, ends), strict=True):
+            rhs.insert(one, own)
+        moved = net.backSubstitute(rhs)
+        for one, column in columns.items():
+            column.append(moved.at(one))
+    return {one: np.column_stack(column) for one, column in columns.items()}
+
+
 def _sequential(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> gtsam.GaussianBayesNet:
     """All eliminated one by one, by QR, the last keys at the end in their order."""
     ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(last), True)
