@@ -28,6 +28,8 @@ OBSERVABLE, WEAK, UNOBSERVABLE = "observable", "weak", "unobservable"
 DECEIVED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale")  # by noise: multiplied by the velocity in what is measured
 DOUBTFUL_ABOVE = 0.15  # an sd of these below it is not noise: half an hour straight ahead takes it to 0.43
 
+STILL = 0.95  # of the prior's sd: where the graph claims no less, noise moves little
+
 
 def verdict(ratio: float) -> str:
     """What an sd, as a part of the prior's, means."""
@@ -118,3 +120,16 @@ def relative_sd(
     own = relative_covariance(without_noise(problem, solution, end, seen, before[None]))[0]
     parts = np.split(np.sqrt(np.diag(own)), np.cumsum([len(r) for r in ratio.values()])[:-1])
     return dict(zip(ratio, parts, strict=True))
+
+
+def deceptive(problem: Problem, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
+    """Constant variables that are unobservable, and that noise can have moved all the same.
+
+    Parameters
+    ----------
+    problem : of the dive
+    claimed, relative : name -> ndarray, shape (dim,), sd as a part of the prior's, as the graph has
+        it and without what noise pretends
+    """
+    constant = [name for name in DECEIVED if name in relative and not problem.unknowns.walks[name]]
+    return [n for n in constant if (relative[n] > UNOBSERVABLE_ABOVE).all() and (claimed[n] < STILL).any()]

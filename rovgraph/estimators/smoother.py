@@ -7,11 +7,10 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
-from rovgraph.estimators.considered import Marginals, considered, deceptive, holding
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.observability import prior_sd, relative_sd
+from rovgraph.estimators.observability import deceptive, prior_sd, relative_sd
 from rovgraph.estimators.results import (
     bias_histories,
     body_trajectory,
@@ -28,6 +27,7 @@ from rovgraph.graph.batch import (
     make_values,
     solve,
 )
+from rovgraph.graph.considered import Marginals, considered, holding
 from rovgraph.graph.stamps import Stamps
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY

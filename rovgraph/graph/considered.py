@@ -2,7 +2,7 @@
 
 Noise moves the estimate of what cannot be observed, by more than the data justify, and the
 track with it. Such a variable is held at its prior's mean; the covariance of all else keeps its
-prior's uncertainty: it is considered, not estimated (Schmidt 1966). With K the derivative of
+prior's uncertainty: it is considered, not estimated (the Schmidt-Kalman filter). With K the derivative of
 the optimum by what is held, P = P(held known) + K P(prior) K'.
 """
 
@@ -13,13 +13,10 @@ import gtsam
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.estimators.observability import DECEIVED, UNOBSERVABLE_ABOVE
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Problem, Solution, covariances, marginals, solve
 from rovgraph.graph.information import sensitivity
 from rovgraph.graph.keys import key
-
-STILL = 0.95  # of the prior's sd: where the graph claims no less, noise moves little
 
 
 @dataclass(frozen=True)
@@ -56,19 +53,6 @@ class Marginals:
         """Covariance of an estimated calibration variable at the end, shape (dim, dim)."""
         segments = int(self.problem.segment[-1]) + 1 if walk else 1
         return np.asarray(self.covariances(name, segments)[-1])
-
-
-def deceptive(problem: Problem, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
-    """Constant variables that are unobservable, and that noise can have moved all the same.
-
-    Parameters
-    ----------
-    problem : of the dive
-    claimed, relative : name -> ndarray, shape (dim,), sd as a part of the prior's, as the graph has
-        it and without what noise pretends
-    """
-    constant = [name for name in DECEIVED if name in relative and not problem.unknowns.walks[name]]
-    return [n for n in constant if (relative[n] > UNOBSERVABLE_ABOVE).all() and (claimed[n] < STILL).any()]
 
 
 def considered(problem: Problem, solution: Solution, without: Problem, beliefs: Mapping[str, Belief]) -> Marginals:
