@@ -82,7 +82,7 @@ def refused(capsys, *arguments: object) -> str:
         patch.setattr(sys, "argv", ["rovgraph", *map(str, arguments)])
         main()
     assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = (x for x in capsys.readouterr().err.splitlines() if not x.startswith("warning: "))
     return line
 
 

@@ -119,12 +119,16 @@ class Navigator:
         if self.origin is None:
             self.origin = self._startup.origin = log.origin
         known = self.engine.marks[0].interval.time if self.engine is not None else -np.inf
+        if self._renewals is not None:
+            self._renewals.patient = True
         for measurement in log.measurements():
             if measurement.time > known:
                 values = measurement.values
                 if measurement.sensor == "mag":
                     values = self._calibrated(values)
                 self._consider(measurement._replace(values=values))
+        if self._renewals is not None:
+            self._renewals.patient = self.patient
 
     def say(self, source: str, kind: str, text: str) -> None:
         """Have the next solution tell of an event."""

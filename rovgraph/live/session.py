@@ -35,6 +35,7 @@ CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  
 SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
+ANEW_S = 600.0  # a recording that is shorter is estimated anew: the filter is still to be renewed
 LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
 COLLECT = (50_000, 20, 50)  # thresholds of the collector: next to nothing here is cyclic
 QUIET_S = 0.5  # without the IMU, after which time goes on by the host's clock
@@ -77,9 +78,10 @@ class Files:
         until = -np.inf
         if self.resume and not (self.folder / RECORDING).exists():
             raise InputError(f"{self.folder}: nothing to resume, there is no {RECORDING}; leave out --resume")
-        if self.resume and checkpoint.exists() and not self.anew:
+        self.anew = self.anew or (self.resume and self._seconds() < ANEW_S)
+        if self.resume and checkpoint.exists():
             self.state = read_checkpoint(checkpoint)
-            until = float(self.state["engine"]["keyframe"][1])
+            until = -np.inf if self.anew else float(self.state["engine"]["keyframe"][1])
         self.recorder = Recorder(self.folder / RECORDING, self.complaints.complain)
         self.track = TrackFile(self.folder / TRACK, until)
         self.keeper = Keeper(checkpoint, self.complaints.complain)
@@ -90,6 +92,18 @@ class Files:
         except OSError as error:
             raise InputError(f"{self.folder}: cannot be written ({error.strerror}); free some space") from None
         self._kept = host.monotonic()
+
+    def _seconds(self) -> float:
+        """Length of the recording [s]; 0 where it has no two rows."""
+        try:
+            with (self.folder / RECORDING).open("rb") as file:
+                file.readline()
+                first = file.readline()
+                file.seek(max(file.tell(), file.seek(0, 2) - 65536))
+                last = file.read().splitlines()[-2:]
+            return float(last[0].split(b",")[0]) - float(first.split(b",")[0])
+        except (OSError, ValueError, IndexError):
+            return 0.0
 
     def recorded(self, origin: tuple[float, float] | None) -> Log | None:
         """The end of a recording that is resumed; None where it has no measurement.
@@ -244,11 +258,14 @@ class Session:
     def resume(self) -> None:
         """Go on from the last checkpoint and what was recorded after it."""
         assert self.files is not None
-        if self.navigator.smooth:
-            recorded = self.files.all_recorded()  # iSAM2 needs all of it
+        state = self.files.state
+        if self.files.anew:
+            if state is not None:
+                self.navigator.clocks.restore(state["clocks"])
+            recorded = self.files.all_recorded()
         else:
-            if self.files.state is not None:
-                self.navigator.restore(self.files.state)
+            if state is not None:
+                self.navigator.restore(state)
             recorded = self.files.recorded(self.navigator.origin)
         if recorded is not None:
             self.navigator.replay(recorded)
