@@ -17,13 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs import FORMS, open_output
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.mavlink_messages import gps_input, vision_position_estimate
 from rovgraph.live.outputs.nmea import gga, hdt
 from rovgraph.live.outputs.standard import StandardOutput
 from rovgraph.live.outputs.url import parsed
-from rovgraph.live.seldom import seldom
 from rovgraph.live.solution import Event, SensorHealth, Solution
 
 pynmea2 = pytest.importorskip("pynmea2", reason="pynmea2 is not installed")
@@ -192,7 +192,7 @@ def test_a_missing_library_names_the_extra(monkeypatch):
 
 
 def test_complaints_come_once_per_kind_and_period(said, complain):
-    limited = seldom(complain, period=0.2)
+    limited = Complaints(complain, period=0.2).complain
     for _ in range(2):
         for _ in range(50):
             limited("a", "slow", "text")

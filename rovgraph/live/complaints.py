@@ -1,11 +1,13 @@
-"""What sources complain of: each is counted, and few are said aloud."""
+"""What sources, outputs and disks complain of: each is counted, and few are said aloud."""
 
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
 
-from rovgraph.live.seldom import PERIOD_S, Complain
+Complain = Callable[[str, str, str], None]  # source, kind, text
+
+PERIOD_S = 60.0
 
 
 class Complaints:

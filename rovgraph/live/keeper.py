@@ -7,7 +7,7 @@ from typing import Any
 
 from rovgraph.errors import InputError
 from rovgraph.live.checkpoint import write_checkpoint
-from rovgraph.live.seldom import Complain
+from rovgraph.live.complaints import Complain
 
 
 class Keeper:

@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complain, Complaints
 from rovgraph.live.message import GEODETIC, Reading
-from rovgraph.live.seldom import Complain, seldom
 from rovgraph.log.streams import COLUMNS, LAT_LON, RECEIVED, STREAMS
 
 FLUSH_S = 0.1  # from a row to the operating system
@@ -55,7 +55,7 @@ class Recorder:
     def __init__(self, path: Path | str, complain: Complain | None = None) -> None:
         self.path = Path(path)
         self.lost = 0
-        self._complain = seldom(complain)
+        self._complain = Complaints(complain).complain
         self._rows: deque[str] = deque(maxlen=BACKLOG)
         self._pending = b""  # rows that were taken from the queue, but for what the system took
         self._unsynced = False

@@ -5,6 +5,7 @@ dropped, counted, and complained of once per kind and minute.
 """
 
 from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complain
 from rovgraph.live.outputs.mavlink import MavlinkOutput
 from rovgraph.live.outputs.nmea import NmeaOutput
 from rovgraph.live.outputs.output import Output
@@ -12,7 +13,6 @@ from rovgraph.live.outputs.standard import StandardOutput
 from rovgraph.live.outputs.tcp import TcpOutput
 from rovgraph.live.outputs.udp import UdpOutput
 from rovgraph.live.outputs.url import parsed
-from rovgraph.live.seldom import Complain
 
 __all__ = ["FORMS", "Output", "open_output"]
 

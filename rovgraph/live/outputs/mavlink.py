@@ -7,11 +7,11 @@ from importlib import import_module
 from typing import Any, ClassVar
 
 from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complain
 from rovgraph.live.outputs.background import Background
 from rovgraph.live.outputs.mavlink_messages import MESSAGES
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
-from rovgraph.live.seldom import Complain
 from rovgraph.live.solution import Solution
 
 QUEUED = 4  # solutions; an autopilot wants the newest

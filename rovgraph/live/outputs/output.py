@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import ClassVar
 
 from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complain, Complaints
 from rovgraph.live.outputs.url import Url
-from rovgraph.live.seldom import Complain, seldom
 from rovgraph.live.solution import Event, Solution
 
 
@@ -41,7 +41,7 @@ class Output(ABC):
         self._rate = url.number("rate", None, 1e-3, 1e4)
         self._tick: int | None = None
         self._held: tuple[Event, ...] = ()
-        self._seldom = seldom(complain)
+        self._seldom = Complaints(complain).complain
         self._counting = threading.Lock()
 
     def send(self, solution: Solution) -> None:

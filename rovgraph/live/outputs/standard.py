@@ -4,11 +4,11 @@ import os
 import select
 import sys
 
+from rovgraph.live.complaints import Complain
 from rovgraph.live.outputs.background import Background
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
-from rovgraph.live.seldom import Complain
 from rovgraph.live.solution import Solution
 
 QUEUED = 200  # lines behind a reader that does not read

@@ -6,10 +6,10 @@ import time
 from collections import deque
 
 from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complain
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
-from rovgraph.live.seldom import Complain
 from rovgraph.live.solution import Solution
 
 QUEUED = 100  # lines per reader, beyond what the system holds

@@ -4,10 +4,10 @@ import socket
 from collections.abc import Iterator
 
 from rovgraph.errors import InputError
+from rovgraph.live.complaints import Complain
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
-from rovgraph.live.seldom import Complain
 from rovgraph.live.solution import Solution
 
 
