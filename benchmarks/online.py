@@ -27,15 +27,13 @@ from rovgraph.live.clocks import Clocks
 from rovgraph.live.complaints import Complaints
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.navigator import Navigator
-from rovgraph.live.session import Session
+from rovgraph.live.session import RATE_HZ, Session
 from rovgraph.live.solution import Solution
-from rovgraph.live.track import trajectory_of
 from rovgraph.log import Log, log_from_frame, read_log
 from rovgraph.simulate import Choices, simulated
 from rovgraph.simulate.named import falcon
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
-RATE_HZ = 5.0  # the command's default
 
 
 def messages(log: Log, order: np.ndarray | None = None) -> Iterator[Message]:
@@ -64,7 +62,7 @@ def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
         navigator.passed.clear()  # with --out it goes to a file
         memory[int(4 * (solution.time - begin) / seconds)] = resident_mb()
 
-    session.watch(watch)
+    session.receivers.append(watch)
     began = time.perf_counter()
     session.run(messages(log))
     wall = time.perf_counter() - began
@@ -139,8 +137,8 @@ def recorded(path: Path, config_path: Path, reference: Path, after: float) -> No
     session.run(messages(log))
     wall = time.perf_counter() - began
     assert navigator.engine is not None
-    arm = np.array(config.imu.lever_arm_m)
-    trajectory = trajectory_of(navigator.passed, navigator.engine.recursion.error, arm)
+    marks = navigator.passed
+    trajectory = navigator.engine.recursion.trajectory([m.interval for m in marks], [m.known for m in marks])
     result = evaluate(trajectory, read_reference(reference), start=after)
     seconds = float(log["imu"].time[-1] - log["imu"].time[0])
     print(f"{seconds:.0f} s in {wall:.1f} s, {seconds / wall:.0f} times real time")

@@ -25,8 +25,9 @@ from rovgraph.cli.app import main
 from rovgraph.errors import InputError
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.complaints import Complaints
+from rovgraph.live.files import Files
 from rovgraph.live.navigator import Navigator
-from rovgraph.live.session import Files, Session
+from rovgraph.live.session import Session
 from rovgraph.log import read_log
 from rovgraph.simulate.files import write_dive
 from rovgraph.trajectory import Trajectory
@@ -324,7 +325,7 @@ class Full:
 
 
 def test_a_disk_that_is_full_for_a_while_costs_nothing(case, tmp_path, monkeypatch):
-    monkeypatch.setattr("rovgraph.live.session.KEEP_S", 0.0)
+    monkeypatch.setattr("rovgraph.live.files.KEEP_S", 0.0)
     said: list[str] = []
     complaints = Complaints(lambda source, kind, text: said.append(text))
     nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def configured(config: Path | None, out: Path | None, resume: bool) -> "Config":
     """The configuration of a run; where one goes on and none is given, that of the run before."""
     from rovgraph.config import load_config
-    from rovgraph.live.session import SETTINGS
+    from rovgraph.live.files import SETTINGS
 
     if resume and config is None and out is not None and (out / SETTINGS).is_file():
         config = out / SETTINGS
@@ -82,7 +82,7 @@ def _smooth(out: Path) -> None:
     """What was recorded, into a folder beside it; standard output is for solutions."""
     from rovgraph.cli.smooth import smooth
     from rovgraph.errors import InputError
-    from rovgraph.live.session import CONFIG, RECORDING
+    from rovgraph.live.files import CONFIG, RECORDING
 
     _note("smoothing what was recorded; Ctrl-C leaves it out")
     try:

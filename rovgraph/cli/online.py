@@ -46,9 +46,10 @@ def online(
     from rovgraph.live.clocks import Clocks
     from rovgraph.live.complaints import Complaints
     from rovgraph.live.feed import Feed
+    from rovgraph.live.files import Files
     from rovgraph.live.navigator import Navigator
     from rovgraph.live.outputs import open_output
-    from rovgraph.live.session import Files, Session
+    from rovgraph.live.session import Session
     from rovgraph.live.sources import open_sources
     from rovgraph.report.status import StatusLine
 
@@ -67,14 +68,14 @@ def online(
         prepared(out, force, resume, sources)
         files = Files(out, settings, complaints, resume, anew=engine is Engine.isam2)
     navigator = Navigator(settings, feed.recorded, smooth=engine is Engine.isam2, clocks=Clocks(trust=feed.replayed))
-    session = Session(navigator, outputs, complaints, rate, files)
+    session = Session(navigator, [each.send for each in outputs], complaints, rate, files)
     asked_by_signal(session.want_smoothed)
     with ended_by_signals(feed.close):
         try:
             with StatusLine() as status:
-                session.watch(status.show)
+                session.receivers.append(status.show)
                 if not status.shown:
-                    session.watch(_tell)
+                    session.receivers.append(_tell)
                 if resume:
                     session.resume()
                 session.run(feed)

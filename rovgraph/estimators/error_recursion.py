@@ -17,6 +17,7 @@ import numpy as np
 from rovgraph.config import beliefs
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.results import body_trajectory
 from rovgraph.estimators.robust_update import normalised_squared, robust_update
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Attached, Interval
@@ -27,7 +28,8 @@ from rovgraph.graph.measurements import Block, make_block, motions, whitening
 from rovgraph.graph.scale import COLUMNS, SCALES
 from rovgraph.graph.transition import transition
 from rovgraph.sensors import Position, SensorModel, innovation
-from rovgraph.state import VELOCITY, State, propagate_with_jacobian
+from rovgraph.state import POSE, VELOCITY, State, propagate_with_jacobian, stack_states
+from rovgraph.trajectory import Trajectory
 
 RETURN_SD = 3.0  # a sensor that was kept out for long returns with an innovation within this many sd
 
@@ -197,6 +199,18 @@ class ErrorStateRecursion:
             W = whitening(instrument, a.sd[None], np.array([a.rate_sd]))[0]
             linear.append((W @ innovation(instrument.model, a.z, predicted[0]), W @ H))
         return linear
+
+    def trajectory(self, intervals: Sequence[Interval], known: Sequence[Gaussian]) -> Trajectory:
+        """The body's origin at keyframes, at least one, in n, with its covariance.
+
+        Parameters
+        ----------
+        intervals, known : the keyframes and what is known of them, n each
+        """
+        P, columns = np.array([k.P for k in known]), self.error.columns
+        pose, velocity = (P[:, columns[v], columns[v]] for v in (POSE, VELOCITY))
+        arm = self.beginning.config.imu.lever_arm_m
+        return body_trajectory(intervals, stack_states([k.state for k in known]), arm, pose, velocity)
 
     def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
         """Whether a measurement lies within its gate."""

@@ -17,7 +17,6 @@ from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.renewal import renewed
 from rovgraph.estimators.results import (
     bias_histories,
-    body_trajectory,
     calibration_estimates,
     calibration_history,
     residual_frame,
@@ -26,7 +25,7 @@ from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.measurements import Block
 from rovgraph.log import Measurement
-from rovgraph.state import BIAS, POSE, VELOCITY, State, stack_states
+from rovgraph.state import BIAS, State, stack_states
 
 # since the start, for `ErrorStateFilter.renew_at`: while heading, mounting and compasses are known to
 # several degrees only, what was linearised once misstates what it knows by the square of that
@@ -45,7 +44,6 @@ class ErrorStateFilter:
         goes on from there [s]
     learn_noise : of the IMU, from its newest samples
     filtered : Gaussian of each keyframe so far, from all data up to it
-    newest_used : measurements of the newest step
     """
 
     beginning: Beginning
@@ -64,7 +62,6 @@ class ErrorStateFilter:
         self._steps: list[Step] = []
         self._used: dict[str, list[Used]] = {}
         self._gates: Gates = {}
-        self.newest_used: list[Used] = []
 
     def add(self, measurement: Measurement) -> list[Interval]:
         """Take a measurement; times must not decrease."""
@@ -78,14 +75,13 @@ class ErrorStateFilter:
         """The newest keyframe's state, at the IMU, calibration included."""
         return self.filtered[-1].state
 
-    def step(self, interval: Interval) -> None:
-        """Take one interval: update, predict, update."""
+    def step(self, interval: Interval) -> list[Used]:
+        """Take one interval: update, predict, update; the measurements that entered, or did not."""
         passage = self.recursion.through(interval, self.filtered[-1] if self.filtered else None, self._gates)
         if passage.departed is not None and passage.step is not None:
             self._departed.append(passage.departed)
             self._steps.append(passage.step)
         self.filtered.append(passage.filtered)
-        self.newest_used = passage.used
         for used in passage.used:
             self._used.setdefault(used.attached.sensor, []).append(used)
         self.intervals.append(interval)
@@ -94,6 +90,7 @@ class ErrorStateFilter:
             states = stack_states([known.state for known in self.filtered])
             self.filtered[-1] = renewed(self.recursion, self.intervals, states)
         self.assembler.stamps.assume(self.latest().calibration)
+        return passage.used
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""
@@ -133,8 +130,7 @@ class ErrorStateFilter:
         b, columns = self.beginning, self.error.columns
         states, P = stack_states([k.state for k in known]), np.array([k.P for k in known])
         sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        pose, velocity = (P[:, columns[v], columns[v]] for v in (POSE, VELOCITY))
-        trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m, pose, velocity)
+        trajectory = self.recursion.trajectory(self.intervals, known)
         history = bias_histories(trajectory.time, states.bias, sd[:, columns[BIAS]])
         for name in self.recursion.unknowns.estimated:
             history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[:, columns[name]])

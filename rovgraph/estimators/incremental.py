@@ -69,8 +69,8 @@ class IncrementalEstimator:
         """Take an interval by way of a filter of its own."""
         if self._filter is None:
             self._filter = ErrorStateFilter(self.beginning, RENEW_AT_S)
-        self._filter.step(interval)
-        self.take(interval, self._filter.filtered[-1], self._filter.newest_used)
+        used = self._filter.step(interval)
+        self.take(interval, self._filter.filtered[-1], used)
 
     def take(self, interval: Interval, known: Gaussian, used: Sequence[Used]) -> None:
         """Take a keyframe of a filter.

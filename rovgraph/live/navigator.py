@@ -20,7 +20,6 @@ from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning, restored
-from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
@@ -30,7 +29,6 @@ from rovgraph.live.renewals import Renewals
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.startup import Startup
 from rovgraph.log import Log, Measurement
-from rovgraph.state import POSE, VELOCITY
 
 SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
 OTHERS_SPACING_S = 0.005
@@ -159,9 +157,7 @@ class Navigator:
         if engine is None or not engine.marks:
             return None
         interval, known = engine.ahead(self.time)
-        columns, arm = engine.recursion.error.columns, engine.beginning.config.imu.lever_arm_m
-        pose, velocity = (known.P[None, columns[v], columns[v]] for v in (POSE, VELOCITY))
-        t = body_trajectory([interval], known.state, arm, pose, velocity)
+        t = engine.recursion.trajectory([interval], [known])
         latitude, longitude = self._geodetic(t.p_n[0])
         return Solution(
             time=interval.time,

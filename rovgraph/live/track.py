@@ -2,33 +2,13 @@
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.fixed_lag import Mark
-from rovgraph.estimators.results import body_trajectory
-from rovgraph.geometry import Array
-from rovgraph.state import POSE, VELOCITY, stack_states
 from rovgraph.trajectory import Trajectory
-
-
-def trajectory_of(marks: Sequence[Mark], error: ErrorVector, lever_arm_m: Array) -> Trajectory:
-    """The body's origin at keyframes, at least one.
-
-    Parameters
-    ----------
-    marks : of the filter
-    error : layout of their covariances
-    lever_arm_m : ndarray, shape (3,), of the IMU
-    """
-    P = np.array([mark.known.P for mark in marks])
-    pose, velocity = (P[:, error.columns[v], error.columns[v]] for v in (POSE, VELOCITY))
-    states = stack_states([mark.known.state for mark in marks])
-    return body_trajectory([mark.interval for mark in marks], states, lever_arm_m, pose, velocity)
 
 
 class TrackFile:

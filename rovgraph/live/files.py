@@ -1,0 +1,190 @@
+"""What a run of the online mode has on disk, so that a crash loses no more than a second."""
+
+import io
+import json
+import time as host
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pymap3d
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.fixed_lag import FixedLag
+from rovgraph.live.checkpoint import read_checkpoint
+from rovgraph.live.complaints import Complaints
+from rovgraph.live.keeper import Keeper
+from rovgraph.live.navigator import Navigator
+from rovgraph.live.recorder import Recorder
+from rovgraph.live.solution import Event
+from rovgraph.live.track import TrackFile
+from rovgraph.log import log_from_frame, read_log
+from rovgraph.log.streams import Log
+
+RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
+CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  # of the recording; of the run
+SMOOTHED = "trajectory_smoothed.csv"
+KEEP_S = 0.5  # of the host's time between checkpoints
+UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
+ANEW_S = 600.0  # a recording that is shorter is estimated anew: the filter is still to be renewed
+LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
+
+
+@dataclass
+class Files:
+    """What is on disk of a run, so that a crash loses no more than a second.
+
+    Parameters
+    ----------
+    folder : an existing one
+    config : as the user gave it
+    complaints : where trouble with the disk goes
+    resume : go on with what is there
+    anew : from the recording alone, not from the checkpoint
+
+    Raises
+    ------
+    InputError : the folder cannot be written, or holds nothing to go on with
+    """
+
+    folder: Path
+    config: Config
+    complaints: Complaints
+    resume: bool = False
+    anew: bool = False
+
+    def __post_init__(self) -> None:
+        if self.resume and not self.folder.is_dir():
+            raise InputError(f"{self.folder}: nothing to resume, there is no such folder; leave out --resume")
+        checkpoint = self.folder / CHECKPOINT
+        self.state: dict[str, Any] | None = None
+        until = -np.inf
+        if self.resume and not (self.folder / RECORDING).exists():
+            raise InputError(f"{self.folder}: nothing to resume, there is no {RECORDING}; leave out --resume")
+        self.anew = self.anew or (self.resume and self._seconds() < ANEW_S)
+        if self.resume and checkpoint.exists():
+            self.state = read_checkpoint(checkpoint)
+            until = -np.inf if self.anew else float(self.state["engine"]["keyframe"][1])
+        self.recorder = Recorder(self.folder / RECORDING, self.complaints.complain)
+        self.track = TrackFile(self.folder / TRACK, until)
+        self.keeper = Keeper(checkpoint, self.complaints.complain)
+        recorded = self.config.model_copy(update=_as_recorded(self.config))
+        try:
+            (self.folder / CONFIG).write_text(recorded.to_yaml(), encoding="utf-8")
+            (self.folder / SETTINGS).write_text(self.config.to_yaml(), encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be written ({error.strerror}); free some space") from None
+        self._kept = host.monotonic()
+
+    def _seconds(self) -> float:
+        """Length of the recording [s]; 0 where it has no two rows."""
+        try:
+            with (self.folder / RECORDING).open("rb") as file:
+                file.readline()
+                first = file.readline()
+                file.seek(max(file.tell(), file.seek(0, 2) - 65536))
+                last = file.read().splitlines()[-2:]
+            return float(last[0].split(b",")[0]) - float(first.split(b",")[0])
+        except (OSError, ValueError, IndexError):
+            return 0.0
+
+    def recorded(self, origin: tuple[float, float] | None) -> Log | None:
+        """The end of a recording that is resumed; None where it has no measurement.
+
+        Parameters
+        ----------
+        origin : latitude and longitude [deg] of north = east = 0, where it is known
+        """
+        try:
+            return log_from_frame(_last_rows(self.folder / RECORDING, origin), str(self.folder / RECORDING))
+        except InputError:
+            return None
+
+    def all_recorded(self) -> Log | None:
+        """All of a recording that is resumed; None where it has no measurement."""
+        try:
+            return read_log(self.folder / RECORDING)
+        except InputError:
+            return None
+
+    def note(self, events: Iterable[Event]) -> None:
+        """Keep events."""
+        lines = "".join(json.dumps(vars(event)) + "\n" for event in events)
+        if not lines:
+            return
+        path = self.folder / EVENTS
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(lines)
+        except OSError as error:
+            self.complaints.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
+
+    def write_smoothed(self, estimate: Estimate) -> None:
+        """Put a smoothed track on disk, in place of an older one."""
+        path, partial = self.folder / SMOOTHED, self.folder / f".{SMOOTHED}.partial"
+        try:
+            estimate.trajectory.write_csv(partial)
+            partial.replace(path)
+        except OSError as error:
+            self.complaints.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
+
+    def keep(self, navigator: Navigator, now: bool = False) -> None:
+        """Put the track and a checkpoint on disk, if it is time to."""
+        if not now and host.monotonic() - self._kept < KEEP_S:
+            return
+        self._kept = host.monotonic()
+        engine = navigator.engine
+        if engine is None:
+            return
+        written = self._add(navigator, engine)
+        if written and (state := navigator.state()) is not None:  # a checkpoint may not be ahead of the track
+            self.keeper.keep(state)
+
+    def _add(self, navigator: Navigator, engine: FixedLag) -> bool:
+        """Add to the track what the lag has passed, if the disk takes it."""
+        if not navigator.passed:
+            return True
+        passed = navigator.passed
+        try:
+            self.track.add(engine.recursion.trajectory([m.interval for m in passed], [m.known for m in passed]))
+        except InputError as error:
+            path = str(self.track.path)
+            self.complaints.complain(path, "disk", str(error).removeprefix(f"{path}: "))
+            del navigator.passed[:-UNWRITTEN]
+            return False
+        navigator.passed = []
+        return True
+
+    def finish(self, navigator: Navigator) -> None:
+        """Put the end of the track on disk; the checkpoint stays where it was, from there one may go on."""
+        if navigator.engine is not None:
+            self._add(navigator, navigator.engine)
+
+    def close(self) -> None:
+        self.keeper.close()
+        self.recorder.close()
+
+
+def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
+    """The newest rows of a recording; fixes relative to an origin."""
+    with path.open("rb") as file:
+        header = file.readline()
+        file.seek(max(len(header), path.stat().st_size - LAST_BYTES))
+        rows = file.read()
+    if len(header) + len(rows) < path.stat().st_size:
+        rows = rows[rows.index(b"\n") + 1 :]
+    frame = pd.read_csv(io.BytesIO(header + rows[: rows.rfind(b"\n") + 1]))
+    if origin is not None and frame["fix_lat"].notna().any():
+        lat, lon = frame.pop("fix_lat").to_numpy(float), frame.pop("fix_lon").to_numpy(float)
+        frame["fix_north"], frame["fix_east"], _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
+    return frame
+
+
+def _as_recorded(config: Config) -> dict[str, Any]:
+    """What of a configuration has been applied to a recording already."""
+    return {"columns": {}, "units": {}, "online": config.online.model_copy(update={"delay_s": {}})}
