@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from rovgraph.errors import DataWarning, InputError
@@ -81,7 +82,10 @@ class Trajectory:
 
     def every(self, step: int) -> "Trajectory":
         """Every ``step``-th epoch and the last one."""
-        index = np.unique(np.append(np.arange(0, len(self), step), len(self) - 1))
+        return self.take(np.unique(np.append(np.arange(0, len(self), step), len(self) - 1)))
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Trajectory":
+        """Some of its epochs, by index or by mask."""
         return Trajectory(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def at(self, time: Array) -> "Trajectory":

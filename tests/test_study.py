@@ -75,6 +75,7 @@ def quick_run(task):
         ("runs: 3", "an empty grid"),
         ("", "an empty grid"),
         ("cells: [{estimator: '4.5'}]", "estimator 4.5 works with both compasses; give heading: mag+dvl"),
+        ("cells: [{duration_s: 60, cut_s: 30}]", "60 s less 30 s at both ends leaves too little to log"),
         ("vehicle: nowhere.yaml", "nowhere.yaml: cannot be read"),
         ("grid: [", "no valid YAML"),
     ],
@@ -137,6 +138,12 @@ def test_a_run_has_what_was_asked_for_beside(short):
     assert [h["time_s"] for h in done.history][-1] == 36.0
     assert abs(done.row["estimate_deg"] - 45.0) == pytest.approx(abs(done.row["error_deg"]))
     assert abs(done.row["error_deg"]) < 4.0 * done.row["sd_deg"]
+
+
+def test_a_dive_can_be_logged_without_its_start_and_its_stop(short):
+    whole, cut = (Cell(manoeuvre="straight", duration_s=60, waves=False, cut_s=s) for s in (0, 20))
+    sd = [one_run(Task(read_study(short), cell, 0)).row["sd_deg"] for cell in (whole, cut)]
+    assert sd[0] < 0.8 * sd[1]  # start and stop are what a straight dive shows
 
 
 def test_an_estimator_that_fails_is_a_row_that_says_why(short, monkeypatch):

@@ -5,7 +5,7 @@ true calibration; noise and faults come on top. All randomness comes from one ge
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,14 @@ class Dive:
     truth: Trajectory
     hidden: dict[str, Any]
     path: Path
+
+    def between(self, begin: float, end: float) -> "Dive":
+        """What it would be if the recorder had run from one time to another [s] only."""
+        time = self.log_frame["time"]
+        log = self.log_frame[(time >= begin) & (time <= end)].reset_index(drop=True)
+        inside = (self.truth.time >= begin) & (self.truth.time <= end)
+        hidden = {**self.hidden, "bias": self.hidden["bias"][inside]}
+        return replace(self, log_frame=log, truth=self.truth.take(inside), hidden=hidden)
 
 
 def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:

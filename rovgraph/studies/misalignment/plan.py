@@ -19,6 +19,7 @@ from rovgraph.studies.misalignment.vehicle import Grade, HeadingError, HeadingSo
 EstimatorName = Literal["smoothed", "filtered", "ekf", "rts", "4.5"]
 DIVE_IGNORES = ("estimator",)  # parameters that do not change the dive: estimators are compared on the same dives
 ID_DIGITS = 10
+SHORTEST_S = 10.0  # of a log
 
 
 class Cell(Section):
@@ -27,6 +28,9 @@ class Cell(Section):
     manoeuvre: str = Field("lawnmower", description="scenario of rovgraph simulate: a motion as such")
     speed_mps: Positive = Field(0.4, description="speed")
     duration_s: Positive = Field(600.0, description="of the dive")
+    cut_s: Annotated[float, Field(ge=0)] = Field(
+        0.0, description="left out of the log at both ends; without start and stop a dive can be steady"
+    )
     waves: bool = Field(True, description="those of a lake; false = calm")
     imu: Grade = Field("mti", description="grade of the inertial unit")
     heading: HeadingSources = Field("mag", description="sources of heading")
@@ -144,6 +148,8 @@ def _check(study: Study, path: Path) -> None:
             scenario(name, duration, speed)
         except InputError as error:
             raise InputError(f"{path}: manoeuvre {name}, {duration:g} s at {speed:g} m/s: {error}") from None
+    if short := next((c for c in cells if c.duration_s < 2.0 * c.cut_s + SHORTEST_S), None):
+        raise InputError(f"{path}: {short.duration_s:g} s less {short.cut_s:g} s at both ends leaves too little to log")
     if any(cell.estimator == "4.5" and cell.heading != "mag+dvl" for cell in cells):
         raise InputError(f"{path}: estimator 4.5 works with both compasses; give heading: mag+dvl")
 

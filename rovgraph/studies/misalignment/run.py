@@ -130,6 +130,8 @@ class _Run:
             fix_interval=None if cell.fix_sd_m is None else cell.fix_interval_s,
         )
         dive = simulate(path, truth, np.random.default_rng(self.task.seed))
+        if cell.cut_s:
+            dive = dive.between(cell.cut_s, cell.duration_s - cell.cut_s)
         return dive, known(dive, config)
 
     def _log(self, dive: Dive) -> Any:
