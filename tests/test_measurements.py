@@ -24,6 +24,7 @@ from rovgraph.graph.measurements import (
     whitening,
 )
 from rovgraph.graph.preintegration import Snapshot
+from rovgraph.graph.rows import Rows
 from rovgraph.graph.scale import felt
 from rovgraph.graph.track import KNOT_S, Track
 from rovgraph.graph.values import insert_calibration, insert_state
@@ -125,12 +126,30 @@ def test_bulk_and_custom_factors_are_the_same_system(sensor, loss):
     block, state = block_of(sensor, loss=loss)
     values = values_of(state, block.unknowns)
     pushed, custom = (gtsam.GaussianFactorGraph() for _ in range(2))
-    block.push(pushed, state, np.ones(N, dtype=bool))
+    Rows({sensor: block}).push(pushed, [block.weighted(state, np.ones(N, dtype=bool))])
     for k in range(N):
         custom.push_back(block.custom_factor(k).linearize(values))
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(pushed)
     expected = custom.hessian(ordering)
     for mine, gtsams in zip(pushed.hessian(ordering), expected, strict=True):
+        scale = np.abs(gtsams).max()
+        np.testing.assert_allclose(mine / scale, gtsams / scale, atol=1e-9)
+
+
+def test_all_sensors_of_a_keyframe_as_one_factor_are_the_same_system_without_what_is_gated():
+    made = {sensor: block_of(sensor, loss="cauchy") for sensor in SENSORS}
+    blocks, state = {sensor: block for sensor, (block, _) in made.items()}, made["dvl"][1]
+    values = values_of(state, Unknowns(state.calibration, WALKS))
+    rng = np.random.default_rng(1)
+    gates = {sensor: rng.random(N) < 0.7 for sensor in blocks}
+    together, apart = (gtsam.GaussianFactorGraph() for _ in range(2))
+    Rows(blocks).push(together, [block.weighted(state, gates[sensor]) for sensor, block in blocks.items()])
+    for sensor, block in blocks.items():
+        for k in np.flatnonzero(gates[sensor]):
+            apart.push_back(block.custom_factor(int(k)).linearize(values))
+    assert together.size() == N
+    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(together)
+    for mine, gtsams in zip(together.hessian(ordering), apart.hessian(ordering), strict=True):
         scale = np.abs(gtsams).max()
         np.testing.assert_allclose(mine / scale, gtsams / scale, atol=1e-9)
 

@@ -10,6 +10,7 @@ taken out, and it is solved again until the gates rest.
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -23,6 +24,7 @@ from rovgraph.graph.assembly import Attached, Interval
 from rovgraph.graph.factors import Start, drift, motion, priors
 from rovgraph.graph.keys import Unknowns, key, key_name, unknowns
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
+from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state, states_from
 from rovgraph.instruments import Instrument
 from rovgraph.state import DIMENSION, State
@@ -34,7 +36,7 @@ MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
 FARTHEST_STEP = 1e7  # beyond it QR has divided by rounding, where Cholesky found nothing to divide by
 RELATIVE_DECREASE = 1e-7  # of the cost, at which the last round stops
-COARSE_DECREASE = 1e-5  # and the rounds before the gates rest
+COARSE_DECREASE = 1e-3  # and the rounds before the gates rest
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,11 @@ class Problem:
     def count(self) -> int:
         """Number of keyframes."""
         return len(self.segment)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """Of the measurements."""
+        return Rows(self.blocks)
 
     def states(self, values: gtsam.Values) -> State:
         """State of every keyframe."""
@@ -93,8 +100,9 @@ class Problem:
     def linearize(self, values: gtsam.Values, gates: Gates) -> gtsam.GaussianFactorGraph:
         """All factors linearised at ``values``, measurements weighted."""
         linear, states = self.native.linearize(values), self.states(values)
-        for sensor, block in self.blocks.items():
-            block.push(linear, states.at(block.keyframe), gates[sensor])
+        if self.blocks:
+            weighted = [block.weighted(states.at(block.keyframe), gates[s]) for s, block in self.blocks.items()]
+            self.rows.push(linear, weighted)
         return linear
 
     def nonlinear(self) -> gtsam.NonlinearFactorGraph:
@@ -173,15 +181,15 @@ def solve(problem: Problem, values: gtsam.Values) -> Solution:
     gates, iterations = problem.open_gates(), 0
     # of the whole graph, as METIS crashes on a variable that the gates have cut off
     ordering = gtsam.Ordering.MetisGaussianFactorGraph(problem.linearize(values, gates))
-    for _ in range(MAX_GATINGS):
-        values, _, steps, _ = _minimise(problem, values, gates, COARSE_DECREASE, ordering)
-        iterations += steps
-        renewed = problem.gates(values)
-        if all(np.array_equal(renewed[s], gates[s]) for s in gates):
+    tolerance, gatings = COARSE_DECREASE, 0
+    while True:
+        values, cost, steps, converged = _minimise(problem, values, gates, tolerance, ordering)
+        iterations, renewed = iterations + steps, problem.gates(values)
+        rest = gatings == MAX_GATINGS or all(np.array_equal(renewed[s], gates[s]) for s in gates)
+        if rest and tolerance == RELATIVE_DECREASE:
             break
-        gates = renewed
-    values, cost, steps, converged = _minimise(problem, values, gates, RELATIVE_DECREASE, ordering)
-    iterations += steps
+        tolerance = RELATIVE_DECREASE if rest else COARSE_DECREASE
+        gates, gatings = gates if rest else renewed, gatings + 1
     return Solution(values, gates, problem.weights(values, gates), cost, iterations, converged)
 
 
@@ -280,15 +288,13 @@ def newest_covariance(problem: Problem, solution: Solution) -> Array:
     linear = problem.linearize(solution.values, solution.gates)
     last = [key(v, problem.count - 1) for v in DIMENSION]
     last += [problem.unknowns.key(name, int(problem.segment[-1])) for name in problem.unknowns.estimated]
-    ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last, True)
+    before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
+    for one in last:
+        order.push_back(one)
     try:
-        net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+        _, ends = linear.eliminatePartialMultifrontal(sorted(before), gtsam.EliminateQR)
     except RuntimeError as error:
         raise InputError(indeterminate(error)) from None
-    ends, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
-    for i, one in enumerate(last, net.size() - len(last)):
-        ends.push_back(net.at(i))
-        order.push_back(one)
     root = np.linalg.inv(np.linalg.qr(ends.jacobian(order)[0], mode="r"))
     return np.asarray(root @ root.T)
 

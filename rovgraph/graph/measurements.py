@@ -152,20 +152,11 @@ class Block:
         """Whitened innovations alone, shape (n, dim)."""
         return rotate(self.W, self.innovations(state))
 
-    def push(self, graph: gtsam.GaussianFactorGraph, state: State, gate: NDArray[np.bool_]) -> None:
-        """Add the Jacobian factors of all measurements within their gate, weighted by the loss."""
+    def weighted(self, state: State, gate: NDArray[np.bool_]) -> tuple[Array, Jacobians]:
+        """As `linearize`, weighted by the loss; zero beyond the gate."""
         r, H = self.linearize(state)
-        weight = loss_and_weight(r, self.instrument.loss)[1]
-        root = np.sqrt(weight)[:, None]
-        r, H = r * root, {v: h * root[..., None] for v, h in H.items()}
-        unit = gtsam.noiseModel.Unit.Create(r.shape[1])
-        for keys, jacobians, own, inside in zip(
-            self.keys, zip(*H.values(), strict=True), r, gate.tolist(), strict=True
-        ):
-            if inside:
-                terms = list(zip(keys, jacobians, strict=True))
-                # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
-                graph.push_back(gtsam.GaussianConditional(terms, 1, own, unit))
+        root = np.sqrt(loss_and_weight(r, self.instrument.loss)[1] * gate)[:, None]
+        return r * root, {v: h * root[..., None] for v, h in H.items()}
 
     def custom_factor(self, k: int = 0) -> gtsam.CustomFactor:
         """Measurement ``k`` as a nonlinear factor that calls back into `linearize`."""
