@@ -58,8 +58,8 @@ def said():
 
 
 @pytest.fixture
-def complain(said):
-    return lambda *about: said.append(about)
+def complaints(said):
+    return Complaints(lambda *about: said.append(about))
 
 
 def free_port(kind=socket.SOCK_STREAM) -> int:
@@ -191,8 +191,8 @@ def test_a_missing_library_names_the_extra(monkeypatch):
         open_output("mavlink:udpout:127.0.0.1:5000")
 
 
-def test_complaints_come_once_per_kind_and_period(said, complain):
-    limited = Complaints(complain, period=0.2).complain
+def test_complaints_come_once_per_kind_and_period(said):
+    limited = Complaints(lambda *about: said.append(about), period=0.2).complain
     for _ in range(2):
         for _ in range(50):
             limited("a", "slow", "text")
@@ -206,10 +206,11 @@ def test_complaints_come_once_per_kind_and_period(said, complain):
 PRINTS = """
 import sys, time
 import numpy as np
+from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs import open_output
 from rovgraph.live.solution import Solution
 v = np.zeros(3)
-out = open_output("-", lambda *about: print(*about, file=sys.stderr), patient=sys.argv[2] == "patient")
+out = open_output("-", Complaints(lambda *about: print(*about, file=sys.stderr)), patient=sys.argv[2] == "patient")
 slowest = 0.0
 for k in range(int(sys.argv[1])):
     begin = time.monotonic()
@@ -270,11 +271,11 @@ def test_a_closed_pipe_is_complained_of_once_and_is_no_error(how):
     assert outcome(err)["dropped"] == 300
 
 
-def test_a_line_that_was_begun_is_ended_before_the_next(said, complain):
+def test_a_line_that_was_begun_is_ended_before_the_next(said, complaints):
     """A pipe that takes a part of a line, as a full disk does."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    out = StandardOutput(parsed("-"), complain, patient=True, descriptor=writing)
+    out = StandardOutput(parsed("-"), complaints, patient=True, descriptor=writing)
     taken = []
 
     def read_late():
@@ -312,8 +313,8 @@ def test_udp_to_nobody_raises_nothing():
     out.close()
 
 
-def test_a_datagram_that_cannot_be_sent_is_dropped_and_counted(said, complain):
-    out = open_output("udp://127.0.0.1:9", complain)
+def test_a_datagram_that_cannot_be_sent_is_dropped_and_counted(said, complaints):
+    out = open_output("udp://127.0.0.1:9", complaints)
     for k in range(3):
         out.send(replace(at(k), events=(Event(0.0, "", "", "x" * 70_000),)))
     assert out.dropped == 3
@@ -350,9 +351,9 @@ def test_tcp_serves_every_reader_on_the_loopback_only():
     out.close()
 
 
-def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(said, complain):
+def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(said, complaints):
     port = free_port()
-    out = open_output(f"tcp://:{port}", complain)
+    out = open_output(f"tcp://:{port}", complaints)
     slow = socket.socket()
     slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     slow.connect(("127.0.0.1", port))
@@ -384,9 +385,9 @@ def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(
     quick.close()
 
 
-def test_readers_come_and_go(said, complain):
+def test_readers_come_and_go(said, complaints):
     port = free_port()
-    out = open_output(f"tcp://:{port}", complain)
+    out = open_output(f"tcp://:{port}", complaints)
     for k in range(20):
         reader = socket.create_connection(("127.0.0.1", port))
         if k % 2:  # cut off at once, as a crash does
@@ -453,8 +454,8 @@ def test_sentences_hold_what_was_given_wherever_on_earth(latitude, longitude, ya
 
 
 @pytest.mark.parametrize("latitude", [None, NAN])
-def test_without_an_origin_only_the_heading_is_sent_and_that_is_said_once(datagrams, said, complain, latitude):
-    out = open_output(f"nmea-udp://127.0.0.1:{datagrams.getsockname()[1]}", complain)
+def test_without_an_origin_only_the_heading_is_sent_and_that_is_said_once(datagrams, said, complaints, latitude):
+    out = open_output(f"nmea-udp://127.0.0.1:{datagrams.getsockname()[1]}", complaints)
     for _ in range(3):
         out.send(replace(SOLUTION, latitude=latitude))
     assert all(datagrams.recv(1000).startswith(b"$GPHDT,331.35,T*") for _ in range(3))
@@ -539,18 +540,18 @@ def test_any_solution_makes_a_message_or_none(solution):
             message.pack(common.MAVLink(None))
 
 
-def test_without_an_origin_gps_input_says_so_once(said, complain):
-    out = open_output("mavlink:udpout:127.0.0.1:9?message=GPS_INPUT", complain)
+def test_without_an_origin_gps_input_says_so_once(said, complaints):
+    out = open_output("mavlink:udpout:127.0.0.1:9?message=GPS_INPUT", complaints)
     for _ in range(3):
         out.send(replace(SOLUTION, latitude=None))
     out.close()
     assert [kind for _, kind, _ in said] == ["not known"]
 
 
-def test_a_tcp_connection_is_waited_for_and_taken_up_again(said, complain, monkeypatch, capfd):
+def test_a_tcp_connection_is_waited_for_and_taken_up_again(said, complaints, monkeypatch, capfd):
     monkeypatch.setattr("rovgraph.live.outputs.mavlink.RETRY_S", 0.05)
     port = free_port()
-    out = open_output(f"mavlink:tcp:127.0.0.1:{port}", complain)
+    out = open_output(f"mavlink:tcp:127.0.0.1:{port}", complaints)
     out.send(SOLUTION)
     for _ in range(2):
         with socket.create_server(("127.0.0.1", port)) as server:

@@ -62,7 +62,7 @@ def online(
         raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
     feed = Feed(opened, complaints)
     wanted = output if output is not None else ([] if sys.stdout.isatty() else ["-"])
-    outputs = [open_output(url, complaints.complain, patient=feed.recorded) for url in wanted]
+    outputs = [open_output(url, complaints, patient=feed.recorded) for url in wanted]
     files = None
     if out is not None:
         prepared(out, force, resume, sources)

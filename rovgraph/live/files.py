@@ -70,9 +70,9 @@ class Files:
         if self.resume and checkpoint.exists():
             self.state = read_checkpoint(checkpoint)
             until = -np.inf if self.anew else float(self.state["engine"]["keyframe"][1])
-        self.recorder = Recorder(self.folder / RECORDING, self.complaints.complain)
+        self.recorder = Recorder(self.folder / RECORDING, self.complaints)
         self.track = TrackFile(self.folder / TRACK, until)
-        self.keeper = Keeper(checkpoint, self.complaints.complain)
+        self.keeper = Keeper(checkpoint, self.complaints)
         recorded = self.config.model_copy(update=_as_recorded(self.config))
         try:
             (self.folder / CONFIG).write_text(recorded.to_yaml(), encoding="utf-8")

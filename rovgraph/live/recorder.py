@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complain, Complaints
+from rovgraph.live.complaints import Complaints
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.log.streams import COLUMNS, LAT_LON, RECEIVED, STREAMS
 
@@ -40,8 +40,7 @@ class Recorder:
     Parameters
     ----------
     path : a new file, or a recording to go on with; its last line is dropped where it was cut off
-    complain : called, from other threads too, with source, kind and text of what goes wrong later;
-        once per kind and minute
+    complaints : told, from other threads too, of what goes wrong later
 
     Attributes
     ----------
@@ -52,10 +51,10 @@ class Recorder:
     InputError : the file cannot be written, or is no recording
     """
 
-    def __init__(self, path: Path | str, complain: Complain | None = None) -> None:
+    def __init__(self, path: Path | str, complaints: Complaints | None = None) -> None:
         self.path = Path(path)
         self.lost = 0
-        self._complain = Complaints(complain).complain
+        self._complain = (complaints or Complaints()).complain
         self._rows: deque[str] = deque(maxlen=BACKLOG)
         self._pending = b""  # rows that were taken from the queue, but for what the system took
         self._unsynced = False

@@ -5,7 +5,7 @@ dropped, counted, and complained of once per kind and minute.
 """
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complain
+from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.mavlink import MavlinkOutput
 from rovgraph.live.outputs.nmea import NmeaOutput
 from rovgraph.live.outputs.output import Output
@@ -31,14 +31,13 @@ _OUTPUTS: dict[str, type[Output]] = {
 }
 
 
-def open_output(url: str, complain: Complain | None = None, patient: bool = False) -> Output:
+def open_output(url: str, complaints: Complaints | None = None, patient: bool = False) -> Output:
     """Open an output.
 
     Parameters
     ----------
     url : one of `FORMS`, with options as in ``udp://host:port?rate=5``
-    complain : called with source (the URL), kind and text of what goes wrong later, from other
-        threads too; once per kind and minute
+    complaints : told, from other threads too, of what goes wrong later
     patient : standard output waits for its reader instead of dropping lines, as a replay may
 
     Raises
@@ -47,7 +46,7 @@ def open_output(url: str, complain: Complain | None = None, patient: bool = Fals
     """
     where = parsed(url)
     if where.scheme == "-":
-        return StandardOutput(where, complain, patient)
+        return StandardOutput(where, complaints, patient)
     if where.scheme not in _OUTPUTS:
         raise InputError(f"output {url!r} is of no known form; known are {', '.join(FORMS.values())}")
-    return _OUTPUTS[where.scheme](where, complain)
+    return _OUTPUTS[where.scheme](where, complaints)

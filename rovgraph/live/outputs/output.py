@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complain, Complaints
+from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.url import Url
 from rovgraph.live.solution import Event, Solution
 
@@ -18,7 +18,7 @@ class Output(ABC):
     Parameters
     ----------
     url : parsed; the option ``rate`` is the most solutions a second [Hz]
-    complain : where complaints go
+    complaints : where complaints go
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Output(ABC):
 
     OPTIONS: ClassVar[tuple[str, ...]] = ("rate",)
 
-    def __init__(self, url: Url, complain: Complain | None = None) -> None:
+    def __init__(self, url: Url, complaints: Complaints | None = None) -> None:
         unknown = [name for name in url.options if name not in self.OPTIONS]
         if unknown:
             known = ", ".join(self.OPTIONS)
@@ -41,7 +41,7 @@ class Output(ABC):
         self._rate = url.number("rate", None, 1e-3, 1e4)
         self._tick: int | None = None
         self._held: tuple[Event, ...] = ()
-        self._seldom = Complaints(complain).complain
+        self._complaints = complaints or Complaints()
         self._counting = threading.Lock()
 
     def send(self, solution: Solution) -> None:
@@ -64,7 +64,7 @@ class Output(ABC):
     def _send(self, solution: Solution) -> None: ...
 
     def _complain(self, kind: str, text: str) -> None:
-        self._seldom(self.url.text, kind, text)
+        self._complaints.complain(self.url.text, kind, text)
 
     def _drop(self, count: int, kind: str, text: str) -> None:
         """Count what is given up, and say it; from any thread."""

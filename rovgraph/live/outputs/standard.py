@@ -4,7 +4,7 @@ import os
 import select
 import sys
 
-from rovgraph.live.complaints import Complain
+from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.background import Background
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
@@ -29,9 +29,9 @@ class StandardOutput(Output):
     """
 
     def __init__(
-        self, url: Url, complain: Complain | None = None, patient: bool = False, descriptor: int = STANDARD_OUTPUT
+        self, url: Url, complaints: Complaints | None = None, patient: bool = False, descriptor: int = STANDARD_OUTPUT
     ) -> None:
-        super().__init__(url, complain)
+        super().__init__(url, complaints)
         self._descriptor = descriptor
         self._begun = b""  # rest of a line of which a part is out
         if descriptor == STANDARD_OUTPUT:

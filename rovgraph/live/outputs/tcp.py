@@ -6,7 +6,7 @@ import time
 from collections import deque
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complain
+from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
@@ -29,8 +29,8 @@ class TcpOutput(Output):
     InputError : the address cannot be listened at
     """
 
-    def __init__(self, url: Url, complain: Complain | None = None) -> None:
-        super().__init__(url, complain)
+    def __init__(self, url: Url, complaints: Complaints | None = None) -> None:
+        super().__init__(url, complaints)
         host, port = url.host_port(default_host=LOOPBACK)
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
