@@ -21,19 +21,10 @@ import gtsam
 import numpy as np
 
 from rovgraph.config import Config, beliefs, mount_matrix
-from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.aiding import Aiding
-from rovgraph.graph.noise_floor import NoiseFloor
-from rovgraph.graph.preintegration import (
-    BRIDGE_ACC,
-    BRIDGE_GYR,
-    KNOCK,
-    Snapshot,
-    preintegrate,
-    preintegration_params,
-    scatter,
-)
+from rovgraph.graph.preintegration import Snapshot
+from rovgraph.graph.samples import HALF_WINDOW_S, Samples, covering
 from rovgraph.graph.scale import felt, wanted
 from rovgraph.graph.stamps import Placed, Stamps, pack_placed, unpack_placed
 from rovgraph.graph.track import Track, track_around
@@ -44,9 +35,6 @@ from rovgraph.model_aiding import ModelAiding
 from rovgraph.state import State
 
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
-HALF_WINDOW_S = 0.05  # around a ping, over which the rate is averaged; measurements wait that long
-ENOUGH_FOR_A_CURVE = 5  # samples in that window; a slower IMU is interpolated between two
-GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
 
@@ -135,12 +123,7 @@ class Assembler:
 
     def __post_init__(self, assumed: Stamps | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
-        noise = self.config.imu.noise
-        self._noise = np.array([noise.acc, noise.gyr])
-        self._floor = NoiseFloor(self._noise)
-        self._params = preintegration_params(self.config, *self._noise)
-        self._bridge = preintegration_params(self.config, BRIDGE_ACC, BRIDGE_GYR)
-        self._imu: list[tuple[float, Array]] = []
+        self._samples = Samples(self.config, self.learn_noise)
         self._waiting: list[Placed] = []
         self._aiding: Aiding | None = None
         if "thruster" in self.instruments:
@@ -148,8 +131,6 @@ class Assembler:
         self._index, self._start = -1, 0.0
         self._segment, self._segment_start = -1, -np.inf
         self._between: list[Placed] = []
-        self._periods: list[float] = []
-        self._longest_step = np.inf
         self.stamps = assumed or Stamps.of(self.config, self.instruments)
         self._scaled = wanted(beliefs(self.config))
         self._around = HALF_WINDOW_S + self.stamps.span
@@ -172,7 +153,7 @@ class Assembler:
             elif self._admissible(measurement):
                 insort(self._waiting, self.stamps.placed(measurement), key=_time)
             return []
-        self._take_sample(measurement)
+        self._samples.add(measurement)
         done: list[Interval] = []
         if self._index < 0:
             self._before_first(measurement.time)
@@ -182,9 +163,8 @@ class Assembler:
     def copy(self) -> "Assembler":
         """One that goes on by itself from here."""
         twin = copy(self)
-        twin._imu, twin._waiting, twin._between = self._imu[:], self._waiting[:], self._between[:]
-        twin._floor = self._floor.copy()
-        twin._periods, twin.left_out = self._periods[:], self.left_out.copy()
+        twin._samples, twin.left_out = self._samples.copy(), self.left_out.copy()
+        twin._waiting, twin._between = self._waiting[:], self._between[:]
         twin.stamps = self.stamps.copy()
         if self._aiding is not None:
             twin._aiding = self._aiding.copy(twin.left_out)
@@ -193,30 +173,24 @@ class Assembler:
     def state(self) -> dict[str, Any]:
         """Where it stands, as plain values and arrays."""
         return {
-            "imu": np.array([[t, *values] for t, values in self._imu]).reshape(-1, 7),
+            **self._samples.state(),
             "waiting": pack_placed(self._waiting),
             "between": pack_placed(self._between),
             "assumed": self.stamps.assumed,
             "signals": pack(self._aiding.signals if self._aiding is not None else []),
             "at": [self._index, self._start, self._segment, self._segment_start],
-            "periods": list(self._periods),
-            "floor": self._floor.state(),
             "bias": self.bias,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
-        self._imu = [(row[0], np.array(row[1:])) for row in state["imu"].tolist()]
+        self._samples.restore(state)
         self._waiting, self._between = unpack_placed(state["waiting"]), unpack_placed(state["between"])
         self.stamps.assumed.update(state["assumed"])
         if self._aiding is not None:
             self._aiding.signals = unpack(state["signals"])
         self._index, self._start, self._segment, self._segment_start = state["at"]
-        self._periods, self.bias = list(state["periods"]), state["bias"]
-        self._longest_step = GAP_PERIODS * float(np.median(self._periods)) if self._periods else np.inf
-        self._floor.restore(state["floor"])
-        if self.learn_noise:
-            self._raise(self._floor.densities())
+        self.bias = state["bias"]
 
     def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> Interval:
         """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.
@@ -227,18 +201,10 @@ class Assembler:
         time : [s]
         state : State of one epoch, of the newest keyframe
         """
-        times, values = zip(*self._imu, strict=True)
-        imu = np.column_stack([times, np.array(values)])
-        if samples:
-            later = np.array([m.values[:6] for m in samples]).reshape(-1, 3) @ self._R_bs.T
-            imu = np.vstack([imu, np.column_stack([[m.time for m in samples], later.reshape(-1, 6)])])
-        if time - imu[-1, 0] > self._longest_step:
-            force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
-            imu = np.vstack([imu, [time, *np.concatenate([force, np.zeros(3)]) + state.bias[0]]])
-        bridged = bool(np.diff(imu[:, 0]).max() > self._longest_step)
-        params = self._bridge if bridged else self._params
-        pim, _ = preintegrate(params, self.bias, imu, self._start, np.empty(0), time)
-        rate_b, rate_sd = self._rate(imu, time)
+        force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
+        table = self._samples.ahead(samples, time, np.concatenate([force, np.zeros(3)]) + state.bias[0])
+        pim, _, bridged = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
+        rate_b, rate_sd = self._samples.rate(table, time)
         return Interval(self._index + 1, time, self._segment, rate_b, rate_sd, pim, bridged, [])
 
     def _take_until(self, time: float) -> list[Interval]:
@@ -255,9 +221,9 @@ class Assembler:
 
     def finish(self) -> list[Interval]:
         """Place the rest, and a last keyframe at the last IMU sample."""
-        if not self._imu:
+        end = self._samples.newest
+        if end == -math.inf:
             return []
-        end = self._imu[-1][0]
         done = self._take_until(end)
         self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
         if end - self._start < 1e-3:
@@ -278,19 +244,6 @@ class Assembler:
             self.left_out[m.sensor, reason] += 1
         return reason is None
 
-    def _take_sample(self, m: Measurement) -> None:
-        if self._imu:
-            period = m.time - self._imu[-1][0]
-            if period > self.config.imu.max_gap_s:
-                raise InputError(
-                    f"row {m.row}: the IMU is silent for {period:.1f} s before {m.time:.3f} s, longer than "
-                    f"imu.max_gap_s = {self.config.imu.max_gap_s:g}; split the log there or raise that key"
-                )
-            if len(self._periods) < 50:
-                self._periods.append(period)
-                self._longest_step = GAP_PERIODS * float(np.median(self._periods))
-        self._imu.append((m.time, (m.values[:6].reshape(2, 3) @ self._R_bs.T).ravel()))
-
     def _before_first(self, time: float) -> None:
         """Nothing can be placed before the first IMU sample."""
         early = [m for m in self._waiting if m.time < time]
@@ -307,9 +260,8 @@ class Assembler:
 
     def _close(self, time: float, ping: Placed | None) -> Interval:
         """Make a keyframe at ``time`` and the interval that leads to it."""
-        times, values = zip(*self._imu, strict=True)
-        every = np.column_stack([times, np.array(values)])
-        samples = every[_first(every, self._start) :]
+        every = self._samples.table
+        samples = covering(every, self._start)
         pim, bridged = None, False
         attached: list[Attached] = []
         if self._index >= 0:
@@ -318,11 +270,11 @@ class Assembler:
         self._index, self._start, self._between = self._index + 1, time, []
         if time - self._segment_start >= self.config.graph.segment_s:
             self._segment, self._segment_start = self._segment + 1, time
-        rate_b, rate_sd = self._rate(samples, time)
+        rate_b, rate_sd = self._samples.rate(samples, time)
         if ping is not None:
             attached += self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd, every)
-        self._imu = self._imu[_first(every, time, self._around) :]
         scaled = self._felt(samples, before, time) if pim is not None else None
+        self._samples.forget(time, self._around)
         return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, bridged, attached, scaled)
 
     def _integrate(
@@ -334,72 +286,28 @@ class Assembler:
                 taken.append(m)
             if m.sensor in ONCE_PER_INTERVAL:
                 seen.add(m.sensor)
-        bridged = bool(np.diff(samples[:, 0]).max() > self._longest_step)
-        if self._aiding is not None and not bridged:
-            aiding = self._aiding.between(self._start, time, samples, lambda t: self._rate(samples, t)[0])
+        if self._aiding is not None and not self._samples.gap(samples):
+            aiding = self._aiding.between(self._start, time, samples, lambda t: self._samples.rate(samples, t)[0])
             taken = sorted(taken + [Placed(*m, m.time) for m in aiding], key=_time)
         stops = np.array([m.time for m in taken])
-        params = self._bridge if bridged else self._params_for(samples)
-        pim, motions = preintegrate(params, self.bias, samples, self._start, stops, time)
+        pim, motions, bridged = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
         attached: list[Attached] = []
         for m, motion in zip(taken, motions, strict=True):
             attached += self._attach(m, motion, *self._rate_for(m, samples), every)
         return pim, bridged, attached
 
-    def _params_for(self, samples: Array) -> gtsam.PreintegrationCombinedParams:
-        """The believed noise, or where a knock shakes the samples far more, what they show."""
-        if len(samples) < 3:
-            return self._params
-        odd = scatter(samples[:, 0], samples[:, 1:])
-        if self.learn_noise:
-            self._floor.take(odd)
-            self._raise(self._floor.densities())
-        seen = np.sqrt((odd**2).reshape(-1, 2, 3).mean(axis=(0, 2)))
-        if (seen < KNOCK * self._noise).all():
-            return self._params
-        return preintegration_params(self.config, *np.maximum(seen, self._noise))
-
-    def _raise(self, noise: Array) -> None:
-        """Take other noise densities, where they differ enough to matter."""
-        if np.abs(noise / self._noise - 1.0).max() > 0.05:
-            self._noise, self._params = noise, preintegration_params(self.config, *noise)
-
     def _rate_for(self, m: Placed, samples: Array) -> tuple[Array, float]:
         """The rate, for those instruments that it reaches: by a lever arm, or by the motion of a turning body."""
         reached = m.sensor == "thruster" or self.instruments[m.sensor].rate_gain.any()
-        return self._rate(samples, m.time) if reached else (np.zeros(3), 0.0)
-
-    def _rate(self, samples: Array, time: float) -> tuple[Array, float]:
-        """Rate at a time, shape (3,), and the sd of its noise.
-
-        A parabola through the samples around it. The lever arm turns the noise of
-        the rate into velocity, and the derivative by the misalignment into knowledge
-        that is not there, so a single sample would not do.
-        """
-        t = samples[:, 0]
-        first, last = t.searchsorted([time - HALF_WINDOW_S, time + HALF_WINDOW_S + 1e-9])
-        degree = 2
-        if last - first < ENOUGH_FOR_A_CURVE:
-            degree = 1
-            first = min(max(int(t.searchsorted(time, side="right")) - 1, 0), max(len(t) - 2, 0))
-            last = first + 2
-        t, rate = t[first:last] - time, samples[first:last, 4:]
-        step = float(t[-1] - t[0]) / max(len(t) - 1, 1)
-        if len(t) < 2:
-            return rate[0], float(self._noise[1])
-        powers = np.vander(t / HALF_WINDOW_S, degree + 1)
-        weights = np.linalg.solve(powers.T @ powers, powers.T)[-1]
-        if step > self._longest_step:
-            return weights @ rate, BRIDGE_GYR
-        return weights @ rate, float(self._noise[1]) * math.sqrt(float(weights @ weights) / step)
+        return self._samples.rate(samples, m.time) if reached else (np.zeros(3), 0.0)
 
     def _attach(self, m: Placed, motion: Snapshot, rate_b: Array, rate_sd: float, every: Array) -> list[Attached]:
         """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``."""
         instrument = self.instruments[m.sensor]
         lag = self.stamps.lag(m.sensor)
-        track = None
+        track, known = None, self._samples
         if lag is not None:
-            track = track_around(m.stamp, lag, every, self._start, (self._params, self.bias), self._longest_step)
+            track = track_around(m.stamp, lag, every, self._start, (known.params, self.bias), known.longest_step)
         if lag is not None and track is None:
             self.left_out[m.sensor, f"calibration.{instrument.lateness} reaches beyond the IMU's samples"] += 1
             return []
@@ -429,8 +337,3 @@ class Assembler:
 
 def _time(m: Placed) -> float:
     return m.time
-
-
-def _first(samples: Array, time: float, before: float = HALF_WINDOW_S) -> int:
-    """Index of the sample from which on a time and what is up to ``before`` it are covered."""
-    return max(int(np.searchsorted(samples[:, 0], time - before, side="right")) - 1, 0)

@@ -3,7 +3,6 @@
 Thrusters shake an IMU beyond its data sheet, and the first seconds, at rest, do not show it.
 """
 
-from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,29 +24,33 @@ class NoiseFloor:
     """
 
     believed: Array
-    _recent: deque[Array] = field(default_factory=lambda: deque(maxlen=INTERVALS))
+    _seen: Array = field(default_factory=lambda: np.empty((INTERVALS, 2)))  # the newest, in a ring
+    _count: int = 0
 
     def copy(self) -> "NoiseFloor":
         """One that goes on by itself from here."""
-        return NoiseFloor(self.believed, self._recent.copy())
+        return NoiseFloor(self.believed, self._seen.copy(), self._count)
 
     def state(self) -> Array:
         """What it remembers, shape (n, 2)."""
-        return np.array(self._recent).reshape(-1, 2)
+        if self._count < INTERVALS:
+            return self._seen[: self._count].copy()
+        return np.roll(self._seen, -(self._count % INTERVALS), axis=0)
 
     def restore(self, state: Array) -> None:
         """Remember what another did."""
-        self._recent.clear()
-        self._recent.extend(state)
+        self._seen[: len(state)], self._count = state, len(state)
 
     def take(self, odd: Array) -> None:
         """Take an interval's scatter, shape (m, 6), of `rovgraph.graph.preintegration.scatter`."""
         middle = np.sort(np.abs(odd), axis=0)[len(odd) // 2]
-        self._recent.append(1.4826 * middle.reshape(2, 3).mean(axis=1))
+        self._seen[self._count % INTERVALS] = 1.4826 * middle.reshape(2, 3).mean(axis=1)
+        self._count += 1
 
     def densities(self) -> Array:
         """Noise densities to go on with, shape (2,); blind to knocks."""
-        if len(self._recent) < ENOUGH:
+        known = min(self._count, INTERVALS)
+        if known < ENOUGH:
             return self.believed
-        seen = np.sort(self._recent, axis=0)[len(self._recent) // 2]
+        seen = np.sort(self._seen[:known], axis=0)[known // 2]
         return np.where(seen > NOISIER * self.believed, seen, self.believed)

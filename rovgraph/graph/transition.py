@@ -3,22 +3,21 @@
 Taken from the graph's own factor, so that a filter believes of the IMU exactly what the graph does.
 """
 
-import gtsam
 import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.factors import unscaled
 from rovgraph.graph.scale import biased
-from rovgraph.graph.values import insert_state
+from rovgraph.graph.values import gtsam_state
 from rovgraph.state import State
 
 
 def transition(interval: Interval, before: State, after: State) -> tuple[Array, Array]:
     """Transition matrix and process noise of an interval, first order.
 
-    The factor's whitened Jacobians A_i, A_j by the two keyframes say A_i e_i + A_j e_j = white
-    noise of unit covariance, so e_j = F e_i + w with F = -A_j^-1 A_i and cov w = A_j^-1 A_j^-T.
+    The factor's Jacobians A_i, A_j by the two keyframes say A_i e_i + A_j e_j = noise of the
+    residual's covariance S, so e_j = F e_i + w with F = -A_j^-1 A_i and cov w = A_j^-1 S A_j^-T.
 
     Parameters
     ----------
@@ -29,15 +28,16 @@ def transition(interval: Interval, before: State, after: State) -> tuple[Array, 
     -------
     F, Q : ndarray, shape (15, 15), pose, velocity, bias, in the tangent space of `State`
     """
-    i, j = interval.index - 1, interval.index
-    values = gtsam.Values()
+    assert interval.pim is not None
     if interval.felt is not None:
         before, after = biased(before, interval.felt[None]), biased(after, interval.felt[None])
-    insert_state(values, i, before)
-    insert_state(values, j, after)
-    A, _ = unscaled(interval).linearize(values).jacobian()  # pose and velocity of i and of j, bias of i and of j
-    noise = np.linalg.inv(A[:, _AFTER])
-    return -noise @ A[:, _BEFORE], noise @ noise.T
+    A = np.zeros((2, 15, 15)).swapaxes(1, 2)  # columns in a row, where GTSAM writes them
+    (pose_i, velocity_i, bias_i), (pose_j, velocity_j, bias_j) = gtsam_state(before), gtsam_state(after)
+    of_i, of_j = ([own[:, columns] for columns in _COLUMNS] for own in A)
+    jacobians = (*of_i[:2], *of_j[:2], of_i[2], of_j[2])
+    unscaled(interval).evaluateError(pose_i, velocity_i, pose_j, velocity_j, bias_i, bias_j, *jacobians)
+    inverse = np.linalg.inv(A[1])
+    return -inverse @ A[0], inverse @ interval.pim.residualCovariance() @ inverse.T
 
 
-_BEFORE, _AFTER = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
+_COLUMNS = (slice(0, 6), slice(6, 9), slice(9, 15))

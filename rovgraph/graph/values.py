@@ -11,12 +11,18 @@ from rovgraph.graph.keys import Unknowns, key
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 
+def gtsam_state(state: State) -> tuple[gtsam.Pose3, Array, gtsam.imuBias.ConstantBias]:
+    """Pose, velocity and bias of a `State` of one epoch."""
+    pose = gtsam.Pose3(gtsam.Rot3(state.R_nb[0]), state.p_n[0])
+    return pose, state.v_n[0], gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
+
+
 def insert_state(values: gtsam.Values, index: int, state: State) -> None:
     """Insert pose, velocity and bias of a `State` of one epoch as keyframe ``index``."""
-    values.insert(key(POSE, index), gtsam.Pose3(gtsam.Rot3(state.R_nb[0]), state.p_n[0]))
-    values.insert(key(VELOCITY, index), state.v_n[0])
-    bias = gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
-    values.insert(j=key(BIAS, index), constant_bias=bias)  # unnamed, the bindings try dozens of other types first
+    pose, velocity, bias = gtsam_state(state)
+    values.insert(j=key(POSE, index), pose3=pose)  # unnamed, the bindings try dozens of other types first
+    values.insert(j=key(VELOCITY, index), vector=velocity)
+    values.insert(j=key(BIAS, index), constant_bias=bias)
 
 
 def state_values(index: int, state: State) -> gtsam.Values:
