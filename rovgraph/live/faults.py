@@ -22,6 +22,7 @@ RECENT_S = 5.0
 TELL_S = 2.0  # a ping without bottom lock is not worth an event
 FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
 TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
+LONGEST_STEP_S = 1.0  # of the gyro, over which a turn is reckoned
 HEADINGS = {"ahrs", "dvl_heading", "mag"}
 
 
@@ -37,6 +38,9 @@ class Verdict:
 
     use: bool = True
     retract_since: float | None = None
+
+
+_GOOD = Verdict()
 
 
 @dataclass
@@ -60,7 +64,7 @@ class Watch:
     values: bytes = b""
     since: float = 0.0  # of the first of equal values
     equal: int = 0
-    turned: Array = field(default_factory=lambda: np.zeros(3))  # meanwhile [rad]
+    turned: Array = field(default_factory=lambda: np.zeros(3))  # how far the vehicle had by then [rad]
 
 
 @dataclass
@@ -76,6 +80,7 @@ class Faults:
     watches: dict[str, Watch] = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
     _now: float = -np.inf
+    _turned: Array = field(default_factory=lambda: np.zeros(3))  # since the beginning, by the gyro [rad]
     _speeds: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=3))
 
     def look(self, m: Measurement) -> Verdict:
@@ -85,18 +90,18 @@ class Faults:
         if values == watch.values:
             watch.equal += 1
         else:
-            watch.equal, watch.since, watch.turned = 1, m.time, np.zeros(3)
-        if m.sensor == "imu":
-            self._turn(m, watch)
+            watch.equal, watch.since, watch.turned = 1, m.time, self._turned
         if watch.time > -np.inf:
             step = m.time - watch.time
+            if m.sensor == "imu" and 0.0 < step < LONGEST_STEP_S:
+                self._turned = self._turned + m.values[3:6] * step
             watch.period = step if not watch.period else watch.period + 0.05 * (step - watch.period)
         self._now = max(self._now, m.time)
         watch.time, watch.heard, watch.values = max(m.time, watch.time), self._now, values
         if m.sensor == "dvl":
             return self._ping(m, watch)
         frozen = watch.equal >= FROZEN.get(m.sensor, np.inf) or (
-            m.sensor in HEADINGS and watch.equal > 2 and float(np.abs(watch.turned).max()) > TURNED
+            watch.equal > 2 and m.sensor in HEADINGS and np.abs(self._turned - watch.turned).max() > TURNED
         )
         return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
 
@@ -107,12 +112,6 @@ class Faults:
             if watch.state != "silent" and quiet > max(SILENT_S, SILENT_PERIODS * watch.period):
                 watch.state = watch.told = "silent"
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))
-
-    def _turn(self, m: Measurement, watch: Watch) -> None:
-        step = m.time - watch.time
-        if 0.0 < step < 1.0:
-            for sensor in HEADINGS & self.watches.keys():
-                self.watches[sensor].turned = self.watches[sensor].turned + m.values[3:6] * step
 
     def _ping(self, m: Measurement, watch: Watch) -> Verdict:
         if m.values[3] == 0.0:
@@ -136,7 +135,7 @@ class Faults:
             if watch.told:
                 self.events.append(Event(m.time, m.sensor, "back", f"{m.sensor}: measures again"))
             watch.told = ""
-            return Verdict()
+            return _GOOD
         if watch.told != state and (state == "frozen" or m.time - watch.entered >= TELL_S):
             watch.told = state
             self.events.append(Event(m.time, m.sensor, state, f"{m.sensor}: {text}; left out"))

@@ -32,6 +32,7 @@ from rovgraph.log import Log, Measurement
 
 SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
 OTHERS_SPACING_S = 0.005
+TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
 
 
@@ -78,7 +79,7 @@ class Navigator:
         self._events: list[Event] = []
         self._newest: dict[str, float] = {}
         self._distance, self._here = 0.0, np.full(3, np.nan)
-        self._arrival = 0.0
+        self._arrival, self._ticked = 0.0, -np.inf
         self._mag = None if self.config.imu.mag == Mag() else self.config.imu.mag
 
     @property
@@ -230,8 +231,9 @@ class Navigator:
         """Give a measurement to the engine, unless it is none."""
         self.time = max(self.time, m.time)
         verdict = self.faults.look(m)
-        if m.sensor != "imu":  # whose silence is seen by others that go on
+        if m.sensor != "imu" and self.time > self._ticked + TICK_S:  # the IMU's silence is seen by others that go on
             self.faults.tick(self.time)
+            self._ticked = self.time
         if verdict.retract_since is not None and self.engine is not None:
             self.engine.retract(m.sensor, verdict.retract_since)
         if not verdict.use:
