@@ -6,10 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rovgraph.geometry import Array
 from rovgraph.report.style import new_figure, save, style
 from rovgraph.report.units import shown
 from rovgraph.studies.plan import Plan
 
+LEAST_SPAN = (0.2, 10.0, 1.0)  # of speed [m/s], heading [deg] and depth [m]
 BEST, OTHERS = "#0072B2", "#B8C7D3"
 
 
@@ -42,25 +44,36 @@ def draw_ranking(plan: Plan) -> Figure:
 
 
 def draw_path(plan: Plan) -> Figure:
-    """The best manoeuvre from above, and its depth and heading against time."""
+    """The best manoeuvre from above; its speed ahead, heading and depth against time."""
     path = plan.path()
     motion = path.motion(np.linspace(0.0, path.duration, 1500))
-    figure = new_figure(3.6)
-    grid = figure.add_gridspec(2, 2, width_ratios=[1.3, 1.0])
-    above, depth, heading = (figure.add_subplot(grid[place]) for place in (np.s_[:, 0], np.s_[0, 1], np.s_[1, 1]))
+    figure = new_figure(4.0)
+    grid = figure.add_gridspec(3, 2, width_ratios=[1.3, 1.0])
+    above = figure.add_subplot(grid[:, 0])
     north, east, down = motion.p_n.T
     above.plot(east, north, color=BEST, lw=1.2)
     above.plot(east[0], north[0], "o", color="black", ms=4)
     above.set_aspect("equal", adjustable="datalim")
     above.set_xlabel("east [m]")
     above.set_ylabel("north [m]")
-    depth.plot(motion.time, down, color=BEST, lw=1.0)
-    depth.invert_yaxis()
-    depth.set_ylabel("depth [m]")
     yaw = np.unwrap(np.arctan2(motion.R_nb[:, 1, 0], motion.R_nb[:, 0, 0]))
-    heading.plot(motion.time, np.rad2deg(yaw), color=BEST, lw=1.0)
-    heading.set_ylabel("heading [deg]")
-    heading.set_xlabel("time [s]")
+    ahead = np.einsum("ni,ni->n", motion.R_nb[:, :, 0], motion.v_n)
+    columns = (("ahead [m/s]", ahead), ("heading [deg]", np.rad2deg(yaw)), ("depth [m]", down))
+    first: Axes | None = None
+    for row, (label, values) in enumerate(columns):
+        axes = first = figure.add_subplot(grid[row, 1], sharex=first)
+        axes.plot(motion.time, values, color=BEST, lw=1.0)
+        axes.set_ylim(*_limits(values, LEAST_SPAN[row]))
+        axes.set_ylabel(label)
+        axes.tick_params(labelbottom=row == len(columns) - 1)
+    axes.invert_yaxis()
+    axes.set_xlabel("time [s]")
     best = plan.ranked[0].manoeuvre
     figure.suptitle(f"{best.name} at {best.speed:g} m/s; it begins at the dot", x=0.01, ha="left", fontsize=9)
     return figure
+
+
+def _limits(values: Array, least: float) -> tuple[float, float]:
+    """Of an axis that shows all values and spans no less than is worth a look."""
+    middle, half = 0.5 * float(values.max() + values.min()), 0.55 * max(float(np.ptp(values)), least)
+    return middle - half, middle + half
