@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pymap3d
 
 from rovgraph.calibration import TABLE
-from rovgraph.config import Config, Mag
+from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
@@ -24,14 +23,13 @@ from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
 from rovgraph.live.health import Health
-from rovgraph.live.message import GEODETIC, Message, Reading
+from rovgraph.live.intake import Intake
+from rovgraph.live.message import Message, Reading
 from rovgraph.live.renewals import Renewals
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.startup import Startup
 from rovgraph.log import Log, Measurement
 
-SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
-OTHERS_SPACING_S = 0.005
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
 
@@ -46,7 +44,6 @@ class Navigator:
     patient : wait for what a second process computes, so that a replay can be repeated
     renew : renew the filter in a second process
     smooth : have iSAM2 smooth the whole dive as it goes
-    origin : latitude and longitude [deg] of north = east = 0, or None
     clocks, faults, health : of the sources, and of the sensors
     isam2 : the smoother, where it was asked for
     engine : None until the first seconds are over
@@ -60,7 +57,6 @@ class Navigator:
     patient: bool = False
     renew: bool = True
     smooth: bool = False
-    origin: tuple[float, float] | None = None
     clocks: Clocks = field(default_factory=Clocks)
     faults: Faults = field(default_factory=Faults)
     health: Health = field(default_factory=Health)
@@ -74,13 +70,17 @@ class Navigator:
 
     def __post_init__(self) -> None:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
-        self._startup = Startup(self.config.model_copy(update={"imu": imu}), self.origin)
+        self._intake = Intake(self.config, self.left_out)
+        self._startup = Startup(self.config.model_copy(update={"imu": imu}))
         self._renewals = Renewals(self.patient) if self.renew else None
         self._events: list[Event] = []
-        self._newest: dict[str, float] = {}
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
-        self._mag = None if self.config.imu.mag == Mag() else self.config.imu.mag
+
+    @property
+    def origin(self) -> tuple[float, float] | None:
+        """Latitude and longitude [deg] of north = east = 0, where they are known."""
+        return self._intake.origin
 
     @property
     def waited(self) -> float:
@@ -102,21 +102,17 @@ class Navigator:
             self.left_out[message.source, "impossible stamp"] += 1
             return []
         self._arrival = message.arrival
-        delays = self.config.online.delay_s
-        if not delays:
-            rows = [(time, message.readings)]
-        else:
-            rows = [(time - delays.get(r.sensor, 0.0), (r,)) for r in message.readings]  # type: ignore[call-overload]
+        rows = list(self._intake.timed(time, message.readings))
         for at, own in rows:
             for reading in own:
-                if (measurement := self._measurement(at, reading)) is not None:
+                if (measurement := self._intake.measurement(at, reading)) is not None:
                     self._consider(measurement)
         return rows
 
     def replay(self, log: Log) -> None:
         """Take what had been received before, on the estimator's clock."""
         if self.origin is None:
-            self.origin = self._startup.origin = log.origin
+            self._intake.origin = log.origin
         known = self.engine.marks[0].interval.time if self.engine is not None else -np.inf
         if self._renewals is not None:
             self._renewals.patient = True
@@ -124,7 +120,7 @@ class Navigator:
             if measurement.time > known:
                 values = measurement.values
                 if measurement.sensor == "mag":
-                    values = self._calibrated(values)
+                    values = self._intake.calibrated(values)
                 self._consider(measurement._replace(values=values))
         if self._renewals is not None:
             self._renewals.patient = self.patient
@@ -140,7 +136,7 @@ class Navigator:
 
     def finish(self) -> None:
         """No more measurements: take what is held back."""
-        if self.engine is None and (beginning := self._startup.begin()) is not None:
+        if self.engine is None and (beginning := self._startup.begin(self.origin)) is not None:
             self._begin(beginning)
         if self.engine is not None:
             self.engine.finish()
@@ -159,7 +155,7 @@ class Navigator:
             return None
         interval, known = engine.ahead(self.time)
         t = engine.recursion.trajectory([interval], [known])
-        latitude, longitude = self._geodetic(t.p_n[0])
+        latitude, longitude = self._intake.geodetic(t.p_n[0])
         return Solution(
             time=interval.time,
             position=t.p_n[0],
@@ -196,7 +192,7 @@ class Navigator:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood; the filter is not renewed any more."""
-        self.origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1])
+        self._intake.origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1])
         self.close()
         self._renewals = None
         self._begin(restored(state["beginning"]), state["engine"])
@@ -205,27 +201,6 @@ class Navigator:
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
-
-    def _measurement(self, time: float, reading: Reading) -> Measurement | None:
-        """A reading as the engine takes it; None where the sensor has just been heard."""
-        sensor, values = reading
-        if sensor == GEODETIC:
-            if self.origin is None:
-                self.origin = self._startup.origin = (float(values[0]), float(values[1]))
-            north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
-            sensor, values = "fix", np.array([north, east, values[2]])
-        elif sensor == "mag":
-            values = self._calibrated(values)
-        newest = self._newest.get(sensor, -np.inf)
-        if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
-            self.left_out[sensor, "more often than can be used"] += 1
-            return None
-        self._newest[sensor] = max(time, newest)
-        return Measurement(time, sensor, values, 0)
-
-    def _calibrated(self, field: Array) -> Array:
-        """A sample of the magnetometer, shape (3,), as the configuration's calibration has it."""
-        return field if self._mag is None else self._mag.calibrated(field[None])[0]
 
     def _consider(self, m: Measurement) -> None:
         """Give a measurement to the engine, unless it is none."""
@@ -239,7 +214,7 @@ class Navigator:
         if not verdict.use:
             self.left_out[m.sensor, self.faults.watches[m.sensor].state] += 1
         elif self.engine is None:
-            if (beginning := self._startup.add(m)) is not None:
+            if (beginning := self._startup.add(m, self.origin)) is not None:
                 self._begin(beginning)
         else:
             self._feed(self.engine, m)
@@ -309,12 +284,6 @@ class Navigator:
                 TABLE[name].labels, known.state.calibration[name].reshape(-1), sd[columns[name]], strict=True
             )
         }
-
-    def _geodetic(self, p_n: Array) -> tuple[float | None, float | None]:
-        if self.origin is None:
-            return None, None
-        latitude, longitude, _ = pymap3d.ned2geodetic(p_n[0], p_n[1], 0.0, *self.origin, 0.0)
-        return float(latitude), float(longitude)
 
     def _travelled(self, p_n: Array) -> float:
         """Distance over ground, in steps of a metre at least: less is noise."""

@@ -23,20 +23,24 @@ class Startup:
     Attributes
     ----------
     config : as the user gave it
-    origin : latitude and longitude [deg] of north = east = 0, or None
     waits_for : why it has not begun, one line; empty while the first seconds go by
     doubts : what looks wrong with the first seconds, one line each
     """
 
     config: Config
-    origin: tuple[float, float] | None = None
     waits_for: str = ""
     measurements: list[Measurement] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     _next: float | None = None
 
-    def add(self, measurement: Measurement) -> Beginning | None:
-        """Take a measurement; the beginning of the dive, once it is known."""
+    def add(self, measurement: Measurement, origin: tuple[float, float] | None) -> Beginning | None:
+        """Take a measurement; the beginning of the dive, once it is known.
+
+        Parameters
+        ----------
+        measurement : the next one
+        origin : latitude and longitude [deg] of north = east = 0, where they are known
+        """
         self.measurements.append(measurement)
         if measurement.sensor != "imu":
             return None
@@ -45,9 +49,9 @@ class Startup:
         if measurement.time < self._next:
             return None
         self._next = measurement.time + AGAIN_S
-        return self.begin()
+        return self.begin(origin)
 
-    def begin(self) -> Beginning | None:
+    def begin(self, origin: tuple[float, float] | None) -> Beginning | None:
         """The beginning from what is there, or None; then `waits_for` says why."""
         self.measurements.sort(key=place)
         imu = [m.time for m in self.measurements if m.sensor == "imu"]
@@ -55,7 +59,7 @@ class Startup:
             first = imu[-1] - HEADING_WITHIN_S
             self.measurements = [m for m in self.measurements if m.time >= first]
         expected = LATER | (COMPASSES if self.config.heading.sources is not None else set())
-        log = gathered(self.measurements, "so far", self.origin)
+        log = gathered(self.measurements, "so far", origin)
         try:
             beginning = initialise(log, self.config, expected)
         except InputError as error:

@@ -1,0 +1,70 @@
+"""From what a source says to measurements as the estimator takes them."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+import pymap3d
+
+from rovgraph.config import Config, Mag
+from rovgraph.geometry import Array
+from rovgraph.live.message import GEODETIC, Reading
+from rovgraph.log import Measurement
+
+SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
+OTHERS_SPACING_S = 0.005
+
+
+class Intake:
+    """Calibrates, puts fixes on the map, and thins out what comes more often than can be used.
+
+    Parameters
+    ----------
+    config : effective configuration
+    left_out : (sensor, reason) -> count, to be added to
+
+    Attributes
+    ----------
+    origin : latitude and longitude [deg] of north = east = 0; None until the first fix
+    """
+
+    def __init__(self, config: Config, left_out: Counter[tuple[str, str]]) -> None:
+        self.origin: tuple[float, float] | None = None
+        self._delays = config.online.delay_s
+        self._mag = None if config.imu.mag == Mag() else config.imu.mag
+        self._left_out = left_out
+        self._newest: dict[str, float] = {}
+
+    def timed(self, time: float, readings: tuple[Reading, ...]) -> Sequence[tuple[float, tuple[Reading, ...]]]:
+        """Readings with their times, where some sensors are known to be late [s]."""
+        if not self._delays:
+            return [(time, readings)]
+        return [(time - self._delays.get(r.sensor, 0.0), (r,)) for r in readings]  # type: ignore[call-overload]
+
+    def measurement(self, time: float, reading: Reading) -> Measurement | None:
+        """A reading as the engine takes it; None where the sensor has just been heard."""
+        sensor, values = reading
+        if sensor == GEODETIC:
+            if self.origin is None:
+                self.origin = float(values[0]), float(values[1])
+            north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
+            sensor, values = "fix", np.array([north, east, values[2]])
+        elif sensor == "mag":
+            values = self.calibrated(values)
+        newest = self._newest.get(sensor, -np.inf)
+        if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
+            self._left_out[sensor, "more often than can be used"] += 1
+            return None
+        self._newest[sensor] = max(time, newest)
+        return Measurement(time, sensor, values, 0)
+
+    def calibrated(self, field: Array) -> Array:
+        """A sample of the magnetometer, shape (3,), as the configuration's calibration has it."""
+        return field if self._mag is None else self._mag.calibrated(field[None])[0]
+
+    def geodetic(self, p_n: Array) -> tuple[float | None, float | None]:
+        """Latitude and longitude [deg] of a position, shape (3,), where the origin is known."""
+        if self.origin is None:
+            return None, None
+        latitude, longitude, _ = pymap3d.ned2geodetic(p_n[0], p_n[1], 0.0, *self.origin, 0.0)
+        return float(latitude), float(longitude)
