@@ -51,7 +51,7 @@ GRADES: Mapping[str, dict[str, Any]] = MappingProxyType(
 )  # fmt: skip
 
 COMPASS = MappingProxyType({"mag": "mag", "dvl": "dvl_compass", "ahrs": "ahrs"})  # source: prefix of its variables
-FIELD = ("hard_iron", "soft_iron", "field_dip", "field_scale")  # a study's compasses err as said, and not otherwise
+IRON = ("hard_iron", "soft_iron")  # a study's compasses err as said, and not otherwise
 
 
 def believed(
@@ -75,7 +75,7 @@ def believed(
     prior_deg : mean, beyond the mounting, and sd of the DVL's yaw
     """
     sources = tuple(headings.split("+"))
-    entries: dict[str, dict[str, Any]] = {name: {"estimate": False} for name in FIELD}
+    entries: dict[str, dict[str, Any]] = {name: {"estimate": False} for name in IRON}
     for source, prefix in COMPASS.items():
         for kind in ("offset", "deviation"):
             estimate = source in sources and heading_error in (kind, "both")
