@@ -108,7 +108,7 @@ class DvlVelocity:
 
     Attributes
     ----------
-    lever_arm_b : ndarray, shape (3,), DVL relative to the state's origin [m]
+    lever_arm_b : ndarray, shape (3,) or (n, 3), DVL relative to the state's origin [m]
     sensor : "dvl" over ground, "dvl_water" relative to the water
     """
 
@@ -185,7 +185,7 @@ class CompassHeading:
     ----------
     sensor : "ahrs" or "dvl_heading"
     offset, curve : names of its calibration variables
-    declination : [rad], east positive
+    declination : [rad], east positive; one for all epochs or for each
     R_bs : ndarray, shape (3, 3), mounting of the instrument; the DVL's own comes from
         the calibration variables instead
     """
@@ -193,7 +193,7 @@ class CompassHeading:
     sensor: str
     offset: str
     curve: str
-    declination: float
+    declination: float | Array
     R_bs: Array = field(default_factory=lambda: np.eye(3))
     dim = 1
     angular = True

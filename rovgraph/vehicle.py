@@ -33,6 +33,8 @@ NO_CHANGE = np.zeros(6)
 class Hydrodynamics:
     """A vehicle in water; the origin is the centre of mass, axes forward, starboard, down.
 
+    `acceleration` takes many vehicles too, mass and drag with leading axes.
+
     Relative changes of drag coefficients, ``change``, are of shape (..., 6): linear x, y, z,
     then quadratic x, y, z; the coefficients are multiplied by ``1 + change``.
 
@@ -149,13 +151,13 @@ class Hydrodynamics:
         momentum = self.mass * velocity_b
         inverse = 1.0 / self.mass
         by = {
-            "velocity": H["velocity"] - skew(w_b) * self.mass,
+            "velocity": H["velocity"] - skew(w_b) * self.mass[..., None, :],
             "rate": skew(momentum),
             "force": _diagonal(np.ones_like(drag)),
             "drag": H["drag"],
         }
         a = inverse * (force_b + drag - cross(w_b, momentum))
-        return a, {name: inverse[:, None] * J for name, J in by.items()}
+        return a, {name: inverse[..., None] * J for name, J in by.items()}
 
     def turning_acceleration(
         self, w_b: Array, down_b: Array, moment_b: Array, change: Array = NO_CHANGE
