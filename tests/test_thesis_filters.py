@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from dives import (
     LIVELY,
@@ -30,7 +31,7 @@ from rovgraph import thesis
 from rovgraph.config import Config, beliefs, load_config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate
-from rovgraph.estimators.kalman import FILTERS, Filter, run_filter
+from rovgraph.estimators.kalman import FILTERS, Asked, Filter, run_filter, run_filters
 from rovgraph.estimators.kalman import quaternion as quat
 from rovgraph.estimators.kalman.dvl import DvlModel, Ping
 from rovgraph.estimators.kalman.known import KnownMotion
@@ -44,6 +45,7 @@ from rovgraph.estimators.kalman.processes import (
 )
 from rovgraph.estimators.kalman.recursion import Recursion
 from rovgraph.estimators.kalman.setup import Setup, prepare
+from rovgraph.estimators.kalman.timetable import timetable
 from rovgraph.geometry import Array, matrix_from_rpy, skew, transpose, wrap_angle
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log, Stream, read_log
@@ -612,6 +614,115 @@ def test_thrusters_carry_4_2_through_a_silence_of_the_dvl():
     assert np.linalg.norm(run_filter("4.2", still, config).trajectory.p_n[-1] - p) > 1.0
 
 
+# ------------------------------------------------------------------------ side by side
+
+
+def test_a_timetable_has_each_sample_and_ping_once_and_in_order():
+    rng = np.random.default_rng(3)
+    samples = [0.01 * np.arange(n) for n in (300, 150, 40)]
+    pings = [np.sort(rng.uniform(0.0, s[-1], n)) for s, n in zip(samples, (17, 3, 0), strict=True)]
+    pings[0][4], pings[1][-1] = samples[0][50], samples[1][-1]  # at a sample's time, and at the very end
+    pings[0].sort()
+    table = timetable(samples, pings, [0.5, 0.1, 10.0])
+    for b, (s, p) in enumerate(zip(samples, pings, strict=True)):
+        own = np.flatnonzero(table.active[:, b])
+        assert table.ends[b] == own[-1] + 1
+        seen, is_ping = table.time[own, b], table.ping[own]
+        assert_allclose(seen[~is_ping], s, atol=0)
+        assert_allclose(seen[is_ping], p, atol=0)
+        assert (table.number[own, b][is_ping] == np.arange(len(p))).all()
+        order = np.lexsort((is_ping, seen))
+        assert (order == np.arange(len(own))).all(), "a sample comes before a ping of its time"
+        assert (s[table.epoch[own, b]] <= seen).all() and (table.epoch[own, b][~is_ping] == np.arange(len(s))).all()
+        assert (np.diff(table.time[:, b]) >= 0.0).all() and not np.diff(table.time[:, b])[~table.active[1:, b]].any()
+        kept_at = seen[table.keeps_state[own, b]]
+        assert (np.diff(kept_at) > 0.0).all() and set(p) <= set(kept_at) and {s[0], s[-1]} <= set(kept_at)
+        assert np.diff(kept_at).max() <= (0.5, 0.1, 10.0)[b] + 0.011
+    samples_alone = timetable(samples[:1], [np.zeros(0)], [0.5])
+    assert samples_alone.active.all() and len(samples_alone.ping) == 300
+
+
+def assert_same(one: Estimate, other: Estimate) -> None:
+    """To the last bit: what comes of a filter does not depend on its company."""
+    assert one.kind == other.kind and one.summary == other.summary
+    for name in ("time", "p_n", "v_n", "R_nb", "cov_p", "cov_v", "cov_theta"):
+        assert_allclose(getattr(one.trajectory, name), getattr(other.trajectory, name), rtol=0, atol=0)
+    pd.testing.assert_frame_equal(one.residuals, other.residuals, check_exact=True)
+    assert one.history.keys() == other.history.keys()
+
+
+def dives_of_many_kinds() -> list[tuple[Log, Config]]:
+    """Of different length and rate; the DVL silent or without lock, the magnetometer slow, other mountings."""
+    case = lively_dive()
+    config, log = started(case), case.log
+    short = kept(log, "imu", log["imu"].time < 12.0)
+    dvl = log["dvl"].data.copy()
+    dvl[(log["dvl"].time > 4.0) & (log["dvl"].time < 9.0), 3] = 0.0
+    silent = kept(kept(log, "dvl", log["dvl"].time > 10.0), "dvl_heading", log["dvl_heading"].time > 10.0)
+    half = kept(log, "imu", (np.arange(len(log["imu"])) % 2 == 0) & (log["imu"].time < 9.0))
+    slow = kept(short, "mag", np.arange(len(log["mag"])) % 7 == 0)
+    other = changed(
+        config,
+        imu={"lever_arm_m": (0.0, 0.0, 0.0), "mount_rpy_deg": (0.0, 0.0, 0.0)},
+        dvl={"lever_arm_m": (0.1, 0.0, 0.2)},
+        environment={"declination_deg": 2.0, "gravity_mps2": 9.82},
+        vehicle={"mass_kg": 80.0},
+        calibration={"dvl_yaw": {"mean_deg": -40.0}, "dvl_scale": {"mean": 0.01}},
+    )
+    return [(short, config), (altered(short, "dvl", dvl), config), (silent, config), (half, config), (slow, other)]
+
+
+@pytest.mark.parametrize("names", ["4.1", "4.1-no-accelerometer", "4.3a 4.3b 4.3c", "4.4a 4.4b 4.4c", "4.5"])
+def test_filters_side_by_side_do_what_each_does_alone(names):
+    asked = [Asked(FILTERS[name], *dive) for dive in dives_of_many_kinds() for name in names.split()]
+    for each, together in zip(asked, run_filters(asked), strict=True):
+        assert isinstance(together, Estimate)
+        assert_same(together, run_filter(each.variant, each.log, each.config))
+
+
+@pytest.mark.parametrize("switch", [{"iterations": 3}, {"linearized_at": "truth"}, {"coriolis": "exact"}])
+def test_filters_with_switches_do_so_too(switch):
+    case = lively_dive()
+    log = kept(case.log, "imu", case.log["imu"].time < 8.0)
+    loud = FILTERS["4.3c"].with_numbers(acceleration=(1e-3, 1e-5, 1e-5))
+    variants = [replace(f, noise_frame="earth", **switch) for f in (FILTERS["4.3a"], FILTERS["4.3b"], loud)]
+    asked = [Asked(f, log, started(case), case.truth) for f in variants]
+    for each, together in zip(asked, run_filters(asked), strict=True):
+        assert isinstance(together, Estimate)
+        alone = run_filter(each.variant, each.log, each.config, each.truth)
+        if each.variant.numbers is loud.numbers:
+            assert_same(together, alone)
+        else:  # noise of equal variances is turned along, which changes its last bit
+            assert_allclose(together.trajectory.p_n, alone.trajectory.p_n, atol=1e-9)
+
+
+def test_vehicles_side_by_side_do_what_each_does_alone():
+    log, _ = thruster_dive(20.0)
+    config = changed(CONFIG, start={"heading_deg": float(np.rad2deg(0.5))})
+    heavy = changed(config, vehicle={"mass_kg": 90.0, "drag_linear": (50.0, 150.0, 80.0)})
+    asked = [Asked(FILTERS["4.2"], kept(log, "imu", log["imu"].time < end), c) for end, c in ((9, heavy), (20, config))]
+    asked.append(Asked(FILTERS["4.2"], kept(log, "dvl", log["dvl"].time < 5.0), heavy))
+    for each, together in zip(asked, run_filters(asked), strict=True):
+        assert isinstance(together, Estimate)
+        assert_same(together, run_filter("4.2", each.log, each.config))
+
+
+def test_one_that_fails_does_not_touch_the_others():
+    case = lively_dive()
+    config, log = started(case), kept(case.log, "imu", case.log["imu"].time < 15.0)
+    absurd = altered(log, "imu", np.where(log["imu"].time[:, None] > 10.0, 1e200, 1.0) * log["imu"].data)
+    logs = [log, absurd, without(log, "mag"), without(log, "dvl_heading")]
+    asked = [Asked(FILTERS[name], each, config) for each in logs for name in ("4.3a", "4.3b", "4.3c")]
+    done = run_filters(asked)
+    words = [None] * 3 + ["diverges at 10."] * 3 + ["mag_x", None, "mag_x"] + ["dvl_heading"] * 2 + [None]
+    for each, outcome, word in zip(asked, done, words, strict=True):
+        if word is None:
+            assert isinstance(outcome, Estimate)
+            assert_same(outcome, run_filter(each.variant, each.log, each.config))
+        else:
+            assert isinstance(outcome, InputError) and word in str(outcome) and each.variant.name in str(outcome)
+
+
 # --------------------------------------------------------------------------- mistakes
 
 
@@ -746,6 +857,21 @@ def real_log() -> tuple[Config, Log]:
     config = load_config(ICTINEU / "ictineu.yaml")
     log = read_log(ICTINEU / "log.csv.gz", config.columns, config.units)
     return config, kept(log, "imu", log["imu"].time < log["imu"].time[0] + 400.0)
+
+
+def test_fifteen_side_by_side_take_less_than_two_thirds_of_the_time():
+    case = lively_dive()
+    log = kept(case.log, "imu", case.log["imu"].time < 8.0)
+    asked = [Asked(FILTERS[f"4.3{letter}"], log, started(case)) for letter in "abc"]
+    spent = []
+    for many in (5 * asked, asked[:1]):
+        runs = []
+        for _ in range(2):
+            begin = time.process_time()
+            run_filters(many)
+            runs.append((time.process_time() - begin) / len(many))
+        spent.append(min(runs))
+    assert spent[0] < 2.0 / 3.0 * spent[1]
 
 
 def test_every_filter_is_fifty_times_faster_than_real_time():

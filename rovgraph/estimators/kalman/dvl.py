@@ -5,24 +5,28 @@ derivatives by a rotation in b are chained to the quaternion: a change dq of a u
 quaternion is a rotation of ``2 T(q)' dq``.
 """
 
-from dataclasses import dataclass
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
-from rovgraph.estimators.kalman.core import Linearized
+from rovgraph.estimators.kalman.core import Linearized, times
+from rovgraph.estimators.kalman.epochs import Epochs, Index
 from rovgraph.estimators.kalman.known import KnownMotion
 from rovgraph.estimators.kalman.processes import Layout
 from rovgraph.estimators.kalman.quaternion import matrix, rate_matrix, unit
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.log import Log
+from rovgraph.sensors import CompassHeading, DvlVelocity
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 HEADING = 3  # its place among x, y, z, heading
-_NO_BIAS, _ANYWHERE = np.zeros((1, 6)), np.zeros((1, 3))
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,14 @@ def pings(log: Log, config: Config, compass: bool) -> list[Ping]:
     return [found[t] for t in sorted(found) if begin <= t <= end]
 
 
+def ping_rows(pings: Sequence[Ping]) -> Array:
+    """Velocity and heading of each ping, NaN where it has none, and a last row of NaN; shape (n + 1, 4)."""
+    rows = np.full((len(pings) + 1, HEADING + 1), np.nan)
+    for row, ping in zip(rows, pings, strict=False):
+        row[list(ping.rows)] = ping.z
+    return rows
+
+
 class DvlModel:
     """Velocity and heading that a filter's state predicts.
 
@@ -87,44 +99,64 @@ class DvlModel:
         known: KnownMotion | None,
         mount_in_heading: bool = True,
     ) -> None:
-        self._places, self._body, self._known = places, body, known
-        self._velocity, self._compass = sensors["dvl"].model, sensors["dvl_heading"].model
+        velocity, compass = sensors["dvl"].model, sensors["dvl_heading"].model
+        assert isinstance(velocity, DvlVelocity) and isinstance(compass, CompassHeading)
+        self._velocity, self._compass = velocity, compass
+        self._places, self._body = places, body
+        self._known = None if known is None else (Epochs(known.R_nb), Epochs(known.w_b))
         self._mount_in_heading = mount_in_heading
         self._means = {name: belief.mean for name, belief in beliefs.items()}
 
-    def __call__(self, x: Array, epoch: int, heading: bool) -> Linearized:
-        """Predicted velocity and heading, shape (4,), and H, shape (4, n); heading 0 where not wanted."""
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        """Those of several filters side by side."""
+        whole = copy.copy(members[0])
+        arms, declinations = zip(*((m._velocity.lever_arm_b, m._compass.declination) for m in members), strict=True)
+        whole._velocity = replace(whole._velocity, lever_arm_b=np.stack(arms))
+        whole._compass = replace(whole._compass, declination=np.stack(declinations))
+        whole._means = {name: np.stack([m._means[name] for m in members]) for name in whole._means}
+        if whole._known is not None:
+            R_nb, w_b = (Epochs.together(rows) for rows in zip(*(m._known or () for m in members), strict=True))
+            whole._known = R_nb, w_b
+        return whole
+
+    def __call__(self, x: Array, epoch: Index, heading: bool) -> Linearized:
+        """Predicted velocity and heading, shape (..., 4), and H, shape (..., 4, n); heading 0 where not wanted."""
+        if x.ndim == 1:
+            h, H = self(x[None], epoch, heading)
+            return h[0], H[0]
         s = self._places
         R_nb, w_b = self._attitude(x, epoch)
-        v_n = R_nb @ x[s["v"]] if self._body else x[s["v"]]
-        state = State(R_nb[None], _ANYWHERE, v_n[None], _NO_BIAS, self._calibration(x))
-        z, J = self._velocity.predict(state, w_b[None])
-        h, H = np.zeros(4), np.zeros((4, len(x)))
-        h[:3] = z[0]
-        H[:3, s["v"]] = J[VELOCITY][0] @ R_nb if self._body else J[VELOCITY][0]
-        slopes = [(slice(0, 3), J)]
+        v_n = times(R_nb, x[:, s["v"]]) if self._body else x[:, s["v"]]
+        nowhere = np.zeros((len(x), 6))
+        state = State(R_nb, nowhere[:, :3], v_n, nowhere, self._calibration(x))
+        h, H = np.zeros((len(x), HEADING + 1)), np.zeros((len(x), HEADING + 1, x.shape[1]))
+        h[:, :HEADING], J = self._velocity.predict(state, w_b)
+        H[:, :HEADING, s["v"]] = J[VELOCITY] @ R_nb if self._body else J[VELOCITY]
+        slopes = [(slice(0, HEADING), J)]
         if heading:
             if not self._mount_in_heading:
-                state = State(state.R_nb, state.p_n, state.v_n, state.bias, self._means)
-            z, J = self._compass.predict(state, w_b[None])
-            h[HEADING] = z[0, 0]
-            slopes.append((slice(HEADING, 4), J))
+                state = replace(state, calibration=self._means)
+            h[:, HEADING:], J = self._compass.predict(state, w_b)
+            slopes.append((slice(HEADING, None), J))
         if "q" in s:
-            H[:3, s["w"]] = -slopes[0][1][BIAS][0, :, 3:]  # the rate enters as rate less bias
-            by_q = 2.0 * rate_matrix(unit(x[s["q"]])).T
+            H[:, :HEADING, s["w"]] = -slopes[0][1][BIAS][..., 3:]  # the rate enters as rate less bias
+            by_q = 2.0 * transpose(rate_matrix(unit(x[:, s["q"]])))
             for rows, J in slopes[int(self._body) :]:  # a velocity in b is seen alike at any attitude
-                H[rows, s["q"]] = J[POSE][0, :, :3] @ by_q
+                H[:, rows, s["q"]] = J[POSE][..., :3] @ by_q
         if "mount" in s:
             for rows, J in slopes if self._mount_in_heading else slopes[:1]:
-                H[rows, s["mount"]] = np.column_stack([J[name][0, :, 0] for name in MOUNT])
+                H[:, rows, s["mount"]] = np.concatenate([J[name] for name in MOUNT], axis=-1)
         return h, H
 
-    def _attitude(self, x: Array, epoch: int) -> tuple[Array, Array]:
+    def _attitude(self, x: Array, epoch: Index) -> tuple[Array, Array]:
         if self._known is not None:
-            return self._known.R_nb[epoch], self._known.w_b[epoch]
-        return matrix(unit(x[self._places["q"]])), x[self._places["w"]]
+            R_nb, w_b = (given.at(epoch) for given in self._known)
+            return R_nb.reshape(-1, 3, 3), w_b.reshape(-1, 3)
+        return matrix(unit(x[:, self._places["q"]])), x[:, self._places["w"]]
 
     def _calibration(self, x: Array) -> dict[str, Array]:
         if "mount" not in self._places:
             return self._means
-        return self._means | {name: angle for name, angle in zip(MOUNT, x[self._places["mount"], None], strict=True)}
+        angles = x[:, self._places["mount"]]
+        return self._means | {name: angles[:, k : k + 1] for k, name in enumerate(MOUNT)}

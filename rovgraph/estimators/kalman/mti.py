@@ -7,13 +7,18 @@ biases in the MTi's axes. ``rovgraph.sensors.MagneticField`` says the same of ma
 once; at 100 Hz that costs more than the filter itself. A test holds the two together.
 """
 
+import copy
+from collections.abc import Sequence
+from typing import Protocol, Self
+
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.estimators.kalman.core import Linearized, Quadratic
+from rovgraph.estimators.kalman.core import Linearized, Quadratic, times
+from rovgraph.estimators.kalman.epochs import Epochs, Index
 from rovgraph.estimators.kalman.known import KnownMotion
 from rovgraph.estimators.kalman.processes import Layout, centripetal, length
-from rovgraph.estimators.kalman.quaternion import Turn
+from rovgraph.estimators.kalman.quaternion import Turn, by_vector
 from rovgraph.geometry import Array, rotate, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import MagneticField, field_direction
@@ -30,6 +35,27 @@ def reference_field(instrument: Instrument, beliefs: dict[str, Belief]) -> Array
     return field_direction(model.declination - offset, model.dip + dip)
 
 
+class ImuModel(Protocol):
+    """What the inertial unit measures.
+
+    Attributes
+    ----------
+    dim : number of components
+    """
+
+    @property
+    def dim(self) -> int: ...
+
+    def __call__(self, x: Array, epoch: Index) -> Linearized:
+        """Predicted samples, shape (..., m), and H, shape (..., m, n)."""
+        ...
+
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        """The model of several filters side by side."""
+        ...
+
+
 class Mti:
     """All of (3.14) for a state with attitude and rate.
 
@@ -42,6 +68,8 @@ class Mti:
     gravity : [m/s^2]
     field_n : ndarray, shape (3,), reference field as a fraction of its length
     """
+
+    dim = 9
 
     def __init__(
         self, body: bool, places: Layout, R_bs: Array, lever_arm_b: Array, gravity: float, field_n: Array
@@ -65,15 +93,23 @@ class Mti:
         self._g_n = g_n
         self._quadratic = Quadratic(constant, linear, second)
 
-    def __call__(self, x: Array, epoch: int) -> Linearized:
-        """Predicted samples, shape (9,), and H, shape (9, n)."""
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        whole = copy.copy(members[0])
+        whole._g_n = np.stack([m._g_n for m in members])
+        whole._turn = Turn.together([m._turn for m in members])
+        whole._quadratic = Quadratic.together([m._quadratic for m in members])
+        return whole
+
+    def __call__(self, x: Array, epoch: Index) -> Linearized:
+        """Predicted samples, shape (..., 9), and H, shape (..., 9, n)."""
         h, H = self._quadratic(x)
         if not self._body:  # cubic: R_sb R_bn (a_n - g)
             a, q = self._places["a"], self._places["q"]
-            R_sn, slope = self._turn(x[q])
-            force_n = x[a] - self._g_n
-            h[:3] += R_sn @ force_n
-            H[:3, a], H[:3, q] = R_sn, force_n @ slope
+            R_sn, slope = self._turn(x[..., q])
+            force_n = x[..., a] - self._g_n
+            h[..., :3] += times(R_sn, force_n)
+            H[..., :3, a], H[..., :3, q] = R_sn, by_vector(force_n, slope)
         return h, H
 
 
@@ -93,13 +129,22 @@ class Accelerometer:
     known : attitude and rate at the IMU's epochs
     """
 
+    dim = 3
+
     def __init__(self, places: Layout, R_bs: Array, lever_arm_b: Array, gravity: float, known: KnownMotion) -> None:
         g_n = np.array([0.0, 0.0, gravity])
         self._H = np.zeros((3, length(places)))
         self._H[:, places["a"]], self._H[:, places["acc_bias"]] = R_bs.T, _EYE
         force_b = centripetal(known.w_b, lever_arm_b) - rotate(transpose(known.R_nb), g_n)
-        self._offset = rotate(R_bs.T, force_b)
+        self._offset = Epochs(rotate(R_bs.T, force_b))
 
-    def __call__(self, x: Array, epoch: int) -> Linearized:
-        """Predicted specific force, shape (3,), and H, shape (3, n)."""
-        return self._offset[epoch] + self._H @ x, self._H
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        whole = copy.copy(members[0])
+        whole._H = np.stack([m._H for m in members])
+        whole._offset = Epochs.together([m._offset for m in members])
+        return whole
+
+    def __call__(self, x: Array, epoch: Index) -> Linearized:
+        """Predicted specific force, shape (..., 3), and H, shape (..., 3, n)."""
+        return self._offset.at(epoch) + times(self._H, x), self._H

@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rovgraph.config import mount_matrix
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate, History
-from rovgraph.estimators.kalman.dvl import HEADING, MOUNT
+from rovgraph.estimators.kalman.dvl import HEADING, MOUNT, ping_rows
 from rovgraph.estimators.kalman.quaternion import SECOND, rate_matrix, unit
 from rovgraph.estimators.kalman.recursion import Innovations, Recursion
 from rovgraph.estimators.results import calibration_estimates, calibration_history
@@ -29,7 +30,8 @@ def estimate_of(done: Recursion) -> Estimate:
     """
     setup = done.setup
     time, epoch, x, P = (np.array(column) for column in zip(*done.kept, strict=True))
-    residuals = pd.concat([_imu_residuals(done), _dvl_residuals(done)], ignore_index=True)
+    tables = [table for table in (_imu_residuals(done), _dvl_residuals(done)) if len(table)]
+    residuals = pd.concat(tables, ignore_index=True) if tables else _imu_residuals(done)
     residuals = residuals.sort_values("time", kind="stable", ignore_index=True)
     history = _histories(done, time, x, P)
     calibration = calibration_estimates(setup.beliefs, _sensors(done), *_final_calibration(done))
@@ -49,7 +51,7 @@ def _trajectory(done: Recursion, time: Array, epoch: Array, x: Array, P: Array) 
         q = unit(x[:, s["q"]])
         slope = np.einsum("ijab,nb->nija", SECOND, q)
         R_nb = np.eye(3) + 0.5 * np.einsum("nija,na->nij", slope, q)
-        turned = 2.0 * R_nb @ transpose(np.array([rate_matrix(each) for each in q]))
+        turned = 2.0 * R_nb @ transpose(rate_matrix(q))
         cov_theta = turned @ P[:, s["q"], s["q"]] @ transpose(turned)
         if setup.variant.motion == "body":
             slope_v[:, :, s["q"]] = np.einsum("nija,nj->nia", slope, v)
@@ -100,42 +102,41 @@ def _sensors(done: Recursion) -> list[str]:
 
 
 def _imu_residuals(done: Recursion) -> pd.DataFrame:
-    imu, kept, setup = done.setup.log["imu"], done.imu, done.setup
+    imu, setup = done.setup.log["imu"], done.setup
     scale = np.concatenate([np.ones(6), np.full(3, setup.field_length)])
-    rows = [
-        _rows(imu.time[i], setup.samples[i, :m] * scale[:m], imu.row[i], _MTI_COMPONENTS[:m], *_scaled(kept, k, scale))
-        for k, i in enumerate(kept.index)
-        for m in [len(kept.residual[k])]
-    ]
-    return _frame(rows)
+    return _residuals(done.imu, imu.time, setup.samples, imu.row, _MTI_COMPONENTS, scale)
 
 
 def _dvl_residuals(done: Recursion) -> pd.DataFrame:
-    kept, pings = done.dvl, done.setup.pings
-    rows = []
-    for k, i in enumerate(kept.index):
-        ping = pings[i]
-        names = [_DVL_COMPONENTS[r] for r in ping.rows]
-        rows.append(_rows(ping.time, ping.z, ping.line, names, *_scaled(kept, k, np.ones(HEADING + 1))))
-    return _frame(rows)
+    pings = done.setup.pings
+    time, line = np.array([p.time for p in pings]), np.array([p.line for p in pings], dtype=int)
+    return _residuals(done.dvl, time, ping_rows(pings), line, _DVL_COMPONENTS, np.ones(HEADING + 1))
 
 
-def _scaled(kept: Innovations, k: int, scale: Array) -> tuple[Array, Array, Array]:
-    m = len(kept.residual[k])
-    return kept.residual[k] * scale[:m], kept.sd[k] * scale[:m], kept.normalised[k]
-
-
-def _rows(
-    time: float, z: Array, line: int, names: list[tuple[str, str]], nu: Array, sd: Array, normalised: Array
-) -> list[tuple[Any, ...]]:
-    columns = (z, z - nu, nu, sd, normalised)
-    return [
-        (time, *name, *numbers, 1.0, line) for name, *numbers in zip(names, *(c.tolist() for c in columns), strict=True)
-    ]
-
-
-def _frame(rows: list[list[tuple[Any, ...]]]) -> pd.DataFrame:
-    return pd.DataFrame([row for rows_of_one in rows for row in rows_of_one], columns=pd.Index(RESIDUAL_COLUMNS))
+def _residuals(
+    kept: Innovations, time: Array, z: Array, line: NDArray[np.int64], names: list[tuple[str, str]], scale: Array
+) -> pd.DataFrame:
+    """A row for each component of what was kept; ``time``, ``z`` and ``line`` are those of all."""
+    if not kept.index:
+        return pd.DataFrame(columns=pd.Index(RESIDUAL_COLUMNS))
+    k = np.repeat(kept.index, [len(c) for c in kept.components])
+    component = np.concatenate(kept.components)
+    residual, sd = (np.concatenate(column) * scale[component] for column in (kept.residual, kept.sd))
+    measured = z[k, component] * scale[component]
+    sensors, words = np.array(names, dtype=object).T
+    columns = (
+        time[k],
+        sensors[component],
+        words[component],
+        measured,
+        measured - residual,
+        residual,
+        sd,
+        np.concatenate(kept.normalised),
+        1.0,
+        line[k],
+    )
+    return pd.DataFrame(dict(zip(RESIDUAL_COLUMNS, columns, strict=True)))
 
 
 def _summary(done: Recursion) -> dict[str, Any]:

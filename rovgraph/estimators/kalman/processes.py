@@ -11,23 +11,31 @@ the hydrodynamic model (4.2), M = mI + M_a, F the forces of thrusters and drag:
     v' = M^-1 (F - w x M v)    p' = R_nb v
 
 All are discretised by forward Euler (2.26), ``x <- x + dt x'``, ``F = I + dt A``.
+
+A process of several filters side by side is made from theirs by ``together``; states,
+intervals and epochs then have a leading axis for the filters.
 """
 
-from typing import Protocol
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol, Self
 
 import numpy as np
 
-from rovgraph.estimators.kalman.core import Linearized, Quadratic
+from rovgraph.estimators.kalman.core import Linearized, Quadratic, diagonal, times
+from rovgraph.estimators.kalman.epochs import Epochs, Index
 from rovgraph.estimators.kalman.known import KnownMotion
-from rovgraph.estimators.kalman.quaternion import RATES, Turn, matrix
+from rovgraph.estimators.kalman.quaternion import RATES, Turn, by_vector, matrix
 from rovgraph.estimators.kalman.variants import Filter, Numbers
-from rovgraph.geometry import Array, cross, exp_rotation, right_jacobian, skew
+from rovgraph.geometry import Array, cross, exp_rotation, right_jacobian, skew, transpose
 from rovgraph.thesis import SAMPLE_S
 from rovgraph.vehicle import Hydrodynamics
 
 Layout = dict[str, slice]  # a, v, p, w, q, acc_bias, gyr_bias, mag_bias, mount -> place in the state
 
 SIZES = {"a": 3, "v": 3, "p": 3, "w": 3, "q": 4, "acc_bias": 3, "gyr_bias": 3, "mag_bias": 3, "mount": 3}
+MOTION = ("a", "v", "p", "w", "q")
 _LEVI_CIVITA = np.moveaxis(skew(np.eye(3)), 0, -1)  # skew(u) = _LEVI_CIVITA @ u
 
 
@@ -42,6 +50,11 @@ def length(places: Layout) -> int:
     return sum(SIZES[name] for name in places)
 
 
+def moving(places: Layout) -> int:
+    """Number of scalars before those that are constant but for their walk."""
+    return max(int(place.stop) for name, place in places.items() if name in MOTION)
+
+
 class Process(Protocol):
     """A process model.
 
@@ -53,12 +66,17 @@ class Process(Protocol):
     @property
     def layout(self) -> Layout: ...
 
-    def step(self, x: Array, dt: float, epoch: int) -> Linearized:
-        """The state ``dt`` seconds on, from IMU epoch ``epoch``, and F, which the next call overwrites."""
+    def step(self, x: Array, dt: float | Array, epoch: Index) -> Linearized:
+        """The state ``dt`` seconds on, from IMU epoch ``epoch``, and F."""
         ...
 
     def noise(self, x: Array) -> Array:
-        """Q of one second, shape (n, n) or the diagonal alone, shape (n,)."""
+        """Q of one second, shape (..., n, n), or the diagonal alone, ``diagonal`` says so."""
+        ...
+
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        """The process of several filters side by side."""
         ...
 
 
@@ -96,13 +114,17 @@ class ConstantAcceleration:
         self.layout = layout(*names)
         self._rhs = self._right_hand_side()
         self._turn = Turn()
-        n = length(self.layout)
-        self._F = np.eye(n)
-        self._diagonal = self._F.reshape(-1)[:: n + 1]
         self._q = noise_per_second(self.layout, variant.numbers)
         own = "body" if self._body else "earth"
         isotropic = len(set(variant.numbers.acceleration)) == 1
         self._turned_noise = variant.noise_frame not in (None, own) and not isotropic
+
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        whole = copy.copy(members[0])
+        whole._q = np.stack([m._q for m in members])
+        whole._turned_noise = any(m._turned_noise for m in members)
+        return whole
 
     def _right_hand_side(self) -> Quadratic:
         """x' but for (2.9)'s cubic R_nb v."""
@@ -117,41 +139,47 @@ class ConstantAcceleration:
             linear[s["p"], s["v"]] = np.eye(3)
         return Quadratic(np.zeros(n), linear, second)
 
-    def step(self, x: Array, dt: float, epoch: int) -> Linearized:
-        s = self.layout
+    def step(self, x: Array, dt: float | Array, epoch: Index) -> Linearized:
+        s, dt = self.layout, np.asarray(dt)[..., None]
         rhs, A = self._rhs(x)
         if self._body:
-            R_nb, slope = self._turn(x[s["q"]])
-            v_b = x[s["v"]]
-            A[s["p"], s["v"]], A[s["p"], s["q"]] = R_nb, v_b @ slope
-            rhs[s["p"]] = R_nb @ v_b
-        np.multiply(A, dt, out=self._F)
-        self._diagonal += 1.0
-        new = x + dt * rhs
+            R_nb, slope = self._turn(x[..., s["q"]])
+            v_b = x[..., s["v"]]
+            A[..., s["p"], s["v"]], A[..., s["p"], s["q"]] = R_nb, by_vector(v_b, slope)
+            rhs[..., s["p"]] = times(R_nb, v_b)
+        new, F = x + dt * rhs, _euler(A, dt)
         if self._exact:
-            self._turn_exactly(x, new, dt)
-        return new, self._F
+            self._turn_exactly(x, new, F, dt)
+        return new, F
 
-    def _turn_exactly(self, x: Array, new: Array, dt: float) -> None:
+    def _turn_exactly(self, x: Array, new: Array, F: Array, dt: Array) -> None:
         """a <- E a, v <- E (v + dt a) with E = Exp(-w dt), in place of Euler's I - dt S(w)."""
-        s, F = self.layout, self._F
-        turn = -dt * x[s["w"]]
+        s = self.layout
+        turn = -dt * x[..., s["w"]]
         E, Jr = exp_rotation(turn), right_jacobian(turn)
-        a, v = x[s["a"]], x[s["v"]] + dt * x[s["a"]]
-        new[s["a"]], new[s["v"]] = E @ a, E @ v
-        F[s["a"], s["a"]] = F[s["v"], s["v"]] = E
-        F[s["v"], s["a"]] = dt * E
-        F[s["a"], s["w"]] = dt * (E @ skew(a) @ Jr)
-        F[s["v"], s["w"]] = dt * (E @ skew(v) @ Jr)
+        a, v = x[..., s["a"]], x[..., s["v"]] + dt * x[..., s["a"]]
+        new[..., s["a"]], new[..., s["v"]] = times(E, a), times(E, v)
+        dt = dt[..., None]
+        F[..., s["a"], s["a"]] = F[..., s["v"], s["v"]] = E
+        F[..., s["v"], s["a"]] = dt * E
+        F[..., s["a"], s["w"]] = dt * (E @ skew(a) @ Jr)
+        F[..., s["v"], s["w"]] = dt * (E @ skew(v) @ Jr)
 
     def noise(self, x: Array) -> Array:
         if not self._turned_noise:
             return self._q
-        R_nb = matrix(x[self.layout["q"]])
-        to_own = R_nb.T if self._body else R_nb
-        Q, a = np.diag(self._q), self.layout["a"]
-        Q[a, a] = to_own @ Q[a, a] @ to_own.T
+        R_nb = matrix(x[..., self.layout["q"]])
+        to_own = transpose(R_nb) if self._body else R_nb
+        Q, a = self._q[..., None] * np.eye(self._q.shape[-1]), self.layout["a"]
+        Q[..., a, a] = to_own @ Q[..., a, a] @ transpose(to_own)
         return Q
+
+
+def _euler(A: Array, dt: Array) -> Array:
+    """I + dt A; ``A`` is overwritten."""
+    A *= dt[..., None]
+    diagonal(A)[...] += 1.0
+    return A
 
 
 def _bilinear(second: Array, rows: slice, u: slice, w: slice, tensor: Array) -> None:
@@ -171,17 +199,24 @@ class KnownAttitude:
 
     def __init__(self, variant: Filter, known: KnownMotion) -> None:
         self.layout = layout("a", "v", "p", *(["acc_bias"] if variant.accelerometer else []))
-        self._known = known
-        self._F = np.eye(length(self.layout))
+        self._given = Epochs(known.R_nb), Epochs(skew(known.w_b))
         self._q = noise_per_second(self.layout, variant.numbers)
 
-    def step(self, x: Array, dt: float, epoch: int) -> Linearized:
-        s, F = self.layout, self._F
-        euler = np.eye(3) - dt * skew(self._known.w_b[epoch])
-        F[s["a"], s["a"]] = F[s["v"], s["v"]] = euler
-        F[s["v"], s["a"]] = dt * np.eye(3)
-        F[s["p"], s["v"]] = dt * self._known.R_nb[epoch]
-        return F @ x, F
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        whole = copy.copy(members[0])
+        R_nb, turning = (Epochs.together(rows) for rows in zip(*(m._given for m in members), strict=True))
+        whole._given = R_nb, turning
+        whole._q = np.stack([m._q for m in members])
+        return whole
+
+    def step(self, x: Array, dt: float | Array, epoch: Index) -> Linearized:
+        s, A = self.layout, np.zeros((*x.shape, x.shape[-1]))
+        R_nb, turning = (given.at(epoch) for given in self._given)
+        A[..., s["a"], s["a"]] = A[..., s["v"], s["v"]] = -turning
+        A[..., s["v"], s["a"]], A[..., s["p"], s["v"]] = np.eye(3), R_nb
+        F = _euler(A, np.asarray(dt)[..., None])
+        return times(F, x), F
 
     def noise(self, x: Array) -> Array:
         return self._q
@@ -200,20 +235,39 @@ class HydrodynamicModel:
 
     def __init__(self, variant: Filter, known: KnownMotion, vehicle: Hydrodynamics, force_b: Array) -> None:
         self.layout = layout("v", "p")
-        self._known, self._vehicle, self._force_b = known, vehicle, force_b
-        self._F = np.eye(length(self.layout))
+        self._given = Epochs(known.R_nb), Epochs(known.w_b), Epochs(force_b)
+        self._vehicle = vehicle
         self._q = noise_per_second(self.layout, variant.numbers)
 
-    def step(self, x: Array, dt: float, epoch: int) -> Linearized:
-        v, p = self.layout["v"], self.layout["p"]
-        R_nb = self._known.R_nb[epoch]
-        rhs, slopes = self._vehicle.acceleration(x[v], self._known.w_b[epoch], self._force_b[epoch])
-        self._F[v, v] = np.eye(3) + dt * slopes["velocity"]
-        self._F[p, v] = dt * R_nb
-        return x + dt * np.concatenate([rhs, R_nb @ x[v]]), self._F
+    @classmethod
+    def together(cls, members: Sequence[Self]) -> Self:
+        whole = copy.copy(members[0])
+        R_nb, w_b, force_b = (Epochs.together(rows) for rows in zip(*(m._given for m in members), strict=True))
+        whole._given = R_nb, w_b, force_b
+        whole._vehicle = _fleet([m._vehicle for m in members])
+        whole._q = np.stack([m._q for m in members])
+        return whole
+
+    def step(self, x: Array, dt: float | Array, epoch: Index) -> Linearized:
+        v, p, dt = self.layout["v"], self.layout["p"], np.asarray(dt)[..., None]
+        R_nb, w_b, force_b = (given.at(epoch) for given in self._given)
+        acceleration, slopes = self._vehicle.acceleration(x[..., v], w_b, force_b)
+        A = np.zeros((*x.shape, x.shape[-1]))
+        A[..., v, v], A[..., p, v] = slopes["velocity"], R_nb
+        return x + dt * np.concatenate([acceleration, times(R_nb, x[..., v])], axis=-1), _euler(A, dt)
 
     def noise(self, x: Array) -> Array:
         return self._q
+
+
+def _fleet(vehicles: Sequence[Hydrodynamics]) -> Hydrodynamics:
+    """What (4.2) takes of several vehicles, side by side."""
+    return replace(
+        vehicles[0],
+        mass=np.stack([v.mass for v in vehicles]),
+        drag_linear=np.stack([v.drag_linear for v in vehicles]),
+        drag_quadratic=np.stack([v.drag_quadratic for v in vehicles]),
+    )
 
 
 def centripetal(w_b: Array, lever_arm_b: Array) -> Array:

@@ -10,10 +10,13 @@ the equations as they are.
 R_nb is quadratic in q, T is linear: their derivatives are constant tensors, made once.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from rovgraph.estimators.kalman.core import times
 from rovgraph.geometry import Array, skew
 
 
@@ -39,6 +42,7 @@ def _rates() -> Array:
 
 SECOND = _second()
 RATES = _rates()
+_FLAT_RATES = RATES.reshape(12, 4)
 _EYE = np.eye(3)
 
 
@@ -48,37 +52,47 @@ class Turn:
     Parameters
     ----------
     inverse : take R_bn instead of R_nb
-    left : ndarray, shape (3, 3), or None for the identity
+    left : ndarray, shape (..., 3, 3), or None for the identity
+
+    Attributes
+    ----------
+    second : ndarray, shape (..., 3, 3, 4, 4), second derivative by q
     """
 
     def __init__(self, inverse: bool = False, left: Array | None = None) -> None:
         second = np.swapaxes(SECOND, 0, 1) if inverse else SECOND
-        self._base = _EYE if left is None else left
-        self._second: Array = np.einsum("ij,jkab->ikab", self._base, second).reshape(36, 4)
+        self._inverse, self._base = inverse, _EYE if left is None else left
+        self.second: Array = np.einsum("...ij,jkab->...ikab", self._base, second)
+        self._flat = self.second.reshape(*self._base.shape[:-2], 36, 4)
 
-    @property
-    def second(self) -> Array:
-        """Second derivative by q, shape (3, 3, 4, 4)."""
-        return self._second.reshape(3, 3, 4, 4)
+    @classmethod
+    def together(cls, members: Sequence["Turn"]) -> "Turn":
+        """Those of several filters side by side."""
+        return cls(members[0]._inverse, np.stack([m._base for m in members]))
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
-        """The matrix, shape (3, 3), and its derivative by q, shape (3, 3, 4)."""
-        slope = (self._second @ q).reshape(9, 4)
-        turned: Array = self._base + 0.5 * (slope @ q).reshape(3, 3)
-        return turned, slope.reshape(3, 3, 4)
+        """The matrix, shape (..., 3, 3), and its derivative by q, shape (..., 3, 3, 4)."""
+        slope = times(self._flat, q).reshape(*q.shape[:-1], 9, 4)
+        turned: Array = self._base + 0.5 * times(slope, q).reshape(*q.shape[:-1], 3, 3)
+        return turned, slope.reshape(*q.shape[:-1], 3, 3, 4)
+
+
+def by_vector(u: Array, slope: Array) -> Array:
+    """Derivative of ``A(q) @ u`` from that of A, shape (..., 3, 4)."""
+    return np.asarray((u[..., None, None, :] @ slope)[..., 0, :])
 
 
 _TURN = Turn()
 
 
 def matrix(q: Array) -> Array:
-    """R_nb, shape (3, 3); a rotation where q is of unit length."""
+    """R_nb, shape (..., 3, 3); a rotation where q is of unit length."""
     return _TURN(q)[0]
 
 
 def rate_matrix(q: Array) -> Array:
-    """T(q) of (2.6), shape (4, 3); ``2 T'`` takes a change of q to a rotation vector in b."""
-    return np.asarray(RATES @ q)
+    """T(q) of (2.6), shape (..., 4, 3); ``2 T'`` takes a change of q to a rotation vector in b."""
+    return times(_FLAT_RATES, q).reshape(*q.shape[:-1], 4, 3)
 
 
 def unit(q: Array) -> Array:

@@ -1,24 +1,38 @@
 """The recursion: predict to each epoch, update with what was measured there.
 
 Inertial samples come at their own epochs, pings at theirs: a ping between two samples is
-reached by a shorter step. At equal times the inertial sample comes first.
+reached by a shorter step. Filters of one kind go in lock step (`timetable`), as one
+recursion over arrays with a leading axis for the filters: at 25 states a filter by itself
+spends most of its time on calling NumPy. Who is idle at a step moves by no time and
+measures nothing; what is not measured has no row in H, an innovation of zero and a noise
+of one, which changes neither state nor covariance. So each filter does what it would do
+alone, and the others go on where one diverges.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.kalman.core import Innovate, Linearized, iterated_update, propagate_covariance
-from rovgraph.estimators.kalman.dvl import HEADING, Ping
+from rovgraph.estimators.kalman.core import Innovate, Linearized, diagonal, iterated_update, propagate_covariance
+from rovgraph.estimators.kalman.dvl import HEADING, DvlModel, ping_rows
+from rovgraph.estimators.kalman.epochs import Epochs, widened
+from rovgraph.estimators.kalman.mti import ImuModel
+from rovgraph.estimators.kalman.processes import moving
 from rovgraph.estimators.kalman.setup import Setup
+from rovgraph.estimators.kalman.timetable import Timetable, timetable
 from rovgraph.estimators.kalman.truth import TrueMotion
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.thesis import SAMPLE_S
 
+Mask = NDArray[np.bool_]
+Taken = tuple[Mask, Array, Array, Array]  # a measurement: which components, innovation, whitened, sd
+
 LONGEST_STEP_S = 1.5 * SAMPLE_S  # of forward Euler; a longer interval is divided
-KEEP_EVERY = 10  # of the inertial samples' innovations
 
 
 @dataclass
@@ -28,16 +42,19 @@ class Innovations:
     Attributes
     ----------
     index : of the sample or ping
+    components : ndarray, shape (m,), which of it were measured
     residual, normalised, sd : ndarray, shape (m,); z minus h, whitened, and sd
     """
 
     index: list[int] = field(default_factory=list)
+    components: list[NDArray[np.int64]] = field(default_factory=list)
     residual: list[Array] = field(default_factory=list)
     normalised: list[Array] = field(default_factory=list)
     sd: list[Array] = field(default_factory=list)
 
-    def keep(self, index: int, residual: Array, normalised: Array, sd: Array) -> None:
+    def keep(self, index: int, components: NDArray[np.int64], residual: Array, normalised: Array, sd: Array) -> None:
         self.index.append(index)
+        self.components.append(components)
         self.residual.append(residual)
         self.normalised.append(normalised)
         self.sd.append(sd)
@@ -45,7 +62,7 @@ class Innovations:
 
 @dataclass
 class Recursion:
-    """A filter under way.
+    """A filter on its way through a log, and what it leaves behind.
 
     Attributes
     ----------
@@ -53,9 +70,9 @@ class Recursion:
     true_motion : where to linearise, or None for the estimate
     time, epoch : of the state [s], and the last IMU epoch at or before it
     x, P : ndarray, state and covariance
-    kept : (time, epoch, x, P) at the first epoch, pings and the last epoch, and every
-        ``graph.max_gap_s`` where pings are missing
+    kept : (time, epoch, x, P) as `Timetable.keeps_state` has them
     imu, dvl : Innovations
+    error : it has diverged; None where it has not
     """
 
     setup: Setup
@@ -67,9 +84,7 @@ class Recursion:
         self.epoch, self.time = 0, float(s.log["imu"].time[0])
         self.kept: list[tuple[float, int, Array, Array]] = []
         self.imu, self.dvl = Innovations(), Innovations()
-        self._quaternion = s.places.get("q")
-        self._diagonal = slice(None, None, len(s.x) + 1)
-        self._complete = np.asarray(np.isfinite(s.samples).all(axis=1))
+        self.error: InputError | None = None
 
     def run(self) -> None:
         """The whole log.
@@ -78,101 +93,173 @@ class Recursion:
         ------
         InputError : the filter diverges
         """
-        s = self.setup
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                self._run()
-        except FloatingPointError:
-            raise InputError(
-                f"{s.log.source}: filter {s.variant.name} diverges at {self.time:.2f} s; "
-                "check mountings, units and start"
-            ) from None
+        run_together([self])
+        if self.error is not None:
+            raise self.error
 
-    def _run(self) -> None:
-        s = self.setup
-        times, longest = s.log["imu"].time.tolist(), s.config.graph.max_gap_s
-        waiting = iter(enumerate(s.pings))
-        number, ping = next(waiting, (0, None))
-        for epoch, time in enumerate(times):
-            while ping is not None and ping.time < time:
-                self._take_ping(number, ping)
-                number, ping = next(waiting, (0, None))
-            self._advance(time)
-            self.epoch = epoch
-            if s.imu is not None:
-                self._take_sample(epoch)
-            while ping is not None and ping.time == time:
-                self._take_ping(number, ping)
-                number, ping = next(waiting, (0, None))
-            if not self.kept or time - self.kept[-1][0] > longest:
-                self._keep()
-        if self.kept[-1][0] < self.time:
-            self._keep()
 
-    def _advance(self, time: float) -> None:
-        """Predict to ``time``, in steps that forward Euler bears."""
-        whole = time - self.time
-        if whole <= 0.0:
-            return
-        count = math.ceil(whole / LONGEST_STEP_S)
-        dt, process = whole / count, self.setup.process
-        for _ in range(count):
-            Q = process.noise(self.x)
-            x, F = process.step(self.x, dt, self.epoch)
-            if self.true_motion is not None:
-                F = process.step(self.true_motion.state(self.time, self.x), dt, self.epoch)[1]
-            self.x, self.P = x, propagate_covariance(self.P, F)
-            if Q.ndim == 1:
-                self.P.reshape(-1)[self._diagonal] += dt * Q
-            else:
-                self.P += dt * Q
-        self.time = time
+def run_together(members: Sequence[Recursion]) -> None:
+    """Filters of one kind (`Filter.kind`) over their whole logs; ``error`` says of each whether it diverged."""
+    whole = timetable(
+        [m.setup.log["imu"].time for m in members],
+        [np.array([ping.time for ping in m.setup.pings]) for m in members],
+        [m.setup.config.graph.max_gap_s for m in members],
+    )
+    ends, under_way, step = whole.ends.tolist(), list(range(len(members))), 0
+    with np.errstate(over="ignore", invalid="ignore"):
+        while under_way:
+            step = _Batch([members[b] for b in under_way]).run(whole.of(under_way), step)
+            under_way = [b for b in under_way if ends[b] > step and members[b].error is None]
 
-    def _take_sample(self, epoch: int) -> None:
-        s = self.setup
-        model, z, R = s.imu, s.samples[epoch], s.R_imu
-        assert model is not None
-        if not self._complete[epoch]:
-            z, R = z[:6], R[:6, :6]
+
+class _Batch:
+    """Members that are under way, their states as one array.
+
+    Parameters
+    ----------
+    members : list of Recursion, of one kind
+    """
+
+    def __init__(self, members: Sequence[Recursion]) -> None:
+        setups = [m.setup for m in members]
+        first, dim = setups[0], setups[0].imu.dim if setups[0].imu else 0
+        self._members, self._iterations = members, first.variant.iterations
+        self._quaternion, self._moving = first.places.get("q"), moving(first.places)
+        self._process = first.process.together([s.process for s in setups])
+        self._dvl = DvlModel.together([s.dvl for s in setups])
+        self._imu = None if first.imu is None else first.imu.together([s.imu for s in setups if s.imu is not None])
+        self._samples = Epochs.together([Epochs(widened(s.samples, dim)) for s in setups])
+        self._pings = Epochs.together([Epochs(ping_rows(s.pings)) for s in setups])
+        self._R_imu = _Noise([block_diag(s.R_imu, np.eye(dim - len(s.R_imu))) for s in setups])
+        self._R_dvl = _Noise([s.R_dvl for s in setups])
+        self._true_motion = [m.true_motion for m in members if m.true_motion is not None]
+        self._x, self._P = np.stack([m.x for m in members]), np.stack([m.P for m in members])
+        self._time, self._epoch = np.array([m.time for m in members]), np.array([m.epoch for m in members])
+
+    def run(self, table: Timetable, first: int) -> int:
+        """Go on with step ``first`` until a member is through or diverges; the step to go on with then."""
+        whole = np.diff(table.time, axis=0, prepend=table.time[:1])
+        count = np.ceil(whole / LONGEST_STEP_S)  # of steps that forward Euler bears
+        parts, dt = count.max(axis=1).astype(int).tolist(), whole / np.maximum(count, 1.0)
+        keeps_innovation, keeps_state = (np.any(keeps, axis=1) for keeps in (table.keeps_innovation, table.keeps_state))
+        for step in range(first, int(table.ends.min())):
+            for part in range(parts[step]):
+                self._predict(dt[step] * (part < count[step]))
+            self._time, self._epoch = table.time[step], table.epoch[step]
+            taken: Taken | None = None
+            if table.ping[step]:
+                taken = self._take_ping(table.number[step], table.active[step])
+            elif self._imu is not None:
+                taken = self._take_sample(self._imu, table.active[step])
+            if taken is not None and keeps_innovation[step]:
+                self._keep_innovations(taken, table, step)
+            if keeps_state[step]:
+                self._keep_states(table.keeps_state[step])
+            if self._diverged():
+                break
+        for m, *state in zip(self._members, self._time, self._epoch, self._x, self._P, strict=True):
+            m.time, m.epoch, m.x, m.P = float(state[0]), int(state[1]), state[2], state[3]
+        return step + 1
+
+    def _predict(self, dt: Array) -> None:
+        """A step of forward Euler."""
+        Q = self._process.noise(self._x)
+        x, F = self._process.step(self._x, dt, self._epoch)
+        if self._true_motion:
+            F = self._process.step(self._truth(self._x), dt, self._epoch)[1]
+        self._x, self._P = x, propagate_covariance(self._P, F, self._moving)
+        if Q.ndim == 2:
+            diagonal(self._P)[...] += dt[:, None] * Q
+        else:
+            self._P += dt[:, None, None] * Q
+
+    def _take_sample(self, model: ImuModel, active: Mask) -> Taken:
+        z = self._samples.at(self._epoch)
 
         def innovate(x: Array) -> Linearized:
-            h, H = model(x, epoch)
-            if self.true_motion is not None:
-                H = model(self.true_motion.state(self.time, x), epoch)[1]
-            return z - h[: len(z)], H[: len(z)]
+            h, H = model(x, self._epoch)
+            return z - h, H
 
-        result = self._update(innovate, R)
-        if epoch % KEEP_EVERY == 0:
-            self.imu.keep(epoch, *result)
+        return self._update(innovate, np.isfinite(z) & active[:, None], self._R_imu)
 
-    def _take_ping(self, number: int, ping: Ping) -> None:
-        self._advance(ping.time)
-        s, rows = self.setup, list(ping.rows)
-        heading = HEADING in ping.rows
+    def _take_ping(self, number: NDArray[np.int64], active: Mask) -> Taken:
+        z = self._pings.at(number)
+        measured = np.isfinite(z) & active[:, None]
+        heading = bool(measured[:, HEADING].any())
 
         def innovate(x: Array) -> Linearized:
-            h, H = s.dvl(x, self.epoch, heading)
-            if self.true_motion is not None:
-                H = s.dvl(self.true_motion.state(self.time, x), self.epoch, heading)[1]
-            residual = ping.z - h[rows]
-            if heading:
-                residual[-1] = wrap_angle(residual[-1])
-            return residual, H[rows]
+            h, H = self._dvl(x, self._epoch, heading)
+            residual = z - h
+            residual[:, HEADING] = wrap_angle(residual[:, HEADING])
+            return residual, H
 
-        self.dvl.keep(number, *self._update(innovate, s.R_dvl[np.ix_(rows, rows)]))
-        self._keep()
+        return self._update(innovate, measured, self._R_dvl)
 
-    def _update(self, innovate: Innovate, R: Array) -> tuple[Array, Array, Array]:
-        """Update with a measurement and bring the quaternion back to unit length."""
-        residual, self.x, self.P, normalised, sd = iterated_update(
-            self.x, self.P, innovate, R, self.setup.variant.iterations
+    def _update(self, innovate: Innovate, measured: Mask, noise: "_Noise") -> Taken:
+        """Update with the components that were measured and bring quaternions back to unit length."""
+        R, all_measured, none_measured = noise.of(measured)
+
+        def innovate_measured(x: Array) -> Linearized:
+            residual, H = innovate(x)
+            if self._true_motion:
+                H = innovate(self._truth(x))[1]
+            return (residual, H) if all_measured else (np.where(measured, residual, 0.0), H * measured[..., None])
+
+        residual, self._x, self._P, normalised, sd = iterated_update(
+            self._x, self._P, innovate_measured, R, self._iterations
         )
-        if not math.isfinite(self.x @ self.x):
-            raise FloatingPointError("the state is not finite")
         if self._quaternion is not None:
-            q = self.x[self._quaternion]
-            q *= 1.0 / math.sqrt(q @ q)
-        return residual, normalised, sd
+            q = self._x[:, self._quaternion]
+            q /= np.where(none_measured, 1.0, np.sqrt(np.einsum("ij,ij->i", q, q)))[:, None]
+        return measured, residual, normalised, sd
 
-    def _keep(self) -> None:
-        self.kept.append((self.time, self.epoch, self.x.copy(), self.P.copy()))
+    def _truth(self, x: Array) -> Array:
+        """The true motion of each, the rest of the state as in ``x``."""
+        return np.stack([m.state(*at) for m, *at in zip(self._true_motion, self._time.tolist(), x, strict=True)])
+
+    def _diverged(self) -> bool:
+        """Whether any has; it is told so."""
+        if math.isfinite(np.vdot(self._x, self._x)):
+            return False
+        diverged = np.flatnonzero(~np.isfinite((self._x * self._x).sum(axis=1))).tolist()
+        for b in diverged:
+            s = self._members[b].setup
+            self._members[b].error = InputError(
+                f"{s.log.source}: filter {s.variant.name} diverges at {self._time[b]:.2f} s; "
+                "check mountings, units and start"
+            )
+        return len(diverged) > 0
+
+    def _keep_innovations(self, taken: Taken, table: Timetable, step: int) -> None:
+        measured, *columns = taken
+        for b in np.flatnonzero(table.keeps_innovation[step]).tolist():
+            m = self._members[b]
+            kept, index = (m.dvl, table.number[step, b]) if table.ping[step] else (m.imu, self._epoch[b])
+            components = np.flatnonzero(measured[b])
+            kept.keep(int(index), components, *(column[b, components] for column in columns))
+
+    def _keep_states(self, which: Mask) -> None:
+        for b in np.flatnonzero(which).tolist():
+            state = self._x[b].copy(), self._P[b].copy()
+            self._members[b].kept.append((float(self._time[b]), int(self._epoch[b]), *state))
+
+
+class _Noise:
+    """R of a measurement of which some components were not measured: there it is one.
+
+    Parameters
+    ----------
+    R : of all components, a matrix for each member
+    """
+
+    def __init__(self, R: Sequence[Array]) -> None:
+        self._R, self._made = np.stack(R), dict[bytes, tuple[Array, bool, Mask]]()
+
+    def of(self, measured: Mask) -> tuple[Array, bool, Mask]:
+        """R, shape (members, m, m), whether all components of all were measured, and of whom none was."""
+        key = measured.tobytes()
+        if key not in self._made:
+            both = measured[:, :, None] & measured[:, None, :]
+            R = np.where(both, self._R, np.eye(measured.shape[1]))
+            self._made[key] = R, bool(measured.all()), np.logical_not(np.any(measured, axis=1))
+        return self._made[key]

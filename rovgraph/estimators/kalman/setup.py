@@ -1,6 +1,5 @@
 """From a filter, a log and a configuration to what the recursion needs."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,9 @@ from rovgraph.calibration import Belief
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.estimators.initialise import Beginning, initialise
-from rovgraph.estimators.kalman.core import Linearized
 from rovgraph.estimators.kalman.dvl import MOUNT, DvlModel, Ping, pings
 from rovgraph.estimators.kalman.known import KnownMotion, known_motion
-from rovgraph.estimators.kalman.mti import Accelerometer, Mti, reference_field
+from rovgraph.estimators.kalman.mti import Accelerometer, ImuModel, Mti, reference_field
 from rovgraph.estimators.kalman.processes import (
     ConstantAcceleration,
     HydrodynamicModel,
@@ -27,8 +25,6 @@ from rovgraph.estimators.kalman.variants import Filter, Numbers
 from rovgraph.geometry import Array
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log
-
-ImuModel = Callable[[Array, int], Linearized]
 
 _NEEDED = {
     "imu": "an IMU (acc_x .. gyr_z)",
@@ -50,7 +46,7 @@ class Setup:
     process, imu, dvl : models; ``imu`` is None where no inertial sample is a measurement
     known : attitude and rate where they are given, else None
     samples : ndarray, shape (n, m), of the inertial unit at its epochs, field as a fraction
-        of ``field_length``; NaN in the field where the epoch has none
+        of ``field_length``; NaN in the field where the epoch has none, which is not measured
     R_imu, R_dvl : ndarray, shapes (m, m), (4, 4)
     field_length : mean length of the log's field, its unit; 1 without magnetometer
     pings : list of Ping

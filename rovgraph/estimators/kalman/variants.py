@@ -92,11 +92,17 @@ class Filter:
         """Attitude and rate are taken from the inertial unit instead of being estimated."""
         return self.motion in ("known_attitude", "hydrodynamic")
 
+    @property
+    def kind(self) -> "Filter":
+        """What it has in common with those that it can go in lock step with: all but name, headings and numbers."""
+        return replace(self, name="", section="", about="", magnetometer=False, compass=False, numbers=_ANY)
+
     def with_numbers(self, **numbers: Any) -> "Filter":
         """The filter with some of its `Numbers` changed."""
         return replace(self, numbers=replace(self.numbers, **numbers))
 
 
+_ANY = Numbers()
 _BODY = "constant acceleration and rate in b (2.9)"
 _EARTH = "constant acceleration and rate in n (2.8)"
 
