@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from dives import falcon, simulated, without
+from dives import falcon, kept, simulated, without
 from scipy.stats import chi2
 
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.named import ESTIMATORS, Named, Task, outcomes, select
+from rovgraph.estimators.named import ESTIMATORS, Named, Task, outcomes, outcomes_of_dives, select
 from rovgraph.estimators.results import residual_frame
 from rovgraph.log import Log
 from rovgraph.studies.aggregate import aggregate, nees_band
@@ -145,6 +145,38 @@ def test_estimators_share_the_stages_they_have_in_common(recorded):
     assert calls == ["slow"]
     assert [o.estimate for o in done] == [f"{which} of dive.csv" for which in ("first", "second")]
     assert all(o.seconds >= 0.02 for o in done)
+
+
+def test_filters_of_several_dives_go_side_by_side_and_share_the_time(recorded):
+    lacking = Task(without(recorded.log, "mag"), recorded.config)
+    short = Task(kept(recorded.log, "imu", recorded.log["imu"].time < 10.0), recorded.config)
+    names = ["dead-reckoning", "4.3a", "4.3b"]
+    done = list(outcomes_of_dives(select(names), [Task(recorded.log, recorded.config), lacking, short]))
+    assert [(k, o.named.name) for k, o in done] == [(k, name) for k in range(3) for name in names]
+    by_name = {(k, o.named.name): o for k, o in done}
+    assert "no magnetometer" in str(by_name[1, "4.3a"].error)
+    for k, dive in ((0, recorded), (1, lacking), (2, short)):
+        together = by_name[k, "4.3b"].estimate
+        alone = ESTIMATORS["4.3b"](dive.log, dive.config)
+        assert together is not None and (together.trajectory.p_n == alone.trajectory.p_n).all()
+    seconds = [by_name[k, "4.3b"].seconds for k in range(3)]
+    assert seconds[0] == seconds[1] == by_name[0, "4.3a"].seconds
+    assert 3.9 < seconds[0] / seconds[2] < 4.1, "a log of 40 s, and 10 s of it"
+
+
+def test_a_dive_without_an_imu_does_not_stop_the_others(recorded):
+    dives = [Task(without(recorded.log, "imu"), recorded.config), Task(recorded.log, recorded.config)]
+    lacking, good = (outcome for _, outcome in outcomes_of_dives(select(["4.3b"]), dives))
+    assert "acc_x" in str(lacking.error) and np.isnan(lacking.seconds)
+    assert good.error is None and good.seconds > 0.0
+
+
+def test_dives_in_groups_give_what_they_give_one_by_one(recorded):
+    logs = [kept(recorded.log, "imu", recorded.log["imu"].time < end) for end in (6.0, 9.0, 7.0, 8.0)]
+    runs = [Recorded(f"dive {k}", Case(log, recorded.config, recorded.reference)) for k, log in enumerate(logs)]
+    grouped, alone = (compare(runs, ["4.3a", "4.3b", "4.4c"], jobs=jobs).runs for jobs in (1, 2))
+    assert grouped["error"].isna().all() and len(grouped) == 12
+    pd.testing.assert_frame_equal(grouped.drop(columns="cpu_per_s"), alone.drop(columns="cpu_per_s"), check_exact=True)
 
 
 def test_any_exception_is_an_outcome(recorded):

@@ -3,7 +3,9 @@
 An estimator is a chain of stages: the first takes a log and a configuration, each of the
 others what the stage before made. Estimators whose chains begin alike share what those
 stages made (filter and smoother of one pass, everything that needs the same keyframes),
-and each is charged for the whole of its chain.
+and each is charged for the whole of its chain. The thesis's filters have no chain: those of
+one kind go side by side, over all dives that are asked for together, and each is charged
+for its share of that, by the seconds of its log.
 
 Headings, as the thesis letters them: a = magnetometer and the DVL's compass, b = the
 DVL's compass, c = the magnetometer.
@@ -11,8 +13,9 @@ DVL's compass, c = the magnetometer.
 
 import difflib
 import fnmatch
+import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,11 +25,13 @@ from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.kalman import FILTERS, Filter, run_filter
+from rovgraph.estimators.kalman import FILTERS, Asked, Filter, run_filters
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.log import Log
 
 Stage = Callable[[Any], Any]
+
+SHORTEST_S = 1e-3  # for which a log counts where time is shared
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,7 @@ class Named:
     whitened : its residuals are normalised by the innovation's own covariance, so that their
         squares sum to the NIS; otherwise by the measurement's noise alone
     stages : the chain, from `Task` to `Estimate`
+    variant : one of the thesis's filters, which has no chain
     """
 
     name: str
@@ -64,6 +70,12 @@ class Named:
     stages: tuple[Stage, ...]
     whitened: bool = False
     hydrodynamics: bool = False
+    variant: Filter | None = None
+
+    @property
+    def shared(self) -> Hashable:
+        """The same for estimators that are best asked for together."""
+        return self.variant.kind if self.variant else (self.headings, self.misalignment, self.stages[0])
 
     def __call__(self, log: Log, config: Config) -> Estimate:
         """The estimate of one dive.
@@ -101,7 +113,8 @@ class Outcome:
     named : the estimator
     estimate : or None where it failed
     error : why it failed, or None
-    seconds : processor time of its chain, shared stages included [s]
+    seconds : processor time of its chain, shared stages included, or its share of those that
+        went side by side [s]
     """
 
     named: Named
@@ -115,20 +128,73 @@ def outcomes(estimators: Sequence[Named], log: Log, config: Config) -> Iterator[
 
     Parameters
     ----------
-    estimators : those that share stages are best asked for together
+    estimators : those of which `Named.shared` is the same are best asked for together
     log, config : the dive, and what is believed of vehicle and sensors
 
     Yields
     ------
     Outcome : in the order of ``estimators``
     """
-    made: dict[tuple[object, ...], tuple[Any, float]] = {}
-    for named in estimators:
+    return (outcome for _, outcome in outcomes_of_dives(estimators, [Task(log, config)]))
+
+
+def outcomes_of_dives(estimators: Sequence[Named], dives: Sequence[Task]) -> Iterator[tuple[int, Outcome]]:
+    """Run estimators on several logs, as `outcomes` does on one; so the thesis's filters take less time.
+
+    Yields
+    ------
+    index of the dive, Outcome : dive by dive, in the order of ``estimators``
+    """
+    side_by_side: dict[Filter, dict[tuple[int, str], Outcome]] = {}
+    for k, dive in enumerate(dives):
+        made: dict[tuple[object, ...], tuple[Any, float]] = {}
+        for named in estimators:
+            if named.variant is not None:
+                kind = named.variant.kind
+                if kind not in side_by_side:
+                    alike = [n for n in estimators if n.variant is not None and n.variant.kind == kind]
+                    side_by_side[kind] = _side_by_side(alike, dives)
+                yield k, side_by_side[kind].pop((k, named.name))
+                continue
+            try:
+                result, seconds = _run_chain(named, dive.log, dive.config, made)
+                yield k, Outcome(named, result, None, seconds)
+            except Exception as error:  # whatever an estimator runs into is a result of the comparison
+                yield k, Outcome(named, None, error, float("nan"))
+
+
+def _side_by_side(estimators: Sequence[Named], dives: Sequence[Task]) -> dict[tuple[int, str], Outcome]:
+    """Filters of one kind on all dives; by index of the dive and name."""
+    out: dict[tuple[int, str], Outcome] = {}
+    asked: dict[tuple[int, str], tuple[Named, Asked]] = {}
+    for (k, dive), named in itertools.product(enumerate(dives), estimators):
         try:
-            result, seconds = _run_chain(named, log, config, made)
-            yield Outcome(named, result, None, seconds)
-        except Exception as error:  # whatever an estimator runs into is a result of the comparison
-            yield Outcome(named, None, error, float("nan"))
+            task = named.task(dive.log, dive.config)
+            assert named.variant is not None
+            asked[k, named.name] = named, Asked(named.variant, task.log, task.config)
+        except Exception as error:
+            out[k, named.name] = Outcome(named, None, error, float("nan"))
+    began = time.process_time()
+    done: list[Estimate | Exception]
+    try:
+        done = run_filters([a for _, a in asked.values()])
+    except Exception as error:
+        done = [error] * len(asked)
+    spent = time.process_time() - began
+    recorded = [
+        0.0 if isinstance(d, Exception) else _recorded_s(a.log) for d, (_, a) in zip(done, asked.values(), strict=True)
+    ]
+    for (key, (named, _)), result, seconds in zip(asked.items(), done, recorded, strict=True):
+        if isinstance(result, Exception):
+            out[key] = Outcome(named, None, result, float("nan"))
+        else:
+            out[key] = Outcome(named, result, None, spent * seconds / sum(recorded))
+    return out
+
+
+def _recorded_s(log: Log) -> float:
+    time = log["imu"].time
+    return max(float(time[-1] - time[0]), SHORTEST_S)
 
 
 def _run_chain(
@@ -202,11 +268,9 @@ _WITH = {"a": "magnetometer and DVL compass", "b": "DVL compass alone", "c": "ma
 def _of_the_thesis(variant: Filter) -> Named:
     """One of the thesis's filters, which hold calibration at its means but for what are their states."""
 
-    def filtered(task: Task) -> Estimate:
-        return run_filter(variant, task.log, task.config)
-
     letter = _LETTERS.get((variant.magnetometer, variant.compass), "")
-    return Named(variant.name, "thesis", variant.about, letter, variant.misalignment, False, (filtered,), whitened=True)
+    about = (variant.about, letter, variant.misalignment, False)
+    return Named(variant.name, "thesis", *about, stages=(), whitened=True, variant=variant)
 
 
 def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> list[Named]:

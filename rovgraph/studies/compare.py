@@ -1,7 +1,8 @@
 """Any set of estimators on any set of dives: what ``rovgraph compare`` does."""
 
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,13 +10,15 @@ import pandas as pd
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.estimators.named import Named, Outcome, outcomes, select
+from rovgraph.estimators.named import Named, Outcome, Task, outcomes_of_dives, select
 from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.measures import measures, misalignment_history, velocity_history
 from rovgraph.studies.runs import Case, Run
 from rovgraph.workers import cores, in_workers
 
 Progress = Callable[[float], None]
+SIDE_BY_SIDE = 5  # runs of a task: more of them gain little, and a worker holds them all
+TASKS_EACH = 3  # of a process at least, so that all end at about the same time
 REFERENCE = "reference"  # in the place of an estimator's name
 
 # columns that every row has, in the order of the file; others follow as far as any row has them
@@ -50,16 +53,16 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Task:
-    """Some estimators on one run; ``first`` of all runs, whose velocity is kept."""
+    """Some estimators on some runs; ``first``: their first is that of all runs, whose velocity is kept."""
 
-    run: Run
+    runs: tuple[Run, ...]
     names: tuple[str, ...]
     first: bool
 
 
 @dataclass(frozen=True)
 class _Result:
-    """Rows and histories of one task, and the configuration of its run."""
+    """Rows and histories of one task, and the configuration of its first run."""
 
     config: Config
     rows: list[dict[str, Any]]
@@ -96,7 +99,8 @@ def compare(
     if jobs < 1:
         raise InputError(f"{jobs} jobs: at least 1 is expected")
     groups = [tuple(n.name for n in named)] if len(runs) >= jobs else _sharing(named)
-    tasks = [_Task(run, group, run is runs[0]) for run in runs for group in groups]
+    size = min(math.ceil(len(runs) / (TASKS_EACH * jobs)), SIDE_BY_SIDE)
+    tasks = [_Task(tuple(runs[k : k + size]), group, k == 0) for k in range(0, len(runs), size) for group in groups]
     results = in_workers(_work, tasks, jobs, progress)
     by_run = {run.name: i for i, run in enumerate(runs)}
     by_name = {n.name: i for i, n in enumerate(named)} | {REFERENCE: -1}
@@ -118,25 +122,26 @@ def compare(
 
 def _sharing(estimators: Sequence[Named]) -> list[tuple[str, ...]]:
     """Names grouped by what they share, so that it is made once."""
-    groups: dict[tuple[object, ...], list[str]] = {}
+    groups: dict[Hashable, list[str]] = {}
     for n in estimators:
-        groups.setdefault((n.headings, n.misalignment, n.stages[0]), []).append(n.name)
+        groups.setdefault(n.shared, []).append(n.name)
     return [tuple(names) for names in groups.values()]
 
 
 def _work(task: _Task) -> _Result:
-    """In a worker: load the dive, run the estimators, measure them."""
+    """In a worker: load the dives, run the estimators, measure them."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # those of one estimator of many; what matters is in its row
-        case = task.run.load()
-        result = _Result(case.config, [], [], [])
+        cases = [run.load() for run in task.runs]
+        dives = [Task(case.log, case.config) for case in cases]
+        result = _Result(cases[0].config, [], [], [])
         for group in _sharing(select(task.names)):  # what one made is forgotten before the next
-            for outcome in outcomes(select(group), case.log, case.config):
-                result.rows.append(_row(task.run.name, outcome, case))
+            for k, outcome in outcomes_of_dives(select(group), dives):
+                result.rows.append(_row(task.runs[k].name, outcome, cases[k]))
                 if result.rows[-1]["error"] is None:
-                    _keep_histories(result, task, outcome, case)
+                    _keep_histories(result, outcome, cases[k], task.first and k == 0)
     if task.first:
-        track = velocity_history(case.reference, case.reference.time[0])
+        track = velocity_history(cases[0].reference, cases[0].reference.time[0])
         result.velocity.append(track.assign(estimator=REFERENCE))
     return result
 
@@ -165,13 +170,13 @@ def _reason(error: Exception | None) -> str:
     return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
 
 
-def _keep_histories(result: _Result, task: _Task, outcome: Outcome, case: Case) -> None:
+def _keep_histories(result: _Result, outcome: Outcome, case: Case, first: bool) -> None:
     assert outcome.estimate is not None
-    name = outcome.named.name
+    name, row = outcome.named.name, result.rows[-1]
     history = misalignment_history(outcome.estimate, case)
     if history is not None:
-        true = result.rows[-1].get("misalignment_true_deg")
-        result.misalignment.append(history.assign(run=task.run.name, estimator=name, true_deg=true))
-    if task.first:
+        true = row.get("misalignment_true_deg")
+        result.misalignment.append(history.assign(run=row["run"], estimator=name, true_deg=true))
+    if first:
         track = outcome.estimate.trajectory
         result.velocity.append(velocity_history(track, case.reference.time[0]).assign(estimator=name))
