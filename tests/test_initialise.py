@@ -241,6 +241,16 @@ def test_magnitude_and_dip_of_the_field_come_from_the_log(field_from_log):
     assert sum("from the log" in line or "of the log" in line for line in field_from_log.assumptions) >= 2
 
 
+@pytest.mark.parametrize("estimate", [True, False])
+def test_a_dip_from_the_log_that_is_held_is_pointed_out(every_source, estimate):
+    config = changed(
+        every_source.config, environment={"dip_deg": None}, calibration={"field_dip": {"estimate": estimate}}
+    )
+    said = [line for line in initialise(every_source.log, config).assumptions if "dip" in line]
+    assert len(said) == 1
+    assert ("held although" in said[0]) is not estimate
+
+
 def test_what_the_configuration_says_of_the_field_stands(every_source):
     env = initialise(every_source.log, every_source.config).config.environment
     assert (env.field_norm, env.dip_deg) == (1.0, 72.0)
