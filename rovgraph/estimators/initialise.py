@@ -153,13 +153,10 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             f = np.column_stack([np.interp(log["mag"].time, imu.time, a) for a in imu.data[:, :3].T])
             sine = -np.sum(f * mag, axis=1) / (np.linalg.norm(f, axis=1) * norm)
             changes["dip_deg"] = float(np.rad2deg(np.arcsin(np.clip(np.median(sine), -1.0, 1.0))))
-            held = (
-                ""
-                if config.calibration.field_dip.estimate
-                # type: ignore[attr-defined]
-                else (", and held although it errs as the levelling does: give it, or estimate calibration.field_dip")
-            )
-            assumptions.append(f"environment.dip_deg {changes['dip_deg']:.1f}, from the log{held}")
+            assumptions.append(f"environment.dip_deg {changes['dip_deg']:.1f}, from the log")
+            if not beliefs(config)["field_dip"].estimate:
+                hint = "give it, or estimate calibration.field_dip"
+                assumptions[-1] += f", and held although it errs as the levelling does: {hint}"
     if env.latitude_deg is None and log.origin is not None:
         changes["latitude_deg"] = log.origin[0]
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:
