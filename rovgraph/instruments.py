@@ -13,7 +13,7 @@ from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, skew
 from rovgraph.model_aiding import ModelAiding
-from rovgraph.sensors import CompassHeading, DvlVelocity, MagneticField, Position, SensorModel
+from rovgraph.sensors import CompassHeading, DvlVelocity, MagneticField, PlaceOffset, Position, SensorModel
 from rovgraph.vehicle import Hydrodynamics
 
 DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
@@ -77,8 +77,8 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
 
     Returns
     -------
-    dict : "dvl", "dvl_water", "dvl_heading", "ahrs", "mag", "depth", "fix", "thruster" -> Instrument; the
-        sd of "thruster" is that of a mean over one second
+    dict : "dvl", "dvl_water", "dvl_heading", "ahrs", "mag", "depth", "fix", "place", "thruster" -> Instrument;
+        the sd of "thruster" is that of a mean over one second
     """
     env = config.environment
     origin: Array = np.asarray(origin_b, float)
@@ -96,7 +96,8 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
         gain = np.zeros((model.dim, 3))
         if isinstance(model, DvlVelocity):
             gain = mount_matrix(config.dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
-        limits = section.gate_sd, section.readmit_s  # type: ignore[attr-defined]
+        # a place that is not believed is another place, which nothing has to be readmitted to
+        limits = section.gate_sd, getattr(section, "readmit_s", np.inf)  # type: ignore[attr-defined]
         late = "dvl_time_offset" if model.sensor.startswith("dvl") else None
         return Instrument(model, spread, section.loss, *limits, components, gain, late)  # type: ignore[attr-defined]
 
@@ -107,6 +108,7 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
     mag_sd = np.deg2rad(heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
     depth = Position("depth", arm(config.depth.lever_arm_m), (2,), "depth_offset")
     fix = Position("fix", arm(config.fix.lever_arm_m), (0, 1))
+    place = PlaceOffset(arm(config.place.lever_arm_m))
     aiding = ModelAiding(hydrodynamics(config), origin, env.gravity_mps2, config.vehicle.thrust_rise_s)
     return {
         "dvl": make(config.dvl, dvl, config.dvl.velocity_sd_mps, ("x", "y", "z")),
@@ -116,6 +118,7 @@ def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[s
         "mag": make(heading, MagneticField(declination, dip, magnitude, R_imu), mag_sd, ("x", "y", "z")),
         "depth": make(config.depth, depth, config.depth.sd_m, ("down",)),
         "fix": make(config.fix, fix, config.fix.sd_m, ("north", "east")),
+        "place": make(config.place, place, config.place.sd_m, ("north", "east")),
         "thruster": make(config.vehicle, aiding, config.vehicle.acceleration_sd_mps2, ("x", "y", "z")),
     }
 

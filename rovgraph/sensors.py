@@ -17,6 +17,8 @@ mag          z = |H| ((1 + s) S R_sb R_bn u(declination - A - ..., dip + d) + ir
                                                                         S: (3.2)
 depth        z = p_d + (R_nb l)_d + offset
 fix          z = (p + R_nb l)_north,east
+place        z = (p + R_nb l)_north,east - m, m where the place is;
+             0 is what seeing it again says
 ===========  =========================================================  ==================
 
 Signs follow the corrected equations: declination is atan2(H_e, H_n), and the heading is
@@ -29,7 +31,7 @@ from typing import Protocol
 import numpy as np
 
 from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose, wrap_angle
-from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
+from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 
 _MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 
@@ -296,6 +298,12 @@ class MagneticField:
         return field + self.magnitude * state.calibration["hard_iron"], H
 
 
+def _point(state: State, lever_arm_b: Array) -> tuple[Array, Array]:
+    """Position of a point on the vehicle, shape (n, 3), and its derivative by the pose, shape (n, 3, 6)."""
+    by_pose = np.concatenate([-state.R_nb @ skew(lever_arm_b), state.R_nb], axis=-1)
+    return state.p_n + rotate(state.R_nb, lever_arm_b), by_pose
+
+
 @dataclass(frozen=True)
 class Position:
     """Some of north, east, down of a point on the vehicle: depth sensor or position fix.
@@ -325,10 +333,34 @@ class Position:
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         rows = list(self.axes)
-        z = (state.p_n + rotate(state.R_nb, self.lever_arm_b))[:, rows]
-        pose = np.concatenate([-state.R_nb @ skew(self.lever_arm_b), state.R_nb], axis=-1)
-        H = {POSE: pose[:, rows, :]}
+        point, pose = _point(state, self.lever_arm_b)
+        z, H = point[:, rows], {POSE: pose[:, rows, :]}
         if self.offset is not None:
             z = z + state.calibration[self.offset]
             H[self.offset] = np.tile(np.eye(self.dim), (len(state), 1, 1))
         return z, H
+
+
+@dataclass(frozen=True)
+class PlaceOffset:
+    """How far a camera or sonar is from a place that it recognises, north and east.
+
+    Horizontally only: a pressure sensor knows the altitude better, and looking down from higher
+    up shows the same place.
+
+    Attributes
+    ----------
+    lever_arm_b : ndarray, shape (3,), of the camera relative to the state's origin [m]
+    """
+
+    lever_arm_b: Array
+    sensor = "place"
+    dim = PLACE_DIM
+    angular = False
+    state = (POSE, VELOCITY, BIAS, PLACE)
+    calibration = ()
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        point, pose = _point(state, self.lever_arm_b)
+        by_place = np.tile(-np.eye(PLACE_DIM), (len(state), 1, 1))
+        return point[:, :PLACE_DIM] - state.calibration[PLACE], {POSE: pose[:, :PLACE_DIM], PLACE: by_place}

@@ -25,6 +25,7 @@ from rovgraph.geometry import Array, exp_and_right_jacobian, exp_rotation, rotat
 
 POSE, VELOCITY, BIAS = "pose", "velocity", "bias"
 DIMENSION = {POSE: 6, VELOCITY: 3, BIAS: 6}
+PLACE, PLACE_DIM = "place", 2  # where a place that is recognised lies, north and east: no part of a keyframe
 
 Jacobians = dict[str, Array]
 
@@ -38,7 +39,7 @@ class State:
     R_nb : ndarray, shape (n, 3, 3)
     p_n, v_n : ndarray, shape (n, 3) [m, m/s]
     bias : ndarray, shape (n, 6), accelerometer [m/s^2], gyro [rad/s], body axes
-    calibration : name -> ndarray, shape (n, dim) or (dim,)
+    calibration : name -> ndarray, shape (n, dim) or (dim,); `PLACE` too, for those who see one
     """
 
     R_nb: Array
@@ -54,6 +55,10 @@ class State:
         """The epochs ``index``; per-epoch calibration is indexed alike."""
         calibration = {k: v[index] if v.ndim == 2 else v for k, v in self.calibration.items()}
         return State(self.R_nb[index], self.p_n[index], self.v_n[index], self.bias[index], calibration)
+
+    def seeing(self, places: Array) -> "State":
+        """The state together with the places that are seen, shape (n, 2) or (2,), north and east [m]."""
+        return replace(self, calibration={**self.calibration, PLACE: places})
 
     def retract(self, variable: str, delta: Array) -> "State":
         """The state perturbed by ``delta`` in the tangent space of one variable."""

@@ -8,7 +8,7 @@ from rovgraph.config import Config, parse_config
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rotate, transpose, wrap_angle
 from rovgraph.instruments import instruments
 from rovgraph.sensors import field_direction, innovation
-from rovgraph.state import BIAS, DIMENSION, POSE, State
+from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, State
 
 CONFIG = parse_config(
     """
@@ -16,6 +16,7 @@ imu: {mount_rpy_deg: [176.6, 1.2, 30], lever_arm_m: [-0.11, 0.22, -0.10]}
 dvl: {mount_rpy_deg: [180, 3, 45], lever_arm_m: [0.24, 0.05, 0.33]}
 depth: {lever_arm_m: [0.3, 0.1, -0.2]}
 fix: {lever_arm_m: [0.3, 0.1, -0.5]}
+place: {lever_arm_m: [0.2, -0.1, 0.3]}
 environment: {declination_deg: 4.5, dip_deg: 72, field_norm: 0.5}
 """
 )
@@ -31,6 +32,7 @@ def random_state(seed=0, n=N, per_epoch=False):
     calibration = {name: 0.3 * rng.standard_normal((*shape, v.dim)) for name, v in TABLE.items()}
     calibration["dvl_roll"] = calibration["dvl_roll"] + np.pi
     bias = rng.standard_normal((n, 6))
+    calibration[PLACE] = rng.standard_normal((*shape, PLACE_DIM))
     return State(matrix_from_rpy(rpy), rng.standard_normal((n, 3)), rng.standard_normal((n, 3)), bias, calibration)
 
 
@@ -41,7 +43,8 @@ def at_rest(n=1, rpy=(0.0, 0.0, 0.0), **calibration):
 
 
 def variables(model):
-    return {**DIMENSION, **{name: TABLE[name].dim for name in model.calibration}}
+    seen = {PLACE: PLACE_DIM} if PLACE in model.state else {}
+    return {**DIMENSION, **seen, **{name: TABLE[name].dim for name in model.calibration}}
 
 
 CASES = [(s, v) for s, instrument in SENSORS.items() for v in variables(instrument.model)]

@@ -26,6 +26,7 @@ _GROUP_TEXT = {
     "heading": "heading: compasses",
     "depth": "depth: pressure sensor",
     "fix": "fix: position fixes",
+    "place": "place: places seen before",
     "calibration": "calibration: held at the mean, or estimated",
     "vehicle": "vehicle: hydrodynamics, thesis (2.16)-(2.24)",
     "graph": "graph: how it is built and solved",

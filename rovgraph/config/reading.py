@@ -22,6 +22,7 @@ from rovgraph.config.sections import (
     Heading,
     Imu,
     Online,
+    Place,
     Section,
     Start,
     Triple,
@@ -44,6 +45,7 @@ class Config(Section):
     heading: Heading = Heading()
     depth: Depth = Depth()
     fix: Fix = Fix()
+    place: Place = Place()
     calibration: Calibration = Calibration()
     vehicle: Vehicle = Vehicle()
     graph: Graph = Graph()

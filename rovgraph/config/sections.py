@@ -16,7 +16,9 @@ Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
-Stamped = Literal["imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "thruster"]
+Stamped = Literal[
+    "imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "place", "thruster"
+]
 HeadingSource = Literal["mag", "dvl", "ahrs"]
 
 
@@ -144,6 +146,23 @@ class Fix(Section):
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is left out")
     readmit_s: Readmission = 60.0
+
+
+class Place(Section):
+    """Places seen before, as a camera or a sonar recognises them."""
+
+    sd_m: Positive = Field(
+        0.3, description="how far the camera is from a place when it sees it, north and east; place_sd goes before it"
+    )
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the camera or sonar in body axes")
+    every_s: NotNegative = Field(5.0, description="a place that stays in view counts once in this time")
+    remembered: Annotated[int, Field(ge=1)] = Field(
+        20, description="places that a filter remembers; beyond it forgets the one not seen for longest"
+    )
+    loss: Loss = Field("cauchy", description="robust loss")
+    gate_sd: Positive | None = Field(
+        4.0, description="a place seen further off than this many sd is another one that looks like it"
+    )
 
 
 class Thruster(Section):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import Array
-from rovgraph.log.streams import COLUMNS, LAT_LON, OPTIONAL, RECEIVED, STREAMS, THRUSTER, Log, Stream, is_column
+from rovgraph.log.streams import COLUMNS, LABEL, LAT_LON, OPTIONAL, RECEIVED, STREAMS, THRUSTER, Log, Stream, is_column
 from rovgraph.log.table import Table, read_table
 from rovgraph.log.units import factors, near_miss, nearest
 
@@ -133,7 +133,7 @@ def _names(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
 
 def _finite(table: Table, name: str, source: str) -> Array:
     """A column with infinities taken as missing, shape (n,)."""
-    values = table.numbers(source)
+    values = table.labels(source) if name == LABEL else table.numbers(source)
     infinite = np.flatnonzero(np.isinf(values))
     if infinite.size:
         _warn(
@@ -243,6 +243,8 @@ def _select(
     complete, partly = filled.all(axis=1), filled.any(axis=1)
     if sensor == "dvl":
         complete, partly = _pings(data, complete, partly, line, source)
+    if sensor == "place":
+        partly = _sightings(data, partly, line, source)
     partly &= ~complete
     if partly.any():
         _warn(
@@ -265,6 +267,18 @@ def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str
     partly = partly | (valid == 1.0)
     valid[np.isnan(valid)] = 1.0
     return complete | lost, partly
+
+
+def _sightings(data: Array, partly: Bools, line: Lines, source: str) -> Bools:
+    """Rows with anything of a place that was seen: its name, or an sd that belongs to none."""
+    sd = data[:, 1]
+    odd = np.flatnonzero(sd <= 0.0)
+    if odd.size:
+        raise InputError(
+            f"{source}: line {line[odd[0]]}, column place_sd: {sd[odd[0]]:g}, expected more than 0; "
+            "leave the cell empty where the configuration's place.sd_m holds"
+        )
+    return np.asarray(partly | ~np.isnan(sd))
 
 
 def _stream(sensor: str, cells: dict[str, Array], line: Lines, source: str) -> Stream | None:

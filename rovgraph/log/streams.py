@@ -1,6 +1,8 @@
 """What a log is: one stream of measurements per sensor, in the order of time."""
 
+import math
 import re
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,8 +22,10 @@ STREAMS: dict[str, tuple[str, ...]] = {
     "dvl_altitude": ("dvl_altitude",),
     "depth": ("depth",),
     "fix": ("fix_north", "fix_east", "fix_sd"),
+    "place": ("place_id", "place_sd"),
 }
-OPTIONAL = frozenset({"ahrs_roll", "ahrs_pitch", "dvl_valid", "dvl_sd", "fix_sd"})
+OPTIONAL = frozenset({"ahrs_roll", "ahrs_pitch", "dvl_valid", "dvl_sd", "fix_sd", "place_sd"})
+LABEL = "place_id"  # a column of names, not of quantities
 LAT_LON = ("fix_lat", "fix_lon")
 COLUMNS = ("time", *(c for columns in STREAMS.values() for c in columns), *LAT_LON)
 RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
@@ -31,6 +35,22 @@ THRUSTER = re.compile(r"thruster_[1-9]\d*")
 def is_column(name: str) -> bool:
     """Whether a log may have a column of this name."""
     return name in COLUMNS or THRUSTER.fullmatch(name) is not None
+
+
+def label_number(label: str) -> float:
+    """The number that stands for a name: itself where it is a whole one, else one that its text always gives.
+
+    >>> label_number("7"), label_number("7.0"), label_number("wreck") == label_number(" wreck")
+    (7.0, 7.0, True)
+    """
+    text = label.strip()
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if number.is_integer() and abs(number) < 2.0**53:
+        return number
+    return float(zlib.crc32(text.encode()) + 2**32)  # beyond the numbers that people count with
 
 
 class Measurement(NamedTuple):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import Array
+from rovgraph.log.streams import label_number
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,14 @@ class Table:
                 f"leave a cell empty where there is no value ({_count(bad.size, 'such cell')})"
             )
         return values.to_numpy(dtype=float, na_value=np.nan)
+
+    def labels(self, name: str) -> Array:
+        """A column of names as the numbers that stand for them, shape (n,); NaN = empty cell."""
+        cells = self.frame[name]
+        told = cells.notna() & (cells.astype(str).str.strip() != "")
+        out = np.full(len(cells), np.nan)
+        out[told] = [label_number(str(cell)) for cell in cells[told]]
+        return out
 
 
 def read_table(path: Path | str) -> Table:

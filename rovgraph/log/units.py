@@ -40,6 +40,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "dvl_altitude": ("dvl_altitude",),
     "depth": ("depth",),
     "fix": ("fix_north", "fix_east", "fix_sd", "fix_lat", "fix_lon"),
+    "place": ("place_sd",),
 }
 
 _KIND_OF_GROUP = {
@@ -53,6 +54,7 @@ _KIND_OF_GROUP = {
     "dvl_altitude": "length",
     "depth": "length",
     "fix": "length",
+    "place": "length",
 }
 KINDS: dict[str, str] = {c: _KIND_OF_GROUP[group] for group, columns in GROUPS.items() for c in columns}
 KINDS |= {"fix_lat": "latitude", "fix_lon": "latitude"}
