@@ -44,7 +44,7 @@ def test_a_variable_is_estimated_only_where_a_sensor_that_shows_it_is_in_use():
 def test_letters_are_unique_and_none_is_a_state_variables():
     letters = [v.letter for v in TABLE.values()]
     assert len(set(letters)) == len(letters)
-    assert not {"x", "v", "b"} & set(letters)
+    assert not {"x", "v", "b", "n"} & set(letters)
     assert all(len(letter) == 1 for letter in letters)
 
 

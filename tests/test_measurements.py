@@ -13,7 +13,7 @@ from rovgraph.calibration import TABLE
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation
-from rovgraph.graph.assembly import Attached
+from rovgraph.graph.assembly import Attached, Sighting
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.measurements import (
     Block,
@@ -28,9 +28,10 @@ from rovgraph.graph.rows import Rows
 from rovgraph.graph.scale import felt
 from rovgraph.graph.track import KNOT_S, Track
 from rovgraph.graph.values import insert_calibration, insert_state
-from rovgraph.state import DIMENSION, State, propagate
+from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
 
 N, STEP = 4, 1e-6
+SIZES = DIMENSION | {PLACE: PLACE_DIM} | {name: variable.dim for name, variable in TABLE.items()}
 WALKS = {name: 0.1 if name in {"hard_iron", "field_scale", "dvl_yaw"} else 0.0 for name in TABLE}
 
 
@@ -51,7 +52,9 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         sd = instrument.sd * rng.uniform(0.5, 2.0, instrument.model.dim)
         track = track_of(motion, bias, rng) if instrument.lateness else None
         S = felt(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
-        attached.append(Attached(sensor, k, k // 2, 0.2 * k, 10 + k, z, sd, rate, 0.01, motion, bias, track, S))
+        seen = Sighting(1.0, 7) if sensor == "place" else None
+        place = (sensor, k, k // 2, 0.2 * k, 10 + k)
+        attached.append(Attached(*place, z, sd, rate, 0.01, motion, bias, track, S, seen))
     return make_block(attached, instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 
 
@@ -76,6 +79,7 @@ def values_of(state: State, unknowns: Unknowns) -> gtsam.Values:
         insert_state(values, k, state.at([k]))
     for segment in range(len(state) // 2 + 1):
         insert_calibration(values, state.calibration, unknowns, segment)
+    values.insert(key(PLACE, 7), state.calibration[PLACE])
     return values
 
 
@@ -107,7 +111,7 @@ def test_custom_factor_is_linearised_by_gtsam_as_its_own_error_moves(sensor):
     names = dict(zip(block.keys[k], block.variables, strict=True))
     column = 0
     for j in list(linear.keys()):
-        dim = DIMENSION.get(names[j]) or TABLE[names[j]].dim
+        dim = SIZES[names[j]]
         for c in range(dim):
             moved = []
             for sign in (1, -1):
@@ -126,7 +130,7 @@ def test_bulk_and_custom_factors_are_the_same_system(sensor, loss):
     block, state = block_of(sensor, loss=loss)
     values = values_of(state, block.unknowns)
     pushed, custom = (gtsam.GaussianFactorGraph() for _ in range(2))
-    Rows({sensor: block}).push(pushed, [block.weighted(state, np.ones(N, dtype=bool))])
+    Rows({sensor: block}).push(pushed, {sensor: block.weighted(state, np.ones(N, dtype=bool))})
     for k in range(N):
         custom.push_back(block.custom_factor(k).linearize(values))
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(pushed)
@@ -137,13 +141,13 @@ def test_bulk_and_custom_factors_are_the_same_system(sensor, loss):
 
 
 def test_all_sensors_of_a_keyframe_as_one_factor_are_the_same_system_without_what_is_gated():
-    made = {sensor: block_of(sensor, loss="cauchy") for sensor in SENSORS}
+    made = {sensor: block_of(sensor, loss="cauchy") for sensor in SENSORS if sensor != "place"}
     blocks, state = {sensor: block for sensor, (block, _) in made.items()}, made["dvl"][1]
     values = values_of(state, Unknowns(state.calibration, WALKS))
     rng = np.random.default_rng(1)
     gates = {sensor: rng.random(N) < 0.7 for sensor in blocks}
     together, apart = (gtsam.GaussianFactorGraph() for _ in range(2))
-    Rows(blocks).push(together, [block.weighted(state, gates[sensor]) for sensor, block in blocks.items()])
+    Rows(blocks).push(together, {sensor: block.weighted(state, gates[sensor]) for sensor, block in blocks.items()})
     for sensor, block in blocks.items():
         for k in np.flatnonzero(gates[sensor]):
             apart.push_back(block.custom_factor(int(k)).linearize(values))

@@ -20,14 +20,9 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Interval
-from rovgraph.graph.batch import (
-    Problem,
-    Solution,
-    make_problem,
-    make_values,
-    solve,
-)
+from rovgraph.graph.batch import make_problem
 from rovgraph.graph.considered import Marginals, considered, holding
+from rovgraph.graph.places import Optimum, optimum
 from rovgraph.graph.stamps import Stamps
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY
@@ -35,21 +30,6 @@ from rovgraph.state import BIAS, POSE, VELOCITY
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
 PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
 CENTRED_REACH_S = 0.1  # around the lateness that was found
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """The graph of a dive, solved.
-
-    Attributes
-    ----------
-    intervals, problem : the dive, each measurement where it belongs
-    solution : its optimum
-    """
-
-    intervals: list[Interval]
-    problem: Problem
-    solution: Solution
 
 
 @dataclass
@@ -94,17 +74,16 @@ class BatchSmoother:
     def optimum(self) -> Optimum:
         """The graph of the dive and its optimum."""
         b = self.beginning
-        dive, calibration = self, None
+        dive, calibration, priors = self, None, beliefs(b.config)
         for _ in range(MAX_PLACINGS):
-            problem = make_problem(dive.intervals, b.start, b.config, beliefs(b.config), b.instruments)
-            states = dead_reckon(dive.intervals, b, problem.unknowns.fixed)
-            solution = solve(problem, make_values(problem, states, calibration))
-            found = problem.states(solution.values).calibration
+            states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
+            best = optimum(dive.intervals, b.start, b.config, priors, b.instruments, states, calibration)
+            found = best.problem.states(best.solution.values).calibration
             anew = dive.placed_anew(found)
             if anew is None:
                 break
             dive, calibration = anew, {name: value.reshape(-1, value.shape[-1])[-1] for name, value in found.items()}
-        return Optimum(dive.intervals, problem, solution)
+        return best
 
     def placed_anew(self, calibration: Mapping[str, Array]) -> "BatchSmoother | None":
         """The same dive with its measurements where late stamps were found to belong; None = they are there already.
@@ -158,7 +137,7 @@ def smoothed(optimum: Optimum, b: Beginning) -> Estimate:
     for name, sd in known.held.items():
         both = np.tile(final[name], (2, 1)), np.tile(sd, (2, 1))
         history[name] = calibration_history(name, trajectory.time[ends], *both)
-    here = {sensor: states.at(block.keyframe) for sensor, block in problem.blocks.items()}
+    here = {sensor: state for sensor, _, state in problem.seen(solution.values)}
     return Estimate(
         "smoothed",
         trajectory,

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import InitVar, dataclass, field
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gtsam
 import numpy as np
@@ -38,6 +38,22 @@ ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
 
+class Sighting(NamedTuple):
+    """Which place a camera or sonar saw.
+
+    Attributes
+    ----------
+    name : what the log calls it
+    number : of the place's variable: that of its first sighting. To begin with each sighting is of a place
+        of its own; `rovgraph.graph.places` finds those that are one.
+    believed : False = the vehicle cannot have been there; it is not let in unless the optimum says otherwise
+    """
+
+    name: float
+    number: int
+    believed: bool = True
+
+
 @dataclass(frozen=True)
 class Attached:
     """A measurement that belongs to a keyframe.
@@ -54,6 +70,7 @@ class Attached:
     bias : ndarray, shape (6,), that the motion was integrated with
     track : Track of one stamp, where stamps may be late
     felt : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
+    sighting : of a place, where it is one
     """
 
     sensor: str
@@ -69,6 +86,7 @@ class Attached:
     bias: Array
     track: Track | None = None
     felt: Array | None = None
+    sighting: Sighting | None = None
 
 
 @dataclass(frozen=True)
@@ -131,6 +149,8 @@ class Assembler:
         self._index, self._start = -1, 0.0
         self._segment, self._segment_start = -1, -np.inf
         self._between: list[Placed] = []
+        self._sighted: dict[float, float] = {}  # place -> when it last counted [s]
+        self._sightings = 0
         self.stamps = assumed or Stamps.of(self.config, self.instruments)
         self._scaled = wanted(beliefs(self.config))
         self._around = HALF_WINDOW_S + self.stamps.span
@@ -165,6 +185,7 @@ class Assembler:
         twin = copy(self)
         twin._samples, twin.left_out = self._samples.copy(), self.left_out.copy()
         twin._waiting, twin._between = self._waiting[:], self._between[:]
+        twin._sighted = dict(self._sighted)
         twin.stamps = self.stamps.copy()
         if self._aiding is not None:
             twin._aiding = self._aiding.copy(twin.left_out)
@@ -179,6 +200,8 @@ class Assembler:
             "assumed": self.stamps.assumed,
             "signals": pack(self._aiding.signals if self._aiding is not None else []),
             "at": [self._index, self._start, self._segment, self._segment_start],
+            "sighted": np.array([*self._sighted.items()]).reshape(-1, 2),
+            "sightings": self._sightings,
             "bias": self.bias,
         }
 
@@ -191,6 +214,7 @@ class Assembler:
             self._aiding.signals = unpack(state["signals"])
         self._index, self._start, self._segment, self._segment_start = state["at"]
         self.bias = state["bias"]
+        self._sighted, self._sightings = dict(state["sighted"].tolist()), state["sightings"]
 
     def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> Interval:
         """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.
@@ -311,7 +335,7 @@ class Assembler:
         if lag is not None and track is None:
             self.left_out[m.sensor, f"calibration.{instrument.lateness} reaches beyond the IMU's samples"] += 1
             return []
-        dim = instrument.model.dim
+        dim, sighting = instrument.model.dim, None
         z, sd = m.values[:dim], instrument.sd
         if m.sensor == "dvl":
             if np.isfinite(m.values[4]):
@@ -322,9 +346,23 @@ class Assembler:
             sd = sd / math.sqrt(m.values[3])
         if m.sensor == "fix" and np.isfinite(m.values[2]):
             sd = np.full(dim, m.values[2])
+        if m.sensor == "place":
+            sighting = self._sighting(m)
+            if sighting is None:
+                return []
+            z, sd = np.zeros(dim), np.full(dim, m.values[1]) if np.isfinite(m.values[1]) else sd
         place = (m.sensor, self._index, self._segment, m.time, m.row)
         scaled = self._felt(every, self._start, m.time)
-        return [Attached(*place, z, sd, rate_b, rate_sd, motion, self.bias, track, scaled)]
+        return [Attached(*place, z, sd, rate_b, rate_sd, motion, self.bias, track, scaled, sighting)]
+
+    def _sighting(self, m: Placed) -> Sighting | None:
+        """A place that is seen; None where it has been in view just now."""
+        name = float(m.values[0])
+        if m.time - self._sighted.get(name, -math.inf) < self.config.place.every_s:
+            self.left_out["place", "still in view"] += 1
+            return None
+        self._sighted[name], self._sightings = m.time, self._sightings + 1
+        return Sighting(name, self._sightings)
 
     def _felt(self, samples: Array, begin: float, end: float) -> Array | None:
         """The IMU's mean signal as scale errors feel it, where there may be any."""

@@ -8,7 +8,7 @@ taken out, and it is solved again until the gates rest.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,13 +21,13 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Attached, Interval
-from rovgraph.graph.factors import Start, drift, motion, priors
+from rovgraph.graph.factors import Start, drift, motion, priors, unseen_place
 from rovgraph.graph.keys import Unknowns, key, key_name, unknowns
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state, states_from
 from rovgraph.instruments import Instrument
-from rovgraph.state import DIMENSION, State
+from rovgraph.state import DIMENSION, PLACE, State
 
 Gates = dict[str, NDArray[np.bool_]]
 
@@ -62,47 +62,58 @@ class Problem:
         return len(self.segment)
 
     @cached_property
-    def rows(self) -> Rows:
-        """Of the measurements."""
-        return Rows(self.blocks)
+    def rows(self) -> list[Rows]:
+        """Of the measurements; those of places touch a variable more."""
+        kinds = ({s: b for s, b in self.blocks.items() if (s == "place") == seen} for seen in (False, True))
+        return [Rows(kind) for kind in kinds if kind]
 
     def states(self, values: gtsam.Values) -> State:
         """State of every keyframe."""
         return states_from(values, self.segment, self.unknowns)
 
+    def seen(self, values: gtsam.Values) -> Iterator[tuple[str, Block, State]]:
+        """Every sensor's block, with the state of each measurement's keyframe."""
+        states = self.states(values)
+        for sensor, block in self.blocks.items():
+            yield sensor, block, block.with_places(states.at(block.keyframe), values)
+
     def open_gates(self) -> Gates:
         return {sensor: np.ones(len(block), dtype=bool) for sensor, block in self.blocks.items()}
 
+    def believed(self) -> Gates:
+        """The gates to begin with: open, but for places that look like others."""
+        return {sensor: block.believed for sensor, block in self.blocks.items()}
+
     def gates(self, values: gtsam.Values) -> Gates:
         """Which measurements lie within their gate at ``values``."""
-        states, out = self.states(values), {}
-        for sensor, block in self.blocks.items():
+        out = {}
+        for sensor, block, state in self.seen(values):
             gate = block.instrument.gate_sd or np.inf
-            out[sensor] = np.linalg.norm(block.normalised(states.at(block.keyframe)), axis=1) <= gate
+            out[sensor] = np.linalg.norm(block.normalised(state), axis=1) <= gate
         return out
 
     def weights(self, values: gtsam.Values, gates: Gates) -> dict[str, Array]:
         """Weight of every measurement, shape (n,) for each sensor."""
-        states, out = self.states(values), {}
-        for sensor, block in self.blocks.items():
-            r = block.normalised(states.at(block.keyframe))
+        out = {}
+        for sensor, block, state in self.seen(values):
+            r = block.normalised(state)
             out[sensor] = loss_and_weight(r, block.instrument.loss)[1] * gates[sensor]
         return out
 
     def cost(self, values: gtsam.Values, gates: Gates) -> float:
         """The robust cost that is minimised."""
-        states, total = self.states(values), self.native.error(values)
-        for sensor, block in self.blocks.items():
-            r = block.normalised(states.at(block.keyframe))
+        total = self.native.error(values)
+        for sensor, block, state in self.seen(values):
+            r = block.normalised(state)
             total += float(loss_and_weight(r, block.instrument.loss)[0] @ gates[sensor])
         return total
 
     def linearize(self, values: gtsam.Values, gates: Gates) -> gtsam.GaussianFactorGraph:
         """All factors linearised at ``values``, measurements weighted."""
-        linear, states = self.native.linearize(values), self.states(values)
-        if self.blocks:
-            weighted = [block.weighted(states.at(block.keyframe), gates[s]) for s, block in self.blocks.items()]
-            self.rows.push(linear, weighted)
+        linear = self.native.linearize(values)
+        weighted = {sensor: block.weighted(state, gates[sensor]) for sensor, block, state in self.seen(values)}
+        for rows in self.rows:
+            rows.push(linear, weighted)
         return linear
 
     def nonlinear(self) -> gtsam.NonlinearFactorGraph:
@@ -153,16 +164,18 @@ def make_problem(
         factors += motion(interval, wanted)
     for segment in range(1, intervals[-1].segment + 1):
         factors += drift(wanted, segment, config.graph.segment_s)
+    gravity = config.environment.gravity_mps2
+    blocks = {s: make_block(rows, instruments[s], gravity, wanted) for s, rows in attached.items()}
+    if "place" in blocks:
+        factors += [unseen_place(number) for number in np.unique(blocks["place"].place).tolist()]
     native = gtsam.NonlinearFactorGraph()
     for factor in factors:
         native.add(factor)
-    gravity = config.environment.gravity_mps2
-    blocks = {s: make_block(rows, instruments[s], gravity, wanted) for s, rows in attached.items()}
     return Problem(native, blocks, np.array([i.segment for i in intervals]), wanted)
 
 
 def make_values(problem: Problem, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:
-    """GTSAM values of the keyframes' states, calibration at its means unless given."""
+    """GTSAM values of the keyframes' states, calibration at its means unless given; without places."""
     values = gtsam.Values()
     for i in range(problem.count):
         insert_state(values, i, states.at([i]))
@@ -178,7 +191,7 @@ def solve(problem: Problem, values: gtsam.Values) -> Solution:
     ------
     InputError : the data do not determine some variable, which is named
     """
-    gates, iterations = problem.open_gates(), 0
+    gates, iterations = problem.believed(), 0
     # of the whole graph, as METIS crashes on a variable that the gates have cut off
     ordering = gtsam.Ordering.MetisGaussianFactorGraph(problem.linearize(values, gates))
     tolerance, gatings = COARSE_DECREASE, 0
@@ -278,16 +291,18 @@ def marginals(problem: Problem, solution: Solution) -> gtsam.GaussianBayesTree:
         raise InputError(indeterminate(error)) from None
 
 
-def newest_covariance(problem: Problem, solution: Solution) -> Array:
-    """Joint covariance of the newest keyframe and of the calibration there.
+def newest_covariance(problem: Problem, solution: Solution, places: Sequence[int] = ()) -> Array:
+    """Joint covariance of the newest keyframe, of the calibration there, and of places.
 
     Returns
     -------
-    ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Problem.unknowns`
+    ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Problem.unknowns`,
+        then the places in the order of their numbers as given
     """
     linear = problem.linearize(solution.values, solution.gates)
     last = [key(v, problem.count - 1) for v in DIMENSION]
     last += [problem.unknowns.key(name, int(problem.segment[-1])) for name in problem.unknowns.estimated]
+    last += [key(PLACE, number) for number in places]
     before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
     for one in last:
         order.push_back(one)

@@ -14,9 +14,10 @@ from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.scale import SCALES, biased, scaled_factor
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
 
 Factor = gtsam.NonlinearFactor
+ANYWHERE_M = 1e5  # sd of the prior of a place, about the origin
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,13 @@ def priors(start: Start, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> l
             for name, b in ((name, beliefs[name]) for name in unknowns.estimated)
         ),
     ]
+
+
+def unseen_place(number: int) -> Factor:
+    """The prior of a place: it says next to nothing, and determines a place that all gates have shut out."""
+    return gtsam.PriorFactorVector(
+        key(PLACE, number), np.zeros(PLACE_DIM), gtsam.noiseModel.Isotropic.Sigma(PLACE_DIM, ANYWHERE_M)
+    )
 
 
 def motion(interval: Interval, unknowns: Unknowns) -> list[Factor]:

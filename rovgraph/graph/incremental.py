@@ -23,6 +23,7 @@ THRESHOLDS = {
     "x": [0.02, 0.02, 0.02, 1.0, 1.0, 1.0],  # [rad, m]
     "v": [0.05, 0.05, 0.05],  # [m/s]
     "b": [0.01] * 6,  # [m/s^2, rad/s]
+    "n": [1.0, 1.0],  # [m], of a place
 }
 CALIBRATION_THRESHOLD = 0.01  # [rad, 1]
 FINE, RELINEARISATIONS = 0.01, 3  # part of the thresholds, and updates, for the last estimate

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Gates, Problem, indeterminate
-from rovgraph.graph.keys import key, state_index
-from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY
+from rovgraph.graph.keys import is_place, key, state_index
+from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,10 @@ def knowledge(problem: Problem, values: gtsam.Values, gates: Gates, keyframes: S
         piece.push_back(left)
         last = [key(v, end) for v in (POSE, VELOCITY, BIAS)]
         last += [key(POSE, 0), *_calibration(problem, int(problem.segment[end]))]
-        left, root = eliminate(piece, last)
-        joint.append(root @ root.T)
+        open_places = _seen_again(problem, end)
+        left, root = eliminate(piece, last + open_places)
+        own = len(root) - PLACE_DIM * len(open_places)
+        joint.append((root @ root.T)[:own, :own])
     P = np.array(joint)
     begin = DIMENSION[POSE] + DIMENSION[VELOCITY]
     rows = np.r_[begin : begin + 9, begin + 12 : P.shape[1]]  # without the first position
@@ -149,16 +151,30 @@ def _calibration(problem: Problem, segment: int) -> list[int]:
     return [problem.unknowns.key(name, segment) for name in problem.unknowns.estimated]
 
 
+def _seen_again(problem: Problem, end: int) -> list[int]:
+    """Keys of the places that are seen up to a keyframe and after it."""
+    block = problem.blocks.get("place")
+    if block is None:
+        return []
+    before = np.unique(block.place[block.keyframe <= end])
+    return [key(PLACE, int(number)) for number in np.intersect1d(before, block.place[block.keyframe > end])]
+
+
 def _pieces(
     problem: Problem, linear: gtsam.GaussianFactorGraph, ends: Sequence[int]
 ) -> list[gtsam.GaussianFactorGraph]:
     """Factors by the piece of the dive that they complete; ``ends`` are the last keyframes of each."""
     begins = np.searchsorted(problem.segment, np.arange(int(problem.segment[-1]) + 1))  # first keyframe of a segment
+    first_seen = {}
+    if "place" in problem.blocks:
+        block = problem.blocks["place"]
+        first_seen = {key(PLACE, p): k for p, k in zip(block.place[::-1], block.keyframe[::-1], strict=True)}
     pieces = [gtsam.GaussianFactorGraph() for _ in ends]
     newest = []
     for k in range(linear.size()):
-        own = [state_index(one) for one in linear.at(k).keys()]  # noqa: SIM118
-        newest.append(max(i if state else begins[i] for state, i in own))
+        keys = linear.at(k).keys()
+        own = [state_index(one) for one in keys if not is_place(one)]
+        newest.append(max((i if state else begins[i] for state, i in own), default=first_seen.get(keys[0], 0)))
     for k, piece in enumerate(np.searchsorted(ends, newest).tolist()):
         if piece < len(pieces):
             pieces[piece].push_back(linear.at(k))

@@ -1,4 +1,4 @@
-"""Keys of the graph's variables: x pose, v velocity, b bias, one letter per calibration."""
+"""Keys of the graph's variables: x pose, v velocity, b bias, n place, one letter per calibration."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -7,9 +7,9 @@ import gtsam
 
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.geometry import Array
-from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY
+from rovgraph.state import BIAS, DIMENSION, PLACE, POSE, VELOCITY
 
-_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b"} | {v.name: v.letter for v in TABLE.values()}
+_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n"} | {v.name: v.letter for v in TABLE.values()}
 _FIRST = {variable: int(gtsam.symbol(letter, 0)) for variable, letter in _LETTER.items()}
 _INDICES = 1 << 56  # of a letter
 _STATES = {_FIRST[variable] // _INDICES for variable in DIMENSION}
@@ -20,10 +20,15 @@ def key(variable: str, index: int = 0) -> int:
 
     Parameters
     ----------
-    variable : "pose", "velocity", "bias" or a name of the calibration table
-    index : keyframe; for a calibration variable that walks its segment, else 0
+    variable : "pose", "velocity", "bias", "place" or a name of the calibration table
+    index : keyframe; number of a place; for a calibration variable that walks its segment, else 0
     """
     return _FIRST[variable] + index  # consecutive, as gtsam.symbol makes them
+
+
+def is_place(key: int) -> bool:
+    """Whether a key is of a place."""
+    return key // _INDICES == _FIRST[PLACE] // _INDICES
 
 
 def state_index(key: int) -> tuple[bool, int]:
@@ -37,6 +42,8 @@ def key_name(key: int) -> str:
     symbol = gtsam.Symbol(key)
     letter = chr(symbol.chr())
     variable = next(name for name, own in _LETTER.items() if own == letter)
+    if variable == PLACE:
+        return f"place {symbol.index()}"
     return f"{variable} of keyframe {symbol.index()}" if variable in DIMENSION else variable
 
 

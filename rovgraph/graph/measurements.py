@@ -27,7 +27,18 @@ from rovgraph.graph.track import Track
 from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
-from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Delta, Jacobians, State, propagate, propagate_with_jacobian
+from rovgraph.state import (
+    BIAS,
+    DIMENSION,
+    PLACE,
+    POSE,
+    VELOCITY,
+    Delta,
+    Jacobians,
+    State,
+    propagate,
+    propagate_with_jacobian,
+)
 
 _COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
 
@@ -49,6 +60,8 @@ class Block:
     unknowns : the calibration variables that are estimated, of those that the instrument has
     track : along which the motion goes on to where a stamp that may be late belongs, or None
     felt : ndarray, shape (n, 6, 6), of `rovgraph.graph.scale`, or None where the IMU's scale is exact
+    place, believed : ndarray of int and of bool, shape (n,), of `rovgraph.graph.assembly.Sighting`; place is -1,
+        and all are believed, where it is no place that is measured
     """
 
     instrument: Instrument
@@ -62,6 +75,8 @@ class Block:
     motion: Delta
     gravity: float
     unknowns: Unknowns
+    place: NDArray[np.int64]
+    believed: NDArray[np.bool_]
     track: Track | None = None
     felt: Array | None = None
 
@@ -76,7 +91,7 @@ class Block:
     @cached_property
     def keys(self) -> list[list[int]]:
         """Keys of every measurement, in the order of `variables`."""
-        columns = [key(v) + self.keyframe for v in self.instrument.model.state]
+        columns = [key(v) + (self.place if v == PLACE else self.keyframe) for v in self.instrument.model.state]
         columns += [key(v) + (self.segment if walk else 0 * self.segment) for v, walk in self.unknowns.walks.items()]
         rows: list[list[int]] = np.column_stack(columns).tolist()
         return rows
@@ -163,13 +178,20 @@ class Block:
         one, index, segment = self.at(slice(k, k + 1)), int(self.keyframe[k]), int(self.segment[k])
 
         def error(_: gtsam.CustomFactor, values: gtsam.Values, H: Any) -> Array:
-            r, jacobians = one.linearize(state_at(values, index, segment, self.unknowns))
+            state = one.with_places(state_at(values, index, segment, self.unknowns), values)
+            r, jacobians = one.linearize(state)
             if H is not None:
                 for place, jacobian in enumerate(jacobians.values()):
                     H[place] = jacobian[0]
             return np.asarray(-r[0])  # GTSAM's error is predicted minus measured
 
         return gtsam.CustomFactor(robust_noise(self.instrument), self.keys[k], error)
+
+    def with_places(self, state: State, values: gtsam.Values) -> State:
+        """The state of each measurement's keyframe together with the place that is seen, where one is."""
+        if PLACE not in self.instrument.model.state:
+            return state
+        return state.seeing(np.array([values.atVector(key(PLACE, number)) for number in self.place.tolist()]))
 
     def at(self, index: slice | Array) -> "Block":
         """Some of the measurements."""
@@ -179,7 +201,7 @@ class Block:
         return replace(self, **arrays, motion=motion, track=track, felt=felt)
 
 
-_PER_MEASUREMENT = ("keyframe", "segment", "time", "row", "z", "W", "rate_b")
+_PER_MEASUREMENT = ("keyframe", "segment", "time", "row", "z", "W", "rate_b", "place", "believed")
 
 
 def make_block(
@@ -199,7 +221,10 @@ def make_block(
     track = Track.stack(tracks) if tracks else None
     scaled = attached[0].felt is not None
     own = unknowns.of((*instrument.calibration, *(SCALES if scaled else ())))
-    return Block(instrument, *arrays, motions(attached), gravity, own, track, stack("felt") if scaled else None)
+    place = np.array([-1 if a.sighting is None else a.sighting.number for a in attached])
+    believed = np.array([a.sighting is None or a.sighting.believed for a in attached])
+    felt = stack("felt") if scaled else None
+    return Block(instrument, *arrays, motions(attached), gravity, own, place, believed, track, felt)
 
 
 def motions(attached: Sequence[Attached]) -> Delta:

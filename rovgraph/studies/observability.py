@@ -22,9 +22,9 @@ from rovgraph.estimators.observability import (
     verdict,
     without_noise,
 )
-from rovgraph.estimators.smoother import Optimum
 from rovgraph.geometry import Array
 from rovgraph.graph.information import OTHERS, knowledge
+from rovgraph.graph.places import Optimum
 from rovgraph.log import Log
 
 Progress = Callable[[str, float], None]

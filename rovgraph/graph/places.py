@@ -1,0 +1,237 @@
+"""Which sightings of a name are of one place.
+
+A camera that takes one rock for another would tie two spots together, and a robust loss does
+not help: between two sightings lie minutes of drift, known to metres only, so the track follows
+a false match and leaves no residual. What tells one is that the vehicle cannot have been there,
+as long as the match is not believed yet. So the dive is solved without places first. That gives
+the joint covariance of where the vehicle was at every sighting, and in the order of time each
+sighting is compared with the places of its name: the innovation squared over its covariance
+(NIS) decides, as it does in the filter. One that fits no place of its name begins another; a
+place that is seen once says nothing, so a false first sighting spoils none of those that
+follow. Each that is accepted narrows the joint covariance for the next (joint compatibility,
+Neira and Tardos 2001, one sighting at a time).
+
+In the end the place of a name is the one that most of its sightings agree on, and those that agree
+with nothing else are kept as sightings of it that are not believed: `rovgraph.graph.batch` begins
+without them, and lets them in if its optimum finds them within their gate after all.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from rovgraph.calibration import Belief
+from rovgraph.config import Config
+from rovgraph.geometry import Array
+from rovgraph.graph.assembly import Attached, Interval, Sighting
+from rovgraph.graph.batch import Problem, Solution, make_problem, make_values, solve
+from rovgraph.graph.factors import Start
+from rovgraph.graph.information import eliminate
+from rovgraph.graph.keys import key
+from rovgraph.graph.measurements import Block, make_block
+from rovgraph.instruments import Instrument
+from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, POSE, State
+
+ORIGIN = np.zeros(PLACE_DIM)
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The graph of a dive, solved.
+
+    Attributes
+    ----------
+    intervals : the dive, each sighting given to its place
+    problem, solution : its graph, and the optimum
+    """
+
+    intervals: list[Interval]
+    problem: Problem
+    solution: Solution
+
+
+def optimum(
+    intervals: Sequence[Interval],
+    start: Start,
+    config: Config,
+    beliefs: Mapping[str, Belief],
+    instruments: Mapping[str, Instrument],
+    states: State,
+    calibration: Mapping[str, Array] | None = None,
+) -> Optimum:
+    """Solve a dive: without the places that it sees, where it sees any, and then with them.
+
+    Parameters
+    ----------
+    intervals, start, config, beliefs, instruments : as `rovgraph.graph.batch.make_problem` takes them
+    states, calibration : of the keyframes to begin with, as `make_values` takes them
+    """
+    apart = _apart(intervals)
+    problem = make_problem(apart, start, config, beliefs, instruments)
+    solution = solve(problem, make_values(problem, states, calibration))
+    seen = _sightings(intervals)
+    if not seen:
+        return Optimum(apart, problem, solution)
+    gravity = config.environment.gravity_mps2
+    given = _given(intervals, recognised(seen, instruments["place"], gravity, problem, solution))
+    together = make_problem(given, start, config, beliefs, instruments)
+    values = gtsam.Values(solution.values)
+    block = together.blocks["place"]
+    insert_places(values, block, problem.states(solution.values).at(block.keyframe))
+    return Optimum(given, together, solve(together, values))
+
+
+def recognised(
+    seen: Sequence[Attached], instrument: Instrument, gravity: float, problem: Problem, solution: Solution
+) -> dict[float, Attached]:
+    """Sightings of what is seen more than once, by their times, each given to its place.
+
+    Parameters
+    ----------
+    seen : all sightings, in the order of time
+    instrument : of the places
+    gravity : [m/s^2]
+    problem, solution : the dive without places, and its optimum
+    """
+    often = Counter(_name(a) for a in seen)
+    again = [a for a in seen if often[_name(a)] > 1]
+    if not again:
+        return {}
+    where, covariance = _where(make_block(again, instrument, gravity, problem.unknowns), problem, solution)
+    return _settled(again, matched(again, where, covariance, instrument.gate_sd))
+
+
+def settled(intervals: Sequence[Interval]) -> list[Interval]:
+    """A dive whose sightings have been given to places one by one: what fits no other of its name is not believed."""
+    seen = _sightings(intervals)
+    return _given(intervals, _settled(seen, [_number(a) for a in seen]))
+
+
+def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
+    """Insert the places of sightings that have none yet, each where the first sighting that is believed has it.
+
+    Parameters
+    ----------
+    values : gets the new ones
+    block : n sightings
+    states : State, n, of the sightings' keyframes
+    """
+    where = block.predicted(states.seeing(ORIGIN))
+    for k in np.flatnonzero(block.believed).tolist():
+        if not values.exists(own := key(PLACE, int(block.place[k]))):
+            values.insert(own, where[k])
+
+
+def matched(seen: Sequence[Attached], where: Array, covariance: Array, gate_sd: float | None) -> list[int]:
+    """Number of the place that each sighting is of.
+
+    Parameters
+    ----------
+    seen : m sightings in the order of time
+    where : ndarray, shape (m, 2), north and east of each place if its sighting is believed alone [m]
+    covariance : ndarray, shape (2 m, 2 m), joint
+    gate_sd : beyond which two sightings are not of one place, or None
+    """
+    gate = np.inf if gate_sd is None else gate_sd
+    mean, P = where.ravel().copy(), covariance.copy()
+    numbers: list[int] = []
+    newest: dict[float, dict[int, int]] = {}  # name -> number of each of its places -> its newest sighting
+    for k, a in enumerate(seen):
+        places, here = newest.setdefault(_name(a), {}), _rows(k)
+        best, least = None, gate**2
+        for number, other in places.items():
+            there = _rows(other)
+            apart = mean[here] - mean[there]
+            S = P[here, here] + P[there, there] - P[here, there] - P[there, here]
+            nis = float(apart @ np.linalg.solve(S, apart))
+            if nis <= least:
+                best, least = number, nis
+        if best is None:
+            best = _number(a)
+        else:  # the two are one: condition on that
+            there = _rows(places[best])
+            H = np.zeros((PLACE_DIM, len(mean)))
+            H[:, here], H[:, there] = np.eye(PLACE_DIM), -np.eye(PLACE_DIM)
+            PHt = P @ H.T
+            gain = np.linalg.solve(H @ PHt, PHt.T).T
+            mean, P = mean - gain @ (H @ mean), P - gain @ PHt.T
+        places[best] = k
+        numbers.append(best)
+    return numbers
+
+
+def _settled(seen: Sequence[Attached], numbers: Sequence[int]) -> dict[float, Attached]:
+    """Sightings by their times; one that agrees with no other is not believed, where others of its name agree.
+
+    Parameters
+    ----------
+    seen : sightings
+    numbers : of the place that each is of
+    """
+    count = Counter(numbers)
+    chief: dict[float, int] = {}
+    for a, number in zip(seen, numbers, strict=True):
+        if count[number] > count.get(chief.get(_name(a), -1), 1):
+            chief[_name(a)] = number
+    out = {}
+    for a, number in zip(seen, numbers, strict=True):
+        alone = count[number] == 1 and _name(a) in chief
+        sighting = Sighting(_name(a), chief[_name(a)] if alone else number, not alone)
+        out[a.time] = replace(a, sighting=sighting)
+    return out
+
+
+def _given(intervals: Sequence[Interval], found: Mapping[float, Attached]) -> list[Interval]:
+    """The dive with sightings replaced by those that were found, by their times."""
+    return [
+        replace(i, attached=[found.get(a.time, a) if a.sighting else a for a in i.attached]) if _sightings([i]) else i
+        for i in intervals
+    ]
+
+
+def _where(block: Block, problem: Problem, solution: Solution) -> tuple[Array, Array]:
+    """Place of each sighting if it is believed alone, shape (m, 2), and their joint covariance, shape (2 m, 2 m).
+
+    The motion from a keyframe to its sighting is short, and taken as exact.
+    """
+    states = problem.states(solution.values).at(block.keyframe)
+    where, H = block.predict(states.seeing(ORIGIN))
+    frames, column = np.unique(block.keyframe, return_inverse=True)
+    linear = problem.linearize(solution.values, solution.gates)
+    _, root = eliminate(linear, [key(POSE, int(frame)) for frame in frames])
+    by_poses = np.zeros((len(block), PLACE_DIM, len(frames), DIMENSION[POSE]))
+    by_poses[np.arange(len(block)), :, column] = H[POSE]
+    spread = by_poses.reshape(-1, len(root)) @ root
+    own = np.linalg.inv(block.W)
+    covariance = spread @ spread.T
+    for k in range(len(block)):
+        covariance[_rows(k), _rows(k)] += own[k] @ own[k].T
+    return where, covariance
+
+
+def _sightings(intervals: Sequence[Interval]) -> list[Attached]:
+    return [a for interval in intervals for a in interval.attached if a.sighting is not None]
+
+
+def _apart(intervals: Sequence[Interval]) -> list[Interval]:
+    """The same dive without places."""
+    return [
+        replace(i, attached=[a for a in i.attached if a.sighting is None]) if _sightings([i]) else i for i in intervals
+    ]
+
+
+def _rows(k: int) -> slice:
+    return slice(PLACE_DIM * k, PLACE_DIM * (k + 1))
+
+
+def _name(a: Attached) -> float:
+    assert a.sighting is not None
+    return a.sighting.name
+
+
+def _number(a: Attached) -> int:
+    assert a.sighting is not None
+    return a.sighting.number
