@@ -43,6 +43,7 @@ def test_every_sensor_comes_back_as_the_very_same_numbers(tmp_path):
         for sensor, columns in STREAMS.items()
     }
     sent["dvl"][:, 3] = 1.0
+    sent["place"] = np.column_stack([np.arange(20.0), np.abs(sent["place"][:, 1])])
     sent["thruster"] = RNG.normal(size=(20, 6))
     times = EPOCH + np.cumsum(RNG.uniform(0.001, 0.1, 20))
     for k, t in enumerate(times):
@@ -305,8 +306,8 @@ def test_no_checkpoint_and_one_of_another_version_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_checkpoint(tmp_path / "missing")
     write_checkpoint(tmp_path / "a", {})
-    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 1 ", b"checkpoint 2 "))
-    with pytest.raises(InputError, match="of version 2, expected 1"):
+    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 2 ", b"checkpoint 3 "))
+    with pytest.raises(InputError, match="of version 3, expected 2"):
         read_checkpoint(tmp_path / "a")
 
 

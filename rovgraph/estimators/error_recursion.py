@@ -17,14 +17,25 @@ import numpy as np
 from rovgraph.config import beliefs
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.remembered_places import (
+    Place,
+    extended,
+    moved,
+    nearest,
+    padded,
+    seen_at,
+    with_another,
+    without_oldest,
+)
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.estimators.robust_update import normalised_squared, robust_update
 from rovgraph.geometry import Array, transpose
-from rovgraph.graph.assembly import Attached, Interval
+from rovgraph.graph.assembly import Attached, Interval, Sighting
 from rovgraph.graph.coasting import BLIND_S, coasted, coasting
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import Block, make_block, motions, whitening
+from rovgraph.graph.places import ORIGIN
 from rovgraph.graph.scale import COLUMNS, SCALES
 from rovgraph.graph.transition import transition
 from rovgraph.sensors import Position, SensorModel, innovation
@@ -43,11 +54,13 @@ class Gaussian:
     Attributes
     ----------
     state : State of one epoch
-    P : ndarray, shape (size, size)
+    P : ndarray, shape (size + 2 m, size + 2 m), the places at the end
+    places : m places that are remembered
     """
 
     state: State
     P: Array
+    places: tuple[Place, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,7 +69,7 @@ class Step:
 
     Attributes
     ----------
-    F, Q : ndarray, shape (size, size), transition from the keyframe before, and its noise
+    F, Q : ndarray, shapes as that of P, transition from the keyframe before, and its noise
     predicted : before anything that was measured at the keyframe
     """
 
@@ -74,7 +87,8 @@ class Used:
     attached : the measurement
     state : of its keyframe, before it entered
     nis : normalised innovation squared
-    weight : 1 for a full measurement, less by its loss, 0 for a rejected one
+    weight : 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits none of its
+        name counts as rejected, and is remembered as another
     """
 
     attached: Attached
@@ -155,12 +169,21 @@ class ErrorStateRecursion:
         here = [a for a in interval.attached if a.keyframe == interval.index]
         return Passage(departed, step, self._update(predicted, here, gates, used), used)
 
+    def _update(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
+        """The state corrected by what belongs to its keyframe, places last."""
+        known = self._measured(before, [a for a in attached if a.sighting is None], gates, used)
+        for a in attached:
+            if a.sighting is not None:
+                known = self._sighted(known, a, a.sighting, used)
+        return known
+
     def predict(self, interval: Interval, before: Gaussian) -> Step:
         """The next keyframe, from the IMU alone; calibration walks."""
         assert interval.pim is not None
         duration = interval.pim.deltaTij()
         state = predict(interval, before.state)
-        F, Q = np.eye(self.error.size), self._walk * duration
+        F, Q = np.eye(len(before.P)), np.zeros_like(before.P)
+        Q[: self.error.size, : self.error.size] = self._walk * duration
         if interval.bridged and duration > BLIND_S:
             state = coasted(before.state, state, duration)
             F[:15, :15], Q[:15, :15] = coasting(before.state, state, duration, before.P)
@@ -170,7 +193,7 @@ class ErrorStateRecursion:
             for name in set(SCALES) & set(self.error.columns):  # they move as the bias does, but for itself
                 F[:9, self.error.columns[name]] = F[:9, 9:15] @ interval.felt[:, COLUMNS[name]]
         P = F @ before.P @ F.T + Q
-        return Step(F, Q, Gaussian(state, 0.5 * (P + P.T)))
+        return Step(F, Q, Gaussian(state, 0.5 * (P + P.T), before.places))
 
     def block(self, attached: Sequence[Attached]) -> Block:
         """Measurements of one sensor."""
@@ -181,8 +204,11 @@ class ErrorStateRecursion:
     def linearize(self, state: State, attached: Sequence[Attached]) -> list[tuple[Array, Array]]:
         """Whitened innovation, shape (dim,), and Jacobian, shape (dim, size), of each measurement of a keyframe.
 
+        A place is taken to be at the origin, and to be known.
+
         What `Block.linearize` says of many keyframes and one sensor, for one keyframe and many sensors.
         """
+        state = state.seeing(ORIGIN)
         there, F, linear = state.at([0] * len(attached)), None, []
         if any(a.motion.dt for a in attached):
             there, F = propagate_with_jacobian(there, motions(attached), self.beginning.config.environment.gravity_mps2)
@@ -207,10 +233,14 @@ class ErrorStateRecursion:
         ----------
         intervals, known : the keyframes and what is known of them, n each
         """
-        P, columns = np.array([k.P for k in known]), self.error.columns
+        P, columns = self.covariances(known), self.error.columns
         pose, velocity = (P[:, columns[v], columns[v]] for v in (POSE, VELOCITY))
         arm = self.beginning.config.imu.lever_arm_m
         return body_trajectory(intervals, stack_states([k.state for k in known]), arm, pose, velocity)
+
+    def covariances(self, known: Sequence[Gaussian]) -> Array:
+        """Covariances of n estimates without their places, shape (n, size, size)."""
+        return np.array([k.P[: self.error.size, : self.error.size] for k in known])
 
     def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
         """Whether a measurement lies within its gate."""
@@ -236,11 +266,11 @@ class ErrorStateRecursion:
         seen[:3] = R_bn
         return seen[:, 2:]
 
-    def _update(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
-        """The state corrected by measurements that belong to its keyframe."""
+    def _measured(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
+        """The state corrected by measurements that belong to its keyframe, of no places."""
         r, H, losses, admitted = [], [], [], []
         for a, (own_r, own_H) in zip(attached, self.linearize(before.state, attached), strict=True):
-            instrument = self.beginning.instruments[a.sensor]
+            instrument, own_H = self.beginning.instruments[a.sensor], padded(own_H, len(before.P))
             nis = normalised_squared(before.P, own_r, own_H)
             if self._admit(a, nis, gates):
                 r.append(own_r)
@@ -251,13 +281,38 @@ class ErrorStateRecursion:
                 used.append(Used(a, before.state, nis, 0.0))
                 if a.time - gates[a.sensor] > instrument.readmit_s:
                     seen = self._seen(instrument.model, before.state)
-                    before = replace(before, P=doubted(before.P, own_r, own_H, seen))
+                    before = replace(before, P=doubted(before.P, own_r, own_H, padded(seen.T, len(before.P)).T))
         if not admitted:
             return before
         delta, P, weights = robust_update(before.P, r, H, losses)
         used += [Used(a, before.state, nis, weight) for (a, nis), weight in zip(admitted, weights, strict=True)]
-        state, basis = self.error.retract(before.state, delta)
-        return Gaussian(state, basis @ P @ basis.T)
+        return self.corrected(before, delta, P)
+
+    def _sighted(self, before: Gaussian, a: Attached, sighting: Sighting, used: list[Used]) -> Gaussian:
+        """The state corrected by a place that is seen again, or with one place more."""
+        instrument, size = self.beginning.instruments[a.sensor], self.error.size
+        [(r, H)] = self.linearize(before.state, [a])
+        match = nearest(before.P, r, H, a.sd, size, before.places, sighting.name)
+        gate = instrument.gate_sd or np.inf
+        if match is not None and match.nis <= gate**2:
+            delta, P, [weight] = robust_update(before.P, [match.r], [match.H], [instrument.loss])
+            place = before.places[match.index]
+            seen = replace(a, sighting=sighting._replace(number=place.number))
+            used.append(Used(seen, before.state.seeing(place.position), match.nis, weight))
+            after = self.corrected(before, delta, P)
+            return replace(after, places=seen_at(after.places, match.index, a.time))
+        place = Place(sighting.name, sighting.number, -a.sd * r, a.time)
+        other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
+        used.append(Used(a, before.state.seeing(other.position), nis, 1.0 if match is None else 0.0))
+        P, places = with_another(before.P, before.places, place, a.sd[:, None] * H, a.sd)
+        return Gaussian(before.state, *without_oldest(P, places, size, self.beginning.config.place.remembered))
+
+    def corrected(self, before: Gaussian, delta: Array, P: Array) -> Gaussian:
+        """The estimate moved by a correction, shape (size + 2 m,); ``P`` is the covariance after it."""
+        size = self.error.size
+        state, basis = self.error.retract(before.state, delta[:size])
+        basis = extended(basis, len(P))
+        return Gaussian(state, basis @ P @ basis.T, moved(before.places, delta[size:]))
 
 
 def doubted(P: Array, r: Array, H: Array, seen: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Step, Used
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.remembered_places import columns, common, extended
 from rovgraph.estimators.renewal import renewed
 from rovgraph.estimators.results import (
     bias_histories,
@@ -25,7 +26,7 @@ from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.measurements import Block
 from rovgraph.log import Measurement
-from rovgraph.state import BIAS, State, stack_states
+from rovgraph.state import BIAS, PLACE, State, stack_states
 
 # since the start, for `ErrorStateFilter.renew_at`: while heading, mounting and compasses are known to
 # several degrees only, what was linearised once misstates what it knows by the square of that
@@ -119,16 +120,21 @@ class ErrorStateFilter:
     def _back(self, departed: Gaussian, step: Step, following: Gaussian) -> Gaussian:
         """The smoothed state of a keyframe, given that of the one after it."""
         delta, basis = self.error.local(step.predicted.state, following.state)
-        sd = np.sqrt(np.diag(step.predicted.P))  # metres beside rad/s: solved with unit variances
-        G = np.linalg.solve(step.predicted.P / np.outer(sd, sd), step.F @ departed.P / sd[:, None]).T / sd
-        kept = np.eye(self.error.size) - G @ step.F
-        P = kept @ departed.P @ kept.T + G @ (basis @ following.P @ basis.T + step.Q) @ G.T
-        state, basis = self.error.retract(departed.state, G @ delta)
-        return Gaussian(state, basis @ P @ basis.T)
+        # of places, those that both know: one that was forgotten since moves with what it is correlated with
+        ours, theirs, shift = common(step.predicted.places, following.places)
+        here, there = columns(self.error.size, ours), columns(self.error.size, theirs)
+        delta, basis = np.concatenate([delta, shift]), extended(basis, len(here))
+        F, Q, predicted = step.F[here], step.Q[np.ix_(here, here)], step.predicted.P[np.ix_(here, here)]
+        sd = np.sqrt(np.diag(predicted))  # metres beside rad/s: solved with unit variances
+        G = np.linalg.solve(predicted / np.outer(sd, sd), F @ departed.P / sd[:, None]).T / sd
+        kept = np.eye(len(departed.P)) - G @ F
+        known = basis @ following.P[np.ix_(there, there)] @ basis.T
+        P = kept @ departed.P @ kept.T + G @ (known + Q) @ G.T
+        return self.recursion.corrected(departed, G @ delta, P)
 
     def _estimate(self, kind: str, known: Sequence[Gaussian]) -> Estimate:
         b, columns = self.beginning, self.error.columns
-        states, P = stack_states([k.state for k in known]), np.array([k.P for k in known])
+        states, P = stack_states([k.state for k in known]), self.recursion.covariances(known)
         sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         trajectory = self.recursion.trajectory(self.intervals, known)
         history = bias_histories(trajectory.time, states.bias, sd[:, columns[BIAS]])
@@ -150,7 +156,12 @@ class ErrorStateFilter:
         blocks, here, weights = {}, {}, {}
         for sensor, rows in self._used.items():
             blocks[sensor] = block = self.recursion.block([used.attached for used in rows])
-            here[sensor] = smoothed.at(block.keyframe) if smoothed else stack_states([used.state for used in rows])
+            here[sensor] = stack_states([used.state for used in rows])
+            if smoothed is not None:
+                places = here[sensor].calibration.get(PLACE)
+                here[sensor] = smoothed.at(block.keyframe)
+                if places is not None:
+                    here[sensor] = here[sensor].seeing(places)
             weights[sensor] = np.array([used.weight for used in rows])
         return blocks, here, weights
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Used
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.remembered_places import Place
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
@@ -156,6 +157,7 @@ class FixedLag:
             "bias": known.state.bias,
             "calibration": {name: np.asarray(value) for name, value in known.state.calibration.items()},
             "P": known.P,
+            "places": np.array([[p.name, p.number, *p.position, p.time] for p in known.places]).reshape(-1, 5),
             "gates": mark.gates,
             "assembler": mark.assembler.state(),
             "record": pack(self._record[mark.taken - self._forgotten :]),
@@ -166,9 +168,10 @@ class FixedLag:
         index, time, segment, rate_sd = state["keyframe"]
         interval = Interval(index, time, segment, state["rate_b"], rate_sd, None, False, [])
         here = State(*(state[name] for name in ("R_nb", "p_n", "v_n", "bias", "calibration")))
+        places = tuple(Place(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         assembler = self._fresh()
         assembler.restore(state["assembler"])
-        self.marks = deque([Mark(interval, Gaussian(here, state["P"]), state["gates"], [], assembler, 0)])
+        self.marks = deque([Mark(interval, Gaussian(here, state["P"], places), state["gates"], [], assembler, 0)])
         self._record, self._forgotten, self._taken = [], 0, 0
         self._back_to(0)
         for measurement in unpack(state["record"]):

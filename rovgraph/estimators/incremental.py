@@ -15,13 +15,14 @@ from rovgraph.estimators.error_recursion import Gaussian, Used
 from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.smoother import Optimum, smoothed
+from rovgraph.estimators.smoother import smoothed
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.batch import make_problem, solution_at
-from rovgraph.graph.factors import drift, motion, priors
+from rovgraph.graph.factors import drift, motion, priors, unseen_place
 from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import make_block
+from rovgraph.graph.places import Optimum, insert_places, settled
 from rovgraph.graph.values import insert_calibration, state_values
 from rovgraph.log import Measurement
 from rovgraph.state import State, stack_states
@@ -53,6 +54,7 @@ class IncrementalEstimator:
         self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
         self.intervals: list[Interval] = []
         self._filter: ErrorStateFilter | None = None
+        self._places: set[int] = set()  # that iSAM2 knows
         self.updated = -1
 
     def add(self, measurement: Measurement) -> list[Interval]:
@@ -88,11 +90,18 @@ class IncrementalEstimator:
             factors += drift(self.unknowns, segment, b.config.graph.segment_s)
             insert_calibration(values, known.state.calibration, self.unknowns, segment)
         for one in used:
-            if one.weight > 0.0:
+            sighting = one.attached.sighting
+            if one.weight > 0.0 or sighting is not None:  # a place that fits none of its name is one by itself
                 instrument = b.instruments[one.attached.sensor]
                 block = make_block([one.attached], instrument, b.config.environment.gravity_mps2, self.unknowns)
                 factors.append(block.custom_factor())
+                if sighting is not None and sighting.number not in self._places:
+                    self._places.add(sighting.number)
+                    insert_places(values, block, one.state)
+                    factors.append(unseen_place(sighting.number))
         self.engine.add(factors, values)
+        if any(a.sighting for a in interval.attached):
+            interval = replace(interval, attached=[one.attached for one in used])
         self.intervals.append(interval)
         if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
             self.update()
@@ -115,8 +124,9 @@ class IncrementalEstimator:
         """The smoothed trajectory with its uncertainty."""
         self.update()
         b = self.beginning
-        problem = make_problem(self.intervals, b.start, b.config, self.beliefs, b.instruments)
-        return smoothed(Optimum(self.intervals, problem, solution_at(problem, self.engine.values())), b)
+        intervals = settled(self.intervals)
+        problem = make_problem(intervals, b.start, b.config, self.beliefs, b.instruments)
+        return smoothed(Optimum(intervals, problem, solution_at(problem, self.engine.values())), b)
 
     def _take(self, intervals: list[Interval]) -> list[Interval]:
         for interval in intervals:

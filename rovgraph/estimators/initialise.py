@@ -93,7 +93,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Begi
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
     present = log.sensors | set(expected)
-    used = [s for s in ("dvl", "dvl_water", "depth", "fix") if s in present] + heading_sources(config, present)
+    used = [s for s in ("dvl", "dvl_water", "depth", "fix", "place") if s in present] + heading_sources(config, present)
     used += _thrusters(log, config)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))

@@ -6,9 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gaussian
+from rovgraph.estimators.remembered_places import Place
 from rovgraph.graph.assembly import Interval
-from rovgraph.graph.batch import make_problem, make_values, newest_covariance, solve
-from rovgraph.state import State
+from rovgraph.graph.batch import newest_covariance
+from rovgraph.graph.keys import key
+from rovgraph.graph.places import Optimum, optimum
+from rovgraph.state import PLACE, PLACE_DIM, State
 
 
 def renewed(recursion: ErrorStateRecursion, intervals: Sequence[Interval], states: State) -> Gaussian:
@@ -21,13 +24,29 @@ def renewed(recursion: ErrorStateRecursion, intervals: Sequence[Interval], state
     states : State of all its keyframes to begin with; its newest calibration is taken
     """
     b = recursion.beginning
-    problem = make_problem(intervals, b.start, b.config, recursion.beliefs, b.instruments)
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
-    solution = solve(problem, make_values(problem, states, calibration))
+    best = optimum(intervals, b.start, b.config, recursion.beliefs, b.instruments, states, calibration)
+    problem, solution = best.problem, best.solution
     newest = problem.states(solution.values).at([problem.count - 1])
     calibration = {name: value.reshape(-1) for name, value in newest.calibration.items()}
     columns = recursion.error.columns
     known = np.concatenate([np.arange(15)] + [np.r_[columns[name]] for name in problem.unknowns.estimated])
-    P = recursion.start().P  # of what no sensor has shown yet
-    P[np.ix_(known, known)] = newest_covariance(problem, solution)
-    return Gaussian(replace(newest, calibration=calibration), P)
+    places = remembered(best, b.config.place.remembered)
+    size = recursion.error.size
+    P = np.zeros((size + PLACE_DIM * len(places), size + PLACE_DIM * len(places)))
+    P[:size, :size] = recursion.start().P  # of what no sensor has shown yet
+    known = np.concatenate([known, np.arange(size, len(P))])
+    P[np.ix_(known, known)] = newest_covariance(problem, solution, [place.number for place in places])
+    return Gaussian(replace(newest, calibration=calibration), P, places)
+
+
+def remembered(best: Optimum, most: int) -> tuple[Place, ...]:
+    """The places that were seen last, of those that anything says where they are."""
+    seen: dict[int, Place] = {}
+    for interval in best.intervals:
+        for a in interval.attached:
+            if a.sighting is not None and a.sighting.believed:
+                number = a.sighting.number
+                position = best.solution.values.atVector(key(PLACE, number))
+                seen[number] = Place(a.sighting.name, number, position, a.time)
+    return tuple(sorted(seen.values(), key=lambda place: place.time)[-most:])
