@@ -49,6 +49,11 @@ def simulate(
         list[str] | None,
         typer.Option(help="No bottom lock from a second to another, as 100:130; may be repeated.", metavar="FROM:TO"),
     ] = None,
+    place: Annotated[
+        list[str] | None,
+        typer.Option(help="A place that a camera recognises, in m, as 10:-5; may be repeated.", metavar="NORTH:EAST"),
+    ] = None,
+    false_places: Annotated[float, typer.Option(help="Share of its sightings that are false, below 1.")] = 0.0,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Noise, biases and drawn calibration.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an older folder.")] = False,
 ) -> None:
@@ -68,8 +73,18 @@ def simulate(
     if duration is not None and duration > LIMIT_S:
         raise InputError(f"duration of {duration} s: at most {LIMIT_S:.0f} s")
     given = None if config is None else load_config(config)
-    dropouts = tuple(_interval(text) for text in dropout or ())
-    choices = library.Choices(duration, speed, variant, current, disturbances, outliers, dropouts, noise)
+    choices = library.Choices(
+        duration=duration,
+        speed=speed,
+        variant=variant,
+        current=current,
+        disturbances=disturbances,
+        outliers=outliers,
+        dropouts=tuple(_interval(text) for text in dropout or ()),
+        places=tuple(_place(text) for text in place or ()),
+        false_places=false_places,
+        noise=noise,
+    )
     dive, believed = library.simulated(scenario, seed, given, choices)
     with results_folder(out, force) as folder:
         write_dive(folder, dive, believed, {**STAMP, "scenario": scenario, "seed": seed, **choices.told()})
@@ -88,6 +103,22 @@ def _interval(text: str) -> tuple[float, float]:
     if not 0.0 <= interval[0] < interval[1]:
         raise InputError(f"--dropout {text}: two times in seconds are expected, as 100:130")
     return interval
+
+
+def _place(text: str) -> tuple[float, float]:
+    """North and east [m] of ``NORTH:EAST``."""
+    from math import isfinite
+
+    from rovgraph.errors import InputError
+
+    north, _, east = text.partition(":")
+    try:
+        place = float(north), float(east)
+    except ValueError:
+        place = (float("nan"), float("nan"))
+    if not all(isfinite(x) for x in place):
+        raise InputError(f"--place {text}: north and east in metres are expected, as 10:-5")
+    return place
 
 
 def _show(out: Path, scenario: str, seed: int, figures: dict[str, Any], dive: "Dive") -> None:

@@ -7,7 +7,7 @@ from typing import Any
 from rovgraph.errors import InputError
 
 CURRENT_MAX = 1.0  # that may be chosen [m/s]
-EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances"})
+EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances", "places", "false_places"})
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,8 @@ class Choices:
     disturbances : iron on the seabed
     outliers : share of DVL pings that are wrong, 0 to 1
     dropouts : intervals (from, to) [s] without bottom lock
+    places : north, east [m] of places that a camera recognises
+    false_places : share of the sightings that are of another spot, 0 to less than 1
     noise : noise, biases, and everything about vehicle and sensors that is drawn
     """
 
@@ -33,13 +35,15 @@ class Choices:
     disturbances: bool | None = None
     outliers: float = 0.0
     dropouts: tuple[tuple[float, float], ...] = ()
+    places: tuple[tuple[float, float], ...] = ()
+    false_places: float = 0.0
     noise: bool = True
 
     def told(self) -> dict[str, Any]:
         """What ``summary.json`` says: the common ones always, the others where something was chosen."""
         common = {"speed_mps": self.speed, "outlier_share": self.outliers, "noise": self.noise}
         others = {name: getattr(self, name) for name in ("variant", "current", "disturbances")}
-        others["dropouts"] = self.dropouts or None
+        others |= {name: getattr(self, name) or None for name in ("dropouts", "places", "false_places")}
         return common | {name: value for name, value in others.items() if value is not None}
 
     def require(self, scenario: str, known: frozenset[str], variants: tuple[str, ...] = ()) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rovgraph.config import mount_matrix
 from rovgraph.geometry import Array, rotate, rpy_from_matrix, transpose, wrap_angle
@@ -28,6 +29,7 @@ MAG_COLUMNS = ["mag_x", "mag_y", "mag_z"]
 DVL_COLUMNS = ["dvl_vx", "dvl_vy", "dvl_vz"]
 WATER_COLUMNS = ["dvl_water_vx", "dvl_water_vy", "dvl_water_vz"]
 TIME_STEP = 1e-4  # resolution of the log's clock [s]
+PASSING_STEP = 0.02  # between epochs at which it is seen whether a place is near [s]
 AHRS_TILT_SD = float(np.deg2rad(0.5))  # noise of the unit's own roll and pitch [rad]
 
 
@@ -78,7 +80,9 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
     sample = _Sampler(truth, calibration, rng)
     frames = [_inertial(sample, motion, bias), _pings(sample, path)]
-    frames += [f for make in (_depths, _attitudes, _fixes, _signals) if (f := make(sample, path)) is not None]
+    frames += [
+        f for make in (_depths, _attitudes, _fixes, _signals, _sightings) if (f := make(sample, path)) is not None
+    ]
     log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
     hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
@@ -86,11 +90,13 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
 
 
 def _world(truth: Truth) -> dict[str, Any]:
-    """What is magnetic about the truth beside its calibration."""
+    """What there is around the vehicle beside its calibration: iron, a raw magnetometer, places."""
     iron, distortion = truth.magnetism.iron, truth.magnetism.distortion
     world: dict[str, Any] = {}
     if len(iron.p_n):
         world |= {"iron_p_n": iron.p_n, "iron_moment_n": iron.moment_n}
+    if truth.places:
+        world["places"] = np.array(truth.places)
     if distortion is not None:
         world |= {"mag_scale": distortion.scale, "mag_offset": distortion.offset}
     return world
@@ -240,6 +246,44 @@ def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
         return None
     motion = path.motion(sample.epochs(path, sample.truth.fix_interval))
     return _frame(motion.time, ["fix_north", "fix_east"], sample.noisy("fix", motion))
+
+
+def _sightings(sample: _Sampler, path: Path) -> pd.DataFrame | None:
+    """Places that are recognised, once whenever one is passed, and some that only look like it.
+
+    A sighting is where the camera comes nearest to the place as it sees it, off by the noise.
+    """
+    truth, sd = sample.truth, sample.instruments["place"].sd
+    if not truth.places:
+        return None
+    motion = path.motion(np.arange(0.0, path.duration, PASSING_STEP))
+    away = np.array([_offset(sample, motion, np.array(place)) for place in truth.places])
+    distance = np.linalg.norm(away, axis=2)
+    around = distance < 2.0 * truth.place_radius  # until it has left this far behind, it does not pass it again
+    seen = []
+    for k, offset in enumerate(away):
+        for first, last in _stretches(around[k]):
+            if distance[k, first : last + 1].min() < truth.place_radius:
+                missed = np.linalg.norm(offset[first : last + 1] - sample.noise(sd, (2,)), axis=1)
+                seen.append((motion.time[first + int(np.argmin(missed))], k + 1))
+    false = round(len(seen) * truth.false_places / (1.0 - truth.false_places)) if truth.noise else 0
+    elsewhere = np.argwhere(~around)
+    for k, epoch in elsewhere[sample.rng.integers(len(elsewhere), size=false)].tolist():
+        seen.append((motion.time[epoch], k + 1))
+    frame = pd.DataFrame(seen, columns=pd.Index(["time", "place_id"])).drop_duplicates("time")
+    return frame.assign(place_id=frame["place_id"].astype("Int64"))
+
+
+def _offset(sample: _Sampler, motion: Motion, place: Array) -> Array:
+    """Of the camera from a place, north and east, shape (n, 2)."""
+    state = State(motion.R_nb, motion.p_n, motion.v_n, np.zeros((len(motion), 6)), sample.calibration).seeing(place)
+    return sample.instruments["place"].model.predict(state, motion.w_b)[0]
+
+
+def _stretches(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of every stretch of True."""
+    steps = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
+    return list(zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True))
 
 
 def _signals(sample: _Sampler, path: Path) -> pd.DataFrame | None:

@@ -51,7 +51,8 @@ def write_dive(folder: Path, dive: Dive, config: Config, summary: dict[str, Any]
 def write_log(log_frame: pd.DataFrame, path: Path) -> None:
     """Write a log as CSV (compressed where the name ends in .gz), rounded below its noise."""
     decimals = {c: DECIMALS.get(c, DECIMALS.get(c.split("_")[0], 6)) for c in log_frame.columns}
-    decimals.pop("dvl_valid", None)
+    for whole in ("dvl_valid", "place_id"):
+        decimals.pop(whole, None)
     log_frame.round(decimals).to_csv(path, index=False)
 
 
@@ -82,7 +83,7 @@ def figures(dive: Dive) -> dict[str, Any]:
     """Length of the dive and number of measurements of each sensor."""
     log = dive.log_frame
     first = {"imu": "acc_x", "dvl": "dvl_vx", "dvl_heading": "dvl_heading", "mag": "mag_x", "depth": "depth"}
-    first |= {"ahrs": "ahrs_yaw", "fix": "fix_north", "thruster": "thruster_1"}
+    first |= {"ahrs": "ahrs_yaw", "fix": "fix_north", "place": "place_id", "thruster": "thruster_1"}
     counts = {sensor: int(log[c].notna().sum()) for sensor, c in first.items() if c in log}
     moved = dive.truth.p_n.max(axis=0) - dive.truth.p_n.min(axis=0)
     return {

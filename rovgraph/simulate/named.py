@@ -65,7 +65,14 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
 
 def _kinematic(path: Path, config: Config, choices: Choices, seed: int) -> Truth:
     """What the sensors obey in a dive that nothing drives."""
-    truth = Truth(config, noise=choices.noise, outlier_share=choices.outliers, dropouts=choices.dropouts)
+    truth = Truth(
+        config,
+        noise=choices.noise,
+        outlier_share=choices.outliers,
+        dropouts=choices.dropouts,
+        places=choices.places,
+        false_places=choices.false_places,
+    )
     if not choices.disturbances:
         return truth
     return replace(truth, magnetism=Magnetism(iron_near(path, config, np.random.default_rng([seed, 1]))))

@@ -39,6 +39,9 @@ class Truth:
     outlier_share : part of the pings that are wrong
     outlier_size : sd of the error of a wrong ping, every component [m/s]
     dropouts : intervals (from, to) [s] without bottom lock
+    places : north, east [m] of each place that a camera recognises, 1, 2, ... in the log
+    place_radius : how near the camera has to come [m]
+    false_places : part of the sightings that are of another spot
     """
 
     config: Config = field(default_factory=Config)
@@ -60,10 +63,15 @@ class Truth:
     outlier_share: float = 0.0
     outlier_size: float = 0.5
     dropouts: tuple[tuple[float, float], ...] = ()
+    places: tuple[tuple[float, float], ...] = ()
+    place_radius: float = 1.0
+    false_places: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.outlier_share <= 1.0:
             raise InputError(f"share of outliers {self.outlier_share}: between 0 and 1 is expected")
+        if not 0.0 <= self.false_places < 1.0:
+            raise InputError(f"share of false places {self.false_places}: 0 to less than 1 is expected")
         unknown = set(self.calibration) - set(beliefs(self.config))
         if unknown:
             raise InputError(f"unknown calibration variable {min(unknown)}")
