@@ -13,6 +13,7 @@ from rovgraph.check.findings import Finding, Level, Report, Timing
 from rovgraph.check.fixes import track
 from rovgraph.check.frozen_dvl import dvl_frozen_intervals, standstill, without_frozen_pings
 from rovgraph.check.outlook import plan
+from rovgraph.check.places import places
 from rovgraph.check.times import overlap, presence, regularity, timing
 from rovgraph.check.values import angles, bottom_lock, depths, frozen, gravity, magnetic_field, turn_rates
 from rovgraph.config import Config
@@ -37,6 +38,7 @@ CHECKS: tuple[Check, ...] = (
     depths,
     vertical,
     track,
+    places,
     plan,
 )
 

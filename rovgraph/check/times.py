@@ -115,7 +115,7 @@ def _moves(stream: Stream) -> bool:
 
 def _gaps(log: Log, config: Config, t: Timing) -> Iterator[Finding]:
     """Silences of sensors that sample all the time."""
-    if t.sensor == "fix" or t.count < 3:
+    if t.sensor in ("fix", "place") or t.count < 3:
         return
     limit = GAP_PERIODS / t.rate
     periods = np.diff(log[t.sensor].time)

@@ -23,6 +23,7 @@ TELL_S = 2.0  # a ping without bottom lock is not worth an event
 FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
 TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
 LONGEST_STEP_S = 1.0  # of the gyro, over which a turn is reckoned
+OCCASIONAL = {"place"}  # sensors that speak when there is something to be seen
 HEADINGS = {"ahrs", "dvl_heading", "mag"}
 
 
@@ -108,6 +109,8 @@ class Faults:
     def tick(self, time: float) -> None:
         """Note sensors that have said nothing for too long."""
         for sensor, watch in self.watches.items():
+            if sensor in OCCASIONAL:
+                continue
             quiet = time - watch.heard  # what comes late all the time is not silent
             if watch.state != "silent" and quiet > max(SILENT_S, SILENT_PERIODS * watch.period):
                 watch.state = watch.told = "silent"

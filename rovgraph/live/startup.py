@@ -12,7 +12,7 @@ from rovgraph.log.streams import gathered
 
 MARGIN_S = 0.5  # beyond the window, for data that come late
 AGAIN_S = 1.0  # between attempts
-LATER = {"dvl", "depth", "fix"}  # sensors that may have their first measurement later
+LATER = {"dvl", "depth", "fix", "place"}  # sensors that may have their first measurement later
 COMPASSES = {"ahrs", "dvl_heading"}  # these too, where the configuration names its heading sources
 
 

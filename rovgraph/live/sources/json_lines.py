@@ -12,14 +12,14 @@ from rovgraph.live.message import GEODETIC, Message, readings
 from rovgraph.live.sources.lines import LineDecoder, Refused, json_number, json_object, shown
 from rovgraph.live.sources.source import Notify
 from rovgraph.log.reading import ACC_GAP
-from rovgraph.log.streams import LAT_LON, OPTIONAL, STREAMS, is_column
+from rovgraph.log.streams import LABEL, LAT_LON, OPTIONAL, STREAMS, is_column, label_number
 from rovgraph.log.units import factors, near_miss
 
 ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
 UNKNOWN = 20  # unknown keys that are told apart
 
 _SENSOR = {c: sensor for sensor, columns in STREAMS.items() for c in columns if c not in OPTIONAL}
-_SENSOR |= dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl"}
+_SENSOR |= dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
 
 
 def json_lines(url: str, notify: Notify, config: Config) -> LineDecoder:
@@ -78,6 +78,8 @@ class JsonRow:
             name = self._names.get(key, key)
             if not is_column(name):
                 self._report(key)
+            elif name == LABEL and isinstance(value, str):
+                cells[name] = label_number(value)
             elif value is not None:
                 cells[name] = json_number(key, value, self._scale.get(name, 1.0))
         return cells
@@ -120,6 +122,8 @@ def _check(cells: dict[str, float]) -> None:
     """Raise `Refused` for values that are finite and cannot be."""
     if cells.get("dvl_valid", 1.0) not in (0.0, 1.0):
         raise Refused("out of range", f"dvl_valid: {cells['dvl_valid']:g}, expected 0 or 1; the line is skipped")
+    if cells.get("place_sd", 1.0) <= 0.0:
+        raise Refused("out of range", f"place_sd: {cells['place_sd']:g}, expected more than 0; the line is skipped")
     lat, lon = (cells.get(name, 0.0) for name in LAT_LON)
     if abs(lat) > 90.0 or abs(lon) > 360.0:
         raise Refused("out of range", f"latitude {lat:g}, longitude {lon:g}, expected degrees; the line is skipped")
