@@ -56,6 +56,8 @@ def padded(H: Array, size: int) -> Array:
 
 def extended(basis: Array, size: int) -> Array:
     """A change of basis, or a transition, that leaves places alone; shape (size, size)."""
+    if len(basis) == size:
+        return basis
     out = np.eye(size)
     out[: len(basis), : len(basis)] = basis
     return out
