@@ -95,11 +95,7 @@ def _interval(text: str) -> tuple[float, float]:
     """From and to [s] of ``FROM:TO``."""
     from rovgraph.errors import InputError
 
-    begin, _, end = text.partition(":")
-    try:
-        interval = float(begin), float(end)
-    except ValueError:
-        interval = (float("nan"), float("nan"))
+    interval = _pair(text)
     if not 0.0 <= interval[0] < interval[1]:
         raise InputError(f"--dropout {text}: two times in seconds are expected, as 100:130")
     return interval
@@ -107,18 +103,21 @@ def _interval(text: str) -> tuple[float, float]:
 
 def _place(text: str) -> tuple[float, float]:
     """North and east [m] of ``NORTH:EAST``."""
-    from math import isfinite
-
     from rovgraph.errors import InputError
 
-    north, _, east = text.partition(":")
-    try:
-        place = float(north), float(east)
-    except ValueError:
-        place = (float("nan"), float("nan"))
-    if not all(isfinite(x) for x in place):
+    place = _pair(text)
+    if not all(abs(x) < float("inf") for x in place):
         raise InputError(f"--place {text}: north and east in metres are expected, as 10:-5")
     return place
+
+
+def _pair(text: str) -> tuple[float, float]:
+    """Two numbers with a colon between them; not a number where they are none."""
+    first, _, second = text.partition(":")
+    try:
+        return float(first), float(second)
+    except ValueError:
+        return float("nan"), float("nan")
 
 
 def _show(out: Path, scenario: str, seed: int, figures: dict[str, Any], dive: "Dive") -> None:
