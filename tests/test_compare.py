@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from rovgraph.studies.compare import RUN_COLUMNS, compare
 from rovgraph.studies.measures import measures
 from rovgraph.studies.runs import Case, Recorded
 from rovgraph.trajectory import Trajectory
-from rovgraph.workers import in_workers
+from rovgraph.workers import in_workers, starting
 
 ROOT = Path(__file__).parents[1]
 FALCON = ROOT / "configs" / "falcon.yaml"
@@ -350,6 +351,22 @@ def test_results_of_workers_come_in_the_order_of_the_tasks():
 def test_a_worker_that_is_killed_is_one_clear_line():
     with pytest.raises(InputError, match="a worker process was killed"):
         in_workers(os._exit, [1, 1], 2, lambda done: None)
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="interrupts cannot be held back here")
+def test_an_interrupt_that_another_thread_takes_waits_until_processes_have_started():
+    through, over = False, threading.Event()
+    other = threading.Thread(target=over.wait)
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt), starting():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.2)
+            through = True
+    finally:
+        over.set()
+        other.join()
+    assert through
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes by /proc")
