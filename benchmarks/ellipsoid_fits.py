@@ -1,6 +1,6 @@
 """Our ellipsoid fit beside navlib's, on magnetometer samples in a CSV with columns mx, my, mz.
 
-    pip install navlib
+    pip install 'rovgraph[benchmarks]'
     python benchmarks/ellipsoid_fits.py samples.csv
 
 Prints for each fit its centre, the scatter of the field's length and the time it took.
