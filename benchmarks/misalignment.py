@@ -27,7 +27,7 @@ from rovgraph.config import Config, load_config, mount_matrix
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.evaluate import read_reference
-from rovgraph.geometry import Array, matrix_from_rpy, rotate, rpy_from_matrix, transpose
+from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, rotate, rpy_from_matrix, transpose
 from rovgraph.log import Log, Stream, log_from_frame, read_log
 from rovgraph.simulate import Dive, Truth, scenario, simulate
 from rovgraph.simulate.files import known
@@ -41,8 +41,8 @@ WIDE = {"dvl_roll": 25.0, "dvl_pitch": 25.0, "dvl_yaw": 180.0}  # sd of our prio
 SPEED, FIX_SD_M, FIX_INTERVAL_S = 0.4, 1.0, 5.0
 TILT_SD_DEG, LARGEST_DEG = 2.0, 45.0
 GOLDEN = 0.618034
-AT_REST_S = 8.0  # every simulated dive begins so
 RATE = 20.0  # of signals for navlib [Hz]
+SLOW = 2.0  # rate of signals in cutoffs, for its optimiser, which takes minutes at the other rate
 CUTOFF = 0.1  # of the ping rate, navlib's own choice
 
 
@@ -59,6 +59,8 @@ class Signals:
     - It differentiates backwards, half an interval late: signals are interpolated to `RATE` first.
     - It filters each signal to a tenth of the signal's own rate: all are filtered to a tenth of the ping
       rate instead, so that the same motion is left in each.
+    - With fixes it multiplies the angular rate by the position, and a gyro's bias by tens of metres: it is
+      given the rate of the attitude itself.
     - It knows one lever arm: depth is moved to the DVL's place, or to the antenna's, by the attitude.
 
     Attributes
@@ -104,40 +106,63 @@ class Signals:
         return np.asarray(cal_dvl_acc_so3(time, time, time, *signals, **options))
 
     def with_fixes(self) -> Array:
-        """R_bs by `cal_dvl_jck_so3`; its method svd has the optimum of its method min in closed form."""
+        """R_bs by `cal_dvl_jck_so3`.
+
+        Its method svd has the optimum of its method min in closed form, and at once; but where a reflection
+        fits better than any rotation it returns that, or what becomes of it as a rotation.
+        """
+        R_bs = self._jck("svd", RATE, force_so3=False)
+        return R_bs if np.linalg.det(R_bs) > 0.0 else self._jck("min", SLOW * self._cutoff)
+
+    def _jck(self, method: str, rate: float, **more: bool) -> Array:
         from navlib.cal import cal_dvl_jck_so3
 
         dvl, antenna = (np.asarray(s.lever_arm_m) for s in (self.config.dvl, self.config.fix))
-        time = self._grid(self.imu_time, self.dvl_time, self.depth_time, self.fix_time)
+        time = self._grid(self.imu_time, self.dvl_time, self.depth_time, self.fix_time, rate=rate)
         down = np.interp(time, self.depth_time, self._depth_of(self.config.fix.lever_arm_m))
         position = np.column_stack([_interpolated(time, self.fix_time, self.fix_n), down])
+        rpy = self._at(time, self.imu_time, self._rpy)
         signals = (
             self._at(time, self.dvl_time, self.velocity_s),
-            self._at(time, self.imu_time, self._rpy),
-            self._at(time, self.imu_time, self.rate_b),
+            rpy,
+            _rate(matrix_from_rpy(rpy), rate),
             position - position.mean(axis=0),
         )
-        options = {"low_pass_filter": False, "lever_arm": dvl - antenna, "method": "svd", "zero_mean_equation": True}
-        return np.asarray(cal_dvl_jck_so3(time, time, time, *signals, **options))
+        np.random.seed(0)  # noqa: NPY002 of the optimiser, which begins anywhere
+        options = {"low_pass_filter": False, "lever_arm": dvl - antenna, "method": method, "zero_mean_equation": True}
+        return np.asarray(cal_dvl_jck_so3(time, time, time, *signals, **options, **more))
+
+    @property
+    def _cutoff(self) -> float:
+        """Of the filter [Hz]."""
+        return CUTOFF / float(np.median(np.diff(self.dvl_time)))
 
     @property
     def _rpy(self) -> Array:
         return np.unwrap(rpy_from_matrix(self.R_nb), axis=0)
 
-    def _grid(self, *times: Array) -> Array:
+    def _grid(self, *times: Array, rate: float = RATE) -> Array:
         """Epochs that all signals have."""
-        return np.arange(max(t[0] for t in times), min(t[-1] for t in times), 1.0 / RATE)
+        return np.arange(max(t[0] for t in times), min(t[-1] for t in times), 1.0 / rate)
 
     def _at(self, time: Array, own: Array, values: Array) -> Array:
         """A signal without what is faster than the cutoff, at other times."""
-        rate, cutoff = (factor / float(np.median(np.diff(t))) for factor, t in ((1.0, own), (CUTOFF, self.dvl_time)))
-        if rate > RATE:  # filtered first: interpolation would fold its noise down
-            return _interpolated(time, own, _low_pass(values, cutoff, rate))
-        return _low_pass(_interpolated(time, own, values), cutoff, RATE)
+        rate = 1.0 / float(np.median(np.diff(own)))
+        if rate <= 2.0 * RATE:  # finer and even, for the filter
+            fine = np.arange(own[0], own[-1], 0.5 / RATE)
+            own, values, rate = fine, _interpolated(fine, own, values), 2.0 * RATE
+        return _interpolated(time, own, _low_pass(values, self._cutoff, rate))
 
     def _depth_of(self, lever_arm_m: Sequence[float]) -> Array:
         arm = np.subtract(lever_arm_m, self.config.depth.lever_arm_m)
         return self.depth + rotate(self.attitude.at(self.depth_time).R_nb, arm)[:, 2]
+
+
+def _rate(R_nb: Array, rate: float) -> Array:
+    """Angular rate of attitudes that come at a rate, body axes."""
+    at = np.arange(len(R_nb))
+    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, len(at) - 1)
+    return log_rotation(transpose(R_nb[before]) @ R_nb[after]) * (rate / (after - before))[:, None]
 
 
 def _low_pass(values: Array, cutoff: float, rate: float) -> Array:
@@ -149,21 +174,19 @@ def _interpolated(time: Array, own: Array, values: Array) -> Array:
     return np.column_stack([np.interp(time, own, column) for column in values.T])
 
 
-def signals(log: Log, config: Config, attitude: Trajectory, bias: Array | None) -> Signals:
+def signals(log: Log, config: Config, attitude: Trajectory, bias: Array) -> Signals:
     """What navlib is given.
 
     Parameters
     ----------
     log, config : the dive; lever arms and limits of the sensors
     attitude : of which only R_nb is used
-    bias : of accelerometer and gyro in body axes, shape (6,) or (n, 6); None = the gyro's as at rest
+    bias : of accelerometer and gyro in body axes, shape (6,) or (n, 6)
     """
     imu, dvl, depth, fix = (log.streams.get(name) for name in ("imu", "dvl", "depth", "fix"))
     assert imu is not None and dvl is not None and depth is not None
     R_bs = mount_matrix(config.imu.mount_rpy_deg)
     force, rate = rotate(R_bs, imu.data[:, :3]), rotate(R_bs, imu.data[:, 3:6])
-    if bias is None:
-        bias = np.append(np.zeros(3), rate[imu.time < imu.time[0] + AT_REST_S].mean(axis=0))
     good = (dvl["dvl_valid"] != 0) & (np.linalg.norm(dvl.data[:, :3], axis=1) <= config.dvl.max_speed_mps)
     return Signals(
         imu.time,
@@ -182,12 +205,16 @@ def signals(log: Log, config: Config, attitude: Trajectory, bias: Array | None) 
 
 
 def from_ahrs(log: Log, config: Config) -> Signals:
-    """With the attitude that the inertial unit gives, and the gyro's bias at rest."""
-    ahrs = log["ahrs"]
+    """With the attitude that the inertial unit gives, and without what the gyro turns further than that."""
+    ahrs, imu = log["ahrs"], log["imu"]
     rpy = np.column_stack([ahrs[f"ahrs_{name}"] for name in ("roll", "pitch", "yaw")])
-    R_nb = matrix_from_rpy(rpy) @ mount_matrix(config.imu.mount_rpy_deg).T
+    R_nm = mount_matrix((0.0, 0.0, config.environment.declination_deg))  # its north is magnetic
+    R_nb = R_nm @ matrix_from_rpy(rpy) @ mount_matrix(config.imu.mount_rpy_deg).T
+    turned = log_rotation(transpose(R_nb[:-1]) @ R_nb[1:]).sum(axis=0) / (ahrs.time[-1] - ahrs.time[0])
+    bias = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:6].mean(axis=0)) - turned
     nothing = np.zeros((len(ahrs), 3))
-    return signals(log, config, Trajectory.certain(ahrs.time, nothing, R_nb, nothing), None)
+    attitude = Trajectory.certain(ahrs.time, nothing, R_nb, nothing)
+    return signals(log, config, attitude, np.append(np.zeros(3), bias))
 
 
 def from_estimate(log: Log, config: Config, estimate: Estimate) -> Signals:
@@ -374,16 +401,21 @@ def recorded(folder: Path) -> str:
                 ours = estimate
         for what, signal in (("AHRS", from_ahrs(given, config)), ("our attitude", from_estimate(given, config, ours))):
             R_bs = signal.with_fixes() if fixes else signal.without_fixes()
-            cells.setdefault((f"navlib, {what}", with_or), []).append(f"{_yaw_deg(R_bs, config):.1f}")
+            cells.setdefault((f"navlib, {what}", with_or), []).append(f"{_yaw_deg(R_bs, signal):.1f}")
     lines = ["| method | fixes | " + " | ".join(parts) + " |", "|---|---|" + "---|" * len(parts)]
     lines += ["| " + " | ".join([*key, *values]) + " |" for key, values in cells.items()]
     return "\n".join(lines)
 
 
-def _yaw_deg(R_bs: Array, config: Config) -> float:
-    """Yaw of a mounting that is turned by its nominal roll and pitch, and by little more."""
-    roll, pitch, _ = config.dvl.mount_rpy_deg
-    return float(error_deg(R_bs, mount_matrix((roll, pitch, 0.0)))["yaw"])
+def _yaw_deg(R_bs: Array, signals: Signals) -> float:
+    """Yaw of a mounting beyond its nominal roll and pitch, of the way that the vehicle went most.
+
+    A turn about that way is not shown by fixes, and must not pass for yaw.
+    """
+    roll, pitch, _ = signals.config.dvl.mount_rpy_deg
+    way_s = signals.velocity_s.mean(axis=0)
+    (x, y, _), (nominal_x, nominal_y, _) = R_bs @ way_s, mount_matrix((roll, pitch, 0.0)) @ way_s
+    return float(np.rad2deg(np.arctan2(nominal_x * y - nominal_y * x, nominal_x * x + nominal_y * y)))
 
 
 def _estimated_yaw(estimate: Estimate) -> str:
