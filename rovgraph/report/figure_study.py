@@ -1,6 +1,7 @@
 """Figures of a study of the misalignment: error against time, coverage, and sd by manoeuvre and inertial unit."""
 
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -8,13 +9,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rovgraph.report.study import labels
+from rovgraph.report.study import labels, unless_said
 from rovgraph.report.style import WIDTH, legend_below, new_figure, save, style
 from rovgraph.studies.misalignment import Tables
 
 HONEST, DISHONEST, PREDICTED = "#0072B2", "#D55E00", "#009E73"
 MOST_PANELS, MOST_BARS, COLUMNS = 12, 60, 3
 TO_95 = 1.96  # sd
+TITLE_WIDTH = 40  # of a panel, letters
 SETTLED = 0.2  # of the dive; the error may leave its panel before
 
 
@@ -54,7 +56,7 @@ def draw_error(tables: Tables) -> Figure | None:
     panels = list(figure.subplots(lines, columns, squeeze=False).flat)
     for i, (axes, cell) in enumerate(zip(panels, chosen, strict=False)):
         _error_panel(axes, tables.history[tables.history["cell"] == cell])
-        axes.set_title(names[cell], loc="left", fontsize=7, pad=3)
+        axes.set_title(fill(names[cell], TITLE_WIDTH), loc="left", fontsize=7, pad=3)
         if i % columns == 0:
             axes.set_ylabel("error [deg]")
         if i >= len(chosen) - columns:
@@ -62,7 +64,13 @@ def draw_error(tables: Tables) -> Figure | None:
     for axes in panels[len(chosen) :]:
         axes.remove()
     legend_below(figure, panels[: len(chosen)], 3)
+    _say_the_rest(figure, tables)
     return figure
+
+
+def _say_the_rest(figure: Figure, tables: Tables) -> None:
+    if told := unless_said(tables):
+        figure.suptitle(fill(told, 130), x=0.01, ha="left", fontsize=7)
 
 
 def _error_panel(axes: Axes, rows: pd.DataFrame) -> None:
@@ -96,13 +104,15 @@ def draw_coverage(tables: Tables) -> Figure:
     axes.set_yticks(range(len(known)), [names[int(i)] for i in known.index], fontsize=7)
     axes.set_ylim(len(known) - 0.4, -0.6)
     axes.set_xlim(0.0, 101.0)
-    axes.set_xlabel("runs within their 95 % interval [%], with 95 % binomial interval")
+    axes.set_xlabel("runs within their 95 % interval [%]")
+    _say_the_rest(figure, tables)
     return figure
 
 
 def draw_sd(cells: pd.DataFrame) -> Figure:
     """Predicted sd, median over the other parameters, by manoeuvre and inertial unit; a panel per heading error."""
-    errors = list(dict.fromkeys(cells["heading_error"]))
+    several = cells.groupby("heading_error", sort=False)["manoeuvre"].nunique()
+    errors = list(several.index[several > 0.5 * several.max()])  # where the comparison is worth a panel
     manoeuvres, grades = (list(dict.fromkeys(cells[name])) for name in ("manoeuvre", "imu"))
     tables = [_grid(cells[cells["heading_error"] == e], manoeuvres, grades) for e in errors]
     seen = np.concatenate([t[np.isfinite(t)] for t in tables])

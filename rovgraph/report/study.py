@@ -49,9 +49,30 @@ def write_study(folder: Path, tables: Tables, about: Mapping[str, Any]) -> None:
 
 
 def labels(tables: Tables) -> list[str]:
-    """What tells each row of ``cells`` from the others."""
-    varied = tables.study.varied()
-    return [", ".join(_said(name, row[name]) for name in varied) or "all" for _, row in tables.cells.iterrows()]
+    """What tells each row of ``cells`` from the others: the grid's parameters, and others where they are unusual."""
+    usual = _usual(tables)
+    return [
+        ", ".join(
+            said for name in tables.study.varied() if (said := _said(name, row[name])) != usual.get(name)
+        ) or "as usual"
+        for _, row in tables.cells.iterrows()
+    ]  # fmt: skip
+
+
+def unless_said(tables: Tables) -> str:
+    """What `labels` leave out; empty where that is nothing."""
+    usual = _usual(tables)
+    return "unless said: " + ", ".join(usual.values()) if usual else ""
+
+
+def _usual(tables: Tables) -> dict[str, str]:
+    """What most cells have, of the parameters that differ and are not in the grid."""
+    usual = {}
+    for name in tables.study.varied():
+        said = tables.cells[name].map(lambda value, name=name: _said(name, value)).value_counts()
+        if name not in tables.study.grid.model_fields_set and said.iloc[0] > len(tables.cells) / 2:
+            usual[name] = str(said.index[0])
+    return usual
 
 
 def _said(name: str, value: object) -> str:
@@ -87,6 +108,7 @@ def study_table(tables: Tables) -> Table:
         "coverage: share of runs whose 95 % interval holds the truth, with the 95 % interval of that share. bias, sd: "
         "of the error. predicted: sd that the estimator says, median. NEES: 1 where honest, ↑↓ outside its 95 % band"
         + (f"; {beyond} more cells are in cells.csv" if beyond > 0 else "")
+        + (f"; {escape(told)}" if (told := unless_said(tables)) else "")
     )
     return table
 
