@@ -76,6 +76,19 @@ def test_a_ping_three_seconds_late_is_used_at_its_own_time(beginning, measuremen
     same(live(beginning, order)[1], reference.filtered, 1e-9)
 
 
+def test_pings_that_are_found_to_be_late_are_put_where_they_belong_from_then_on():
+    """As the filter of a recorded dive does it, so nothing but the IMU's last tenth of a second lies between."""
+    offset = {"dvl_time_offset": np.array([0.1])}
+    config = falcon(calibration={"dvl_time_offset": {"estimate": True, "sd": 0.1}})
+    case = simulated(config, 40.0, seed=6, dvl_rate=3.0, calibration=offset)
+    beginning = initialise(case.log, case.config)
+    engine, known = live(beginning, list(case.log.measurements()))
+    recorded = fed(ErrorStateFilter(beginning), case.log)
+    same(known, recorded.filtered, 1e-12)
+    assert engine._assembler.stamps.off(known[-1].state.calibration) < 0.02
+    assert abs(known[-1].state.calibration["dvl_time_offset"][0] - 0.1) < 0.02
+
+
 def test_what_is_later_than_the_lag_or_repeated_is_left_out_and_said(beginning, measurements):
     engine = FixedLag(beginning, LAG, HOLD)
     cut = next(k for k, m in enumerate(measurements) if m.time > 15.0)

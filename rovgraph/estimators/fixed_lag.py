@@ -208,11 +208,16 @@ class FixedLag:
         """Take intervals that are complete, and forget what the lag has passed."""
         if not intervals:
             return
-        assembler, taken = self._assembler.copy(), self._forgotten + self._taken
+        known = self.marks[-1].known if self.marks else None
+        taken, passed = self._forgotten + self._taken, []
         for interval in intervals:
-            known = self.marks[-1].known if self.marks else None
             passage = self.recursion.through(interval, known, self._gates)
-            self.marks.append(Mark(interval, passage.filtered, dict(self._gates), passage.used, assembler, taken))
+            known = passage.filtered
+            passed.append((interval, known, dict(self._gates), passage.used))
+        assert known is not None
+        self._assembler.stamps.assume(known.state.calibration)
+        assembler = self._assembler.copy()
+        self.marks += [Mark(*one, assembler, taken) for one in passed]
         while self.marks[0].interval.time < self.marks[-1].interval.time - self.lag_s:
             self.passed(self.marks.popleft())
         if self._settled > len(self._record) // 2:
