@@ -95,6 +95,8 @@ def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "
     return offset, deviation
 
 
+MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")  # of the DVL's axes in the body's
+
 TABLE: dict[str, Variable] = {
     v.name: v
     for v in (

@@ -10,7 +10,7 @@ two degrees of freedom (mean 2) for an honest P.
 """
 
 import warnings
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,7 @@ def evaluate(trajectory: Trajectory, reference: Trajectory, start: float = 0.0, 
             f"the reference ({_span(reference)}) has {len(common)} epochs within the trajectory "
             f"({_span(trajectory)}) from {first:.1f} s on, at least 2 are needed; are both on the same clock?"
         )
-    truth = _pick(reference, common)
+    truth = reference.take(common)
     estimate = trajectory.at(truth.time)
     removed: dict[str, Any] = {}
     if align:
@@ -107,10 +107,6 @@ def evaluate(trajectory: Trajectory, reference: Trajectory, start: float = 0.0, 
 
 def _span(trajectory: Trajectory) -> str:
     return f"{trajectory.time[0]:.1f} to {trajectory.time[-1]:.1f} s"
-
-
-def _pick(trajectory: Trajectory, index: Any) -> Trajectory:
-    return Trajectory(*(getattr(trajectory, f.name)[index] for f in fields(trajectory)))
 
 
 def _rms(x: Array) -> float:

@@ -200,6 +200,14 @@ def log_rotation(R: ArrayLike) -> Array:
     return np.asarray(rotvec.reshape(R.shape[:-1]), dtype=float)
 
 
+def earth_rate_n(latitude: float) -> Array:
+    """Angular rate of the Earth in n [rad/s], shape (3,); latitude in radians."""
+    return _EARTH_RATE * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
+
+
+_EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
+
+
 def transpose(R: Array) -> Array:
     """Transpose of the last two axes."""
     return np.swapaxes(R, -1, -2)

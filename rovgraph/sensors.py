@@ -30,10 +30,9 @@ from typing import Protocol
 
 import numpy as np
 
+from rovgraph.calibration import MOUNT
 from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose, wrap_angle
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
-
-_MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 
 
 class SensorModel(Protocol):
@@ -95,7 +94,7 @@ def dvl_mount(state: State) -> tuple[Array, Array]:
     axes : ndarray, shape (n, 3, 3), a column each for roll, pitch, yaw
     """
     rpy, axes = np.empty((len(state), 3)), np.zeros((len(state), 3, 3))
-    for k, name in enumerate(_MOUNT):
+    for k, name in enumerate(MOUNT):
         rpy[:, k] = state.calibration[name][..., 0]
     R_bs, yaw = matrix_from_rpy(rpy), rpy[:, 2]
     axes[:, :, 0] = R_bs[:, :, 0]
@@ -142,7 +141,7 @@ class DvlVelocity:
         bias[..., 3:] = R_sb @ arm
         z, by_angle = rotate(R_sb, v_b), R_sb @ skew(v_b) @ axes
         H = {POSE: pose, VELOCITY: R_sb @ R_bn, BIAS: bias, "dvl_lever_arm": R_sb @ skew(w)}
-        H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(_MOUNT)}
+        H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(MOUNT)}
         H["dvl_scale"] = (z / gain)[..., None]
         if self.sensor == "dvl_water":
             H["current"] = -H[VELOCITY][..., :2]
@@ -203,7 +202,7 @@ class CompassHeading:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        mount = _MOUNT if self.sensor == "dvl_heading" else ()
+        mount = MOUNT if self.sensor == "dvl_heading" else ()
         return (self.offset, self.curve, *mount)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
@@ -219,7 +218,7 @@ class CompassHeading:
         H = {POSE: pose, self.offset: np.ones((n, 1, 1)), self.curve: sine_cosine[:, None, :]}
         if axes is not None:
             by_angle = pose[..., :3] @ axes
-            H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(_MOUNT)}
+            H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(MOUNT)}
         return wrap_angle(heading + deviation)[:, None], H
 
 

@@ -189,6 +189,9 @@ def read_table(path: Path | str) -> pd.DataFrame:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(f"{path}: cannot be read as CSV ({reason})") from None
     table.columns = table.columns.str.strip()
+    twice = table.columns[table.columns.duplicated()]
+    if len(twice):
+        raise InputError(f"{path}: column {twice[0]} stands there twice")
     missing = [c for c in ("time", "north", "east") if c not in table]
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing, a trajectory has time, north, east")

@@ -315,7 +315,7 @@ def without_priors(problem: Problem, of: set[int]) -> Problem:
         factor = problem.native.at(k)
         if not (len(factor.keys()) == 1 and factor.keys()[0] in of):
             native.add(factor)
-    return Problem(native, problem.blocks, problem.segment, problem.unknowns)
+    return Problem(native, problem.blocks, problem.segment, problem.time, problem.unknowns)
 
 
 def complaint(problem: Problem, values: gtsam.Values, of: set[int]) -> str:

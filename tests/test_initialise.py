@@ -262,7 +262,8 @@ def test_the_start_is_the_first_fix_unless_it_is_given():
     first = case.log["fix"].data[0, :2]
     b = initialise(case.log, free)
     np.testing.assert_allclose([b.config.start.north_m, b.config.start.east_m], first)
-    assert (b.start.p_sd >= free.fix.sd_m).all()
+    assert (b.start.p_sd[:2] >= free.fix.sd_m).all()
+    assert b.start.p_sd[2] == free.start.position_sd_m
     assert any("start position from the first fix" in line for line in b.assumptions)
     given = initialise(case.log, changed(case.config, start={"north_m": 3.0}))
     assert given.config.start.north_m == 3.0

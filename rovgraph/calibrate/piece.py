@@ -1,24 +1,16 @@
 """A piece of configuration: the keys that a calibration found, as YAML and within a whole configuration."""
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ruamel.yaml import YAML
-
-from rovgraph.config import Config
+from rovgraph.config import Config, yaml_text
 
 Piece = Mapping[str, Any]
 
 
 def piece_yaml(piece: Piece, remarks: Sequence[str]) -> str:
     """A piece as YAML that is a configuration by itself, under remarks."""
-    stream = io.StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style, yaml.width = None, 4096
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-    yaml.dump(dict(piece), stream)
-    return "".join(f"# {line}\n" for line in remarks) + stream.getvalue()
+    return "".join(f"# {line}\n" for line in remarks) + yaml_text(dict(piece))
 
 
 def with_piece(config: Config, piece: Piece) -> Config:

@@ -1,6 +1,6 @@
 """The console script: registers the commands and turns bad input into one line.
 
-Exit codes: 0 done, 2 bad input, 130 interrupted.
+Exit codes: 0 done, 2 bad input, 130 interrupted (typer's).
 """
 
 import sys
@@ -49,6 +49,3 @@ def main() -> None:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted, nothing was written", file=sys.stderr)
-        sys.exit(130)

@@ -18,7 +18,7 @@ def evaluate(
 ) -> None:
     """Compare a trajectory with a reference.
 
-    Example: rovgraph evaluate results/smoothed.csv data/falcon/truth.csv.gz
+    Example: rovgraph evaluate results/trajectory_smoothed.csv data/falcon/truth.csv.gz
     """
     import json
 

@@ -59,7 +59,8 @@ def simulate(
 ) -> None:
     """Simulate a dive: log.csv, the truth, and the configuration an estimator may know.
 
-    What the configuration says to estimate (calibration, biases) is drawn from its priors.
+    Of motions as such, what the configuration says to estimate is drawn from its priors; the world
+    of a driven scenario is its own (docs/simulation.md).
 
     Example: rovgraph simulate vattern --seed 7 --out dive
     """

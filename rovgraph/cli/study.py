@@ -40,6 +40,7 @@ def misalignment(
     from rovgraph.studies.engines import Cluster, Local
     from rovgraph.studies.misalignment import chosen, open_results, read_study
     from rovgraph.studies.misalignment import study as library
+    from rovgraph.studies.misalignment.ledger import kept_so_far
 
     console = Console()
     if not console.is_terminal:
@@ -62,8 +63,9 @@ def misalignment(
     except KeyboardInterrupt:
         console.print(f"interrupted; {out} keeps every run that was made, --resume goes on", highlight=False)
         raise typer.Exit(130) from None
-    write_study(out, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
-    draw_study(out, tables)
+    with kept_so_far(out):  # its rows are on disk already
+        write_study(out, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
+        draw_study(out, tables)
     console.print(study_table(tables))
     for row in tables.runs.dropna(subset="failure").drop_duplicates("cell").itertuples():
         console.print(f"{row.cell} failed in run {row.run}: {row.failure}", highlight=False, markup=False)

@@ -5,10 +5,8 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, create_model
 
-from rovgraph.calibration import TABLE, Variable
+from rovgraph.calibration import MOUNT, TABLE, Variable
 from rovgraph.config.sections import NotNegative, Positive, Section
-
-MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 
 
 def _calibration_entry(variable: Variable) -> type[BaseModel]:

@@ -11,8 +11,8 @@ from pydantic import BaseModel, Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rovgraph.calibration import TABLE, Belief
-from rovgraph.config.priors import MOUNT, Calibration
+from rovgraph.calibration import MOUNT, TABLE, Belief
+from rovgraph.config.priors import Calibration
 from rovgraph.config.sections import (
     Depth,
     Dvl,
@@ -135,10 +135,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     try:
         data = YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
+    except (YAMLError, ValueError) as error:  # ValueError: a date or a number that is none
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
-        problem = str(getattr(error, "problem", None) or "cannot be parsed").splitlines()[0]
+        problem = str(getattr(error, "problem", None) or error or "cannot be parsed").splitlines()[0]
         raise InputError(f"{source}{where}: no valid YAML ({problem})") from None
     if data is None:
         return {}

@@ -35,7 +35,8 @@ class Start(Section):
     heading_deg: float | None = Field(None, description="heading; null = first heading samples")
     roll_deg: float | None = Field(None, description="roll; null = gravity")
     pitch_deg: float | None = Field(None, description="pitch; null = gravity")
-    position_sd_m: Positive = Field(0.1, description="sd of the start's north, east and down")
+    position_sd_m: Positive = Field(0.1, description="sd of the start's north and east")
+    down_sd_m: Positive | None = Field(None, description="sd of the start's down; null = position_sd_m")
     heading_sd_deg: Positive = Field(5.0, description="sd of the start's heading")
     tilt_sd_deg: Positive = Field(2.0, description="sd of the start's roll and pitch, where it begins at rest")
 

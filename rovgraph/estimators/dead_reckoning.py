@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.config import Config
 from rovgraph.estimators.initialise import Beginning, trusted_first, yaw_correction
-from rovgraph.geometry import Array, cross, exp_rotation, wrap_angle
+from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
 from rovgraph.graph.assembly import Interval
 from rovgraph.sensors import dvl_mount
 from rovgraph.state import State
@@ -48,7 +47,7 @@ def dead_reckon(intervals: Sequence[Interval], beginning: Beginning, calibration
     time = np.array([i.time for i in intervals])
     step = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(time)[:, None]
     p_n = start.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
-    p_n[:, 2] = _depths(intervals, p_n[:, 2], beginning.config)
+    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb, beginning, float(calibration["depth_offset"][0]))
     return State(R_nb, p_n, v_n, np.array(biases), dict(calibration))
 
 
@@ -104,10 +103,14 @@ def _velocities(
     return np.column_stack([np.interp(time, time[index], column) for column in v_n.T])
 
 
-def _depths(intervals: Sequence[Interval], integrated: Array, config: Config) -> Array:
-    """Depth from the pressure sensor where there is one."""
+def _depths(
+    intervals: Sequence[Interval], integrated: Array, R_nb: Array, beginning: Beginning, offset: float
+) -> Array:
+    """Depth of the IMU from the pressure sensor, where there is one."""
     found = [(a.time, a.z[0]) for i in intervals for a in i.attached if a.sensor == "depth"]
     if not found:
         return integrated
     time, depth = np.array(found).T
-    return np.asarray(np.interp([i.time for i in intervals], time, depth))
+    arm = beginning.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
+    own = np.interp([i.time for i in intervals], time, depth) - offset
+    return np.asarray(own - rotate(R_nb, arm)[:, 2])

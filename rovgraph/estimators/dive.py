@@ -118,4 +118,5 @@ def run(intervals: Sequence[Interval], beginning: Beginning, progress: Progress 
         estimator.step(interval)
         if interval.index % PROGRESS_EVERY == 0:
             progress("incremental smoothing", interval.index / len(intervals))
+    estimator.update()
     return estimator

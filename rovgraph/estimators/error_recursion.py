@@ -332,7 +332,8 @@ class ErrorStateRecursion:
         Parameters
         ----------
         before : the estimate
-        delta, P : ndarray, shapes (size + 2 m,) and (size + 2 m, size + 2 m), the correction and the covariance after it
+        delta : ndarray, shape (size + 2 m,), the correction
+        P : ndarray, shape (size + 2 m, size + 2 m), the covariance after it
         plain : of `ErrorVector.retract`
         """
         size = self.error.size

@@ -55,6 +55,7 @@ class IncrementalEstimator:
         self.intervals: list[Interval] = []
         self._filter: ErrorStateFilter | None = None
         self._places: set[int] = set()  # that iSAM2 knows
+        self._begun = 0.0  # when the newest segment began [s]
         self.updated = -1
 
     def add(self, measurement: Measurement) -> list[Interval]:
@@ -87,8 +88,9 @@ class IncrementalEstimator:
         factors = motion(interval, self.unknowns) if self.intervals else priors(b.start, self.beliefs, self.unknowns)
         values = state_values(interval.index, known.state)
         if not self.intervals or segment > self.intervals[-1].segment:
-            factors += drift(self.unknowns, segment, b.config.graph.segment_s)
+            factors += drift(self.unknowns, segment, interval.time - self._begun)
             insert_calibration(values, known.state.calibration, self.unknowns, segment)
+            self._begun = interval.time
         for one in used:
             sighting = one.attached.sighting
             if one.weight > 0.0 or sighting is not None:  # a place that fits none of its name is one by itself

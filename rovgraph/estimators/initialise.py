@@ -15,6 +15,7 @@ from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy, rotate, rpy_from_matrix
 from rovgraph.graph.factors import Start
+from rovgraph.graph.noise_floor import NOISIER
 from rovgraph.graph.preintegration import scatter
 from rovgraph.instruments import Instrument, heading_sources, instruments
 from rovgraph.log import Log
@@ -27,9 +28,9 @@ STILL_GYR_SD = 3e-3  # a vehicle that looks still may turn this much [rad/s]
 MOVING_TILT_SD = np.deg2rad(5.0)
 UNKNOWN_HEADING_SD = np.deg2rad(20.0)  # the samples themselves enter as factors
 START_VELOCITY_SD = 1.0
+FIRST_FIX_SD = 5.0  # the fix enters by itself, too, and the vehicle may have moved before it [m]
 HEADING_WITHIN_S = 30.0
 ENOUGH_SAMPLES = 100
-NOISIER = 1.25  # times the believed density, before the log's own is taken
 
 
 @dataclass(frozen=True)
@@ -111,14 +112,16 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Begi
             "north_m": float(p_n[0]),
             "east_m": float(p_n[1]),
             "down_m": float(p_n[2]),
-            "position_sd_m": float(p_sd),
+            "position_sd_m": float(p_sd[0]),
+            "down_sd_m": float(p_sd[2]),
+            "tilt_sd_deg": float(np.rad2deg(rpy_sd[0])),
             "heading_sd_deg": float(np.rad2deg(rpy_sd[2])),
         }
     )
     config = config.model_copy(update={"start": filled})
     at_imu = p_n + R_nb @ np.asarray(config.imu.lever_arm_m)
     state = State(R_nb[None], at_imu[None], np.zeros((1, 3)), bias[None])
-    prior = Start(state, rpy_sd, np.full(3, p_sd), np.full(3, START_VELOCITY_SD), bias_sd)
+    prior = Start(state, rpy_sd, p_sd, np.full(3, START_VELOCITY_SD), bias_sd)
     return Beginning(config, sensors, prior, assumptions)
 
 
@@ -311,9 +314,10 @@ def _bias(config: Config, gyr_mean: Array, quiet: bool, seconds: float, assumpti
     return bias, sd
 
 
-def _position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, float]:
-    """Position of the body's origin at the first epoch, and its sd."""
-    start, sd = config.start, config.start.position_sd_m
+def _position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, Array]:
+    """Position of the body's origin at the first epoch, and its sd, shapes (3,)."""
+    start = config.start
+    sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
     p_n = np.array([start.north_m, start.east_m, 0.0 if start.down_m is None else start.down_m])
     given = start.model_fields_set & {"north_m", "east_m"}
     if "fix" in log and not given:
@@ -322,7 +326,8 @@ def _position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> 
         if first < len(fix) and fix.time[first] <= begin + HEADING_WITHIN_S:
             own = fix["fix_sd"][first]
             p_n[:2] = fix.data[first, :2]
-            sd = max(sd, float(own) if np.isfinite(own) else config.fix.sd_m, WINDOW_S)
+            p_n[:2] -= rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
+            sd[:2] = np.maximum(sd[:2], max(float(own) if np.isfinite(own) else config.fix.sd_m, FIRST_FIX_SD))
             assumptions.append(f"start position from the first fix, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
     if start.down_m is None and "depth" in log:
         p_n[2] = log["depth"].data[0, 0] - float(rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2])

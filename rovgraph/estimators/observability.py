@@ -55,20 +55,20 @@ def relative_covariance(information: Array) -> Array:
     return np.asarray(np.linalg.inv(np.eye(information.shape[-1]) + information))
 
 
-def prior_sd(problem: Problem, beliefs: Mapping[str, Belief], segment: int, segment_s: float) -> dict[str, Array]:
+def prior_sd(problem: Problem, beliefs: Mapping[str, Belief], segment: int) -> dict[str, Array]:
     """sd of the estimated calibration before any data; what walks has walked to a segment.
 
     Parameters
     ----------
     problem, beliefs : of the dive
-    segment, segment_s : of time, and its length [s]
+    segment : of time
 
     Returns
     -------
     dict : name -> ndarray, shape (dim,)
     """
     return {
-        name: np.full(TABLE[name].dim, np.hypot(beliefs[name].sd, walk * np.sqrt(segment * segment_s)))
+        name: np.full(TABLE[name].dim, np.hypot(beliefs[name].sd, walk * np.sqrt(problem.walked(segment))))
         for name, walk in problem.unknowns.walks.items()
     }
 

@@ -21,12 +21,12 @@ from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement
 from rovgraph.workers import companion
 
-DUE_LATER, DUE_AFTER_S = 0.4, 5.0  # a renewal is due this part of its time later, and this much more
+DUE_LATER = 0.4  # a renewal takes up to this part of its time
 
 
-def due_times(renew_at: Sequence[float] = RENEW_AT_S) -> list[float]:
-    """Times since the start at which a renewal should be ready."""
-    return [(1.0 + DUE_LATER) * t + DUE_AFTER_S for t in renew_at]
+def due_times(lag_s: float, renew_at: Sequence[float] = RENEW_AT_S) -> list[float]:
+    """Times since the start at which a renewal should be ready, where measurements are settled after ``lag_s``."""
+    return [(1.0 + DUE_LATER) * t + lag_s for t in renew_at]
 
 
 class Refiner:
@@ -81,6 +81,8 @@ class Refiner:
             known = self._answers.recv()
         except (EOFError, OSError):
             raise InputError("the process that renews the filter has ended; the filter goes on without it") from None
+        if isinstance(known, str):
+            raise InputError(f"the filter is renewed no more ({known}); it goes on as it is")
         index, self._asked = self._asked, None
         assert index is not None
         return index, known
@@ -134,12 +136,15 @@ class _Renewed:
 def _refine(renew_at: tuple[float, ...], learn_noise: bool, work: Any, answers: Connection) -> None:
     """Work off what the first process sends: measurements, the index of a keyframe, None = the answer served."""
     dive = _Renewed(work.get(), renew_at, learn_noise)
-    while True:
-        item = work.get()
-        if item is None:
-            dive.rest()
-        elif isinstance(item, int):
-            answers.send(dive.known(item))
-        else:
-            for measurement in item:
-                dive.add(measurement)
+    try:
+        while True:
+            item = work.get()
+            if item is None:
+                dive.rest()
+            elif isinstance(item, int):
+                answers.send(dive.known(item))
+            else:
+                for measurement in item:
+                    dive.add(measurement)
+    except Exception as error:  # whatever it is, the first process goes on without this one
+        answers.send(str(error) or type(error).__name__)

@@ -160,7 +160,7 @@ def _marginals(optimum: Optimum, b: Beginning, priors: Mapping[str, Belief]) -> 
     problem, solution = optimum.problem, optimum.solution
     known = Marginals.of(problem, solution)
     sd = {name: np.sqrt(np.diag(known.newest(name, walk))) for name, walk in problem.unknowns.walks.items()}
-    before = prior_sd(problem, priors, int(problem.segment[-1]), b.config.graph.segment_s)
+    before = prior_sd(problem, priors, int(problem.segment[-1]))
     relative = relative_sd(problem, solution, sd, before)
     claimed = {name: sd[name] / before[name] for name in sd}
     names = deceptive(problem, claimed, relative)

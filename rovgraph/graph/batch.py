@@ -48,18 +48,24 @@ class Problem:
     native : priors and IMU factors
     blocks : sensor -> Block
     segment : ndarray of int, shape (count,), the segment of time that each keyframe lies in
+    time : ndarray, shape (count,), of the keyframes [s]
     unknowns : the calibration variables
     """
 
     native: gtsam.NonlinearFactorGraph
     blocks: dict[str, Block]
     segment: NDArray[np.int64]
+    time: Array
     unknowns: Unknowns
 
     @property
     def count(self) -> int:
         """Number of keyframes."""
         return len(self.segment)
+
+    def walked(self, segment: int) -> float:
+        """Time from the start to the first keyframe of a segment [s]."""
+        return float(self.time[np.searchsorted(self.segment, segment)] - self.time[0])
 
     @cached_property
     def rows(self) -> list[Rows]:
@@ -162,8 +168,9 @@ def make_problem(
     factors = priors(start, beliefs, wanted)
     for interval in intervals:
         factors += motion(interval, wanted)
+    first = {interval.segment: interval.time for interval in reversed(intervals)}
     for segment in range(1, intervals[-1].segment + 1):
-        factors += drift(wanted, segment, config.graph.segment_s)
+        factors += drift(wanted, segment, first[segment] - first[segment - 1])
     gravity = config.environment.gravity_mps2
     blocks = {s: make_block(rows, instruments[s], gravity, wanted) for s, rows in attached.items()}
     if "place" in blocks:
@@ -171,7 +178,8 @@ def make_problem(
     native = gtsam.NonlinearFactorGraph()
     for factor in factors:
         native.add(factor)
-    return Problem(native, blocks, np.array([i.segment for i in intervals]), wanted)
+    segments, time = np.array([i.segment for i in intervals]), np.array([i.time for i in intervals])
+    return Problem(native, blocks, segments, time, wanted)
 
 
 def make_values(problem: Problem, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:
@@ -198,7 +206,7 @@ def solve(problem: Problem, values: gtsam.Values) -> Solution:
     while True:
         values, cost, steps, converged = _minimise(problem, values, gates, tolerance, ordering)
         iterations, renewed = iterations + steps, problem.gates(values)
-        rest = gatings == MAX_GATINGS or all(np.array_equal(renewed[s], gates[s]) for s in gates)
+        rest = gatings >= MAX_GATINGS or all(np.array_equal(renewed[s], gates[s]) for s in gates)
         if rest and tolerance == RELATIVE_DECREASE:
             break
         tolerance = RELATIVE_DECREASE if rest else COARSE_DECREASE

@@ -84,8 +84,8 @@ def unscaled(interval: Interval) -> gtsam.CombinedImuFactor:
     return gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)
 
 
-def drift(unknowns: Unknowns, segment: int, segment_s: float) -> list[Factor]:
-    """The random walk of calibration variables into a segment from the one before."""
+def drift(unknowns: Unknowns, segment: int, duration: float) -> list[Factor]:
+    """The random walk of calibration variables into a segment from the one before, which lasted ``duration`` [s]."""
     if segment == 0:
         return []
     return [
@@ -93,7 +93,7 @@ def drift(unknowns: Unknowns, segment: int, segment_s: float) -> list[Factor]:
             unknowns.key(name, segment - 1),
             unknowns.key(name, segment),
             np.zeros(len(unknowns.fixed[name])),
-            gtsam.noiseModel.Isotropic.Sigma(len(unknowns.fixed[name]), unknowns.walks[name] * np.sqrt(segment_s)),
+            gtsam.noiseModel.Isotropic.Sigma(len(unknowns.fixed[name]), unknowns.walks[name] * np.sqrt(duration)),
         )
         for name in unknowns.begun_by(segment)
     ]

@@ -15,19 +15,11 @@ import gtsam
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.geometry import Array, cross
+from rovgraph.geometry import Array, cross, earth_rate_n
 from rovgraph.state import Delta
 
-EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
 INTEGRATION_SD = 1e-3  # per root second; smaller makes the covariance nearly singular
 BRIDGE_ACC, BRIDGE_GYR = 0.3, 0.3  # densities over a gap: an ROV at its liveliest [SI/rtHz]
-
-
-def earth_rate_n(latitude: float) -> Array:
-    """Angular rate of the Earth in n [rad/s], shape (3,); latitude in radians."""
-    return EARTH_RATE * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
-
-
 KNOCK = 3.0  # times the believed noise, before an interval's own scatter is taken
 
 

@@ -47,9 +47,14 @@ class Files:
     resume : go on with what is there
     anew : from the recording alone, not from the checkpoint
 
+    Attributes
+    ----------
+    state : the checkpoint that is resumed; None where there is none
+    received : what had been received after it; None where there is nothing
+
     Raises
     ------
-    InputError : the folder cannot be written, or holds nothing to go on with
+    InputError : the folder cannot be written, or holds nothing to go on with, or a recording that cannot be read
     """
 
     folder: Path
@@ -71,6 +76,7 @@ class Files:
             self.state = read_checkpoint(checkpoint)
             until = -np.inf if self.anew else float(self.state["engine"]["keyframe"][1])
         self.recorder = Recorder(self.folder / RECORDING, self.complaints)
+        self.received = self._received() if self.resume else None  # before the track is touched: it may not be readable
         self.track = TrackFile(self.folder / TRACK, until)
         self.keeper = Keeper(checkpoint, self.complaints)
         recorded = self.config.model_copy(update=_as_recorded(self.config))
@@ -93,28 +99,18 @@ class Files:
         except (OSError, ValueError, IndexError):
             return 0.0
 
-    def recorded(self, origin: tuple[float, float] | None) -> Log | None:
-        """The end of a recording that is resumed; None where it has no measurement.
-
-        Parameters
-        ----------
-        origin : latitude and longitude [deg] of north = east = 0, where it is known
-        """
-        try:
-            return log_from_frame(_last_rows(self.folder / RECORDING, origin), str(self.folder / RECORDING))
-        except InputError:
+    def _received(self) -> Log | None:
+        """Of a recording that is resumed all, or what is newer than the checkpoint; None where it has no row."""
+        path = self.folder / RECORDING
+        if path.read_bytes().count(b"\n") < 2:  # the header alone
             return None
-
-    def all_recorded(self) -> Log | None:
-        """All of a recording that is resumed; None where it has no measurement."""
-        try:
-            return read_log(self.folder / RECORDING)
-        except InputError:
-            return None
+        if self.anew or self.state is None:
+            return read_log(path)
+        return log_from_frame(_last_rows(path, self.state["origin"]), str(path))
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""
-        lines = "".join(json.dumps(vars(event)) + "\n" for event in events)
+        lines = "".join(json.dumps(event.as_dict(), allow_nan=False) + "\n" for event in events)
         if not lines:
             return
         path = self.folder / EVENTS

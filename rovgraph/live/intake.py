@@ -13,6 +13,7 @@ from rovgraph.log import Measurement
 
 SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
 OTHERS_SPACING_S = 0.005
+_STREAM = {GEODETIC: "fix"}  # where a reading goes by another name
 
 
 class Intake:
@@ -30,16 +31,17 @@ class Intake:
 
     def __init__(self, config: Config, left_out: Counter[tuple[str, str]]) -> None:
         self.origin: tuple[float, float] | None = None
-        self._delays = config.online.delay_s
+        self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.online.delay_s.items()}
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._left_out = left_out
         self._newest: dict[str, float] = {}
+        self._sizes: dict[str, int] = {}
 
     def timed(self, time: float, readings: tuple[Reading, ...]) -> Sequence[tuple[float, tuple[Reading, ...]]]:
         """Readings with their times, where some sensors are known to be late [s]."""
         if not self._delays:
             return [(time, readings)]
-        return [(time - self._delays.get(r.sensor, 0.0), (r,)) for r in readings]  # type: ignore[call-overload]
+        return [(time - self._delays.get(_STREAM.get(r.sensor, r.sensor), 0.0), (r,)) for r in readings]
 
     def measurement(self, time: float, reading: Reading) -> Measurement | None:
         """A reading as the engine takes it; None where the sensor has just been heard."""
@@ -51,6 +53,9 @@ class Intake:
             sensor, values = "fix", np.array([north, east, values[2]])
         elif sensor == "mag":
             values = self.calibrated(values)
+        if len(values) != self._sizes.setdefault(sensor, len(values)):
+            self._left_out[sensor, f"{len(values)} signals, and {self._sizes[sensor]} before"] += 1
+            return None
         newest = self._newest.get(sensor, -np.inf)
         if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
             self._left_out[sensor, "more often than can be used"] += 1

@@ -49,6 +49,8 @@ class Message:
 def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
     """Readings of a row: of every sensor whose required columns are all there and finite.
 
+    Of thrusters: from the first on without a hole, or it would not be known whose signal it is.
+
     Parameters
     ----------
     cells : column of a log -> value in SI; NaN or an infinity counts as absent
@@ -62,7 +64,7 @@ def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
             found.append(Reading(sensor, values))
     if all(name in cells for name in LAT_LON):
         found.append(Reading(GEODETIC, np.array([*(cells[n] for n in LAT_LON), cells.get("fix_sd", np.nan)])))
-    thrusters = sorted((n for n in cells if THRUSTER.fullmatch(n)), key=lambda n: int(n.split("_")[1]))
-    if thrusters:
+    thrusters = [f"thruster_{k + 1}" for k in range(sum(THRUSTER.fullmatch(n) is not None for n in cells))]
+    if thrusters and all(name in cells for name in thrusters):
         found.append(Reading("thruster", np.array([cells[n] for n in thrusters])))
     return tuple(found)

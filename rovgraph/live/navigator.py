@@ -32,6 +32,7 @@ from rovgraph.log import Log, Measurement
 
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
+UNEXPECTED = "began after the first seconds, and is not used"
 
 
 @dataclass
@@ -72,7 +73,7 @@ class Navigator:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
-        self._renewals = Renewals(self.patient) if self.renew else None
+        self._renewals = Renewals(self.patient, self.config.graph.lag_s) if self.renew else None
         self._events: list[Event] = []
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
@@ -118,16 +119,20 @@ class Navigator:
             self._renewals.patient = True
         for measurement in log.measurements():
             if measurement.time > known:
-                values = measurement.values
-                if measurement.sensor == "mag":
-                    values = self._intake.calibrated(values)
-                self._consider(measurement._replace(values=values))
+                taken = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
+                if taken is not None:
+                    self._consider(taken)
         if self._renewals is not None:
             self._renewals.patient = self.patient
 
     def say(self, source: str, kind: str, text: str) -> None:
         """Have the next solution tell of an event."""
         self._events.append(Event(self.time, source, kind, text))
+
+    def lose_isam2(self, reason: str) -> None:
+        """Go on with the filter alone."""
+        self.isam2 = None
+        self.say("isam2", "lost", reason)
 
     def tick(self, time: float) -> None:
         """Time goes on, with measurements or without."""
@@ -243,6 +248,13 @@ class Navigator:
 
     def _feed(self, engine: FixedLag, m: Measurement) -> None:
         before, began = engine.marks[-1] if engine.marks else None, host.perf_counter()
+        if m.sensor == "dvl_water" and m.sensor not in engine.beginning.instruments:
+            if not self.left_out[m.sensor, UNEXPECTED]:
+                self.say(
+                    m.sensor, "unused", f"dvl_water: {UNEXPECTED}; give dvl.water_velocity_sd_mps, and it is expected"
+                )
+            self.left_out[m.sensor, UNEXPECTED] += 1
+            return
         outcome = engine.add(m)
         if outcome != Taken.IN:
             self.left_out[m.sensor, outcome.value] += 1
@@ -259,9 +271,8 @@ class Navigator:
         if self.isam2 is not None:
             try:
                 self.isam2.take(mark.interval, mark.known, mark.used)
-            except InputError as error:  # the filter goes on without it
-                self.isam2 = None
-                self.say("isam2", "lost", str(error))
+            except InputError as error:
+                self.lose_isam2(str(error))
         self.health.passed(mark)
 
     def _take_events(self) -> tuple[Event, ...]:

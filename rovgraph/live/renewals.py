@@ -18,17 +18,19 @@ class Renewals:
     Attributes
     ----------
     patient : wait for an answer, so that a replay can be repeated
+    lag_s : of the engine; the second process has nothing younger [s]
     news : what went wrong, one line each, since it was last emptied
     waited : for answers, which only a replay does that is faster than the second process [s]
     """
 
     patient: bool
+    lag_s: float
     news: list[str] = field(default_factory=list)
     waited: float = 0.0
 
     def __post_init__(self) -> None:
         self._refiner: Refiner | None = Refiner(learn_noise=True)
-        self._due = due_times()
+        self._due = due_times(self.lag_s)
         self._start: float | None = None
 
     def begin(self, beginning: Beginning) -> None:

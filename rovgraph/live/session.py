@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rovgraph.errors import InputError
 from rovgraph.live.complaints import Complaints
 from rovgraph.live.files import Files
 from rovgraph.live.message import Message
@@ -56,8 +57,14 @@ class Session:
     def write_smoothed(self) -> None:
         """The whole smoothed track so far to disk, where iSAM2 has it."""
         isam2 = self.navigator.isam2
-        if self.files is not None and isam2 is not None and isam2.updated > 0:
-            self.files.write_smoothed(isam2.solve())
+        if self.files is None or isam2 is None or isam2.updated <= 0:
+            return
+        try:
+            estimate = isam2.solve()
+        except InputError as error:
+            self.navigator.lose_isam2(str(error))
+        else:
+            self.files.write_smoothed(estimate)
 
     def updates(self) -> dict[str, float]:
         """Times that updates of the filter took [ms]."""
@@ -73,16 +80,14 @@ class Session:
         """Go on from the last checkpoint and what was recorded after it."""
         assert self.files is not None
         state = self.files.state
-        if self.files.anew:
-            if state is not None:
-                self.navigator.clocks.restore(state["clocks"])
-            recorded = self.files.all_recorded()
-        else:
-            if state is not None:
-                self.navigator.restore(state)
-            recorded = self.files.recorded(self.navigator.origin)
-        if recorded is not None:
-            self.navigator.replay(recorded)
+        if state is not None and self.files.anew:
+            self.navigator.clocks.restore(state["clocks"])
+        elif state is not None:
+            self.navigator.restore(state)
+        if self.files.received is None:
+            self.navigator.say("start", "resumed", "nothing had been received before; begins anew")
+            return
+        self.navigator.replay(self.files.received)
         self._resumed = self.navigator.time
         self.navigator.say("start", "resumed", f"goes on from what was received up to {self._resumed:.1f} s")
 

@@ -1,5 +1,6 @@
 """What the online mode says of a moment: where the vehicle is, how sure that is, and how the sensors are."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -22,6 +23,10 @@ class Event:
     source: str
     kind: str
     text: str
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON; no time before there is any."""
+        return {**vars(self), "time": round(self.time, 6) if math.isfinite(self.time) else None}
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,11 @@ import numpy as np
 
 from rovgraph.config import Config, ImuNoise, mount_matrix
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, rotate, transpose
+from rovgraph.geometry import Array, earth_rate_n, rotate, transpose
 from rovgraph.simulate.path import Motion
 
-EARTH_RATE = 7.292115e-5  # [rad/s]
 
-
-def earth_rate_n(config: Config) -> Array:
+def _earth_rate(config: Config) -> Array:
     """Rate of the Earth in n, shape (3,) [rad/s]; zero where it is not modelled.
 
     Raises
@@ -31,8 +29,7 @@ def earth_rate_n(config: Config) -> Array:
         return np.zeros(3)
     if env.latitude_deg is None:
         raise InputError("environment.earth_rotation needs environment.latitude_deg")
-    latitude = np.deg2rad(env.latitude_deg)
-    return EARTH_RATE * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
+    return earth_rate_n(float(np.deg2rad(env.latitude_deg)))
 
 
 def specific_force_and_rate(motion: Motion, config: Config) -> Array:
@@ -48,7 +45,7 @@ def specific_force_and_rate(motion: Motion, config: Config) -> Array:
     ndarray, shape (n, 6), specific force [m/s^2], angular rate [rad/s]
     """
     arm = np.asarray(config.imu.lever_arm_m, float)
-    w_ie_n, g_n = earth_rate_n(config), np.array([0.0, 0.0, config.environment.gravity_mps2])
+    w_ie_n, g_n = _earth_rate(config), np.array([0.0, 0.0, config.environment.gravity_mps2])
     R_bn = transpose(motion.R_nb)
     w_ie_b = rotate(R_bn, w_ie_n)
     swing = np.cross(motion.w_b, arm)

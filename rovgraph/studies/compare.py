@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from rovgraph.config import Config
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, in_one_line
 from rovgraph.estimators.named import Named, Outcome, Task, outcomes_of_dives, select
 from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.measures import measures, misalignment_history, velocity_history
@@ -151,23 +151,18 @@ def _row(run: str, outcome: Outcome, case: Case) -> dict[str, Any]:
     duration = float(case.reference.time[-1] - case.reference.time[0])
     row = {"run": run, "estimator": outcome.named.name, "error": None, "duration_s": duration}
     try:
-        if outcome.estimate is None:
-            return {**row, "error": _reason(outcome.error)}
+        if outcome.error is not None:
+            return {**row, "error": in_one_line(outcome.error)}
+        assert outcome.estimate is not None
         numbers = measures(outcome.estimate, case, outcome.named)
         return {**row, **numbers, "cpu_per_s": outcome.seconds / _recorded_s(case)}
     except Exception as error:
-        return {**row, "error": _reason(error)}
+        return {**row, "error": in_one_line(error)}
 
 
 def _recorded_s(case: Case) -> float:
     time = case.log["imu"].time
     return float(time[-1] - time[0])
-
-
-def _reason(error: Exception | None) -> str:
-    """An error in one line; what is no bad input is named by its kind."""
-    text = (str(error).splitlines() or [""])[0][:300]
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
 
 
 def _keep_histories(result: _Result, outcome: Outcome, case: Case, first: bool) -> None:

@@ -184,7 +184,7 @@ def examined(
     ends = np.unique(np.linspace(0, problem.count - 1, TIMES + 1).round().astype(int)[1:]).tolist()
     known = knowledge(problem, solution.values, solution.gates, ends)
     priors = beliefs(config)
-    walked = [prior_sd(problem, priors, s, config.graph.segment_s) for s in problem.segment[ends].tolist()]
+    walked = [prior_sd(problem, priors, s) for s in problem.segment[ends].tolist()]
     before = np.array([np.concatenate(list(sd.values())) for sd in walked])
     seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
     progress("information", 0.7)

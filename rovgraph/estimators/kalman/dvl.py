@@ -12,7 +12,7 @@ from typing import Self
 
 import numpy as np
 
-from rovgraph.calibration import Belief
+from rovgraph.calibration import MOUNT, Belief
 from rovgraph.config import Config
 from rovgraph.estimators.kalman.core import Linearized, times
 from rovgraph.estimators.kalman.epochs import Epochs, Index
@@ -25,7 +25,6 @@ from rovgraph.log import Log
 from rovgraph.sensors import CompassHeading, DvlVelocity
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
-MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")
 HEADING = 3  # its place among x, y, z, heading
 
 

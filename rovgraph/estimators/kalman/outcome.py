@@ -6,9 +6,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rovgraph.calibration import MOUNT
 from rovgraph.config import mount_matrix
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate, History
-from rovgraph.estimators.kalman.dvl import HEADING, MOUNT, ping_rows
+from rovgraph.estimators.kalman.dvl import HEADING, ping_rows
 from rovgraph.estimators.kalman.quaternion import SECOND, rate_matrix, unit
 from rovgraph.estimators.kalman.recursion import Innovations, Recursion
 from rovgraph.estimators.results import calibration_estimates, calibration_history

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rovgraph.calibration import Belief
+from rovgraph.calibration import MOUNT, Belief
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.estimators.initialise import Beginning, initialise
-from rovgraph.estimators.kalman.dvl import MOUNT, DvlModel, Ping, pings
+from rovgraph.estimators.kalman.dvl import DvlModel, Ping, pings
 from rovgraph.estimators.kalman.known import KnownMotion, known_motion
 from rovgraph.estimators.kalman.mti import Accelerometer, ImuModel, Mti, reference_field
 from rovgraph.estimators.kalman.processes import (

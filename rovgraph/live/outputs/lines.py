@@ -34,9 +34,7 @@ def as_dict(solution: Solution) -> dict[str, Any]:
             name: {"state": h.state, "age": _number(h.age), "used": int(h.used), "rejected": int(h.rejected)}
             for name, h in s.sensors.items()
         },
-        "events": [
-            {"time": _number(e.time, decimals=6), "source": e.source, "kind": e.kind, "text": e.text} for e in s.events
-        ],
+        "events": [event.as_dict() for event in s.events],
     }
 
 

@@ -12,7 +12,7 @@ from rovgraph.live.message import GEODETIC, Message, readings
 from rovgraph.live.sources.lines import LineDecoder, Refused, json_number, json_object, shown
 from rovgraph.live.sources.source import Notify
 from rovgraph.log.reading import ACC_GAP
-from rovgraph.log.streams import LABEL, LAT_LON, OPTIONAL, STREAMS, is_column, label_number
+from rovgraph.log.streams import LABEL, LAT_LON, OPTIONAL, STREAMS, THRUSTER, is_column, label_number
 from rovgraph.log.units import factors, near_miss
 
 ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
@@ -66,7 +66,7 @@ class JsonRow:
         _check(cells)
         alone = self._join(cells, stamp, arrival)
         found = readings(cells)
-        lost = {_SENSOR[name] for name in cells if name in _SENSOR} - {r.sensor for r in found} - alone
+        lost = {sensor for name in cells if (sensor := _sensor(name))} - {r.sensor for r in found} - alone
         if lost:
             self._notify("incomplete", f"{', '.join(sorted(lost))}: not all of its columns are in the line")
         return Message(self._url, arrival, stamp, found) if found else None
@@ -110,6 +110,11 @@ class JsonRow:
                 return {"imu"}
             cells.update(zip(ACC, self._acc[0].tolist(), strict=True))
         return set()
+
+
+def _sensor(column: str) -> str | None:
+    """Whose column it is, where it says nothing without others."""
+    return "thruster" if THRUSTER.fullmatch(column) else _SENSOR.get(column)
 
 
 def _age(before: tuple[float | None, float], stamp: float | None, arrival: float) -> float:

@@ -34,20 +34,20 @@ class Ledger:
 
     def _mend(self) -> None:
         """Cut off a row that was not written to its end."""
-        with _one_line(self.path), self.path.open("rb+") as file:
+        with kept_so_far(self.path), self.path.open("rb+") as file:
             content = file.read()
             file.truncate(content.rfind(b"\n") + 1)
 
     def add(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Append rows; what a column lacks is left empty."""
-        with _one_line(self.path), self.path.open("a", newline="", encoding="utf-8") as file:
+        with kept_so_far(self.path), self.path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self.columns, lineterminator="\n")
             writer.writerows(rows)
             file.flush()
 
     def read(self) -> pd.DataFrame:
         """All rows, each once."""
-        with _one_line(self.path):
+        with kept_so_far(self.path):
             try:
                 frame = pd.read_csv(self.path, engine="python", dtype={"cell": str})  # floats exactly as written
             except ValueError as error:
@@ -67,14 +67,14 @@ class Ledger:
 
     def _write(self, frame: pd.DataFrame) -> None:
         fresh = self.path.with_suffix(".new")
-        with _one_line(self.path):
+        with kept_so_far(self.path):
             frame.to_csv(fresh, index=False)
             fresh.replace(self.path)
 
 
 @contextlib.contextmanager
-def _one_line(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into an `InputError`."""
+def kept_so_far(path: Path) -> Iterator[None]:
+    """Turn an error of the file system into an `InputError` that says how to go on."""
     try:
         yield
     except OSError as error:

@@ -7,12 +7,12 @@ from pathlib import Path
 import pandas as pd
 
 from rovgraph.config import parse_model, read_yaml
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, in_one_line
 from rovgraph.studies.engines import Engine, Local
 from rovgraph.studies.misalignment.cells import cell_table
 from rovgraph.studies.misalignment.ledger import Ledger
 from rovgraph.studies.misalignment.plan import Cell, Study
-from rovgraph.studies.misalignment.run import HISTORY_COLUMNS, RUN_COLUMNS, Done, Task, in_one_line, one_run
+from rovgraph.studies.misalignment.run import HISTORY_COLUMNS, RUN_COLUMNS, Done, Task, one_run
 
 STUDY_FILE = "study.yaml"
 Progress = Callable[[float], None]

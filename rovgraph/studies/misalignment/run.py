@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.errors import InputError
+from rovgraph.errors import in_one_line
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.estimators.named import ESTIMATORS, Named, Outcome, outcomes
 from rovgraph.evaluate import evaluate
@@ -202,9 +202,3 @@ def _time_to(history: Sequence[dict[str, Any]]) -> float:
     beyond = np.flatnonzero(largest >= REACHED_DEG)
     after = int(beyond[-1]) + 1 if len(beyond) else 0
     return float(history[after]["time_s"]) if after < len(history) else math.inf
-
-
-def in_one_line(error: BaseException) -> str:
-    """An error in one line; what is no bad input is named by its kind."""
-    text = (str(error).splitlines() or [""])[0][:300]
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
