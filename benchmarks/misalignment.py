@@ -360,8 +360,7 @@ def between(log: Log, begin: float, end: float) -> Log:
     """Part of a log."""
     streams = {}
     for name, stream in log.streams.items():
-        inside = (stream.time >= begin) & (stream.time <= end)
-        streams[name] = replace(stream, time=stream.time[inside], data=stream.data[inside], row=stream.row[inside])
+        streams[name] = stream.take((stream.time >= begin) & (stream.time <= end))
     return replace(log, streams=streams)
 
 

@@ -62,7 +62,7 @@ def altered(log: Log, sensor: str, data: Array) -> Log:
 def kept(log: Log, sensor: str, keep: Array) -> Log:
     """A log with some measurements of one sensor."""
     s = log[sensor]
-    stream = Stream(sensor, s.columns, s.time[keep], s.data[keep], s.row[keep])
+    stream = s.take(keep)
     return Log(log.source, {**log.streams, sensor: stream}, log.origin)
 
 

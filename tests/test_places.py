@@ -354,10 +354,15 @@ def test_names_of_places_may_be_numbers_or_texts(tmp_path, name):
     assert label_number("wreck") != label_number("Wreck")
 
 
-@pytest.mark.parametrize("sd", [0.0, -0.5])
-def test_an_sd_that_cannot_be_is_refused_with_its_line(sd):
+def test_an_sd_that_cannot_be_is_refused_with_its_line():
     with pytest.raises(InputError, match=r"line 3, column place_sd: .* expected more than 0"):
-        log_from_frame(table(place_id=[1, 2, 1], place_sd=[0.1, sd, 0.1]))
+        log_from_frame(table(place_id=[1, 2, 1], place_sd=[0.1, -0.5, 0.1]))
+
+
+def test_an_sd_of_0_is_taken_as_not_known():
+    with pytest.warns(DataWarning, match="place_sd: 1 times 0, taken as not known"):
+        stream = log_from_frame(table(place_id=[1, 2, 1], place_sd=[0.1, 0.0, 0.1]))["place"]
+    np.testing.assert_array_equal(stream["place_sd"], [0.1, np.nan, 0.1])
 
 
 def test_an_sd_of_no_place_is_left_out_with_a_warning():

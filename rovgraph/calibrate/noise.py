@@ -155,7 +155,7 @@ def _valid(stream: Stream) -> Stream:
 
 
 def _part(stream: Stream, keep: Any) -> Stream:
-    return replace(stream, time=stream.time[keep], data=stream.data[keep], row=stream.row[keep])
+    return stream.take(keep)
 
 
 def _without_gaps(stream: Stream, source: str) -> Stream:

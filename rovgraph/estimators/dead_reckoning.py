@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.estimators.initialise import Beginning, trusted_first, yaw_correction
+from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
+from rovgraph.estimators.initialise import Beginning
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
 from rovgraph.graph.assembly import Interval
 from rovgraph.sensors import dvl_mount

@@ -11,25 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.config import Config, beliefs, mount_matrix
+from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy, rotate, rpy_from_matrix
+from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
+from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix
 from rovgraph.graph.factors import Start
 from rovgraph.graph.noise_floor import NOISIER
 from rovgraph.graph.preintegration import scatter
 from rovgraph.instruments import Instrument, heading_sources, instruments
 from rovgraph.log import Log
-from rovgraph.sensors import innovation
-from rovgraph.state import POSE, State
+from rovgraph.state import State
 
-WINDOW_S = 5.0  # of the log's beginning, over which it is levelled
-QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that counts as quiet [SI]
 STILL_GYR_SD = 3e-3  # a vehicle that looks still may turn this much [rad/s]
 MOVING_TILT_SD = np.deg2rad(5.0)
 UNKNOWN_HEADING_SD = np.deg2rad(20.0)  # the samples themselves enter as factors
 START_VELOCITY_SD = 1.0
-FIRST_FIX_SD = 5.0  # the fix enters by itself, too, and the vehicle may have moved before it [m]
-HEADING_WITHIN_S = 30.0
 ENOUGH_SAMPLES = 100
 
 
@@ -99,10 +95,10 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Begi
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 
-    f_b, gyr_mean, quiet, seconds = _first_seconds(log, config)
-    R_nb, rpy_sd = _attitude(log, config, sensors, sources, f_b, quiet, assumptions)
-    bias, bias_sd = _bias(config, gyr_mean, quiet, seconds, assumptions)
-    p_n, p_sd = _position(log, config, R_nb, assumptions)
+    first = level(log, config)
+    bias, bias_sd = _bias(config, first, assumptions)
+    R_nb, rpy_sd = _attitude(log, config, sensors, sources, first, bias[3:], assumptions)
+    p_n, p_sd = first_position(log, config, R_nb, assumptions)
     rpy, start = np.rad2deg(rpy_from_matrix(R_nb)), config.start
     filled = start.model_copy(
         update={
@@ -155,7 +151,7 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             imu = log["imu"]
             f = np.column_stack([np.interp(log["mag"].time, imu.time, a) for a in imu.data[:, :3].T])
             sine = -np.sum(f * mag, axis=1) / (np.linalg.norm(f, axis=1) * norm)
-            changes["dip_deg"] = float(np.rad2deg(np.arcsin(np.clip(np.median(sine), -1.0, 1.0))))
+            changes["dip_deg"] = float(np.rad2deg(np.arcsin(np.clip(np.nanmedian(sine), -1.0, 1.0))))
             assumptions.append(f"environment.dip_deg {changes['dip_deg']:.1f}, from the log")
             if not beliefs(config)["field_dip"].estimate:
                 hint = "give it, or estimate calibration.field_dip"
@@ -194,51 +190,27 @@ def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
     return config.model_copy(update={"imu": imu_section})
 
 
-def _first_seconds(log: Log, config: Config) -> tuple[Array, Array, bool, float]:
-    """Mean specific force in the first sample's axes, mean rate, whether quiet, length [s]."""
-    imu, R_bs = log["imu"], mount_matrix(config.imu.mount_rpy_deg)
-    first = imu.time <= imu.time[0] + WINDOW_S
-    time, acc, gyr = imu.time[first], imu.data[first, :3] @ R_bs.T, imu.data[first, 3:] @ R_bs.T
-    seconds = float(time[-1] - time[0])
-    if len(time) < 3:
-        return acc.mean(axis=0), gyr.mean(axis=0), False, seconds
-    rate = (len(time) - 1) / seconds
-    noise = config.imu.noise
-    quiet = bool(
-        (acc.std(axis=0) < QUIET_ACC + 2.0 * noise.acc * np.sqrt(rate)).all()
-        and (gyr.std(axis=0) < QUIET_GYR + 2.0 * noise.gyr * np.sqrt(rate)).all()
-        and np.linalg.norm(gyr.mean(axis=0)) < 3.0 * np.deg2rad(config.imu.gyr_bias_sd_dps)
-    )
-    if quiet:
-        return acc.mean(axis=0), gyr.mean(axis=0), True, seconds
-    turned, forces = np.eye(3), [acc[0]]
-    for k in range(1, len(time)):
-        turned = turned @ exp_rotation(0.5 * (gyr[k] + gyr[k - 1]) * (time[k] - time[k - 1]))
-        forces.append(turned @ acc[k])
-    return np.mean(forces, axis=0), gyr.mean(axis=0), False, seconds
-
-
 def _attitude(
     log: Log,
     config: Config,
     sensors: dict[str, Instrument],
     sources: list[str],
-    f_b: Array,
-    quiet: bool,
+    first: Level,
+    gyro_bias: Array,
     assumptions: list[str],
 ) -> tuple[Array, Array]:
     """R_nb of the first epoch and the sd of roll, pitch, yaw."""
-    start = config.start
+    start, f_b = config.start, first.force_b
     roll = np.arctan2(-f_b[1], -f_b[2]) if start.roll_deg is None else np.deg2rad(start.roll_deg)
     pitch = np.arctan2(f_b[0], np.hypot(f_b[1], f_b[2])) if start.pitch_deg is None else np.deg2rad(start.pitch_deg)
     tilt_sd = np.deg2rad(start.tilt_sd_deg)
-    if not quiet and (start.roll_deg is None or start.pitch_deg is None):
+    if not first.quiet and (start.roll_deg is None or start.pitch_deg is None):
         tilt_sd = max(tilt_sd, MOVING_TILT_SD)
         assumptions.append("the log begins in motion: levelled roughly, roll and pitch settle in the graph")
     yaw_sd = np.deg2rad(start.heading_sd_deg)
     if start.heading_deg is None:
-        level = matrix_from_rpy([roll, pitch, 0.0])
-        yaw, source = _first_heading(log, config, sensors, sources, level)
+        levelled = matrix_from_rpy([roll, pitch, 0.0])
+        yaw, source = first_heading(log, config, sensors, sources, levelled, gyro_bias)
         yaw_sd = max(yaw_sd, UNKNOWN_HEADING_SD)
         assumptions.append(f"start.heading_deg {np.rad2deg(yaw) % 360.0:.1f}, from {source}")
     else:
@@ -246,89 +218,12 @@ def _attitude(
     return matrix_from_rpy([roll, pitch, yaw]), np.array([tilt_sd, tilt_sd, yaw_sd])
 
 
-def trusted_first(config: Config, sources: list[str]) -> list[str]:
-    """Heading sources with those first whose offset is held fixed, or known best."""
-    priors = beliefs(config)
-    offset = {"mag": "mag_offset", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
-    return sorted(sources, key=lambda s: priors[offset[s]].sd if priors[offset[s]].estimate else 0.0)
-
-
-def _first_heading(
-    log: Log, config: Config, sensors: dict[str, Instrument], sources: list[str], level: Array
-) -> tuple[float, str]:
-    begin = log["imu"].time[0]
-    for source in trusted_first(config, sources):
-        stream = log[source]
-        first = int(np.searchsorted(stream.time, begin))
-        if first < len(stream) and stream.time[first] <= begin + HEADING_WITHIN_S:
-            means = {name: b.mean for name, b in beliefs(config).items()}
-            z = stream.data[first, : sensors[source].model.dim]
-            return solve_yaw(sensors[source], z, level, means), source
-    raise InputError(
-        f"{log.source}: no heading in the first {HEADING_WITHIN_S:.0f} s (mag_x.., ahrs_yaw or dvl_heading) and no "
-        "start.heading_deg; give start.heading_deg in the configuration"
-    )
-
-
-def yaw_correction(instrument: Instrument, z: Array, state: State) -> Array:
-    """Rotation about down that best explains heading measurements, shape (n,) [rad].
-
-    One Gauss-Newton step of the instrument's own model, so it serves every source alike.
-
-    Parameters
-    ----------
-    instrument : a heading source
-    z : ndarray, shape (n, dim)
-    state : State of n epochs
-    """
-    predicted, H = instrument.model.predict(state, np.zeros((len(state), 3)))
-    # a turn about down is R_bn e_z in body axes
-    slope = np.einsum("nij,nj->ni", H[POSE][..., :3], state.R_nb[:, 2, :])
-    r = innovation(instrument.model, z, predicted)
-    return np.asarray(np.sum(slope * r, axis=1) / np.maximum(np.sum(slope**2, axis=1), 1e-12))
-
-
-def solve_yaw(instrument: Instrument, z: Array, level: Array, calibration: dict[str, Array]) -> float:
-    """Yaw at which a levelled attitude predicts a heading measurement [rad]."""
-    zero = np.zeros((4, 3))
-    yaw = np.arange(4) * 0.5 * np.pi
-    tilt = rpy_from_matrix(level)[:2]
-    for _ in range(10):
-        R = matrix_from_rpy(np.column_stack([np.tile(tilt, (4, 1)), yaw]))
-        state = State(R, zero, zero, np.zeros((4, 6)), calibration)
-        yaw = yaw + np.clip(yaw_correction(instrument, np.tile(z, (4, 1)), state), -0.5, 0.5)
-    R = matrix_from_rpy(np.column_stack([np.tile(tilt, (4, 1)), yaw]))
-    state = State(R, zero, zero, np.zeros((4, 6)), calibration)
-    misfit = innovation(instrument.model, z, instrument.model.predict(state, zero)[0])
-    return float(yaw[np.argmin(np.linalg.norm(misfit, axis=1))])
-
-
-def _bias(config: Config, gyr_mean: Array, quiet: bool, seconds: float, assumptions: list[str]) -> tuple[Array, Array]:
+def _bias(config: Config, first: Level, assumptions: list[str]) -> tuple[Array, Array]:
     """Bias of the first keyframe and its sd, shapes (6,)."""
     gyr_sd = np.deg2rad(config.imu.gyr_bias_sd_dps)
     bias, sd = np.zeros(6), np.repeat([config.imu.acc_bias_sd_mps2, gyr_sd], 3)
-    if quiet and seconds >= 1.0:
-        bias[3:] = gyr_mean
-        sd[3:] = min(gyr_sd, float(np.hypot(config.imu.noise.gyr / np.sqrt(seconds), STILL_GYR_SD)))
-        assumptions.append(f"gyro bias from the first {seconds:.0f} s, taken as standing still")
+    if first.quiet and first.seconds >= 1.0:
+        bias[3:] = first.rate_b
+        sd[3:] = min(gyr_sd, float(np.hypot(config.imu.noise.gyr / np.sqrt(first.seconds), STILL_GYR_SD)))
+        assumptions.append(f"gyro bias from the first {first.seconds:.0f} s, taken as standing still")
     return bias, sd
-
-
-def _position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, Array]:
-    """Position of the body's origin at the first epoch, and its sd, shapes (3,)."""
-    start = config.start
-    sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
-    p_n = np.array([start.north_m, start.east_m, 0.0 if start.down_m is None else start.down_m])
-    given = start.model_fields_set & {"north_m", "east_m"}
-    if "fix" in log and not given:
-        fix, begin = log["fix"], log["imu"].time[0]
-        first = int(np.searchsorted(fix.time, begin))
-        if first < len(fix) and fix.time[first] <= begin + HEADING_WITHIN_S:
-            own = fix["fix_sd"][first]
-            p_n[:2] = fix.data[first, :2]
-            p_n[:2] -= rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
-            sd[:2] = np.maximum(sd[:2], max(float(own) if np.isfinite(own) else config.fix.sd_m, FIRST_FIX_SD))
-            assumptions.append(f"start position from the first fix, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
-    if start.down_m is None and "depth" in log:
-        p_n[2] = log["depth"].data[0, 0] - float(rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2])
-    return p_n, sd

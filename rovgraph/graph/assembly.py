@@ -34,6 +34,8 @@ from rovgraph.log.packing import pack, unpack
 from rovgraph.model_aiding import ModelAiding
 from rovgraph.state import State
 
+DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
+LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
@@ -264,6 +266,10 @@ class Assembler:
             reason = "no bottom lock"
         elif m.sensor in ("dvl", "dvl_water") and np.abs(m.values[:3]).max() > self.config.dvl.max_speed_mps:
             reason = "faster than dvl.max_speed_mps"
+        elif m.sensor == "mag" and not m.values.any():
+            reason = "exactly zero"
+        elif m.sensor == "depth" and abs(m.values[0]) > DEEPEST_M:
+            reason = "deeper than any sea"
         if reason:
             self.left_out[m.sensor, reason] += 1
         return reason is None
@@ -338,19 +344,19 @@ class Assembler:
         dim, sighting = instrument.model.dim, None
         z, sd = m.values[:dim], instrument.sd
         if m.sensor == "dvl":
-            if np.isfinite(m.values[4]):
-                sd = np.maximum(sd, m.values[4])
+            if m.values[4] > 0.0:
+                sd = np.maximum(sd, min(m.values[4], LARGEST_SD))
             if self.config.dvl.scale_sd:
                 sd = np.hypot(sd, self.config.dvl.scale_sd * np.linalg.norm(z))
         if m.sensor == "thruster":  # a mean over values[3] seconds
             sd = sd / math.sqrt(m.values[3])
-        if m.sensor == "fix" and np.isfinite(m.values[2]):
-            sd = np.full(dim, m.values[2])
+        if m.sensor == "fix" and m.values[2] > 0.0:  # 0 is how receivers say that they do not know
+            sd = np.full(dim, min(m.values[2], LARGEST_SD))
         if m.sensor == "place":
             sighting = self._sighting(m)
             if sighting is None:
                 return []
-            z, sd = np.zeros(dim), np.full(dim, m.values[1]) if np.isfinite(m.values[1]) else sd
+            z, sd = np.zeros(dim), np.full(dim, min(m.values[1], LARGEST_SD)) if m.values[1] > 0.0 else sd
         place = (m.sensor, self._index, self._segment, m.time, m.row)
         scaled = self._felt(every, self._start, m.time)
         return [Attached(*place, z, sd, rate_b, rate_sd, motion, self.bias, track, scaled, sighting)]

@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 from rovgraph.check.values import angles, gravity, turn_rates
 from rovgraph.config import Config
 from rovgraph.errors import InputError
+from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
 from rovgraph.estimators.fixed_lag import place
-from rovgraph.estimators.initialise import HEADING_WITHIN_S, WINDOW_S, Beginning, initialise
+from rovgraph.estimators.initialise import Beginning, initialise
 from rovgraph.log import Measurement
 from rovgraph.log.streams import gathered
 
@@ -56,7 +57,7 @@ class Startup:
         self.measurements.sort(key=place)
         imu = [m.time for m in self.measurements if m.sensor == "imu"]
         if imu:
-            first = imu[-1] - HEADING_WITHIN_S
+            first = imu[-1] - WITHIN_S
             self.measurements = [m for m in self.measurements if m.time >= first]
         expected = LATER | (COMPASSES if self.config.heading.sources is not None else set())
         if "water_velocity_sd_mps" in self.config.dvl.model_fields_set:  # who has none shall not pay for it

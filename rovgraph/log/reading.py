@@ -243,8 +243,10 @@ def _select(
     complete, partly = filled.all(axis=1), filled.any(axis=1)
     if sensor == "dvl":
         complete, partly = _pings(data, complete, partly, line, source)
+    for name in OPTIONAL & {c for c in columns if c.endswith("_sd")}:
+        _check_sd(name, data[:, columns.index(name)], line, source)
     if sensor == "place":
-        partly = _sightings(data, partly, line, source)
+        partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
     if partly.any():
         _warn(
@@ -269,16 +271,21 @@ def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str
     return complete | lost, partly
 
 
-def _sightings(data: Array, partly: Bools, line: Lines, source: str) -> Bools:
-    """Rows with anything of a place that was seen: its name, or an sd that belongs to none."""
-    sd = data[:, 1]
-    odd = np.flatnonzero(sd <= 0.0)
+def _check_sd(column: str, sd: Array, line: Lines, source: str) -> None:
+    """Refuse a negative sd; 0, as many receivers write it, becomes unknown."""
+    odd = np.flatnonzero(sd < 0.0)
     if odd.size:
         raise InputError(
-            f"{source}: line {line[odd[0]]}, column place_sd: {sd[odd[0]]:g}, expected more than 0; "
-            "leave the cell empty where the configuration's place.sd_m holds"
+            f"{source}: line {line[odd[0]]}, column {column}: {sd[odd[0]]:g}, expected more than 0; "
+            "leave the cell empty where the configuration's sd holds"
         )
-    return np.asarray(partly | ~np.isnan(sd))
+    zero = sd == 0.0
+    if zero.any():
+        _warn(
+            f"{source}: {column}: {zero.sum()} times 0, taken as not known; the configuration's sd holds there; "
+            f"first in line {line[np.argmax(zero)]}"
+        )
+        sd[zero] = np.nan
 
 
 def _stream(sensor: str, cells: dict[str, Array], line: Lines, source: str) -> Stream | None:
@@ -359,5 +366,4 @@ def _distinct_times(stream: Stream, source: str) -> Stream:
         if which.any():
             line = stream.row[np.argmax(which)]
             _warn(f"{source}: {stream.sensor}: {which.sum()} measurements {what}; first in line {line}")
-    keep = ~again
-    return Stream(stream.sensor, stream.columns, stream.time[keep], stream.data[keep], stream.row[keep])
+    return stream.take(~again)

@@ -95,6 +95,10 @@ class Stream:
     def __getitem__(self, column: str) -> Array:
         return self.data[:, self.columns.index(column)]
 
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Stream":
+        """Some of its measurements, by index or by mask."""
+        return Stream(self.sensor, self.columns, self.time[index], self.data[index], self.row[index])
+
 
 @dataclass(frozen=True)
 class Log:

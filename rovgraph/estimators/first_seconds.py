@@ -1,0 +1,218 @@
+"""What the first seconds of a log say: how it is levelled, whether it stands still, its heading, where it is.
+
+Nothing rests on a single sample: the first of a sensor is as often wrong as any other, and here
+no gate would find out.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import theilslopes
+
+from rovgraph.config import Config, beliefs, mount_matrix
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy, rotate, rpy_from_matrix, wrap_angle
+from rovgraph.instruments import Instrument
+from rovgraph.log import Log, Stream
+from rovgraph.sensors import innovation
+from rovgraph.state import POSE, State
+
+WINDOW_S = 5.0  # over which a log is levelled, and a sensor's first value taken
+WITHIN_S = 30.0  # of the log's beginning: first headings and fixes
+QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that counts as quiet [SI]
+STILL_SPEED = 0.1  # of a vehicle that stands still, by its DVL [m/s]
+STILL_TURN = np.deg2rad(3.0)  # its heading at the window's ends, at most [rad]
+HEADINGS = 50  # samples of a source that are looked at
+FIRST_FIX_SD = 5.0  # the fix enters by itself, too [m]
+AGREE_SD = 3.0  # of a fix with the line through those around it
+MOST_MPS = 1.0  # that a vehicle moves before anything says where it is
+
+
+class Level(NamedTuple):
+    """The IMU's first seconds.
+
+    Attributes
+    ----------
+    force_b, rate_b : ndarray, shape (3,), mean specific force in the axes of the first sample, mean rate
+    quiet : whether it stands still
+    seconds : that there are
+    """
+
+    force_b: Array
+    rate_b: Array
+    quiet: bool
+    seconds: float
+
+
+def level(log: Log, config: Config) -> Level:
+    """What the IMU says of the first seconds."""
+    imu, R_bs = log["imu"], mount_matrix(config.imu.mount_rpy_deg)
+    first = imu.time <= imu.time[0] + WINDOW_S
+    time, acc, gyr = imu.time[first], imu.data[first, :3] @ R_bs.T, imu.data[first, 3:] @ R_bs.T
+    seconds = float(time[-1] - time[0])
+    if len(time) < 3:
+        return Level(acc.mean(axis=0), gyr.mean(axis=0), False, seconds)
+    rate = (len(time) - 1) / seconds
+    noise = config.imu.noise
+    quiet = bool(
+        (acc.std(axis=0) < QUIET_ACC + 2.0 * noise.acc * np.sqrt(rate)).all()
+        and (gyr.std(axis=0) < QUIET_GYR + 2.0 * noise.gyr * np.sqrt(rate)).all()
+        and np.linalg.norm(gyr.mean(axis=0)) < 3.0 * np.deg2rad(config.imu.gyr_bias_sd_dps)
+    )
+    if quiet and not _moves(log):
+        return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds)
+    turned, forces = np.eye(3), [acc[0]]
+    for k in range(1, len(time)):
+        turned = turned @ exp_rotation(0.5 * (gyr[k] + gyr[k - 1]) * (time[k] - time[k - 1]))
+        forces.append(turned @ acc[k])
+    return Level(np.mean(forces, axis=0), gyr.mean(axis=0), False, seconds)
+
+
+def _moves(log: Log) -> bool:
+    """Whether DVL or compass say so: a steady turn is as quiet as standing still."""
+    if "dvl" in log:
+        ping = _opening(log["dvl"], log["imu"].time[0], WINDOW_S)
+        speed = np.linalg.norm(ping.data[ping["dvl_valid"] == 1.0, :3], axis=1)
+        if len(speed) and np.median(speed) > STILL_SPEED:
+            return True
+    for source in ("ahrs", "dvl_heading"):
+        if source in log:
+            heading = np.unwrap(_opening(log[source], log["imu"].time[0], WINDOW_S).data[:, 0])
+            third = len(heading) // 3
+            if third and abs(np.median(heading[-third:]) - np.median(heading[:third])) > STILL_TURN:
+                return True
+    return False
+
+
+def _opening(stream: Stream, begin: float, seconds: float) -> Stream:
+    """Of a stream what lies within some seconds of a time."""
+    return stream.take((stream.time >= begin) & (stream.time <= begin + seconds))
+
+
+def trusted_first(config: Config, sources: list[str]) -> list[str]:
+    """Heading sources with those first whose offset is held fixed, or known best."""
+    priors = beliefs(config)
+    offset = {"mag": "mag_offset", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
+    return sorted(sources, key=lambda s: priors[offset[s]].sd if priors[offset[s]].estimate else 0.0)
+
+
+def first_heading(
+    log: Log, config: Config, sensors: dict[str, Instrument], sources: list[str], level: Array, gyro_bias: Array
+) -> tuple[float, str]:
+    """Yaw of the first epoch [rad], and the source that shows it.
+
+    The median of what a source says in its first seconds, each sample brought back to the first epoch by
+    the gyro.
+
+    Parameters
+    ----------
+    level : ndarray, shape (3, 3), R_nb of the first epoch but for its yaw
+    gyro_bias : ndarray, shape (3,), as far as it is known [rad/s]
+
+    Raises
+    ------
+    InputError : no source speaks early enough
+    """
+    begin, means = log["imu"].time[0], {name: b.mean for name, b in beliefs(config).items()}
+    for source in trusted_first(config, sources):
+        stream = _opening(log[source], begin, WITHIN_S)
+        if not len(stream):
+            continue
+        stream = _opening(stream, stream.time[0], WINDOW_S)
+        stream = stream.take(np.unique(np.linspace(0, len(stream) - 1, HEADINGS).astype(int)))
+        yaws = []
+        for z, turned in zip(stream.data, _turned(log, config, gyro_bias, stream.time), strict=True):
+            there = level @ turned
+            own = solve_yaw(sensors[source], z[: sensors[source].model.dim], there, means)
+            yaws.append(own - rpy_from_matrix(there)[2])
+        apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
+        return float(yaws[int(np.argmin(apart))]), source
+    raise InputError(
+        f"{log.source}: no heading in the first {WITHIN_S:.0f} s (mag_x.., ahrs_yaw or dvl_heading) and no "
+        "start.heading_deg; give start.heading_deg in the configuration"
+    )
+
+
+def _turned(log: Log, config: Config, gyro_bias: Array, at: Array) -> list[Array]:
+    """Rotations from the body's axes at some times, increasing, to those of the first epoch."""
+    imu, R_bs = log["imu"], mount_matrix(config.imu.mount_rpy_deg)
+    turned, out, k = np.eye(3), [], 0
+    for time in at:
+        while k + 1 < len(imu) and imu.time[k + 1] <= time:
+            rate_b = R_bs @ imu.data[k, 3:] - gyro_bias
+            turned, k = turned @ exp_rotation(rate_b * (imu.time[k + 1] - imu.time[k])), k + 1
+        out.append(turned)
+    return out
+
+
+def yaw_correction(instrument: Instrument, z: Array, state: State) -> Array:
+    """Rotation about down that best explains heading measurements, shape (n,) [rad].
+
+    One Gauss-Newton step of the instrument's own model, so it serves every source alike.
+
+    Parameters
+    ----------
+    instrument : a heading source
+    z : ndarray, shape (n, dim)
+    state : State of n epochs
+    """
+    predicted, H = instrument.model.predict(state, np.zeros((len(state), 3)))
+    # a turn about down is R_bn e_z in body axes
+    slope = np.einsum("nij,nj->ni", H[POSE][..., :3], state.R_nb[:, 2, :])
+    r = innovation(instrument.model, z, predicted)
+    return np.asarray(np.sum(slope * r, axis=1) / np.maximum(np.sum(slope**2, axis=1), 1e-12))
+
+
+def solve_yaw(instrument: Instrument, z: Array, level: Array, calibration: dict[str, Array]) -> float:
+    """Yaw at which a levelled attitude predicts a heading measurement [rad]."""
+    zero = np.zeros((4, 3))
+    yaw = np.arange(4) * 0.5 * np.pi
+    tilt = rpy_from_matrix(level)[:2]
+    for _ in range(10):
+        R = matrix_from_rpy(np.column_stack([np.tile(tilt, (4, 1)), yaw]))
+        state = State(R, zero, zero, np.zeros((4, 6)), calibration)
+        yaw = yaw + np.clip(yaw_correction(instrument, np.tile(z, (4, 1)), state), -0.5, 0.5)
+    R = matrix_from_rpy(np.column_stack([np.tile(tilt, (4, 1)), yaw]))
+    state = State(R, zero, zero, np.zeros((4, 6)), calibration)
+    misfit = innovation(instrument.model, z, instrument.model.predict(state, zero)[0])
+    return float(yaw[np.argmin(np.linalg.norm(misfit, axis=1))])
+
+
+def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, Array]:
+    """Position of the body's origin at the first epoch, and its sd, shapes (3,)."""
+    start, begin = config.start, log["imu"].time[0]
+    p_n = np.array([start.north_m, start.east_m, 0.0 if start.down_m is None else start.down_m])
+    sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
+    if "fix" in log and not start.model_fields_set & {"north_m", "east_m"}:
+        fixes = _opening(log["fix"], begin, WITHIN_S)
+        if len(fixes):
+            here, own_sd = _first_fix(fixes, config.fix.sd_m)
+            p_n[:2] = here - rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
+            sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))
+            assumptions.append(f"start position from the first fix, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
+    if start.down_m is None and "depth" in log:
+        depth = log["depth"]
+        first = _opening(depth, depth.time[0], WINDOW_S)
+        p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
+        sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
+    elif start.down_m is None:
+        assumptions.append("start.down_m 0.0, as the log has no depth")
+    return p_n, sd
+
+
+def _first_fix(fixes: Stream, sd: float) -> tuple[Array, float]:
+    """The first fix, shape (2,), and its sd [m]; the line through the first ones instead of one that is far off it."""
+    own = fixes["fix_sd"][0]
+    sd = float(own) if own > 0.0 else sd
+    line = np.array([_robust_first(fixes.time, fixes.data[:, k]) for k in (0, 1)])
+    off = float(np.linalg.norm(fixes.data[0, :2] - line))
+    spread = AGREE_SD * (sd + FIRST_FIX_SD)
+    return (line, spread) if off > spread else (fixes.data[0, :2], sd)
+
+
+def _robust_first(time: Array, values: Array) -> float:
+    """The first of some values, by the line that half of them cannot turn; of two the first (Theil and Sen)."""
+    if len(time) < 3:
+        return float(values[0])
+    slope, at_median, *_ = theilslopes(values, time)
+    return float(at_median + slope * time[0])
