@@ -1,9 +1,12 @@
 """Where a dive begins: from the log where the configuration is silent, else from the configuration."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from dives import (
     LIVELY,
+    Simulated,
     altered,
     attitude_errors,
     batch,
@@ -12,6 +15,7 @@ from dives import (
     kept,
     level_log,
     simulated,
+    true_at,
     without,
 )
 
@@ -20,8 +24,10 @@ from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import trusted_first
 from rovgraph.estimators.initialise import UNKNOWN_HEADING_SD, initialise, sample_density
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix, wrap_angle
+from rovgraph.log import Log
 from rovgraph.simulate import Path, Style, scenario
 from rovgraph.simulate.scenario import SCENARIOS
+from rovgraph.trajectory import Trajectory
 
 DEG = np.deg2rad(1.0)
 G = 9.81
@@ -290,3 +296,122 @@ def test_noise_of_one_sensor_is_raised_alone_and_that_of_an_honest_dive_is_not()
     noise = initialise(altered(case.log, "imu", data), case.config).config.imu.noise
     assert noise.gyr == pytest.approx(np.hypot(density, case.config.imu.noise.gyr), rel=0.05)
     assert noise.acc == case.config.imu.noise.acc
+
+
+# samples that are wrong, or late
+
+
+def spoilt(case: Simulated, sensor: str, rows: slice, column: int, value: float) -> Log:
+    data = case.log[sensor].data.copy()
+    data[rows, column] = value
+    return altered(case.log, sensor, data)
+
+
+UNDER_WAY = 40.0  # from when on a dive moves
+
+
+@pytest.fixture(scope="module")
+def lively() -> Simulated:
+    """Turning and moving from its first second."""
+    config = falcon(heading={"sources": ["ahrs"]})
+    whole = simulated(config, 120.0, seed=4, style=LIVELY, ahrs_rate=10.0, fix_interval=2.0)
+    log = whole.log
+    for sensor, stream in whole.log.streams.items():
+        log = kept(log, sensor, stream.time >= UNDER_WAY)
+    return replace(whole, log=log)
+
+
+def begun(case: Simulated) -> Trajectory:
+    """The truth where the log begins."""
+    return true_at(case, np.array([UNDER_WAY]))
+
+
+def free(case: Simulated) -> Config:
+    """Its configuration, the start left to the log."""
+    return case.config.model_copy(update={"start": Config().start})
+
+
+def start_heading_deg(case: Simulated, log: Log) -> float:
+    return float(initialise(log, free(case)).config.start.heading_deg)
+
+
+def apart_deg(a: float, b: float) -> float:
+    return abs(float(np.rad2deg(wrap_angle(np.deg2rad(a - b)))))
+
+
+def test_a_heading_that_begins_late_is_brought_back_to_the_start_by_the_gyro(lively):
+    late_from = UNDER_WAY + 15.0
+    yaw = rpy_from_matrix(true_at(lively, np.array([UNDER_WAY, late_from])).R_nb)[:, 2]
+    assert apart_deg(*np.rad2deg(yaw)) > 20.0
+    late = kept(lively.log, "ahrs", lively.log["ahrs"].time > late_from)
+    assert apart_deg(start_heading_deg(lively, late), start_heading_deg(lively, lively.log)) < 10.0
+
+
+@pytest.mark.parametrize("wrong", [1, 15])
+def test_wrong_first_headings_are_outvoted(lively, wrong):
+    log = spoilt(lively, "ahrs", slice(0, wrong), 0, lively.log["ahrs"].data[0, 0] + 1.5)
+    assert apart_deg(start_heading_deg(lively, log), start_heading_deg(lively, lively.log)) < 3.0
+
+
+@pytest.mark.parametrize("value", [0.0, -9999.0])
+def test_wrong_first_depths_are_outvoted(lively, value):
+    count = int(0.4 * np.sum(lively.log["depth"].time < UNDER_WAY + 5.0))
+    assert count > 1
+    b = initialise(spoilt(lively, "depth", slice(0, count), 0, value), free(lively))
+    assert b.config.start.down_m == pytest.approx(begun(lively).p_n[0, 2], abs=0.5)
+
+
+def test_a_wrong_first_fix_is_outvoted(lively):
+    far = lively.log["fix"].data[0, 0] + 60.0
+    b = initialise(spoilt(lively, "fix", slice(0, 1), 0, far), free(lively))
+    assert b.config.start.north_m == pytest.approx(begun(lively).p_n[0, 0], abs=15.0)
+
+
+def test_a_late_first_fix_or_depth_leaves_the_start_as_unknown_as_the_way_since(lively):
+    log = lively.log
+    for sensor in ("fix", "depth"):
+        log = kept(log, sensor, log[sensor].time > UNDER_WAY + 18.0)
+    assert (initialise(log, free(lively)).start.p_sd > 15.0).all()
+
+
+def test_the_antennas_lever_arm_is_taken_off_the_first_fix():
+    case = simulated(falcon(fix={"lever_arm_m": [4.0, 0.0, 0.0]}), 40.0, noise=False, fix_interval=1.0, seed=2)
+    start = initialise(case.log, free(case)).config.start
+    assert np.linalg.norm(np.array([start.north_m, start.east_m]) - case.truth.p_n[0, :2]) < 1.0
+
+
+@pytest.mark.parametrize("shown_by", [None, "dvl", "dvl_heading"])
+def test_a_steady_turn_that_dvl_or_compass_show_is_not_taken_for_standing_still(shown_by):
+    log = still([0, 0, 0], gyr=(0.0, 0.0, 1.0 * DEG))
+    data = log[shown_by or "dvl"].data.copy()
+    if shown_by == "dvl":
+        data[:, 0] = 0.5
+    if shown_by == "dvl_heading":
+        data[:, 0] += DEG * log["dvl_heading"].time
+    _, b = start_of(altered(log, shown_by or "dvl", data))
+    assert any("taken as standing still" in line for line in b.assumptions) == (shown_by is None)
+
+
+def test_what_was_written_of_the_start_gives_the_same_start_again(lively):
+    b = initialise(lively.log, free(lively))
+    again = initialise(lively.log, Config.model_validate(b.config.model_dump()))
+    np.testing.assert_allclose(again.start.rpy_sd, b.start.rpy_sd)
+    np.testing.assert_allclose(again.start.p_sd, b.start.p_sd)
+    np.testing.assert_allclose(again.start.state.p_n, b.start.state.p_n)
+
+
+def test_a_log_without_depth_says_that_it_begins_at_the_surface(lively):
+    assert (
+        "start.down_m 0.0, as the log has no depth"
+        in initialise(without(lively.log, "depth"), free(lively)).assumptions
+    )
+
+
+@pytest.mark.parametrize("row", [0, 40])
+def test_a_magnetometer_that_reads_zero_once_is_not_believed_then(row):
+    case = simulated(falcon(), 40.0, seed=2)
+    data = case.log["mag"].data.copy()
+    data[row] = 0.0
+    smoother = batch(altered(case.log, "mag", data), free(case))
+    assert smoother.assembler.left_out["mag", "exactly zero"] == 1
+    assert np.isfinite(smoother.solve().trajectory.p_sd).all()

@@ -3,8 +3,11 @@
 Exit codes: 0 done, 2 bad input, 130 interrupted (typer's).
 """
 
+import errno
+import os
 import sys
 import warnings
+from typing import NoReturn
 
 import typer
 
@@ -45,7 +48,27 @@ def main() -> None:
     warnings.simplefilter("always", DataWarning)
     warnings.showwarning = _show_warning
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(str(error))
+    except BrokenPipeError:  # whoever read has had enough, as ``head``
+        _silence()
+        sys.exit(0)
+    except OSError as error:
+        if error.errno != errno.ENOSPC or error.filename is not None:
+            raise
+        _silence()
+        _refuse(f"standard output cannot be written ({error.strerror}); free some space")
+
+
+def _refuse(reason: str) -> NoReturn:
+    print(f"error: {reason}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _silence() -> None:
+    """Nothing is to be flushed at the end to where nothing can be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

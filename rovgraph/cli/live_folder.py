@@ -50,12 +50,22 @@ def prepared(out: Path, force: bool, resume: bool, sources: Sequence[str]) -> No
 
 def unfinished(out: Path | None) -> None:
     """Say in the folder that no estimate was made."""
+    from rovgraph.errors import InputError
+
     if out is not None:
-        _write_summary(out, {"state": "no estimate"})
+        with contextlib.suppress(InputError):
+            _write_summary(out, {"state": "no estimate"})
 
 
 def finished(out: Path, session: "Session", refine: bool) -> None:
-    """Write the summary, and smooth what was recorded."""
+    """Write the summary, and smooth what was recorded.
+
+    Raises
+    ------
+    InputError : not all of it could be written
+    """
+    from rovgraph.errors import InputError
+
     solution, navigator = session.solution, session.navigator
     assert solution is not None
     _write_summary(
@@ -75,6 +85,8 @@ def finished(out: Path, session: "Session", refine: bool) -> None:
     )
     if refine:
         _smooth(out)
+    if session.files is not None and session.files.recorder.lost:
+        raise InputError(f"{out}: {session.files.recorder.lost} rows of the recording were lost, the disk was full")
     _note(f"results in {out}")
 
 
@@ -105,11 +117,16 @@ def _file(url: str) -> Path:
 
 
 def _write_summary(out: Path, content: dict[str, Any]) -> None:
+    from rovgraph.errors import InputError
     from rovgraph.report.folder import STAMP, SUMMARY
+    from rovgraph.report.results import to_plain
 
     partial = out / f".{SUMMARY}.partial"
     try:
-        partial.write_text(json.dumps({**STAMP, "kind": "online", **content}, indent=2) + "\n", encoding="utf-8")
+        plain = to_plain({**STAMP, "kind": "online", **content})
+        partial.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         partial.replace(out / SUMMARY)
     except OSError as error:
-        _note(f"{out / SUMMARY}: cannot be written ({error.strerror}); free some space")
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise InputError(f"{out / SUMMARY}: cannot be written ({error.strerror}); free some space") from None

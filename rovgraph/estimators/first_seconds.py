@@ -7,7 +7,7 @@ no gate would find out.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import theilslopes
+from scipy.stats import siegelslopes
 
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
@@ -206,13 +206,12 @@ def _first_fix(fixes: Stream, sd: float) -> tuple[Array, float]:
     sd = float(own) if own > 0.0 else sd
     line = np.array([_robust_first(fixes.time, fixes.data[:, k]) for k in (0, 1)])
     off = float(np.linalg.norm(fixes.data[0, :2] - line))
-    spread = AGREE_SD * (sd + FIRST_FIX_SD)
-    return (line, spread) if off > spread else (fixes.data[0, :2], sd)
+    return (line if off > AGREE_SD * (sd + FIRST_FIX_SD) else fixes.data[0, :2]), sd
 
 
 def _robust_first(time: Array, values: Array) -> float:
-    """The first of some values, by the line that half of them cannot turn; of two the first (Theil and Sen)."""
+    """The first of some values, by the line that half of them cannot turn; of two the first (Siegel 1982)."""
     if len(time) < 3:
         return float(values[0])
-    slope, at_median, *_ = theilslopes(values, time)
-    return float(at_median + slope * time[0])
+    slope, intercept = siegelslopes(values, time)
+    return float(intercept + slope * time[0])
