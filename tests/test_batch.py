@@ -20,12 +20,14 @@ from dives import (
     simulated,
     smoothed,
     started,
+    true_at,
 )
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
+from rovgraph.estimators.dive import smooth
 from rovgraph.graph import batch as solver
 from rovgraph.graph.batch import Problem, covariance, covariances, make_problem, make_values, marginals, solve
 from rovgraph.graph.keys import key
@@ -374,3 +376,49 @@ def test_a_sensor_that_its_gate_keeps_out_altogether_does_no_harm(noisy):
     residuals = estimate.residuals
     assert (residuals.loc[residuals["sensor"] == "mag", "weight"] == 0.0).all()
     assert np.isfinite(estimate.trajectory.p_n).all()
+
+
+def test_gates_that_flip_for_ever_come_to_rest(noisy, monkeypatch):
+    problem, values = problem_of(noisy.log, noisy.config)
+    asked = []
+
+    def flipping(self, values):
+        asked.append(1)
+        assert len(asked) < 100
+        gates = self.believed()
+        return {s: g & ((np.arange(len(g)) + len(asked)) % 2 == 0) for s, g in gates.items()}
+
+    monkeypatch.setattr(Problem, "gates", flipping)
+    assert np.isfinite(solve(problem, values).cost)
+
+
+def test_dead_reckoning_has_the_depth_of_the_body_not_of_the_sensor():
+    sections = {
+        "depth": {"lever_arm_m": [0.0, 0.0, -1.0]},
+        "imu": {"lever_arm_m": [0.0, 0.0, 0.3]},
+        "calibration": {"depth_offset": {"mean": 0.5}},
+    }
+    case = simulated(falcon(**sections), 60.0, noise=False, calibration={"depth_offset": np.array([0.5])})
+    track = batch(case.log, started(case)).dead_reckoning().trajectory
+    assert np.abs(track.p_n[:, 2] - true_at(case, track.time).p_n[:, 2]).max() < 0.05
+
+
+def test_a_dive_shorter_than_a_second_is_solved_by_both_solvers():
+    case = simulated(falcon(), 40.0)
+    log = case.log
+    for sensor, stream in log.streams.items():
+        log = kept(log, sensor, stream.time < 0.9)
+    for name in ("batch", "isam2"):
+        (estimate, *_) = smooth(log, changed(case.config, graph={"solver": name}), "smoothed").estimates
+        assert np.isfinite(estimate.trajectory.p_n).all()
+
+
+def test_what_walks_does_so_by_the_time_between_its_values_however_short_a_segment_is_said_to_be():
+    """Without pings keyframes are a second apart, whatever `graph.segment_s`."""
+    case, walk = simulated(falcon(), 40.0, noise=False), 0.01
+    config = started(case, graph={"segment_s": 0.2}, calibration={"field_scale": {"walk": walk}})
+    problem, _ = problem_of(kept(case.log, "dvl", case.log["dvl"].time < 1.0), config)
+    factors = [problem.native.at(k) for k in range(problem.native.size())]
+    steps = [f.noiseModel().sigmas()[0] for f in factors if isinstance(f, gtsam.BetweenFactorVector)]
+    assert np.sum(np.square(steps)) == pytest.approx(walk**2 * problem.walked(int(problem.segment[-1])))
+    assert problem.walked(int(problem.segment[-1])) > 39.0

@@ -1017,3 +1017,19 @@ def test_a_gzipped_telemetry_log_and_a_plain_one_are_the_same(real_tlog, tmp_pat
     )
     assert one == other
     assert len(one) > 50
+
+
+def test_thrusters_are_taken_from_the_first_on_without_a_hole(heard):
+    decoder = json_lines("-", heard, Config())
+    sent = (b'{"thruster_1": 1, "thruster_2": 2}', b'{"thruster_2": 2}', b'{"thruster_1": 1, "thruster_3": 3}')
+    found = [decoded(decoder, line + b"\n") for line in sent]
+    assert [[r.values.tolist() for m in messages for r in m.readings] for messages in found] == [[[1.0, 2.0]], [], []]
+    assert heard.kinds == {"incomplete": 2}
+
+
+def test_an_sd_of_0_is_not_known_and_a_negative_one_refused(heard):
+    decoder = json_lines("-", heard, Config())
+    (message,) = decoded(decoder, b'{"fix_north": 1, "fix_east": 2, "fix_sd": 0}\n')
+    np.testing.assert_array_equal(message.readings[0].values, [1.0, 2.0, np.nan])
+    assert not decoded(decoder, b'{"fix_north": 1, "fix_east": 2, "fix_sd": -1}\n')
+    assert heard.kinds == {"out of range": 1}

@@ -349,3 +349,48 @@ def test_a_checkpoint_that_is_damaged_is_said_in_one_line(case, tmp_path):
     (tmp_path / "checkpoint").write_bytes(b"rovgraph checkpoint 2 0000\nx")
     with pytest.raises(InputError, match="damaged"):
         Files(tmp_path, case.config, Complaints(), resume=True)
+
+
+def recorded(folder: Path, case: Simulated, until: float) -> None:
+    """A run that was ended at some time."""
+    complaints = Complaints()
+    nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
+    files = Files(folder, case.config, complaints)
+    Session(nav, [], complaints, 2.0, files).run(message(m) for m in case.log.measurements() if m.time < until)
+    files.close()
+
+
+def test_a_recording_that_cannot_be_read_is_said_and_the_track_before_stands(case, tmp_path):
+    recorded(tmp_path, case, 20.0)
+    track = (tmp_path / "trajectory_filtered.csv").read_bytes()
+    recording = (tmp_path / "received.csv").read_bytes().split(b"\n")
+    recording[500] = b"\0" * 80
+    (tmp_path / "received.csv").write_bytes(b"\n".join(recording))
+    with pytest.raises(InputError, match="line 501 holds binary data"):
+        Files(tmp_path, case.config, Complaints(), resume=True)
+    assert (tmp_path / "trajectory_filtered.csv").read_bytes() == track
+
+
+def test_resuming_what_received_nothing_begins_anew_and_writes_what_is_json(case, tmp_path):
+    recorded(tmp_path, case, 0.0)
+    nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
+    files = Files(tmp_path, case.config, Complaints(), resume=True)
+    session = Session(nav, [], Complaints(), 2.0, files)
+    session.resume()
+    session.run(message(m) for m in case.log.measurements() if m.time < 20.0)
+    files.close()
+    first = json.loads((tmp_path / "events.jsonl").read_text().splitlines()[0], parse_constant=lambda name: 1 / 0)
+    assert first["time"] is None and "begins anew" in first["text"]
+
+
+def test_a_summary_that_cannot_be_written_is_one_line_and_leaves_no_rest(capsys, dive, tmp_path, monkeypatch):
+    def full(self, *args, **kwargs):
+        if self.name == ".summary.json.partial":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write_text(self, *args, **kwargs)
+
+    write_text = Path.write_text
+    monkeypatch.setattr(Path, "write_text", full)
+    line = refused(capsys, "online", f"file:{dive / 'log.csv'}", "--speed", "max", "--out", tmp_path / "out")
+    assert "summary.json: cannot be written (No space left on device)" in line
+    assert not list(tmp_path.rglob("*.partial"))

@@ -10,7 +10,15 @@ import pytest
 from dives import Simulated, falcon, simulated, true_at
 from live import Flight, flown, message, navigator, turned
 
+from rovgraph.errors import InputError
+from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.estimators.refiner import due_times
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.complaints import Complaints
+from rovgraph.live.files import Files
+from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.navigator import Navigator
+from rovgraph.live.session import Session
 from rovgraph.log import Log, Measurement, Stream
 
 AT = 20.0  # when something fails
@@ -199,3 +207,59 @@ def test_what_is_read_again_after_a_crash_is_no_event(case):
 def stream_until(stream: Stream, time: float) -> Stream:
     keep = stream.time < time
     return Stream(stream.sensor, stream.columns, stream.time[keep], stream.data[keep], stream.row[keep])
+
+
+def test_a_fix_in_degrees_is_as_late_as_one_in_metres(case):
+    config = case.config.model_copy(update={"online": case.config.online.model_copy(update={"delay_s": {"fix": 0.5}})})
+    nav = Navigator(config, renew=False)
+    intake = nav._intake
+    local, geodetic = Reading("fix", np.zeros(3)), Reading(GEODETIC, np.array([58.0, 14.0, 1.0]))
+    assert [time for time, _ in intake.timed(100.0, (local, geodetic))] == [99.5, 99.5]
+
+
+def test_thruster_lines_that_change_their_count_are_left_out_and_the_estimate_begins(case):
+    signals = Measurement(0.0, "thruster", np.array([10.0, 20.0]), 0)
+    some = [
+        signals._replace(time=t, values=signals.values[: 1 + k % 2]) for k, t in enumerate(np.arange(0.1, 12.0, 0.1))
+    ]
+    nav = navigator(case)
+    measurements = [m for m in case.log.measurements() if m.time < 12.0]
+    for m in sorted(measurements + some, key=lambda m: m.time):
+        nav.take(message(m))
+    assert nav.engine is not None
+    assert nav.left_out["thruster", "2 signals, and 1 before"] > 50
+
+
+@pytest.mark.parametrize("expected", [False, True])
+def test_water_track_that_begins_late_is_used_where_it_is_expected_and_else_said_not_to_be(expected):
+    dvl = {"water_velocity_sd_mps": [0.01, 0.01, 0.01]} if expected else {}
+    case = simulated(falcon(dvl=dvl), 40.0, seed=1, dvl_rate=4.0, water_track=True)
+    flight = flown(case, lambda m: [] if m.sensor == "dvl_water" and m.time < AT else [m])
+    assert (flight.navigator.health.used["dvl_water"] > 10) == expected
+    assert flight.events("dvl_water") == ([] if expected else ["unused"])
+
+
+@pytest.mark.parametrize("lag", [2.0, 20.0])
+def test_the_filter_is_renewed_whatever_the_lag(case, lag):
+    config = case.config.model_copy(update={"graph": case.config.graph.model_copy(update={"lag_s": lag})})
+    nav = Navigator(config, patient=True, clocks=Clocks(trust=True))
+    for m in case.log.measurements():
+        nav.take(message(m))
+    asked = len(due_times(lag)) - len(nav._renewals._due)
+    nav.finish()
+    assert asked >= 2
+    assert not [e for e in nav._take_events() if e.kind == "lost"]
+
+
+def test_a_track_that_cannot_be_smoothed_leaves_the_filter_running(case, tmp_path, monkeypatch):
+    def fails(self):
+        raise InputError("the data do not determine pose of keyframe 3")
+
+    monkeypatch.setattr(IncrementalEstimator, "solve", fails)
+    nav = Navigator(case.config, renew=False, smooth=True, clocks=Clocks(trust=True))
+    files = Files(tmp_path, case.config, Complaints())
+    session = Session(nav, [], Complaints(), 2.0, files)
+    session.run(message(m) for m in case.log.measurements() if m.time < 20.0)
+    files.close()
+    assert nav.isam2 is None
+    assert session.solution.time > 19.0
