@@ -259,6 +259,16 @@ def test_a_late_dvl_is_measured_against_depth(sound):
     assert any(f"vertical velocity comes {x} s later" in said for x in ("1.48", "1.49", "1.50", "1.51", "1.52"))
 
 
+@pytest.mark.parametrize("sd", [0.08, 0.2])
+def test_noise_of_depth_on_a_level_dive_is_not_taken_for_a_mounting(sound, sd):
+    def level(data, time):
+        data[:, 0] = 5.0 + np.random.default_rng(3).normal(0, sd, len(time))
+
+    flat = changed(sound, "dvl", lambda data, _: data.__setitem__((slice(None), 2), 0.0))
+    assert complaints(changed(flat, "depth", level), sensor="dvl") == ""
+    assert "does not follow depth" in complaints(flat, sensor="dvl")
+
+
 def test_a_dvl_that_looks_up_is_named_by_depth_and_by_fixes(sound):
     log = scaled(sound, "dvl", slice(1, 3), -1.0)
     assert "Then dvl.mount_rpy_deg is [180, 0, 0]" in complaints(without(log, "fix"), sensor="dvl")

@@ -269,7 +269,9 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         return
     numbers = f"slope {f.slope:.2g}, correlation {f.correlation:.2f} over {f.windows} windows"
     if abs(f.correlation) < FOLLOWS:
-        if f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
+        if f.sd_a < 2.0 * np.sqrt(2.0) * _depth_noise(depth, config, window):
+            yield Finding("dvl", "ok", "too little diving for the noise of depth to compare its vertical velocity with")
+        elif f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
             yield Finding("dvl", "warning", f"vertical velocity does not follow depth ({numbers}); mounting or clock?")
         return
     if f.slope < 0.0:
@@ -284,6 +286,14 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
     behind = lag(dvl, depth, window)  # the integral is the less noisy one
     yield from _clock("dvl", "vertical velocity", "the change of depth", Lag(-behind.seconds, behind.sd))
+
+
+def _depth_noise(depth: Signal, config: Config, window: float) -> float:
+    """Noise of a depth [m]: the configuration's, or what second differences show where that is more."""
+    if np.median(np.diff(depth.time)) > window / 4.0:  # they would show the diving
+        return config.depth.sd_m
+    shown = np.median(np.abs(np.diff(depth.value, 2))) / 0.6745 / np.sqrt(6.0)
+    return float(max(config.depth.sd_m, shown))
 
 
 def _flip(config: Config) -> str:
