@@ -368,6 +368,18 @@ def test_invalid_zeros_are_not_frozen(sound):
     assert dvl_frozen_intervals(changed(sound, "dvl", lose)) == []
 
 
+@pytest.mark.parametrize("held", [np.nan, 0.0, -32.768])
+def test_pings_without_bottom_lock_may_hold_anything_and_do_not_count_as_repeated(sound, held):
+    def lose(data, time):
+        lost = (time >= 100) & (time <= 200)
+        data[lost, :3], data[lost, 3] = held, 0.0
+
+    log = changed(sound, "dvl", lose)
+    (said,) = complaints(log, sensor="dvl").split("\n")
+    assert said.startswith("bottom lock 75")
+    assert timing(log["dvl"]).repeats == 0
+
+
 def test_keyframes_are_pings_and_what_fills_gaps():
     imu = stream("imu", np.arange(0, 10.001, 0.01), *np.zeros((6, 1001)))
     dvl = stream("dvl", [1.0, 1.5, 1.51, 4.0, 9.0], *np.ones((4, 5)))
