@@ -114,12 +114,17 @@ def lag(a: Signal, b: Signal, window: float) -> Lag:
     step = 0.1
     lags = np.arange(-LARGEST_LAG, LARGEST_LAG + step / 2, step)
     first, last = max(a.time[0], b.time[0]) + LARGEST_LAG, min(a.time[-1], b.time[-1]) - LARGEST_LAG
-    start = np.arange(first, last - window, window / OVERLAP)
-    if len(start) < OVERLAP * MIN_WINDOWS:
+    times = np.arange(first, last, window / OVERLAP)
+    count = len(times) - OVERLAP
+    if count < OVERLAP * MIN_WINDOWS:
         return Lag(np.nan, np.nan)
-    part = np.arange(len(start)) * PARTS // len(start)
-    y = b.at(start + window, window) - b.at(start, window)
-    sums = np.array([_moments(a.at(start + window - x, window) - a.at(start - x, window), y, part) for x in lags])
+
+    def changes(signal: Signal, late: float) -> Array:
+        value = signal.at(times - late, window)
+        return value[OVERLAP:] - value[:-OVERLAP]
+
+    part, y = np.arange(count) * PARTS // count, changes(b, 0.0)
+    sums = np.array([_moments(changes(a, float(x)), y, part) for x in lags])
     every = sums.sum(axis=-1)
     seconds = _peak(lags, _correlation(every))
     without = np.array([_peak(lags, _correlation(every - sums[..., k])) for k in range(PARTS)])
