@@ -34,8 +34,9 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / report / estimators, simulate, evaluate, check / graph / instruments /
-config, log, trajectory / sensors / calibration, state / geometry / errors.
+cli / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph /
+instruments / config, log, trajectory / sensors, model_aiding / vehicle /
+state, calibration, thesis / geometry, workers / errors.
 """
 
 __version__ = "0.1.0"

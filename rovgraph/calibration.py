@@ -4,9 +4,10 @@ The configuration's ``calibration`` section, the graph's keys and priors, the
 simulator's hidden truth and the rows of a report all come from `TABLE`.
 A variable is added by adding a row here and using its name in a measurement model.
 
-The offset and the deviation of every compass are estimated by default: no compass in a
-vehicle is free of them, and holding them at zero pushes them into the DVL's misalignment
-and makes the track look far more certain than it is.
+The offset and the deviation of every compass are estimated by default, of a magnetometer its
+hard iron instead of the deviation: no compass in a vehicle is free of them, and holding them
+at zero pushes them into the DVL's misalignment and makes the track look far more certain than
+it is.
 """
 
 from dataclasses import dataclass

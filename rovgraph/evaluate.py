@@ -86,8 +86,12 @@ def evaluate(trajectory: Trajectory, reference: Trajectory, start: float = 0.0, 
 
     Raises
     ------
-    InputError : fewer than two reference epochs inside the trajectory's time
+    InputError : a start before or after the trajectory; fewer than two reference epochs inside the rest of it
     """
+    if not start >= 0.0:
+        raise InputError(f"comparing from {start:g} s on: expected 0 or more after the trajectory's first epoch")
+    if (lasts := float(trajectory.time[-1] - trajectory.time[0])) < start:
+        raise InputError(f"comparing from {start:g} s on: the trajectory lasts {lasts:.1f} s, nothing of it is left")
     first = trajectory.time[0] + start
     wanted = reference.time >= first
     common = np.flatnonzero(wanted & (reference.time >= trajectory.time[0]) & (reference.time <= trajectory.time[-1]))

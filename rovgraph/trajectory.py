@@ -181,6 +181,11 @@ def read_table(path: Path | str) -> pd.DataFrame:
     ------
     InputError : no such file, no CSV, a required column missing, something that is no number
     """
+    if Path(path).is_dir():
+        likely = ("trajectory_s*.csv", "trajectory_*.csv", "truth.csv*", "reference.csv*")
+        inside = [found for pattern in likely for found in sorted(Path(path).glob(pattern))]
+        such = f", such as {inside[0]}" if inside else ""
+        raise InputError(f"{path}: is a directory, expected a CSV file; give one in it{such}")
     try:
         table = pd.read_csv(path, index_col=False, skipinitialspace=True, low_memory=False)
     except FileNotFoundError:

@@ -164,6 +164,9 @@ class Hydrodynamics:
     ) -> tuple[Array, Jacobians]:
         """Angular acceleration, drag and buoyancy's moment included (2.19), (2.20).
 
+        The simulator integrates the same equations in plain floats, for speed; this is the
+        reference that tests compare it with.
+
         Parameters
         ----------
         w_b : ndarray, shape (..., 3) [rad/s]

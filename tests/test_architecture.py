@@ -1,12 +1,15 @@
 """Imports go downwards only, heavy libraries stay where they belong, and help is instant."""
 
 import ast
+import re
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+
+import rovgraph
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "rovgraph"
@@ -134,6 +137,11 @@ def test_the_documents_name_every_layer_and_every_module():
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     missing = [n for n in MODULES if "." in n and f"`{n.split('.', 1)[1].replace('.', '/')}`" not in text]
     assert not missing, "docs/architecture.md does not name them"
+
+
+def test_the_package_lists_all_layers_in_their_order():
+    listed = rovgraph.__doc__.rpartition("----\n")[2].strip().rstrip(".").split("/")
+    assert [set(re.findall(r"\w+", members)) for members in listed] == list(reversed(LAYERS))
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:

@@ -177,10 +177,9 @@ def test_every_measurement_is_attached_thinned_or_counted():
 def test_sensors_that_are_not_in_use_are_ignored():
     config = Config()
     assembler = Assembler(config, {"dvl": instruments(config)["dvl"]}, np.zeros(6))
-    for m in log_of(2.0, [0.5], depth=scalar([0.7])).measurements():
-        assembler.add(m)
+    intervals = [i for m in log_of(2.0, [0.5], depth=scalar([0.7])).measurements() for i in assembler.add(m)]
     assert not assembler.left_out
-    assert all(a.sensor == "dvl" for i in assembler.finish() for a in i.attached)
+    assert [a.sensor for i in [*intervals, *assembler.finish()] for a in i.attached] == ["dvl"]
 
 
 def test_an_interval_is_given_once_the_imu_is_half_a_window_past_its_ping():

@@ -226,10 +226,47 @@ def test_a_late_compass_is_measured(sound):
     assert any(f"comes {x} s later than the gyro's" in said for x in ("0.79", "0.80", "0.81"))
 
 
+def gentle_dive(seed: int, late: float = 0.0) -> Log:
+    """Two minutes or less of gentle turning: gyro and AHRS, a degree of white noise, the latter stamped late."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 60.0 + 20.0 * (seed % 4), 0.02)
+    rate = 0.12 * (0.5 + np.sin(0.11 * t + rng.uniform(0, 2 * np.pi)))
+    heading = np.cumsum(rate) * 0.02
+    imu = np.column_stack([*np.zeros((2, len(t))), np.full(len(t), -9.81), *np.zeros((2, len(t))), rate])
+    imu[:, 3:] += rng.normal(0, 5e-3, (len(t), 3))
+    compass = wrap_angle(heading[::5] + rng.normal(0, np.deg2rad(1.0), len(t[::5])))
+    streams = stream("imu", t, *imu.T), stream("ahrs", t[::5] + late, compass)
+    return Log("gentle.csv", {s.sensor: s for s in streams})
+
+
+def test_noise_of_a_heading_is_not_taken_for_a_clock_that_is_late():
+    warned = [seed for seed in range(30) if "do the clocks disagree" in complaints(gentle_dive(seed), sensor="ahrs")]
+    assert len(warned) <= 1
+    late = [seed for seed in range(30) if "do the clocks disagree" in complaints(gentle_dive(seed, 0.6), sensor="ahrs")]
+    assert len(late) > 20
+
+
+def test_half_a_second_between_clocks_is_found_on_a_dive_that_turns(sound):
+    for sensor in ("ahrs", "dvl_heading"):
+        late = replace(sound[sensor], time=sound[sensor].time - 0.5)
+        said = complaints(replace(sound, streams={**sound.streams, sensor: late}), sensor=sensor)
+        assert "s earlier than the gyro's (sd 0.0" in said
+
+
 def test_a_late_dvl_is_measured_against_depth(sound):
     late = replace(sound["dvl"], time=sound["dvl"].time + 1.5)
     said = complaints(replace(sound, streams={**sound.streams, "dvl": late}), sensor="dvl")
     assert any(f"vertical velocity comes {x} s later" in said for x in ("1.48", "1.49", "1.50", "1.51", "1.52"))
+
+
+@pytest.mark.parametrize("sd", [0.08, 0.2])
+def test_noise_of_depth_on_a_level_dive_is_not_taken_for_a_mounting(sound, sd):
+    def level(data, time):
+        data[:, 0] = 5.0 + np.random.default_rng(3).normal(0, sd, len(time))
+
+    flat = changed(sound, "dvl", lambda data, _: data.__setitem__((slice(None), 2), 0.0))
+    assert complaints(changed(flat, "depth", level), sensor="dvl") == ""
+    assert "does not follow depth" in complaints(flat, sensor="dvl")
 
 
 def test_a_dvl_that_looks_up_is_named_by_depth_and_by_fixes(sound):
@@ -329,6 +366,18 @@ def test_invalid_zeros_are_not_frozen(sound):
         data[(time >= 100) & (time <= 120), :4] = 0.0
 
     assert dvl_frozen_intervals(changed(sound, "dvl", lose)) == []
+
+
+@pytest.mark.parametrize("held", [np.nan, 0.0, -32.768])
+def test_pings_without_bottom_lock_may_hold_anything_and_do_not_count_as_repeated(sound, held):
+    def lose(data, time):
+        lost = (time >= 100) & (time <= 200)
+        data[lost, :3], data[lost, 3] = held, 0.0
+
+    log = changed(sound, "dvl", lose)
+    (said,) = complaints(log, sensor="dvl").split("\n")
+    assert said.startswith("bottom lock 75")
+    assert timing(log["dvl"]).repeats == 0
 
 
 def test_keyframes_are_pings_and_what_fills_gaps():

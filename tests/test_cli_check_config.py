@@ -157,6 +157,47 @@ def test_config_names_a_wrong_key(run, tmp_path):
     assert "dvl.mount_rpy_deg" in err
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("dvl: {velocity_sd_mps: 0.01}", "dvl.velocity_sd_mps: expected three numbers, found 0.01"),
+        ("dvl: {mount_rpy_deg: [180, 0]}", "dvl.mount_rpy_deg: expected three numbers, found two"),
+        ("dvl: {mount_rpy_deg: []}", "dvl.mount_rpy_deg: expected three numbers, found none"),
+        ("dvl: {mount_rpy_deg: [180, 0, 0, 1]}", "dvl.mount_rpy_deg: expected three numbers, found four"),
+        ("dvl: {mount_rpy_deg: [180, 0, x]}", "dvl.mount_rpy_deg.2: expected a number, found 'x'"),
+        ("dvl: {gate_sd: 0}", "dvl.gate_sd: expected more than 0, found 0"),
+        ("dvl: {loss: hubr}", "dvl.loss: expected 'none', 'huber' or 'cauchy', found 'hubr'"),
+        ("dvl: 3", "dvl: expected keys and values, found 3"),
+        ("name:", "name: expected text, found nothing"),
+        ("imu: {mag: {matrix: [1]}}", "imu.mag.matrix.0: expected three numbers, found 1"),
+        ("vehicle: {thrusters: [{}]}", "vehicle.thrusters.0.position_m: expected three numbers, found nothing"),
+        ("vehicle: {thrusters: 4}", "vehicle.thrusters: expected a list of entries, found 4"),
+        ("environment: {latitude_deg: 99}", "environment.latitude_deg: expected 90 or less, found 99"),
+        ("environment: {earth_rotation: maybe}", "environment.earth_rotation: expected true or false, found 'maybe'"),
+        ("place: {remembered: 1.5}", "place.remembered: expected a whole number, found 1.5"),
+        ("online: {delay_s: {dv: 1}}", "online.delay_s: expected one of 'imu', 'mag'"),
+        ("null: 3", "expected text as a key, found nothing"),
+        ("dvl: {2: 3}", "dvl: expected text as a key, found 2"),
+        ("calibration: {dvl_yaw: {mean_deg: [1, 2]}}", "dvl_yaw.mean_deg: expected a number, found [1, 2]"),
+        ("calibration: {hard_iron: {mean: [1, 2]}}", "hard_iron.mean: expected one number or three, found [1, 2]"),
+        ("calibration: {hard_iron: {mean: [1, 2, x]}}", "expected one number or three, found [1, 2, 'x']"),
+    ],
+)
+def test_a_wrong_value_is_said_with_file_key_and_what_was_expected(run, tmp_path, text, said):
+    (tmp_path / "c.yaml").write_text(text)
+    code, out, err = run("config", tmp_path / "c.yaml")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"error: {tmp_path / 'c.yaml'}: ")
+    assert said in err
+
+
+@pytest.mark.parametrize(
+    "text", ["dvl:\n", "dvl:\n  # scale_sd: 0.1\ncolumns:\n", "imu:\n  noise:\n", "calibration:\n  dvl_yaw:\n"]
+)
+def test_a_section_with_nothing_below_it_is_all_defaults(text):
+    assert parse_config(text) == parse_config("")
+
+
 def test_config_lists_every_key(run):
     code, out, _ = run("config", "--keys")
     assert code == 0

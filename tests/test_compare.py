@@ -22,8 +22,9 @@ from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.named import ESTIMATORS, Named, Task, outcomes, outcomes_of_dives, select
 from rovgraph.estimators.results import residual_frame
 from rovgraph.log import Log
+from rovgraph.report.figure_compare import draw_errors, draw_velocity
 from rovgraph.studies.aggregate import aggregate, nees_band
-from rovgraph.studies.compare import RUN_COLUMNS, compare
+from rovgraph.studies.compare import REFERENCE, RUN_COLUMNS, compare
 from rovgraph.studies.measures import measures
 from rovgraph.studies.runs import Case, Recorded
 from rovgraph.trajectory import Trajectory
@@ -59,6 +60,22 @@ def test_the_folder_holds_tables_summary_and_figures(compared):
     tables = {"table.csv", "runs.csv", "misalignment.csv", "velocity.csv", "summary.json", "config.yaml"}
     figures = {"errors.png", "end_points.png", "velocity.png", "misalignment.png"}
     assert {p.name for p in compared.iterdir()} == tables | figures
+
+
+def test_what_the_reference_does_not_know_has_no_panel_and_the_thesis_only_its_own_dives(compared):
+    table, runs = (pd.read_csv(compared / f"{name}.csv") for name in ("table", "runs"))
+    table["thesis_end_mean_m"] = 1.0
+    for thesis in (False, True):
+        figure = draw_errors(table, runs.assign(velocity_rms_mps=np.nan), "own log", thesis)
+        assert [axes.get_xlabel() for axes in figure.axes] == ["end error [m]", "heading, rms [deg]"]
+        said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        assert ("as printed there" in said) == thesis
+    velocity = pd.read_csv(compared / "velocity.csv")
+    velocity.loc[velocity["estimator"] == REFERENCE, ["v_north", "v_east"]] = np.nan
+    figure = draw_velocity(velocity, "own log")
+    assert figure is not None and figure.get_suptitle().endswith("the reference has none")
+    said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert said == ["north", "east"]
 
 
 def test_rows_are_in_the_order_of_runs_and_of_the_registry(compared):

@@ -57,6 +57,19 @@ def test_from_counts_from_the_trajectorys_beginning():
     assert evaluate(late, truth).max_m > 50.0
 
 
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        (5000.0, "from 5000 s on: the trajectory lasts 100.0 s, nothing of it is left"),
+        (-5.0, "from -5 s on: expected 0 or more"),
+        (np.nan, "from nan s on: expected 0 or more"),
+    ],
+)
+def test_a_start_outside_the_trajectory_is_refused(start, said):
+    with pytest.raises(InputError, match=said):
+        evaluate(track(), track(), start)
+
+
 def test_coverage_is_the_part_of_the_reference_that_was_compared():
     whole = track()
     half = Trajectory.certain(whole.time[:101], whole.p_n[:101], whole.R_nb[:101], whole.v_n[:101])

@@ -48,6 +48,16 @@ def test_blank_lines_are_passed_over_and_lines_still_count(tmp_path):
     assert log["depth"].row.tolist() == [2, 5]
 
 
+def test_blanks_around_names_and_cells_are_no_part_of_them(tmp_path):
+    text = " time , depth, fix_north ,fix_east, fix_sd,dvl_altitude\n1, 5,  ,,, 2\n 2 ,\t6 , 7 , 8 ,0.5 , \n"
+    log = read_quietly(write(tmp_path, text))
+    np.testing.assert_array_equal(log["depth"].data, [[5], [6]])
+    np.testing.assert_array_equal(log["fix"].data, [[7, 8, 0.5]])
+    assert log["dvl_altitude"].time.tolist() == [1]
+    with pytest.raises(InputError, match="line 3, column depth: 'deep' is no number"):
+        read_log(write(tmp_path, "time, depth\n1,\t5\n2, deep \n"))
+
+
 def test_windows_line_ends_and_byte_order_mark_are_read(tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(b"\xef\xbb\xbftime,depth\r\n1,5\r\n2,6\r\n")
@@ -158,7 +168,7 @@ def test_a_wrong_mapping_names_the_nearest_known(tmp_path, mapping, said):
         read_log(write(tmp_path, "time,depth\n0,1\n"), **mapping)
 
 
-@pytest.mark.parametrize("name", ["acx_x", "gyro_x", "acc_x ", "ACC_X"])
+@pytest.mark.parametrize("name", ["acx_x", "gyro_x", "ACC_X"])
 def test_a_near_miss_of_a_column_is_named(tmp_path, name):
     with pytest.warns(DataWarning) as caught:
         read_log(write(tmp_path, f"time,depth,{name}\n0,1,2\n"))
@@ -185,6 +195,8 @@ HOSTILE = {
     "clock set back": ("time,depth\n10,2\n11,2\n3,2\n", "line 4: time goes back from 11.000 to 3.000 s"),
     "semicolons": ("time;depth\n1;2\n", "separated by semicolons"),
     "twice": ("time,depth,depth\n1,2,3\n", "column 'depth' twice"),
+    "comment": ("# dive 3, lake\n# calm\ntime,depth,x,y\n1,2,3,4\n", "line 1 begins with #, a comment"),
+    "empty columns": ("time,depth,,\n1,2,,\n", "line 1 has 2 columns without a name, as spreadsheets"),
     "no sensor": ("time,x\n1,2\n", "no measurement of any sensor"),
     "validity": (
         "time,dvl_vx,dvl_vy,dvl_vz,dvl_valid\n1,1,1,1,255\n",

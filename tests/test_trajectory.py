@@ -136,7 +136,11 @@ def test_bad_files_are_named_with_their_line(tmp_path, content, words):
 def test_missing_file_and_folder_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_trajectory(tmp_path / "none.csv")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match=r"is a directory, expected a CSV file; give one in it$"):
+        read_trajectory(tmp_path)
+    for name in ("residuals.csv", "trajectory_filtered.csv", "trajectory_smoothed.csv"):
+        (tmp_path / name).write_text("time,north,east\n0,1,2\n1,1,2\n")
+    with pytest.raises(InputError, match=r"give one in it, such as .*trajectory_smoothed\.csv$"):
         read_trajectory(tmp_path)
 
 

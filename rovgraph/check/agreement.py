@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.check.findings import Finding, Level, integral
 from rovgraph.config import Config, mount_matrix
@@ -20,6 +21,9 @@ MIN_WINDOWS = 15
 FOLLOWS = 0.7  # correlation of sensors that see the same motion
 LAG_WARNING = 0.3  # [s]
 LARGEST_LAG = 3.0  # that is searched for [s]
+SURE = 3.0  # standard deviations of a lag that is no chance
+PARTS = 10  # of the log, each left out once to see how much a lag depends on it
+OVERLAP = 5  # windows that begin within one
 NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading"}
 
 
@@ -36,12 +40,16 @@ class Signal:
     time: Array
     value: Array
 
+    def at(self, times: Array, longest: float) -> Array:
+        """Values at times of any order, NaN in a gap; shape (len(times),)."""
+        k = np.searchsorted(self.time, times).clip(1, len(self.time) - 1)
+        in_gap = self.time[k] - self.time[k - 1] > longest
+        inside = (times >= self.time[0]) & (times <= self.time[-1]) & ~in_gap
+        return np.where(inside, np.interp(times, self.time, self.value), np.nan)
+
     def changes(self, edges: Array, longest: float) -> Array:
         """Change from each edge to the next, NaN next to a gap; shape (len(edges) - 1,)."""
-        k = np.searchsorted(self.time, edges).clip(1, len(self.time) - 1)
-        in_gap = self.time[k] - self.time[k - 1] > longest
-        inside = (edges >= self.time[0]) & (edges <= self.time[-1]) & ~in_gap
-        return np.diff(np.where(inside, np.interp(edges, self.time, self.value), np.nan))
+        return np.diff(self.at(edges, longest))
 
 
 @dataclass(frozen=True)
@@ -62,13 +70,32 @@ class Fit:
     windows: int
 
 
-def fit(a: Signal, b: Signal, window: float, lag: float = 0.0) -> Fit:
-    """Compare the changes of two signals, b taken ``lag`` seconds later."""
+@dataclass(frozen=True)
+class Lag:
+    """How much later one signal shows a motion than another.
+
+    Attributes
+    ----------
+    seconds : NaN if they do not follow each other
+    sd : NaN if it is not known
+    """
+
+    seconds: float
+    sd: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is more than noise makes of clocks that agree."""
+        return bool(abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd)
+
+
+def fit(a: Signal, b: Signal, window: float) -> Fit:
+    """Compare the changes of two signals."""
     first, last = max(a.time[0], b.time[0]) + LARGEST_LAG, min(a.time[-1], b.time[-1]) - LARGEST_LAG
     edges = np.arange(first, last, window)
     if len(edges) < 3:
         return Fit(np.nan, 0.0, 0.0, 0.0, 0)
-    x, y = a.changes(edges, window), b.changes(edges + lag, window)
+    x, y = a.changes(edges, window), b.changes(edges, window)
     both = np.isfinite(x) & np.isfinite(y)
     x, y = x[both], y[both]
     if len(x) < 3 or x.std() == 0.0 or y.std() == 0.0:
@@ -77,18 +104,55 @@ def fit(a: Signal, b: Signal, window: float, lag: float = 0.0) -> Fit:
     return Fit(correlation * float(y.std() / x.std()), correlation, float(x.std()), float(y.std()), len(x))
 
 
-def lag(a: Signal, b: Signal, window: float) -> float:
-    """How much later b shows the same motion than a [s]; NaN if they do not follow each other."""
+def lag(a: Signal, b: Signal, window: float) -> Lag:
+    """How much later b shows the same motion than a; NaN if they do not follow each other.
+
+    ``a``, the less noisy one, is moved along: b's noise is then the same at every lag, so that
+    the correlation is a smooth function of it. The standard deviation comes from leaving out one
+    part of the log after the other, which needs no model of what the two signals do not share.
+    """
     step = 0.1
-    window *= 1.0618  # no multiple of a period, so that interpolation smooths the noise alike at every lag
     lags = np.arange(-LARGEST_LAG, LARGEST_LAG + step / 2, step)
-    correlation = np.array([abs(fit(a, b, window, float(x)).correlation) for x in lags])
+    first, last = max(a.time[0], b.time[0]) + LARGEST_LAG, min(a.time[-1], b.time[-1]) - LARGEST_LAG
+    times = np.arange(first, last, window / OVERLAP)
+    count = len(times) - OVERLAP
+    if count < OVERLAP * MIN_WINDOWS:
+        return Lag(np.nan, np.nan)
+
+    def changes(signal: Signal, late: float) -> Array:
+        value = signal.at(times - late, window)
+        return value[OVERLAP:] - value[:-OVERLAP]
+
+    part, y = np.arange(count) * PARTS // count, changes(b, 0.0)
+    sums = np.array([_moments(changes(a, float(x)), y, part) for x in lags])
+    every = sums.sum(axis=-1)
+    seconds = _peak(lags, _correlation(every))
+    without = np.array([_peak(lags, _correlation(every - sums[..., k])) for k in range(PARTS)])
+    return Lag(seconds, float(np.sqrt((PARTS - 1) * np.var(without))))
+
+
+def _moments(x: Array, y: Array, part: NDArray[np.int64]) -> Array:
+    """Sums over the windows of each part: how many, x, y, x squared, y squared, x times y; shape (6, PARTS)."""
+    both = np.isfinite(x) & np.isfinite(y)
+    x, y = np.where(both, x, 0.0), np.where(both, y, 0.0)
+    return np.array([np.bincount(part, w, PARTS) for w in (both * 1.0, x, y, x * x, y * y, x * y)])
+
+
+def _correlation(sums: Array) -> Array:
+    """Absolute correlation of sums (m, 6) as `_moments` gives them; shape (m,), 0 where there is none."""
+    n, x, y, xx, yy, xy = sums.T
+    spread = (n * xx - x * x) * (n * yy - y * y)
+    return np.asarray(np.abs(n * xy - x * y) / np.sqrt(np.where(spread > 0.0, spread, np.inf)))
+
+
+def _peak(lags: Array, correlation: Array) -> float:
+    """Lag at which a correlation is largest [s]; NaN if the signals do not follow each other there."""
     k = int(np.argmax(correlation))
     if not 0 < k < len(lags) - 1 or correlation[k] < FOLLOWS:
         return np.nan
     before, peak, after = correlation[k - 1 : k + 2]
     bend = before - 2.0 * peak + after
-    return float(lags[k] + (0.5 * step * (before - after) / bend if bend < 0 else 0.0))
+    return float(lags[k] + (0.5 * (lags[1] - lags[0]) * (before - after) / bend if bend < 0 else 0.0))
 
 
 def headings(log: Log, config: Config) -> Iterator[Finding]:
@@ -105,8 +169,8 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         yield _turning(log, sensor, f)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             # short windows: in long ones a compass's deviation looks like a lag
-            seconds = lag(gyro, heading, max(1.0, 1.5 * period))
-            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", seconds)
+            found = lag(gyro, heading, max(1.0, 1.5 * period))
+            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", found)
 
 
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
@@ -180,15 +244,16 @@ def _say_degrees(sensor: str) -> str:
     return f"Say units: {{{sensor}: deg}}"
 
 
-def _clock(sensor: str, what: str, against: str, seconds: float) -> Iterator[Finding]:
+def _clock(sensor: str, what: str, against: str, found: Lag) -> Iterator[Finding]:
     """A lag, if there is one."""
-    if np.isnan(seconds):
+    if np.isnan(found.seconds):
         return
-    later = f"{abs(seconds):.2f} s {'later' if seconds > 0 else 'earlier'} than {against}"
-    if abs(seconds) > LAG_WARNING:
-        yield Finding(sensor, "warning", f"{what} comes {later}: do the clocks disagree, or is it filtered slowly?")
+    later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
+    sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
+    if found.significant:
+        yield Finding(sensor, "warning", f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?")
     else:
-        yield Finding(sensor, "ok", f"{what} comes {later}")
+        yield Finding(sensor, "ok", f"{what} comes {later}{sd}")
 
 
 def vertical(log: Log, config: Config) -> Iterator[Finding]:
@@ -209,7 +274,9 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         return
     numbers = f"slope {f.slope:.2g}, correlation {f.correlation:.2f} over {f.windows} windows"
     if abs(f.correlation) < FOLLOWS:
-        if f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
+        if f.sd_a < 2.0 * np.sqrt(2.0) * _depth_noise(depth, config, window):
+            yield Finding("dvl", "ok", "too little diving for the noise of depth to compare its vertical velocity with")
+        elif f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
             yield Finding("dvl", "warning", f"vertical velocity does not follow depth ({numbers}); mounting or clock?")
         return
     if f.slope < 0.0:
@@ -222,7 +289,16 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     else:
         level: Level = "ok" if 0.7 < f.slope < 1.4 else "warning"
         yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
-    yield from _clock("dvl", "vertical velocity", "the change of depth", lag(depth, dvl, window))
+    behind = lag(dvl, depth, window)  # the integral is the less noisy one
+    yield from _clock("dvl", "vertical velocity", "the change of depth", Lag(-behind.seconds, behind.sd))
+
+
+def _depth_noise(depth: Signal, config: Config, window: float) -> float:
+    """Noise of a depth [m]: the configuration's, or what second differences show where that is more."""
+    if np.median(np.diff(depth.time)) > window / 4.0:  # they would show the diving
+        return config.depth.sd_m
+    shown = np.median(np.abs(np.diff(depth.value, 2))) / 0.6745 / np.sqrt(6.0)
+    return float(max(config.depth.sd_m, shown))
 
 
 def _flip(config: Config) -> str:

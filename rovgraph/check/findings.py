@@ -81,6 +81,13 @@ def repeats(values: Array) -> NDArray[np.bool_]:
     return np.concatenate([[False], same.all(axis=1)])[: len(values)]
 
 
+def told(stream: Stream) -> Array:
+    """What a sensor measured, shape (n, k): NaN in pings without bottom lock, which hold nothing or a sentinel."""
+    if stream.sensor != "dvl":
+        return stream.data
+    return np.where((stream["dvl_valid"] == 1.0)[:, None], stream.data, np.nan)
+
+
 def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """First and last index of every stretch of True."""
     edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import Finding, Timing, repeats, since
+from rovgraph.check.findings import Finding, Timing, repeats, since, told
 from rovgraph.config import Config
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
@@ -18,7 +18,8 @@ RATES = {"imu": (5.0, 4000.0), "dvl": (0.1, 100.0), "depth": (0.05, 1000.0), "ma
 def timing(stream: Stream) -> Timing:
     """When the measurements of one sensor came."""
     periods = np.diff(stream.time)
-    again = int(repeats(stream.data).sum())
+    data = told(stream)
+    again = int((repeats(data) & ~np.isnan(data).all(axis=1)).sum())
     if not len(periods):
         time = float(stream.time[0])
         return Timing(stream.sensor, 1, np.nan, time, time, np.nan, np.nan, np.nan, again)
@@ -110,7 +111,8 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
 
 
 def _moves(stream: Stream) -> bool:
-    return bool((np.nanstd(stream.data[:, :3], axis=0) > 0).any()) if np.isfinite(stream.data[:, :3]).any() else False
+    values = told(stream)[:, :3]
+    return bool((np.nanstd(values, axis=0) > 0).any()) if np.isfinite(values).any() else False
 
 
 def _gaps(log: Log, config: Config, t: Timing) -> Iterator[Finding]:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import Finding, Level, frozen_runs, integral, since
+from rovgraph.check.findings import Finding, Level, frozen_runs, integral, since, told
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log
@@ -141,7 +141,7 @@ def frozen(log: Log, config: Config) -> Iterator[Finding]:
     for name, (sensor, first) in parts.items():
         if sensor not in log:
             continue
-        values = log[sensor].data[:, first : first + 3]
+        values = told(log[sensor])[:, first : first + 3]
         zero_or_empty = ~np.any(values, axis=1) | np.isnan(values).any(axis=1)
         allowed = [zero_or_empty[a] for a, _ in frozen_runs(values)] if name == "dvl" else []
         stretches = [r for i, r in enumerate(frozen_runs(values)) if not (allowed and allowed[i])]

@@ -55,7 +55,7 @@ def compare(
         comparison = library(runs, names, jobs, lambda done: progress("comparing", done))
     about["seconds"] = time.perf_counter() - began
     with results_folder(out, force) as folder:
-        draw_comparison(folder, comparison, title)
+        draw_comparison(folder, comparison, title, scenario == THESIS)
         write_comparison(folder, comparison, about)
     console = Console()
     if not console.is_terminal:

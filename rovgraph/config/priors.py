@@ -1,12 +1,33 @@
 """Calibration variables in the configuration, and the priors that come of them."""
 
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field, create_model
+from pydantic import BaseModel, BeforeValidator, Field, create_model
+from pydantic_core import PydanticCustomError
 
 from rovgraph.calibration import MOUNT, TABLE, Variable
+from rovgraph.config.complaints import count
 from rovgraph.config.sections import NotNegative, Positive, Section
+
+
+def _components(dim: int) -> Callable[[Any], Any]:
+    """Refuses what is neither one number for all components nor one for each; null passes."""
+    expected = "expected a number" if dim == 1 else f"expected one number or {count(dim)}"
+
+    def check(value: Any) -> Any:
+        several = value if isinstance(value, list | tuple) else [value]
+        if value is not None and not (len(several) in (1, dim) and all(map(_is_number, several))):
+            raise PydanticCustomError("components", expected)
+        return value
+
+    return check
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
 
 
 def _calibration_entry(variable: Variable) -> type[BaseModel]:
@@ -21,7 +42,7 @@ def _calibration_entry(variable: Variable) -> type[BaseModel]:
             Field(variable.estimate, description=f"estimate it: {variable.about}. Shown by: {variable.excited_by}"),
         ),
         "mean" + tail: (
-            float | tuple[float, ...] | None,
+            Annotated[float | tuple[float, ...] | None, BeforeValidator(_components(variable.dim))],
             Field(None, description=f"prior mean [{unit}]; null = " + ("the mounting" if mounted else "0")),
         ),
         "sd" + tail: (Positive, Field(round(variable.sd * scale, 12), description=f"prior sd [{unit}]")),

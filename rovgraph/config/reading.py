@@ -1,10 +1,9 @@
 """`Config`, and how it is read, written and described."""
 
-import difflib
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_origin
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
@@ -12,6 +11,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from rovgraph.calibration import MOUNT, TABLE, Belief
+from rovgraph.config.complaints import complaint
 from rovgraph.config.priors import Calibration
 from rovgraph.config.sections import (
     Depth,
@@ -77,10 +77,6 @@ def beliefs(config: Config) -> dict[str, Belief]:
     """The prior of every calibration variable, in the order of the table.
 
     The mean of the DVL's angles is its mounting where the configuration gives none.
-
-    Raises
-    ------
-    InputError : a mean with the wrong number of components
     """
     mount = dict(zip(MOUNT, config.dvl.mount_rpy_deg, strict=True))
     out = {}
@@ -90,8 +86,6 @@ def beliefs(config: Config) -> dict[str, Belief]:
         mean = getattr(entry, "mean" + tail)
         mean = mount.get(name, 0.0) if mean is None else mean
         values = np.atleast_1d(np.asarray(mean, dtype=float))
-        if values.size not in (1, variable.dim):
-            raise InputError(f"calibration.{name}.mean{tail}: {values.size} numbers, expected {variable.dim}")
         out[name] = Belief(
             variable,
             unit * np.broadcast_to(values, (variable.dim,)),
@@ -155,31 +149,26 @@ def parse_model(model: type[Model], data: dict[str, Any], source: str) -> Model:
     InputError : an unknown key (with the nearest known one), a value of the wrong kind
     """
     try:
-        return model.model_validate(data)
+        return model.model_validate(_without_empty(model, data))
     except ValidationError as error:
-        raise InputError(f"{source}: " + "; ".join(_complaint(e, model) for e in error.errors())) from None
+        said = dict.fromkeys(complaint(e, model) for e in error.errors())  # each item that a list lacks says the same
+        raise InputError(f"{source}: " + "; ".join(said)) from None
 
 
 def _reason(error: OSError | UnicodeDecodeError) -> str:
     return error.strerror or str(error) if isinstance(error, OSError) else "not UTF-8 text"
 
 
-def _known_keys(location: tuple[int | str, ...], model: Any) -> list[str]:
-    """Keys that are known beside the one at ``location``; a number in it stands for an item of a list."""
-    for part in location[:-1]:
-        model = get_args(model)[0] if isinstance(part, int) else model.model_fields[part].annotation
-    return list(model.model_fields)
-
-
-def _complaint(error: Any, model: type[BaseModel]) -> str:
-    """One validation error as a phrase that names key, problem and remedy."""
-    location = error["loc"]
-    key = ".".join(str(part) for part in location)
-    if error["type"] == "extra_forbidden":
-        known = _known_keys(location, model)
-        near = difflib.get_close_matches(str(location[-1]), known, 1, cutoff=0.0)
-        return f"unknown key {key}, nearest known key is {'.'.join([*map(str, location[:-1]), near[0]])}"
-    return f"{key}: {error['msg'][0].lower()}{error['msg'][1:]} (found {error['input']!r})"
+def _without_empty(model: type[BaseModel], data: dict[str, Any]) -> dict[str, Any]:
+    """Keys and values without sections that have nothing below them, so that their defaults hold."""
+    out = {}
+    for key, value in data.items():
+        kind = model.model_fields[key].annotation if key in model.model_fields else None
+        section = isinstance(kind, type) and issubclass(kind, BaseModel)
+        if value is None and (section or get_origin(kind) is dict):
+            continue
+        out[key] = _without_empty(kind, value) if section and isinstance(value, dict) else value  # type: ignore[arg-type]
+    return out
 
 
 def describe(model: type[BaseModel] = Config, prefix: str = "") -> Iterator[tuple[str, str, str]]:

@@ -48,6 +48,8 @@ class Table:
         InputError : a cell that is no number
         """
         cells = self.frame[name]
+        if pd.api.types.is_string_dtype(cells):  # the parser leaves blanks around numbers that stand among texts
+            cells = cells.where(cells.isna(), cells.astype(str).str.strip()).replace("", None)
         values = pd.to_numeric(cells, errors="coerce") if not pd.api.types.is_datetime64_any_dtype(cells) else None
         if values is None:
             raise InputError(f"{self.source}: column {name} holds dates, expected numbers; write it in seconds")
@@ -122,7 +124,7 @@ def _parquet(content: bytes, source: str) -> tuple[pd.DataFrame, NDArray[np.int6
 def _csv(content: bytes, source: str) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Frame and line numbers; blank lines are passed over."""
     lines = _text_lines(content, source)
-    names = _header(lines[0], source)
+    names = _header(lines, source)
     lines = _without_torn_end(content, lines, len(names), source)
     _require_even(lines, len(names), source)
     body = b"\n".join(lines[1:])
@@ -130,7 +132,13 @@ def _csv(content: bytes, source: str) -> tuple[pd.DataFrame, NDArray[np.int64]]:
         return pd.DataFrame(columns=names), np.empty(0, dtype=np.int64)
     try:
         frame = pd.read_csv(
-            io.BytesIO(body), header=None, names=names, index_col=False, skip_blank_lines=False, low_memory=False
+            io.BytesIO(body),
+            header=None,
+            names=names,
+            index_col=False,
+            skip_blank_lines=False,
+            skipinitialspace=True,
+            low_memory=False,
         )
     except (pd.errors.ParserError, UnicodeDecodeError, ValueError) as error:
         reason = _shortened(str(error).splitlines()[0], 80)
@@ -152,13 +160,23 @@ def _text_lines(content: bytes, source: str) -> list[bytes]:
     return content.removeprefix(b"\xef\xbb\xbf").splitlines()
 
 
-def _header(line: bytes, source: str) -> list[str]:
-    """Names of the columns."""
-    text = line.decode("utf-8")
+def _header(lines: list[bytes], source: str) -> list[str]:
+    """Names of the columns, without blanks around them."""
+    text = lines[0].decode("utf-8")
+    first = next((line for line in lines if not line.lstrip().startswith(b"#")), lines[0])
+    if first.count(b",") != lines[0].count(b","):
+        raise InputError(
+            f"{source}: line 1 begins with #, a comment? Expected the columns' names; delete what stands above them"
+        )
     for mark, called in ((";", "semicolons"), ("\t", "tabs")):
         if "," not in text and mark in text:
             raise InputError(f"{source}: line 1 is separated by {called}, expected commas; convert the file")
-    names = next(csv.reader([text]), [])
+    names = [name.strip() for name in next(csv.reader([text], skipinitialspace=True), [])]
+    if names.count("") > 1:
+        raise InputError(
+            f"{source}: line 1 has {names.count('')} columns without a name, as spreadsheets leave empty ones; "
+            "delete them, or name them"
+        )
     twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
     if twice is not None:
         raise InputError(f"{source}: line 1 has the column {twice!r} twice, expected each name once; rename one")

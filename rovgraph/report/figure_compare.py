@@ -30,7 +30,7 @@ SETTLED = 0.25  # of the dive; the misalignment may leave its panel before
 MOST_SEEN = 0.75  # share of estimators whose end points all lie within the panels
 
 
-def draw_comparison(folder: Path, comparison: Comparison, title: str) -> list[Path]:
+def draw_comparison(folder: Path, comparison: Comparison, title: str, thesis: bool = False) -> list[Path]:
     """Draw every figure that there are data for.
 
     Parameters
@@ -38,6 +38,7 @@ def draw_comparison(folder: Path, comparison: Comparison, title: str) -> list[Pa
     folder : an existing folder
     comparison : of `rovgraph.studies.compare.compare`
     title : what was compared on what
+    thesis : show the thesis's end errors beside ours; they are of its own dives
 
     Returns
     -------
@@ -48,7 +49,7 @@ def draw_comparison(folder: Path, comparison: Comparison, title: str) -> list[Pa
         return []
     with style():
         figures = {
-            "errors.png": draw_errors(comparison.table, good, title),
+            "errors.png": draw_errors(comparison.table, good, title, thesis),
             "end_points.png": draw_end_points(comparison.table, good, title),
             "velocity.png": draw_velocity(comparison.velocity, str(comparison.runs["run"].iloc[0])),
             "misalignment.png": draw_misalignment(comparison.misalignment),
@@ -56,16 +57,21 @@ def draw_comparison(folder: Path, comparison: Comparison, title: str) -> list[Pa
         return [save(figure, folder / name) for name, figure in figures.items() if figure is not None]
 
 
-def draw_errors(table: pd.DataFrame, runs: pd.DataFrame, title: str) -> Figure:
-    """End, heading and velocity errors of every run as dots, their mean over runs marked; log axes."""
+def draw_errors(table: pd.DataFrame, runs: pd.DataFrame, title: str, thesis: bool = False) -> Figure:
+    """End, heading and velocity errors of every run as dots, their mean over runs marked; log axes.
+
+    What the reference does not know has no panel.
+    """
     names = table["estimator"].tolist()
     panels = {
         "end_m": ("end_mean_m", "end error [m]"),
         "heading_rms_deg": ("heading_rms_deg", "heading, rms [deg]"),
         "velocity_rms_mps": ("velocity_rms_mps", "velocity, rms [m/s]"),
     }
+    panels = {single: panel for single, panel in panels.items() if runs[single].notna().any()}
     figure = new_figure(1.3 + 0.21 * len(names))
-    grid = figure.subplots(1, 3, sharey=True, width_ratios=(1.5, 1, 1), squeeze=False)[0]
+    widths = (1.5, 1, 1)[: len(panels)]
+    grid = figure.subplots(1, len(panels), sharey=True, width_ratios=widths, squeeze=False)[0]
     for axes, (single, (mean, label)) in zip(grid, panels.items(), strict=True):
         for y, (_, row) in enumerate(table.iterrows()):
             look = FAMILIES.get(str(row["family"]), OTHER)
@@ -74,11 +80,9 @@ def draw_errors(table: pd.DataFrame, runs: pd.DataFrame, title: str) -> Figure:
             axes.plot([row[mean]], [y], ls="none", mec="white", mew=0.6, ms=6.5, label=row["family"], zorder=4, **look)
         _log_axis(axes, label)
     known = table["thesis_end_mean_m"].notna().to_numpy()
-    if known.any():
-        at = np.flatnonzero(known)
-        grid[0].plot(
-            table["thesis_end_mean_m"][known], at, "x", color="black", ms=6, mew=1.3, zorder=5, label="as printed there"
-        )
+    if thesis and known.any():
+        at, printed = np.flatnonzero(known), table["thesis_end_mean_m"][known]
+        grid[0].plot(printed, at, "x", color="black", ms=6, mew=1.3, zorder=5, label="as printed there")
     grid[0].set_yticks(range(len(names)), names)
     grid[0].set_ylim(len(names) - 0.4, -0.6)
     figure.suptitle(f"{title}: each dot a run, marks the mean (end) or rms over runs", x=0.01, ha="left", fontsize=9)
@@ -154,16 +158,18 @@ def draw_velocity(velocity: pd.DataFrame, run: str) -> Figure | None:
     if not names:
         return None
     figure, grid = _grid(names, 1.35, "time [s]", "[m/s]")
+    known = bool(reference[["v_north", "v_east"]].notna().any(axis=None))
     top = _limit(reference[["v_north", "v_east"]].to_numpy(float), velocity)
     for axes, name in zip(grid, names, strict=True):
         rows = velocity[velocity["estimator"] == name]
         axes.plot(rows["time"], rows["v_north"], color="#0072B2", lw=0.7, label="north")
         axes.plot(rows["time"], rows["v_east"], color="#D55E00", lw=0.7, label="east")
-        for column in ("v_north", "v_east"):
+        for column in ("v_north", "v_east") if known else ():
             axes.plot(reference["time"], reference[column], color="black", lw=0.5, ls=(0, (4, 2)), label="reference")
         axes.set_ylim(-top, top)
         axes.set_xlim(0.0, float(velocity["time"].max()))
-    figure.suptitle(f"velocity over ground, {run}", x=0.01, ha="left", fontsize=9)
+    beside = "" if known else "; the reference has none"
+    figure.suptitle(f"velocity over ground, {run}{beside}", x=0.01, ha="left", fontsize=9)
     legend_below(figure, grid)
     return figure
 
