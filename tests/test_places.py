@@ -375,6 +375,7 @@ def test_the_recording_of_json_lines_has_the_places_again(tmp_path):
     said: list[tuple[str, str]] = []
     row = JsonRow("udp://:1", lambda kind, text, once=False: said.append((kind, text)), Config())
     lines = [b'{"time": 1, "place_id": "wreck", "place_sd": 0.5}', b'{"time": 2, "place_id": 7}']
+    lines.append(b'{"time": 2.5, "place_id": 7.5}')
     messages = [row.message(line, 10.0) for line in lines]
     with pytest.raises(Refused, match="place_sd: -1, expected more than 0"):
         row.message(b'{"place_id": 7, "place_sd": -1}', 10.0)
@@ -385,7 +386,7 @@ def test_the_recording_of_json_lines_has_the_places_again(tmp_path):
     recorder.write(3.0, 10.0, [Reading("depth", np.array([1.0]))])
     recorder.close()
     stream = read_log(tmp_path / "recording.csv")["place"]
-    assert stream["place_id"].tolist() == [label_number("wreck"), 7.0]
+    assert stream["place_id"].tolist() == [label_number("wreck"), 7.0, label_number("7.5")]
     assert stream["place_sd"][0] == 0.5 and np.isnan(stream["place_sd"][1])
 
 

@@ -119,7 +119,7 @@ def depths(log: Log, config: Config) -> Iterator[Finding]:
     if np.median(depth) < -0.5:
         yield Finding("depth", "warning", f"median depth {np.median(depth):.2f} m; depth counts downwards: mirrored?")
     if np.ptp(depth) > 1000.0:
-        yield Finding("depth", "warning", f"depth spans {np.ptp(depth):.0f} m; in cm or mm? Say units: {{depth: mm}}")
+        yield Finding("depth", "warning", f"depth spans {np.ptp(depth):.4g} m; in cm or mm? Say units: {{depth: mm}}")
 
 
 def magnetic_field(log: Log, config: Config) -> Iterator[Finding]:

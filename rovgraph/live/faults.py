@@ -17,6 +17,7 @@ from rovgraph.live.solution import Event
 from rovgraph.log import Measurement
 
 SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
+SILENT_AT_FIRST_S = 30.0  # after a first measurement, as long as the period is not known
 MOVED = 0.1  # speed of a vehicle that does not stop within a ping [m/s]
 RECENT_S = 5.0
 TELL_S = 2.0  # a ping without bottom lock is not worth an event
@@ -112,7 +113,8 @@ class Faults:
             if sensor in OCCASIONAL:
                 continue
             quiet = time - watch.heard  # what comes late all the time is not silent
-            if watch.state != "silent" and quiet > max(SILENT_S, SILENT_PERIODS * watch.period):
+            longest = max(SILENT_S, SILENT_PERIODS * watch.period) if watch.period else SILENT_AT_FIRST_S
+            if watch.state != "silent" and quiet > longest:
                 watch.state = watch.told = "silent"
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))
 

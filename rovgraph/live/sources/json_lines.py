@@ -78,9 +78,11 @@ class JsonRow:
             name = self._names.get(key, key)
             if not is_column(name):
                 self._report(key)
-            elif name == LABEL and isinstance(value, str):
-                cells[name] = label_number(value)
-            elif value is not None:
+            elif value is None:
+                continue
+            elif name == LABEL and (isinstance(value, str) or json_number(key, value) % 1.0):
+                cells[name] = label_number(str(value))  # 7.5 is a name, as it is in a log
+            else:
                 cells[name] = json_number(key, value, self._scale.get(name, 1.0))
         return cells
 
