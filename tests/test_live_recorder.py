@@ -43,7 +43,10 @@ def test_every_sensor_comes_back_as_the_very_same_numbers(tmp_path):
         for sensor, columns in STREAMS.items()
     }
     sent["dvl"][:, 3] = 1.0
-    sent["place"] = np.column_stack([np.arange(20.0), np.abs(sent["place"][:, 1])])
+    for sensor, columns in STREAMS.items():
+        for k, name in enumerate(columns):
+            sent[sensor][:, k] = np.abs(sent[sensor][:, k]) if name.endswith("_sd") else sent[sensor][:, k]
+    sent["place"] = np.column_stack([np.arange(20.0), sent["place"][:, 1]])
     sent["thruster"] = RNG.normal(size=(20, 6))
     times = EPOCH + np.cumsum(RNG.uniform(0.001, 0.1, 20))
     for k, t in enumerate(times):

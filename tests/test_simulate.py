@@ -11,10 +11,10 @@ import pytest
 from rovgraph.cli.app import main
 from rovgraph.config import Config, beliefs, parse_config
 from rovgraph.errors import InputError
-from rovgraph.geometry import exp_rotation, log_rotation, rotate, transpose, wrap_angle
+from rovgraph.geometry import earth_rate_n, exp_rotation, log_rotation, rotate, transpose, wrap_angle
 from rovgraph.instruments import instruments
 from rovgraph.simulate import CALM, SCENARIOS, Path, Style, Truth, Waves, scenario, simulate
-from rovgraph.simulate.imu import EARTH_RATE, specific_force_and_rate
+from rovgraph.simulate.imu import specific_force_and_rate
 from rovgraph.simulate.route import Route, courses
 from rovgraph.state import State
 
@@ -133,7 +133,7 @@ def test_imu_at_rest_reads_gravity_upwards_and_the_earth_rate():
     values = specific_force_and_rate(still, parse_config(text))[0]
     np.testing.assert_allclose(values[:3], [0, 0, -9.82], atol=1e-12)
     latitude = np.deg2rad(58.3)
-    np.testing.assert_allclose(values[3:], EARTH_RATE * np.array([np.cos(latitude), 0, -np.sin(latitude)]), atol=1e-15)
+    np.testing.assert_allclose(values[3:], earth_rate_n(latitude), atol=1e-15)
     with pytest.raises(InputError, match="latitude"):
         specific_force_and_rate(still, parse_config("environment: {earth_rotation: true}"))
 
@@ -143,7 +143,7 @@ def test_moving_east_over_a_turning_earth_lightens_the_vehicle():
     motion = scenario("straight", 100.0, style=Style(waves=CALM)).motion([50.0])
     east = replace(motion, v_n=np.array([[0.0, 100.0, 0.0]]), a_n=np.zeros((1, 3)))
     force = specific_force_and_rate(east, config)[0, 2]
-    assert force == pytest.approx(-9.81 + 2 * EARTH_RATE * 100.0)  # Eotvos
+    assert force == pytest.approx(-9.81 + 2 * earth_rate_n(0.0)[0] * 100.0)  # Eotvos
 
 
 @pytest.mark.parametrize(
