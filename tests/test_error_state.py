@@ -25,12 +25,11 @@ from test_consistency import OVERCONFIDENT, band, drawn, nees
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
 from rovgraph.estimators import error_vector
-from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.error_state import ErrorStateFilter, replay
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.robust_update import robust_update
-from rovgraph.geometry import Array, exp_rotation, log_rotation, matrix_from_rpy, transpose
+from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.factors import predict
 from rovgraph.graph.measurements import loss_and_weight
@@ -378,28 +377,6 @@ def test_a_sensor_that_is_kept_out_for_long_is_let_in_again_and_moves_nothing_by
     k = int(np.searchsorted(t.time, back - 1e-6))
     jump = np.linalg.norm(t.v_n[k] - t.v_n[k - 1])
     assert 0.5 < jump < 3.0 * np.linalg.norm(t.v_sd[k - 1])
-
-
-def test_a_magnetometer_corrects_a_heading_that_is_off_by_as_much_as_it_is_doubted(case):
-    """By so much that the field's turn is no longer along the tangent, which a gate takes for nonsense."""
-    config, off = changed(case.config, heading={"sources": ["mag"], "gate_sd": 6.0}), 60.0 * DEG
-    estimator = filtered(case.log, config)
-    middle = len(estimator.intervals) // 2
-    good = estimator.filtered[middle]
-    turn = exp_rotation(np.array([0.0, 0.0, off]))
-    doubt = np.zeros((len(good.P), 1))
-    doubt[:3, 0] = good.state.R_nb[0].T[:, 2]
-    doubt[6:9, 0] = np.cross([0.0, 0.0, 1.0], turn @ good.state.v_n[0])  # the DVL knows the velocity along the body
-    turned = replace(good.state, R_nb=turn @ good.state.R_nb, v_n=good.state.v_n @ turn.T)
-    known, gates, mags = Gaussian(turned, good.P + off**2 * doubt @ doubt.T), {}, []
-    for interval in estimator.intervals[middle + 1 : middle + 20]:
-        passage = estimator.recursion.through(interval, known, gates)
-        known = passage.filtered
-        mags += [used for used in passage.used if used.attached.sensor == "mag"]
-    assert len(mags) > 5
-    assert all(used.weight > 0.0 for used in mags)
-    left = log_rotation(known.state.R_nb @ transpose(estimator.filtered[middle + 19].state.R_nb))[0]
-    assert abs(left[2]) < 3.0 * DEG
 
 
 def test_a_dvl_that_vanishes_and_returns_leaves_an_honest_track():

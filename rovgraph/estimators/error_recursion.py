@@ -42,8 +42,6 @@ from rovgraph.sensors import Position, SensorModel, innovation
 from rovgraph.state import POSE, VELOCITY, State, propagate_with_jacobian, stack_states
 from rovgraph.trajectory import Trajectory
 
-BENT = ("mag",)  # what a large turn moves by more than along the tangent; other innovations are linear in our errors
-RELINEARIZATIONS = 4  # of a measurement of these that its gate would reject
 RETURN_SD = 3.0  # a sensor that was kept out for long returns with an innovation within this many sd
 
 Gates = dict[str, float]  # sensor that is being kept out -> since when [s]
@@ -244,27 +242,17 @@ class ErrorStateRecursion:
         """Covariances of n estimates without their places, shape (n, size, size)."""
         return np.array([k.P[: self.error.size, : self.error.size] for k in known])
 
-    def _gate(self, a: Attached, gates: Gates) -> float:
-        """The NIS beyond which a measurement is left out."""
-        instrument, since = self.beginning.instruments[a.sensor], gates.get(a.sensor)
+    def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
+        """Whether a measurement lies within its gate."""
+        instrument = self.beginning.instruments[a.sensor]
+        gate, since = instrument.gate_sd, gates.get(a.sensor)
         if since is not None and a.time - since > instrument.readmit_s:
-            return RETURN_SD**2
-        return np.inf if instrument.gate_sd is None else instrument.gate_sd**2
-
-    def _relinearized(self, before: Gaussian, a: Attached, r: Array, H: Array) -> tuple[Array, Array]:
-        """Whitened innovation and Jacobian as they are where the measurement would take the state.
-
-        The way there may be long and bent: a heading that is off by 40 degrees turns the field by what no
-        tangent reaches. That is the update of an iterated Kalman filter (Bell and Cathey 1993).
-        """
-        for _ in range(RELINEARIZATIONS):
-            PHt = before.P @ H.T
-            delta = PHt @ np.linalg.solve(H @ PHt + np.eye(len(r)), r)
-            state, basis = self.error.retract(before.state, delta[: self.error.size], (a.sensor,))
-            [(there, own_H)] = self.linearize(state, [a])
-            H = padded(own_H @ basis, len(before.P))
-            r = there + H @ delta
-        return r, H
+            gate = RETURN_SD
+        if gate is not None and nis > gate**2:
+            gates.setdefault(a.sensor, a.time)
+            return False
+        gates.pop(a.sensor, None)
+        return True
 
     def _seen(self, model: SensorModel, state: State) -> Array:
         """Directions of the error that a sensor sees, shape (size, k): velocity, or turn and shift along n's axes."""
@@ -280,23 +268,16 @@ class ErrorStateRecursion:
 
     def _measured(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
         """The state corrected by measurements that belong to its keyframe, of no places."""
-        r, H, losses, admitted, bent = [], [], [], [], []
+        r, H, losses, admitted = [], [], [], []
         for a, (own_r, own_H) in zip(attached, self.linearize(before.state, attached), strict=True):
             instrument, own_H = self.beginning.instruments[a.sensor], padded(own_H, len(before.P))
-            gate, nis = self._gate(a, gates), normalised_squared(before.P, own_r, own_H)
-            if nis > gate and a.sensor in BENT:
-                own_r, own_H = self._relinearized(before, a, own_r, own_H)
-                nis = normalised_squared(before.P, own_r, own_H)
-                if nis <= gate:
-                    bent.append(a.sensor)
-            if nis <= gate:
-                gates.pop(a.sensor, None)
+            nis = normalised_squared(before.P, own_r, own_H)
+            if self._admit(a, nis, gates):
                 r.append(own_r)
                 H.append(own_H)
                 losses.append(instrument.loss)
                 admitted.append((a, nis))
             else:
-                gates.setdefault(a.sensor, a.time)
                 used.append(Used(a, before.state, nis, 0.0))
                 if a.time - gates[a.sensor] > instrument.readmit_s:
                     seen = self._seen(instrument.model, before.state)
@@ -305,7 +286,7 @@ class ErrorStateRecursion:
             return before
         delta, P, weights = robust_update(before.P, r, H, losses)
         used += [Used(a, before.state, nis, weight) for (a, nis), weight in zip(admitted, weights, strict=True)]
-        return self.corrected(before, delta, P, bent)
+        return self.corrected(before, delta, P)
 
     def _sighted(self, before: Gaussian, a: Attached, sighting: Sighting, used: list[Used]) -> Gaussian:
         """The state corrected by a place that is seen again, or with one place more."""
@@ -326,18 +307,10 @@ class ErrorStateRecursion:
         P, places = with_another(before.P, before.places, place, a.sd[:, None] * H, a.sd)
         return Gaussian(before.state, *without_oldest(P, places, size, self.beginning.config.place.remembered))
 
-    def corrected(self, before: Gaussian, delta: Array, P: Array, plain: Sequence[str] = ()) -> Gaussian:
-        """The estimate moved by a correction.
-
-        Parameters
-        ----------
-        before : the estimate
-        delta : ndarray, shape (size + 2 m,), the correction
-        P : ndarray, shape (size + 2 m, size + 2 m), the covariance after it
-        plain : of `ErrorVector.retract`
-        """
+    def corrected(self, before: Gaussian, delta: Array, P: Array) -> Gaussian:
+        """The estimate moved by a correction, shape (size + 2 m,); ``P`` is the covariance after it."""
         size = self.error.size
-        state, basis = self.error.retract(before.state, delta[:size], plain)
+        state, basis = self.error.retract(before.state, delta[:size])
         basis = extended(basis, len(P))
         return Gaussian(state, basis @ P @ basis.T, moved(before.places, delta[size:]))
 

@@ -14,7 +14,7 @@ teaches nothing about those. `ErrorVector.retract` and `ErrorVector.local` move 
 coordinates and give the change of basis of the tangent space.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -73,15 +73,13 @@ class ErrorVector:
                 out[..., self.columns[name]] = jacobian
         return out
 
-    def retract(self, state: State, delta: Array, plain: Collection[str] = ()) -> tuple[State, Array]:
+    def retract(self, state: State, delta: Array) -> tuple[State, Array]:
         """The state that lies ``delta`` away.
 
         Parameters
         ----------
         state : State of one epoch
         delta : ndarray, shape (size,)
-        plain : sensors whose variable is moved by itself, as where the heading moves by so much that what
-            is known is the iron, no longer the field that the magnetometer sees
 
         Returns
         -------
@@ -92,8 +90,6 @@ class ErrorVector:
         moved = self._straight(state, delta)
         both, basis = self._both(state, moved), self._turned(state, moved)
         for model, variable, columns in self._seen:
-            if model.sensor in plain:
-                continue
             z, H = model.predict(both, _NO_RATE)
             before, after = self.matrix(H)
             inverse = np.linalg.inv(after[:, columns])

@@ -250,9 +250,7 @@ class Navigator:
         before, began = engine.marks[-1] if engine.marks else None, host.perf_counter()
         if m.sensor == "dvl_water" and m.sensor not in engine.beginning.instruments:
             if not self.left_out[m.sensor, UNEXPECTED]:
-                self.say(
-                    m.sensor, "unused", f"dvl_water: {UNEXPECTED}; give dvl.water_velocity_sd_mps, and it is expected"
-                )
+                self.say(m.sensor, "unused", f"dvl_water: {UNEXPECTED} before what was recorded is smoothed")
             self.left_out[m.sensor, UNEXPECTED] += 1
             return
         outcome = engine.add(m)

@@ -60,8 +60,6 @@ class Startup:
             first = imu[-1] - WITHIN_S
             self.measurements = [m for m in self.measurements if m.time >= first]
         expected = LATER | (COMPASSES if self.config.heading.sources is not None else set())
-        if "water_velocity_sd_mps" in self.config.dvl.model_fields_set:  # who has none shall not pay for it
-            expected |= {"dvl_water"}
         log = gathered(self.measurements, "so far", origin)
         try:
             beginning = initialise(log, self.config, expected)
