@@ -1027,9 +1027,8 @@ def test_thrusters_are_taken_from_the_first_on_without_a_hole(heard):
     assert heard.kinds == {"incomplete": 2}
 
 
-def test_an_sd_of_0_is_not_known_and_a_negative_one_refused(heard):
-    decoder = json_lines("-", heard, Config())
-    (message,) = decoded(decoder, b'{"fix_north": 1, "fix_east": 2, "fix_sd": 0}\n')
+@pytest.mark.parametrize("sd", [0, -1])
+def test_an_sd_of_0_or_less_is_not_known(sd, heard):
+    (message,) = decoded(json_lines("-", heard, Config()), b'{"fix_north": 1, "fix_east": 2, "fix_sd": %d}\n' % sd)
     np.testing.assert_array_equal(message.readings[0].values, [1.0, 2.0, np.nan])
-    assert not decoded(decoder, b'{"fix_north": 1, "fix_east": 2, "fix_sd": -1}\n')
-    assert heard.kinds == {"out of range": 1}
+    assert not heard.kinds

@@ -244,7 +244,7 @@ def _select(
     if sensor == "dvl":
         complete, partly = _pings(data, complete, partly, line, source)
     for name in OPTIONAL & {c for c in columns if c.endswith("_sd")}:
-        _check_sd(name, data[:, columns.index(name)], line, source)
+        _known_sd(name, data[:, columns.index(name)], line, source)
     if sensor == "place":
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
@@ -271,21 +271,15 @@ def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str
     return complete | lost, partly
 
 
-def _check_sd(column: str, sd: Array, line: Lines, source: str) -> None:
-    """Refuse a negative sd; 0, as many receivers write it, becomes unknown."""
-    odd = np.flatnonzero(sd < 0.0)
-    if odd.size:
-        raise InputError(
-            f"{source}: line {line[odd[0]]}, column {column}: {sd[odd[0]]:g}, expected more than 0; "
-            "leave the cell empty where the configuration's sd holds"
-        )
-    zero = sd == 0.0
-    if zero.any():
+def _known_sd(column: str, sd: Array, line: Lines, source: str) -> None:
+    """An sd of 0 or -1, as many instruments write it that do not know, becomes NaN."""
+    unknown = sd <= 0.0
+    if unknown.any():
         _warn(
-            f"{source}: {column}: {zero.sum()} times 0, taken as not known; the configuration's sd holds there; "
-            f"first in line {line[np.argmax(zero)]}"
+            f"{source}: {column}: {unknown.sum()} times 0 or less, taken as not known; "
+            f"the configuration's sd holds there; first in line {line[np.argmax(unknown)]}"
         )
-        sd[zero] = np.nan
+        sd[unknown] = np.nan
 
 
 def _stream(sensor: str, cells: dict[str, Array], line: Lines, source: str) -> Stream | None:

@@ -130,9 +130,7 @@ def _check(cells: dict[str, float]) -> None:
     if cells.get("dvl_valid", 1.0) not in (0.0, 1.0):
         raise Refused("out of range", f"dvl_valid: {cells['dvl_valid']:g}, expected 0 or 1; the line is skipped")
     for name in ("dvl_sd", "fix_sd", "place_sd"):
-        if cells.get(name, 1.0) < 0.0:
-            raise Refused("out of range", f"{name}: {cells[name]:g}, expected more than 0; the line is skipped")
-        if cells.get(name) == 0.0:  # as many receivers say that they do not know
+        if cells.get(name, 1.0) <= 0.0:  # as many instruments say that they do not know
             del cells[name]
     lat, lon = (cells.get(name, 0.0) for name in LAT_LON)
     if abs(lat) > 90.0 or abs(lon) > 360.0:
