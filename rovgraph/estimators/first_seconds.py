@@ -97,7 +97,7 @@ def trusted_first(config: Config, sources: list[str]) -> list[str]:
 
 
 def first_heading(
-    log: Log, config: Config, sensors: dict[str, Instrument], sources: list[str], level: Array, gyro_bias: Array
+    log: Log, config: Config, sensors: dict[str, Instrument], sources: list[str], levelled: Array, gyro_bias: Array
 ) -> tuple[float, str]:
     """Yaw of the first epoch [rad], and the source that shows it.
 
@@ -106,7 +106,7 @@ def first_heading(
 
     Parameters
     ----------
-    level : ndarray, shape (3, 3), R_nb of the first epoch but for its yaw
+    levelled : ndarray, shape (3, 3), R_nb of the first epoch but for its yaw
     gyro_bias : ndarray, shape (3,), as far as it is known [rad/s]
 
     Raises
@@ -122,7 +122,7 @@ def first_heading(
         stream = stream.take(np.unique(np.linspace(0, len(stream) - 1, HEADINGS).astype(int)))
         yaws = []
         for z, turned in zip(stream.data, _turned(log, config, gyro_bias, stream.time), strict=True):
-            there = level @ turned
+            there = levelled @ turned
             own = solve_yaw(sensors[source], z[: sensors[source].model.dim], there, means)
             yaws.append(own - rpy_from_matrix(there)[2])
         apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
