@@ -102,8 +102,10 @@ class Files:
     def _received(self) -> Log | None:
         """Of a recording that is resumed all, or what is newer than the checkpoint; None where it has no row."""
         path = self.folder / RECORDING
-        if path.read_bytes().count(b"\n") < 2:  # the header alone
-            return None
+        with path.open("rb") as file:
+            file.readline()
+            if not file.readline():  # the header alone
+                return None
         if self.anew or self.state is None:
             return read_log(path)
         return log_from_frame(_last_rows(path, self.state["origin"]), str(path))
