@@ -4,6 +4,7 @@ Nothing rests on a single sample: the first of a sensor is as often wrong as any
 no gate would find out.
 """
 
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +46,13 @@ class Level(NamedTuple):
 
 
 def level(log: Log, config: Config) -> Level:
-    """What the IMU says of the first seconds."""
+    """What the IMU says of the first seconds.
+
+    Parameters
+    ----------
+    log : with an IMU
+    config : its mounting and noise
+    """
     imu, R_bs = log["imu"], mount_matrix(config.imu.mount_rpy_deg)
     first = imu.time <= imu.time[0] + WINDOW_S
     time, acc, gyr = imu.time[first], imu.data[first, :3] @ R_bs.T, imu.data[first, 3:] @ R_bs.T
@@ -61,11 +68,7 @@ def level(log: Log, config: Config) -> Level:
     )
     if quiet and not _moves(log):
         return Level(acc.mean(axis=0), gyr.mean(axis=0), True, seconds)
-    turned, forces = np.eye(3), [acc[0]]
-    for k in range(1, len(time)):
-        turned = turned @ exp_rotation(0.5 * (gyr[k] + gyr[k - 1]) * (time[k] - time[k - 1]))
-        forces.append(turned @ acc[k])
-    return Level(np.mean(forces, axis=0), gyr.mean(axis=0), False, seconds)
+    return Level(rotate(_turned(time, gyr), acc).mean(axis=0), gyr.mean(axis=0), False, seconds)
 
 
 def _moves(log: Log) -> bool:
@@ -90,7 +93,13 @@ def _opening(stream: Stream, begin: float, seconds: float) -> Stream:
 
 
 def trusted_first(config: Config, sources: list[str]) -> list[str]:
-    """Heading sources with those first whose offset is held fixed, or known best."""
+    """Heading sources with those first whose offset is held fixed, or known best.
+
+    Parameters
+    ----------
+    config : priors of the offsets
+    sources : of "mag", "ahrs", "dvl_heading"
+    """
     priors = beliefs(config)
     offset = {"mag": "mag_offset", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
     return sorted(sources, key=lambda s: priors[offset[s]].sd if priors[offset[s]].estimate else 0.0)
@@ -101,11 +110,14 @@ def first_heading(
 ) -> tuple[float, str]:
     """Yaw of the first epoch [rad], and the source that shows it.
 
-    The median of what a source says in its first seconds, each sample brought back to the first epoch by
-    the gyro.
+    Of what a source says in its first seconds, each sample brought back to the first epoch by the gyro, the
+    one that the others are nearest to: the median on a circle.
 
     Parameters
     ----------
+    log, config : the dive, and what is believed of it
+    sensors : instruments by stream
+    sources : heading sources of the log
     levelled : ndarray, shape (3, 3), R_nb of the first epoch but for its yaw
     gyro_bias : ndarray, shape (3,), as far as it is known [rad/s]
 
@@ -120,9 +132,12 @@ def first_heading(
             continue
         stream = _opening(stream, stream.time[0], WINDOW_S)
         stream = stream.take(np.unique(np.linspace(0, len(stream) - 1, HEADINGS).astype(int)))
+        imu = _opening(log["imu"], begin, stream.time[-1] - begin)
+        turned = _turned(imu.time, imu.data[:, 3:] @ mount_matrix(config.imu.mount_rpy_deg).T - gyro_bias)
         yaws = []
-        for z, turned in zip(stream.data, _turned(log, config, gyro_bias, stream.time), strict=True):
-            there = levelled @ turned
+        for z, there in zip(
+            stream.data, levelled @ turned[imu.time.searchsorted(stream.time, "right") - 1], strict=True
+        ):
             own = solve_yaw(sensors[source], z[: sensors[source].model.dim], there, means)
             yaws.append(own - rpy_from_matrix(there)[2])
         apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
@@ -133,16 +148,10 @@ def first_heading(
     )
 
 
-def _turned(log: Log, config: Config, gyro_bias: Array, at: Array) -> list[Array]:
-    """Rotations from the body's axes at some times, increasing, to those of the first epoch."""
-    imu, R_bs = log["imu"], mount_matrix(config.imu.mount_rpy_deg)
-    turned, out, k = np.eye(3), [], 0
-    for time in at:
-        while k + 1 < len(imu) and imu.time[k + 1] <= time:
-            rate_b = R_bs @ imu.data[k, 3:] - gyro_bias
-            turned, k = turned @ exp_rotation(rate_b * (imu.time[k + 1] - imu.time[k])), k + 1
-        out.append(turned)
-    return out
+def _turned(time: Array, rate_b: Array) -> Array:
+    """Rotations from the body's axes at each sample of the gyro to those at the first, shape (n, 3, 3)."""
+    steps = exp_rotation(0.5 * (rate_b[1:] + rate_b[:-1]) * np.diff(time)[:, None])
+    return np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
 
 
 def yaw_correction(instrument: Instrument, z: Array, state: State) -> Array:
@@ -163,11 +172,21 @@ def yaw_correction(instrument: Instrument, z: Array, state: State) -> Array:
     return np.asarray(np.sum(slope * r, axis=1) / np.maximum(np.sum(slope**2, axis=1), 1e-12))
 
 
-def solve_yaw(instrument: Instrument, z: Array, level: Array, calibration: dict[str, Array]) -> float:
-    """Yaw at which a levelled attitude predicts a heading measurement [rad]."""
+def solve_yaw(instrument: Instrument, z: Array, attitude: Array, calibration: dict[str, Array]) -> float:
+    """Yaw at which an attitude predicts a heading measurement [rad].
+
+    By Gauss-Newton from four sides, as far as it fits best.
+
+    Parameters
+    ----------
+    instrument : a heading source
+    z : ndarray, shape (dim,)
+    attitude : ndarray, shape (3, 3), R_nb, of which roll and pitch count
+    calibration : name -> ndarray, shape (dim of variable,), all that the instrument depends on
+    """
     zero = np.zeros((4, 3))
     yaw = np.arange(4) * 0.5 * np.pi
-    tilt = rpy_from_matrix(level)[:2]
+    tilt = rpy_from_matrix(attitude)[:2]
     for _ in range(10):
         R = matrix_from_rpy(np.column_stack([np.tile(tilt, (4, 1)), yaw]))
         state = State(R, zero, zero, np.zeros((4, 6)), calibration)
@@ -179,7 +198,14 @@ def solve_yaw(instrument: Instrument, z: Array, level: Array, calibration: dict[
 
 
 def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, Array]:
-    """Position of the body's origin at the first epoch, and its sd, shapes (3,)."""
+    """Position of the body's origin at the first epoch, in n, and its sd, shapes (3,) [m].
+
+    Parameters
+    ----------
+    log, config : the dive, and what is believed of it; a stated start goes before the log
+    R_nb : ndarray, shape (3, 3), of the first epoch
+    assumptions : to be added to, one line each
+    """
     start, begin = config.start, log["imu"].time[0]
     p_n = np.array([start.north_m, start.east_m, 0.0 if start.down_m is None else start.down_m])
     sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
