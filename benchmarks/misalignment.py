@@ -3,6 +3,7 @@
     pip install 'rovgraph[benchmarks]'
     python benchmarks/misalignment.py check                   what navlib finds where nothing is noisy
     python benchmarks/misalignment.py simulated --minutes 5   rms errors of all methods, a Markdown table
+    python benchmarks/misalignment.py arm --seeds 40          what the DVL's lever arm does to our sd
     python benchmarks/misalignment.py recorded FOLDER         a recorded dive: log.csv.gz, reference.csv.gz, FOLDER.yaml
     python benchmarks/misalignment.py fixes LOG REFERENCE OUT a log with the reference's positions as its fixes
 
@@ -268,15 +269,26 @@ def without(log: Log, sensor: str) -> Log:
 
 
 def make_dive(
-    manoeuvre: str, minutes: float, grade: Grade, angles_deg: Sequence[float], seed: int, noise: bool = True
+    manoeuvre: str,
+    minutes: float,
+    grade: Grade,
+    angles_deg: Sequence[float],
+    seed: int,
+    noise: bool = True,
+    together: bool = False,
 ) -> tuple[Dive, Config, Array]:
     """A dive in the waves of a lake with AHRS and fixes, what may be known of it, and the true R_bs.
 
     Parameters
     ----------
     angles_deg : roll, pitch, yaw of the DVL beyond its mounting
+    together : the DVL is where the inertial unit is
     """
-    config = believed(falcon(), grade, "ahrs", "offset", 5.0, FIX_SD_M, (0.0, WIDE["dvl_yaw"]))
+    vehicle = falcon()
+    if together:
+        dvl = vehicle.dvl.model_copy(update={"lever_arm_m": vehicle.imu.lever_arm_m})
+        vehicle = vehicle.model_copy(update={"dvl": dvl})
+    config = believed(vehicle, grade, "ahrs", "offset", 5.0, FIX_SD_M, (0.0, WIDE["dvl_yaw"]))
     angles = np.deg2rad(np.add(config.dvl.mount_rpy_deg, angles_deg))
     calibration = {name: np.array([angle]) for name, angle in zip(ANGLES, angles, strict=True)}
     truth = Truth(config, calibration=calibration, noise=noise, ahrs_rate=10.0, fix_interval=FIX_INTERVAL_S)
@@ -286,9 +298,7 @@ def make_dive(
 
 def one_dive(manoeuvre: str, minutes: float, grade: Grade, seed: int) -> Iterator[Row]:
     """Errors of all methods; the misalignments of any number of dives lie evenly between 0 and `LARGEST_DEG`."""
-    tilt = TILT_SD_DEG * np.random.default_rng([seed, 2]).standard_normal(2)
-    yaw = LARGEST_DEG * (seed * GOLDEN % 1.0)
-    dive, config, true = make_dive(manoeuvre, minutes, grade, (*tilt, yaw), seed)
+    dive, config, true = make_dive(manoeuvre, minutes, grade, _angles_deg(seed), seed)
     log = log_from_frame(dive.log_frame)
     for fixes in (False, True):
         given = log if fixes else without(log, "fix")
@@ -304,6 +314,29 @@ def one_dive(manoeuvre: str, minutes: float, grade: Grade, seed: int) -> Iterato
         for method, signal in fed.items():
             R_bs = signal.with_fixes() if fixes else signal.without_fixes()
             yield row | {"method": method} | error_deg(R_bs, true)
+
+
+def _angles_deg(seed: int) -> tuple[float, float, float]:
+    """Misalignment of a dive: roll, pitch, yaw."""
+    roll, pitch = TILT_SD_DEG * np.random.default_rng([seed, 2]).standard_normal(2)
+    return roll, pitch, LARGEST_DEG * (seed * GOLDEN % 1.0)
+
+
+def arm(seeds: int) -> str:
+    """Our yaw on figures of eight of five minutes with an MTi and no fixes: its error, sd and mean NEES."""
+    lines = ["| DVL | dives | error, rms | sd | mean NEES |", "|---|---|---|---|---|"]
+    for together in (False, True):
+        found = []
+        for seed in range(1, seeds + 1):
+            dive, config, true = make_dive("figure8", 5.0, "mti", _angles_deg(seed), seed, together=together)
+            estimate = estimated(without(log_from_frame(dive.log_frame), "fix"), config)
+            (sd,) = (float(np.rad2deg(x.sd)) for x in estimate.calibration if x.label == "dvl_yaw")
+            found.append((error_deg(mounting(estimate), true)["yaw"], sd))
+        error, sds = np.array(found).T
+        rms, sd = np.sqrt(np.mean(error**2)), np.sqrt(np.mean(sds**2))
+        where = "at the inertial unit" if together else "where the Falcon has it"
+        lines.append(f"| {where} | {seeds} | {rms:.2f} | {sd:.2f} | {np.mean((error / sds) ** 2):.2f} |")
+    return "\n".join(lines)
 
 
 def simulated(seeds: int, minutes: float, manoeuvres: Sequence[str], grades: Sequence[Grade], out: Path | None) -> str:
@@ -444,6 +477,7 @@ def main(arguments: Sequence[str] | None = None) -> str:
     simulation.add_argument("--manoeuvres", nargs="+", default=["figure8", "lawnmower"])
     simulation.add_argument("--grades", nargs="+", default=["mti", "fog"])
     simulation.add_argument("--out", type=Path, help="a CSV file with a row per dive and method")
+    commands.add_parser("arm").add_argument("--seeds", type=int, default=40, help="dives of each kind")
     commands.add_parser("recorded").add_argument("folder", type=Path)
     fixes = commands.add_parser("fixes")
     for name in ("log", "reference", "out"):
@@ -455,6 +489,8 @@ def main(arguments: Sequence[str] | None = None) -> str:
             text = check()
         elif chosen.command == "simulated":
             text = simulated(chosen.seeds, chosen.minutes, chosen.manoeuvres, chosen.grades, chosen.out)
+        elif chosen.command == "arm":
+            text = arm(chosen.seeds)
         elif chosen.command == "recorded":
             if not (chosen.folder / "log.csv.gz").exists():
                 text = f"{chosen.folder}: no log.csv.gz there; the recorded dive is left out"

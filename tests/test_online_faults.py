@@ -3,6 +3,7 @@
 Bounds on errors are in sd of the solution: 4, which one dive in thousands exceeds by chance.
 """
 
+from collections import Counter
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from rovgraph.estimators.refiner import due_times
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.complaints import Complaints
 from rovgraph.live.files import Files
+from rovgraph.live.intake import Intake
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import Session
@@ -211,8 +213,7 @@ def stream_until(stream: Stream, time: float) -> Stream:
 
 def test_a_fix_in_degrees_is_as_late_as_one_in_metres(case):
     config = case.config.model_copy(update={"online": case.config.online.model_copy(update={"delay_s": {"fix": 0.5}})})
-    nav = Navigator(config, renew=False)
-    intake = nav._intake
+    intake = Intake(config, Counter())
     local, geodetic = Reading("fix", np.zeros(3)), Reading(GEODETIC, np.array([58.0, 14.0, 1.0]))
     assert [time for time, _ in intake.timed(100.0, (local, geodetic))] == [99.5, 99.5]
 
