@@ -84,7 +84,8 @@ def callbacks(seconds: float, seed: int) -> None:
     log = log_from_frame(dive.log_frame)
     beginning = initialise(log, config)
     batch = assemble(log, beginning)
-    recursion, gates, known, passages = ErrorStateRecursion(beginning), {}, None, []
+    recursion, gates, passages = ErrorStateRecursion(beginning), dict[str, float](), []
+    known = recursion.start()
     for interval in batch.intervals:
         passages.append(recursion.through(interval, known, gates))
         known = passages[-1].filtered

@@ -4,6 +4,7 @@ Everything here takes and returns NumPy arrays. ``(..., 3)`` and ``(..., 3, 3)``
 that any leading axes broadcast.
 """
 
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -12,6 +13,14 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Coefficient = TypeVar("Coefficient", float, Array)
+
+
+@cache
+def identity(n: int) -> Array:
+    """The unit matrix of n rows, not to be written to."""
+    out = np.eye(n)
+    out.flags.writeable = False
+    return out
 
 
 def wrap_angle(angle: ArrayLike) -> Array:

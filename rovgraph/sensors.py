@@ -31,7 +31,7 @@ from typing import Protocol
 import numpy as np
 
 from rovgraph.calibration import MOUNT
-from rovgraph.geometry import Array, cross, matrix_from_rpy, rotate, skew, transpose, wrap_angle
+from rovgraph.geometry import Array, cross, identity, matrix_from_rpy, rotate, skew, transpose, wrap_angle
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 
 
@@ -277,14 +277,14 @@ class MagneticField:
         turns_n = _field_turns(self.declination - deviation, self.dip + _scalar(state, "field_dip"))
         gain = (1.0 + _scalar(state, "field_scale"))[:, None]
         unsoftened = self.magnitude * gain[..., None] * self.R_bs.T
-        R_sb = (np.eye(3) + _symmetric(state.calibration["soft_iron"])) @ unsoftened
+        R_sb = (identity(3) + _symmetric(state.calibration["soft_iron"])) @ unsoftened
         turns_b = transpose(state.R_nb) @ turns_n
         u_b, seen = turns_b[..., 0], R_sb @ turns_b
         field, by_dip, by_deviation = seen[..., 0], seen[..., 1:2], -seen[..., 2:]
 
         pose, iron = np.zeros((len(state), 3, 6)), np.zeros((len(state), 3, 3))
         pose[..., :3] = R_sb @ skew(u_b) + by_deviation * (slope[:, None] * gradient)[:, None, :]
-        iron[...] = self.magnitude * np.eye(3)
+        iron[...] = self.magnitude * identity(3)
         H = {
             POSE: pose,
             "mag_offset": by_deviation,
@@ -336,7 +336,7 @@ class Position:
         z, H = point[:, rows], {POSE: pose[:, rows, :]}
         if self.offset is not None:
             z = z + state.calibration[self.offset]
-            H[self.offset] = np.tile(np.eye(self.dim), (len(state), 1, 1))
+            H[self.offset] = np.tile(identity(self.dim), (len(state), 1, 1))
         return z, H
 
 
@@ -361,5 +361,5 @@ class PlaceOffset:
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         point, pose = _point(state, self.lever_arm_b)
-        by_place = np.tile(-np.eye(PLACE_DIM), (len(state), 1, 1))
+        by_place = np.tile(-identity(PLACE_DIM), (len(state), 1, 1))
         return point[:, :PLACE_DIM] - state.calibration[PLACE], {POSE: pose[:, :PLACE_DIM], PLACE: by_place}

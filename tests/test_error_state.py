@@ -2,6 +2,7 @@
 
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -28,13 +29,13 @@ from rovgraph.estimators import error_vector
 from rovgraph.estimators.error_state import ErrorStateFilter, replay
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.robust_update import robust_update
+from rovgraph.estimators.innovations import Innovations
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.factors import predict
 from rovgraph.graph.measurements import loss_and_weight
 from rovgraph.graph.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
-from rovgraph.graph.transition import transition
+from rovgraph.graph.transition import transitions
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 from rovgraph.sensors import innovation
@@ -95,7 +96,7 @@ def test_transition_is_the_derivative_of_the_prediction():
     state, samples = moving(0.5)
     interval = interval_of(samples, 0.5, np.zeros(6), falcon())
     after = predict(interval, state)
-    F, _ = transition(interval, state, after)
+    [F], _ = transitions([interval], [state], [after])
     step, columns = 1e-5, []
     for variable, size in DIMENSION.items():
         for k in range(size):
@@ -113,7 +114,7 @@ def test_process_noise_is_that_of_noisy_samples():
     state = replace(state, bias=np.zeros((1, 6)))
     interval = interval_of(samples, seconds, np.zeros(6), config)
     exact = predict(interval, state)
-    _, Q = transition(interval, state, exact)
+    _, [Q] = transitions([interval], [state], [exact])
     densities = np.repeat([noise.acc, noise.gyr], 3)
     walks = np.repeat([noise.acc_walk, noise.gyr_walk], 3)
     errors = []
@@ -136,11 +137,11 @@ def test_all_measurements_of_a_keyframe_together_are_linearised_as_each_alone(es
     state = estimator.filtered[interval.index].state
     assert len(interval.attached) > 2
     assert any(a.motion.dt for a in interval.attached)
-    together = estimator.recursion.linearize(state, interval.attached)
-    for attached, (r, H) in zip(interval.attached, together, strict=True):
+    (r,), (H,), [parts] = estimator.recursion.linearize(state, [interval.attached])
+    for attached, part in zip(interval.attached, parts, strict=True):
         alone, jacobians = estimator.recursion.block([attached]).linearize(state)
-        np.testing.assert_allclose(r, alone[0], atol=1e-9)
-        np.testing.assert_allclose(H, estimator.error.matrix(jacobians)[0], atol=1e-9)
+        np.testing.assert_allclose(r[part], alone[0], atol=1e-9)
+        np.testing.assert_allclose(H[part], estimator.error.matrix(jacobians)[0], atol=1e-9)
 
 
 # coordinates of the error
@@ -160,8 +161,8 @@ def test_the_local_error_is_the_inverse_of_the_retraction():
     rng = np.random.default_rng(1)
     error, state = error_vector_and_state(rng)
     delta = 0.2 * rng.standard_normal(error.size)
-    moved, _ = error.retract(state, delta)
-    np.testing.assert_allclose(error.local(state, moved)[0], delta, atol=1e-9)
+    moved, _ = error.retract(state, delta[None])
+    np.testing.assert_allclose(error.local(state, moved)[0][0], delta, atol=1e-9)
 
 
 def test_a_change_of_basis_carries_errors_from_one_state_to_another():
@@ -169,11 +170,12 @@ def test_a_change_of_basis_carries_errors_from_one_state_to_another():
     rng = np.random.default_rng(2)
     error, state = error_vector_and_state(rng)
     delta, e = 1e-4 * rng.standard_normal(error.size), 1e-6 * rng.standard_normal(error.size)
-    moved, basis = error.retract(state, delta)
-    about_moved = error.local(moved, error.retract(state, delta + e)[0])[0]
+    moved, [basis] = error.retract(state, delta[None])
+    [about_moved] = error.local(moved, error.retract(state, (delta + e)[None])[0])[0]
     np.testing.assert_allclose(about_moved, basis @ e, atol=1e-9)
-    back = error.local(moved, error.retract(moved, delta)[0])[1]
-    np.testing.assert_allclose(back @ error.retract(moved, delta)[1], np.eye(error.size), atol=1e-6)
+    further, [there] = error.retract(moved, delta[None])
+    [back] = error.local(moved, further)[1]
+    np.testing.assert_allclose(back @ there, np.eye(error.size), atol=1e-6)
 
 
 @pytest.mark.parametrize("sensor", error_vector.SEEN)
@@ -184,7 +186,7 @@ def test_what_an_instrument_sees_is_linear_in_the_error(sensor):
     model = error_vector.seen_model(instruments(falcon(environment={"field_norm": 48.0}))[sensor].model)
     delta = 0.1 * rng.standard_normal(error.size)
     z, H = model.predict(state, np.zeros((1, 3)))
-    moved = model.predict(error.retract(state, delta)[0], np.zeros((1, 3)))[0]
+    moved = model.predict(error.retract(state, delta[None])[0], np.zeros((1, 3)))[0]
     linear = (error.matrix(H) @ delta)[0]
     np.testing.assert_allclose(innovation(model, moved, z)[0], linear, atol=1e-9 * max(np.abs(z).max(), 1.0))
 
@@ -200,9 +202,17 @@ def problem(rng: np.random.Generator, spoilt: float = 0.0) -> tuple[Array, list[
     return root @ root.T + 0.1 * np.eye(5), r, H
 
 
+def updated(P: Array, r: list[Array], H: list[Array], loss: str) -> tuple[Array, Array, list[float]]:
+    ends = np.cumsum([0, *map(len, r)]).tolist()
+    parts = [slice(*pair) for pair in pairwise(ends)]
+    said = Innovations(P[None], np.concatenate(r)[None], np.vstack(H)[None], [parts])
+    [delta], [posterior], [weights] = said.update([[loss] * len(r)])
+    return delta, posterior, weights
+
+
 def test_an_update_without_losses_is_kalmans():
     P, r, H = problem(np.random.default_rng(1))
-    delta, posterior, weights = robust_update(P, r, H, ["none"] * 3)
+    delta, posterior, weights = updated(P, r, H, "none")
     J = np.vstack(H)
     information = np.linalg.inv(P) + J.T @ J
     np.testing.assert_allclose(posterior, np.linalg.inv(information), atol=1e-9)
@@ -213,7 +223,7 @@ def test_an_update_without_losses_is_kalmans():
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_an_update_with_a_loss_minimises_the_robust_cost(loss):
     P, r, H = problem(np.random.default_rng(2), spoilt=15.0)
-    delta, _, weights = robust_update(P, r, H, [loss] * 3)
+    delta, _, weights = updated(P, r, H, loss)
 
     def cost(x: Array) -> float:
         parts = [loss_and_weight((a - h @ x)[None], loss)[0][0] for a, h in zip(r, H, strict=True)]

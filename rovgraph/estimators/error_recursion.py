@@ -1,5 +1,8 @@
 """One interval of the error-state Kalman filter: update, predict, update.
 
+Of one filter, or of several of the same configuration side by side, which takes NumPy hardly
+longer than one.
+
 The error has 15 components (attitude, position, velocity, biases) and those of the
 calibration that is estimated. Motion, measurement models, noise, losses, gates and start
 are the graph's own. What differs: every measurement is linearised once, where it comes.
@@ -11,12 +14,14 @@ updates it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, groupby, pairwise
 
 import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.innovations import Innovations
 from rovgraph.estimators.remembered_places import (
     Place,
     extended,
@@ -28,16 +33,15 @@ from rovgraph.estimators.remembered_places import (
     without_oldest,
 )
 from rovgraph.estimators.results import body_trajectory
-from rovgraph.estimators.robust_update import normalised_squared, robust_update
-from rovgraph.geometry import Array, transpose
-from rovgraph.graph.assembly import Attached, Interval, Sighting
+from rovgraph.geometry import Array, identity, rotate, transpose
+from rovgraph.graph.assembly import Attached, Interval
 from rovgraph.graph.coasting import BLIND_S, coasted, coasting
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import Block, make_block, motions, whitening
 from rovgraph.graph.places import ORIGIN
 from rovgraph.graph.scale import COLUMNS, SCALES
-from rovgraph.graph.transition import transition
+from rovgraph.graph.transition import transitions
 from rovgraph.sensors import Position, SensorModel, innovation
 from rovgraph.state import POSE, VELOCITY, State, propagate_with_jacobian, stack_states
 from rovgraph.trajectory import Trajectory
@@ -115,6 +119,34 @@ class Passage:
     used: list[Used]
 
 
+@dataclass(frozen=True)
+class _Together:
+    """The estimates of n filters; only a filter that is alone remembers places.
+
+    Attributes
+    ----------
+    state : State of n epochs; calibration that is estimated has shape (n, dim)
+    P : ndarray, shape (n, d, d)
+    places : of the one filter
+    """
+
+    state: State
+    P: Array
+    places: tuple[Place, ...] = ()
+
+    def apart(self) -> list[Gaussian]:
+        """Each by itself."""
+        whole, calibration = self.state, self.state.calibration
+        own = [name for name, value in calibration.items() if value.ndim == 2]
+        out = []
+        for k, P in enumerate(self.P):
+            one = slice(k, k + 1)
+            known = {**calibration, **{name: calibration[name][k] for name in own}}
+            state = State(whole.R_nb[one], whole.p_n[one], whole.v_n[one], whole.bias[one], known)
+            out.append(Gaussian(state, P, self.places))
+        return out
+
+
 class ErrorStateRecursion:
     """Extended Kalman filter that keeps nothing: the state goes in and comes out.
 
@@ -148,52 +180,62 @@ class ErrorStateRecursion:
         P[:3, :3], P[3:6, 3:6] = (transpose(R_nb) @ P[i : i + 3, i : i + 3] @ R_nb for i in (0, 3))
         return Gaussian(replace(start.state, calibration=self.unknowns.fixed), P)
 
-    def through(self, interval: Interval, before: Gaussian | None, gates: Gates) -> Passage:
+    def through(self, interval: Interval, before: Gaussian, gates: Gates) -> Passage:
         """Take one interval.
 
         Parameters
         ----------
         interval : the next one
-        before : the keyframe before; None at the first
+        before : the keyframe before, or at the first `start`
         gates : renewed in place
         """
-        used: list[Used] = []
-        departed = step = None
-        if before is None:
-            predicted = self.start()
-        else:
-            between = [a for a in interval.attached if a.keyframe < interval.index]
-            departed = self._update(before, between, gates, used)
-            step = self.predict(interval, departed)
-            predicted = step.predicted
-        here = [a for a in interval.attached if a.keyframe == interval.index]
-        return Passage(departed, step, self._update(predicted, here, gates, used), used)
+        return self.through_together([interval], [before], [gates])[0]
 
-    def _update(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
-        """The state corrected by what belongs to its keyframe, places last."""
-        known = self._measured(before, [a for a in attached if a.sighting is None], gates, used)
-        for a in attached:
-            if a.sighting is not None:
-                known = self._sighted(known, a, a.sighting, used)
-        return known
+    def through_together(
+        self, intervals: Sequence[Interval], before: Sequence[Gaussian], gates: Sequence[Gates]
+    ) -> list[Passage]:
+        """Take one interval of each of some filters; `through` says of what.
+
+        All of them are at their first keyframe, or none is; where there are several, none has seen a place.
+        """
+        used: list[list[Used]] = [[] for _ in intervals]
+        departed: Sequence[Gaussian | None] = [None] * len(intervals)
+        steps: Sequence[Step | None] = [None] * len(intervals)
+        predicted = before
+        if intervals[0].pim is not None:
+            between = [[a for a in i.attached if a.keyframe < i.index] for i in intervals]
+            departed = left = self._update(before, between, gates, used)
+            steps = made = self.predict_together(intervals, left)
+            predicted = [step.predicted for step in made]
+        here = [[a for a in i.attached if a.keyframe == i.index] for i in intervals]
+        filtered = self._update(predicted, here, gates, used)
+        return [Passage(*one) for one in zip(departed, steps, filtered, used, strict=True)]
 
     def predict(self, interval: Interval, before: Gaussian) -> Step:
         """The next keyframe, from the IMU alone; calibration walks."""
-        assert interval.pim is not None
-        duration = interval.pim.deltaTij()
-        state = predict(interval, before.state)
-        F, Q = np.eye(len(before.P)), np.zeros_like(before.P)
-        Q[: self.error.size, : self.error.size] = self._walk * duration
-        if interval.bridged and duration > BLIND_S:
-            state = coasted(before.state, state, duration)
-            F[:15, :15], Q[:15, :15] = coasting(before.state, state, duration, before.P)
-        else:
-            F[:15, :15], Q[:15, :15] = transition(interval, before.state, state)
-        if interval.felt is not None:
-            for name in set(SCALES) & set(self.error.columns):  # they move as the bias does, but for itself
-                F[:9, self.error.columns[name]] = F[:9, 9:15] @ interval.felt[:, COLUMNS[name]]
-        P = F @ before.P @ F.T + Q
-        return Step(F, Q, Gaussian(state, 0.5 * (P + P.T), before.places))
+        return self.predict_together([interval], [before])[0]
+
+    def predict_together(self, intervals: Sequence[Interval], before: Sequence[Gaussian]) -> list[Step]:
+        """The next keyframes of some filters; as `predict`."""
+        size, P = self.error.size, np.array([known.P for known in before])
+        states = [predict(interval, known.state) for interval, known in zip(intervals, before, strict=True)]
+        F, Q = np.tile(identity(P.shape[1]), (len(P), 1, 1)), np.zeros_like(P)
+        F[:, :15, :15], own_Q = transitions(intervals, [known.state for known in before], states)
+        for k, (interval, known) in enumerate(zip(intervals, before, strict=True)):
+            assert interval.pim is not None
+            duration = interval.pim.deltaTij()
+            Q[k, :size, :size] = self._walk * duration
+            if interval.bridged and duration > BLIND_S:
+                states[k] = coasted(known.state, states[k], duration)
+                F[k, :15, :15], own_Q[k] = coasting(known.state, states[k], duration, known.P)
+            if interval.felt is not None:
+                for name in set(SCALES) & set(self.error.columns):  # they move as the bias does, but for itself
+                    F[k, :9, self.error.columns[name]] = F[k, :9, 9:15] @ interval.felt[:, COLUMNS[name]]
+        Q[:, :15, :15] = own_Q
+        P = F @ P @ transpose(F) + Q
+        P = 0.5 * (P + transpose(P))
+        predicted = [Gaussian(*one) for one in zip(states, P, (known.places for known in before), strict=True)]
+        return [Step(*one) for one in zip(F, Q, predicted, strict=True)]
 
     def block(self, attached: Sequence[Attached]) -> Block:
         """Measurements of one sensor."""
@@ -201,30 +243,79 @@ class ErrorStateRecursion:
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
         return make_block(attached, instrument, gravity, self.unknowns)
 
-    def linearize(self, state: State, attached: Sequence[Attached]) -> list[tuple[Array, Array]]:
-        """Whitened innovation, shape (dim,), and Jacobian, shape (dim, size), of each measurement of a keyframe.
+    def linearize(self, state: State, attached: Sequence[Sequence[Attached]]) -> tuple[Array, Array, list[list[slice]]]:
+        """Whitened innovations and Jacobians of the measurements of a keyframe of each of n filters.
 
         A place is taken to be at the origin, and to be known.
 
         What `Block.linearize` says of many keyframes and one sensor, for one keyframe and many sensors.
+
+        Parameters
+        ----------
+        state : State of n epochs
+        attached : measurements of each; at least one of them all
+
+        Returns
+        -------
+        r, H : ndarray, shapes (n, m) and (n, m, size); where one has fewer than m rows the last are zero
+        parts : for each its measurements' rows
         """
-        state = state.seeing(ORIGIN)
-        there, F, linear = state.at([0] * len(attached)), None, []
-        if any(a.motion.dt for a in attached):
-            there, F = propagate_with_jacobian(there, motions(attached), self.beginning.config.environment.gravity_mps2)
-        for k, a in enumerate(attached):
-            if a.track is not None or a.felt is not None:  # by a motion of its own, or more than the model knows
-                own, jacobians = self.block([a]).linearize(state)
-                linear.append((own[0], self.error.matrix(jacobians)[0]))
-                continue
-            instrument = self.beginning.instruments[a.sensor]
-            predicted, jacobians = instrument.model.predict(there.at(slice(k, k + 1)), a.rate_b[None])
-            H = self.error.matrix(jacobians)[0]
-            if F is not None:
-                H[:, :15] = H[:, :15] @ F[k]
-            W = whitening(instrument, a.sd[None], np.array([a.rate_sd]))[0]
-            linear.append((W @ innovation(instrument.model, a.z, predicted[0]), W @ H))
-        return linear
+        parts, flat = self._rows(attached)
+        rows = max(own[-1].stop for own in parts if own)
+        r, H = np.zeros((len(state), rows)), np.zeros((len(state), rows, self.error.size))
+        here, F = state.at([k for k, _, _ in flat]), None
+        there = here
+        if any(a.motion.dt for _, _, a in flat):
+            moved = motions([a for _, _, a in flat])
+            there, F = propagate_with_jacobian(here, moved, self.beginning.config.environment.gravity_mps2)
+        for _, group in groupby(range(len(flat)), lambda i: _kind(flat[i][2])):
+            chosen = list(group)
+            those, which = [flat[i][2] for i in chosen], slice(chosen[0], chosen[-1] + 1)
+            if those[0].track is not None or those[0].felt is not None:
+                own_r, own_H = self._of_block(here.at(which), those)
+            else:
+                own_r, own_H = self._of_sensor(there.at(which), None if F is None else F[which], those)
+            for i, one_r, one_H in zip(chosen, own_r, own_H, strict=True):
+                k, part, _ = flat[i]
+                r[k, part], H[k, part] = one_r, one_H
+        return r, H, parts
+
+    def _rows(
+        self, attached: Sequence[Sequence[Attached]]
+    ) -> tuple[list[list[slice]], list[tuple[int, slice, Attached]]]:
+        """Rows of each filter's measurements; and all of them with filter and rows, those of one kind together."""
+        parts, flat = [], []
+        for k, own in enumerate(attached):
+            ends = accumulate((self.beginning.instruments[a.sensor].model.dim for a in own), initial=0)
+            parts.append([slice(*pair) for pair in pairwise(ends)])
+            flat += [(k, part, a) for part, a in zip(parts[-1], own, strict=True)]
+        return parts, sorted(flat, key=lambda one: _kind(one[2]))
+
+    def _of_block(self, state: State, attached: Sequence[Attached]) -> tuple[Array, Array]:
+        """Whitened innovations, shape (m, dim), and Jacobians, shape (m, dim, size), of m measurements of a sensor."""
+        if attached[0].sighting is not None:
+            state = state.seeing(ORIGIN)
+        r, jacobians = self.block(attached).linearize(state)
+        return r, self.error.matrix(jacobians)
+
+    def _of_sensor(self, state: State, F: Array | None, attached: Sequence[Attached]) -> tuple[Array, Array]:
+        """The same at less cost, of measurements that are where their stamps say, with an IMU of exact scale.
+
+        Parameters
+        ----------
+        state : State where the measurements are
+        F : ndarray, shape (m, 15, 15), its derivative by that of the keyframe, where it is another
+        """
+        instrument = self.beginning.instruments[attached[0].sensor]
+        if attached[0].sighting is not None:
+            state = state.seeing(ORIGIN)
+        predicted, jacobians = instrument.model.predict(state, np.array([a.rate_b for a in attached]))
+        H = self.error.matrix(jacobians)
+        if F is not None:
+            H[..., :15] = H[..., :15] @ F
+        W = whitening(instrument, np.array([a.sd for a in attached]), np.array([a.rate_sd for a in attached]))
+        z = np.array([a.z for a in attached])
+        return rotate(W, innovation(instrument.model, z, predicted)), W @ H
 
     def trajectory(self, intervals: Sequence[Interval], known: Sequence[Gaussian]) -> Trajectory:
         """The body's origin at keyframes, at least one, in n, with its covariance.
@@ -241,6 +332,38 @@ class ErrorStateRecursion:
     def covariances(self, known: Sequence[Gaussian]) -> Array:
         """Covariances of n estimates without their places, shape (n, size, size)."""
         return np.array([k.P[: self.error.size, : self.error.size] for k in known])
+
+    def corrected(self, before: Sequence[Gaussian], delta: Array, P: Array) -> list[Gaussian]:
+        """n estimates moved by corrections, shape (n, d); ``P``, shape (n, d, d), are the covariances after them."""
+        return self._corrected(self._together(before), delta, P)
+
+    def local(self, some: Sequence[Gaussian], others: Sequence[Gaussian]) -> tuple[Array, Array]:
+        """`ErrorVector.local` from n estimates to n others."""
+        return self.error.local(self._together(some).state, self._together(others).state)
+
+    def _together(self, known: Sequence[Gaussian]) -> _Together:
+        states = [one.state for one in known]
+        own = {name: np.array([s.calibration[name] for s in states]) for name in self.unknowns.estimated}
+        R_nb, p_n, v_n, bias = (
+            np.concatenate([getattr(s, name) for s in states]) for name in ("R_nb", "p_n", "v_n", "bias")
+        )
+        state = State(R_nb, p_n, v_n, bias, {**states[0].calibration, **own})
+        return _Together(state, np.array([one.P for one in known]), known[0].places)
+
+    def _update(
+        self,
+        before: Sequence[Gaussian],
+        attached: Sequence[Sequence[Attached]],
+        gates: Sequence[Gates],
+        used: Sequence[list[Used]],
+    ) -> Sequence[Gaussian]:
+        """The estimates corrected by what belongs to their keyframes, places last."""
+        known = self._measured(before, [[a for a in own if a.sighting is None] for own in attached], gates, used)
+        sighted = [a for own in attached for a in own if a.sighting is not None]
+        assert not sighted or len(known) == 1
+        for a in sighted:
+            known = [self._sighted(known[0], a, used[0])]
+        return known
 
     def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
         """Whether a measurement lies within its gate."""
@@ -266,40 +389,59 @@ class ErrorStateRecursion:
         seen[:3] = R_bn
         return seen[:, 2:]
 
-    def _measured(self, before: Gaussian, attached: Sequence[Attached], gates: Gates, used: list[Used]) -> Gaussian:
-        """The state corrected by measurements that belong to its keyframe, of no places."""
-        r, H, losses, admitted = [], [], [], []
-        for a, (own_r, own_H) in zip(attached, self.linearize(before.state, attached), strict=True):
-            instrument, own_H = self.beginning.instruments[a.sensor], padded(own_H, len(before.P))
-            nis = normalised_squared(before.P, own_r, own_H)
-            if self._admit(a, nis, gates):
-                r.append(own_r)
-                H.append(own_H)
-                losses.append(instrument.loss)
-                admitted.append((a, nis))
-            else:
-                used.append(Used(a, before.state, nis, 0.0))
-                if a.time - gates[a.sensor] > instrument.readmit_s:
-                    seen = self._seen(instrument.model, before.state)
-                    before = replace(before, P=doubted(before.P, own_r, own_H, padded(seen.T, len(before.P)).T))
-        if not admitted:
+    def _measured(
+        self,
+        before: Sequence[Gaussian],
+        attached: Sequence[Sequence[Attached]],
+        gates: Sequence[Gates],
+        used: Sequence[list[Used]],
+    ) -> Sequence[Gaussian]:
+        """The estimates corrected by measurements that belong to their keyframes, of no places."""
+        if not any(attached):
             return before
-        delta, P, weights = robust_update(before.P, r, H, losses)
-        used += [Used(a, before.state, nis, weight) for (a, nis), weight in zip(admitted, weights, strict=True)]
-        return self.corrected(before, delta, P)
+        known = self._together(before)
+        r, H, parts = self.linearize(known.state, attached)
+        said = Innovations(known.P, r, padded(H, known.P.shape[1]), parts)
+        admitted = []
+        for k, (one, own) in enumerate(zip(before, attached, strict=True)):
+            for j, (a, part) in enumerate(zip(own, parts[k], strict=True)):
+                nis = said.nis(k, part)
+                if self._admit(a, nis, gates[k]):
+                    admitted.append((k, j, a, nis))
+                else:
+                    used[k].append(Used(a, one.state, nis, 0.0))
+                    self._left_out(said, k, part, a, gates[k], one.state)
+        if not admitted:
+            return known.apart()
+        losses = [[self.beginning.instruments[a.sensor].loss for a in own] for own in attached]
+        delta, P, weights = said.update(losses)
+        for k, j, a, nis in admitted:
+            used[k].append(Used(a, before[k].state, nis, weights[k][j]))
+        return self._corrected(known, delta, P)
 
-    def _sighted(self, before: Gaussian, a: Attached, sighting: Sighting, used: list[Used]) -> Gaussian:
+    def _left_out(self, said: Innovations, k: int, part: slice, a: Attached, gates: Gates, state: State) -> None:
+        """Leave a measurement out, and after long enough doubt what its sensor sees."""
+        instrument = self.beginning.instruments[a.sensor]
+        if a.time - gates[a.sensor] > instrument.readmit_s:
+            seen = padded(self._seen(instrument.model, state).T, said.P.shape[1]).T
+            said.doubt(k, doubted(said.P[k], said.r[k, part], said.H[k, part], seen))
+        said.leave_out(k, part)
+
+    def _sighted(self, before: Gaussian, a: Attached, used: list[Used]) -> Gaussian:
         """The state corrected by a place that is seen again, or with one place more."""
-        instrument, size = self.beginning.instruments[a.sensor], self.error.size
-        [(r, H)] = self.linearize(before.state, [a])
+        assert a.sighting is not None
+        instrument, size, sighting = self.beginning.instruments[a.sensor], self.error.size, a.sighting
+        together = self._together([before])
+        (r,), (H,), [[part]] = self.linearize(together.state, [[a]])
         match = nearest(before.P, r, H, a.sd, size, before.places, sighting.name)
         gate = instrument.gate_sd or np.inf
         if match is not None and match.nis <= gate**2:
-            delta, P, [weight] = robust_update(before.P, [match.r], [match.H], [instrument.loss])
+            said = Innovations(together.P, match.r[None], match.H[None], [[part]])
+            delta, P, [[weight]] = said.update([[instrument.loss]])
             place = before.places[match.index]
             seen = replace(a, sighting=sighting._replace(number=place.number))
             used.append(Used(seen, before.state.seeing(place.position), match.nis, weight))
-            after = self.corrected(before, delta, P)
+            [after] = self._corrected(together, delta, P)
             return replace(after, places=seen_at(after.places, match.index, a.time))
         place = Place(sighting.name, sighting.number, -a.sd * r, a.time)
         other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
@@ -307,12 +449,16 @@ class ErrorStateRecursion:
         P, places = with_another(before.P, before.places, place, a.sd[:, None] * H, a.sd)
         return Gaussian(before.state, *without_oldest(P, places, size, self.beginning.config.place.remembered))
 
-    def corrected(self, before: Gaussian, delta: Array, P: Array) -> Gaussian:
-        """The estimate moved by a correction, shape (size + 2 m,); ``P`` is the covariance after it."""
+    def _corrected(self, before: _Together, delta: Array, P: Array) -> list[Gaussian]:
         size = self.error.size
-        state, basis = self.error.retract(before.state, delta[:size])
-        basis = extended(basis, len(P))
-        return Gaussian(state, basis @ P @ basis.T, moved(before.places, delta[size:]))
+        state, basis = self.error.retract(before.state, delta[:, :size])
+        basis = extended(basis, P.shape[1])
+        return _Together(state, basis @ P @ transpose(basis), moved(before.places, delta[0, size:])).apart()
+
+
+def _kind(a: Attached) -> tuple[str, bool, bool]:
+    """Of which measurements can be linearised together."""
+    return a.sensor, a.track is None, a.felt is None
 
 
 def doubted(P: Array, r: Array, H: Array, seen: Array) -> Array:

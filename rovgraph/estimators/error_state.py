@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Step, Used
+from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Passage, Step, Used
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.remembered_places import columns, common, extended
@@ -22,7 +22,7 @@ from rovgraph.estimators.results import (
     calibration_history,
     residual_frame,
 )
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.measurements import Block
 from rovgraph.log import Measurement
@@ -45,6 +45,9 @@ class ErrorStateFilter:
         goes on from there [s]
     learn_noise : of the IMU, from its newest samples
     filtered : Gaussian of each keyframe so far, from all data up to it
+    departed, steps : for the smoother, of a filter that is not renewed: each keyframe but the newest with what was
+        measured before the next, too, and the way from there
+    gates : sensors that are being kept out
     """
 
     beginning: Beginning
@@ -58,11 +61,11 @@ class ErrorStateFilter:
         self.recursion = ErrorStateRecursion(b)
         self.error = self.recursion.error
         self.filtered: list[Gaussian] = []
+        self.departed: list[Gaussian] = []
+        self.steps: list[Step] = []
+        self.gates: Gates = {}
         self._renewals = list(self.renew_at)
-        self._departed: list[Gaussian] = []  # with what was measured before the next keyframe, too
-        self._steps: list[Step] = []
         self._used: dict[str, list[Used]] = {}
-        self._gates: Gates = {}
 
     def add(self, measurement: Measurement) -> list[Interval]:
         """Take a measurement; times must not decrease."""
@@ -78,10 +81,13 @@ class ErrorStateFilter:
 
     def step(self, interval: Interval) -> list[Used]:
         """Take one interval: update, predict, update; the measurements that entered, or did not."""
-        passage = self.recursion.through(interval, self.filtered[-1] if self.filtered else None, self._gates)
-        if passage.departed is not None and passage.step is not None:
-            self._departed.append(passage.departed)
-            self._steps.append(passage.step)
+        return step_together([self], [interval])[0]
+
+    def passed(self, interval: Interval, passage: Passage) -> None:
+        """Keep what came of an interval."""
+        if passage.departed is not None and passage.step is not None and not self.renew_at:
+            self.departed.append(passage.departed)
+            self.steps.append(passage.step)
         self.filtered.append(passage.filtered)
         for used in passage.used:
             self._used.setdefault(used.attached.sensor, []).append(used)
@@ -91,15 +97,19 @@ class ErrorStateFilter:
             states = stack_states([known.state for known in self.filtered])
             self.filtered[-1] = renewed(self.recursion, self.intervals, states)
         self.assembler.stamps.assume(self.latest().calibration)
-        return passage.used
+
+    @property
+    def known(self) -> Gaussian:
+        """The newest keyframe, or what is believed before the first."""
+        return self.filtered[-1] if self.filtered else self.recursion.start()
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""
-        return self._estimate("filtered" if self.renew_at else "ekf", self.filtered)
+        return self.estimate("filtered" if self.renew_at else "ekf", self.filtered)
 
     def smoothed(self) -> Estimate:
         """The smoother's estimate of every keyframe so far; not of a filter that was renewed."""
-        return self._estimate("rts", self.backward())
+        return smoothed_together([self])[0]
 
     def backward(self) -> list[Gaussian]:
         """Every keyframe so far, from all data, before it and after.
@@ -107,32 +117,15 @@ class ErrorStateFilter:
         e_s = e_f + G (e_s,next - e_predicted,next), G = P_f F' P_predicted^-1, with the
         differences taken along `ErrorVector`'s coordinates.
         """
-        known = [self.filtered[-1]]
-        for departed, step in zip(reversed(self._departed), reversed(self._steps), strict=True):
-            known.append(self._back(departed, step, known[-1]))
-        return known[::-1]
+        return backward_together([self])[0]
 
     def _take(self, intervals: list[Interval]) -> list[Interval]:
         for interval in intervals:
             self.step(interval)
         return intervals
 
-    def _back(self, departed: Gaussian, step: Step, following: Gaussian) -> Gaussian:
-        """The smoothed state of a keyframe, given that of the one after it."""
-        delta, basis = self.error.local(step.predicted.state, following.state)
-        # of places, those that both know: one that was forgotten since moves with what it is correlated with
-        ours, theirs, shift = common(step.predicted.places, following.places)
-        here, there = columns(self.error.size, ours), columns(self.error.size, theirs)
-        delta, basis = np.concatenate([delta, shift]), extended(basis, len(here))
-        F, Q, predicted = step.F[here], step.Q[np.ix_(here, here)], step.predicted.P[np.ix_(here, here)]
-        sd = np.sqrt(np.diag(predicted))  # metres beside rad/s: solved with unit variances
-        G = np.linalg.solve(predicted / np.outer(sd, sd), F @ departed.P / sd[:, None]).T / sd
-        kept = np.eye(len(departed.P)) - G @ F
-        known = basis @ following.P[np.ix_(there, there)] @ basis.T
-        P = kept @ departed.P @ kept.T + G @ (known + Q) @ G.T
-        return self.recursion.corrected(departed, G @ delta, P)
-
-    def _estimate(self, kind: str, known: Sequence[Gaussian]) -> Estimate:
+    def estimate(self, kind: str, known: Sequence[Gaussian]) -> Estimate:
+        """What is known of every keyframe, as an estimate."""
         b, columns = self.beginning, self.error.columns
         states, P = stack_states([k.state for k in known]), self.recursion.covariances(known)
         sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
@@ -184,6 +177,51 @@ class ErrorStateFilter:
         }
 
 
+def backward_together(filters: Sequence[ErrorStateFilter]) -> list[list[Gaussian]]:
+    """`ErrorStateFilter.backward` of filters that are `alike`."""
+    known = [[one.filtered[-1]] for one in filters]
+    for back in range(1, max(len(one.filtered) for one in filters)):
+        left = [k for k, one in enumerate(filters) if back < len(one.filtered)]
+        departed, steps = [filters[k].departed[-back] for k in left], [filters[k].steps[-back] for k in left]
+        earlier = _back(filters[0].recursion, departed, steps, [known[k][-1] for k in left])
+        for k, own in zip(left, earlier, strict=True):
+            known[k].append(own)
+    return [own[::-1] for own in known]
+
+
+def smoothed_together(filters: Sequence[ErrorStateFilter]) -> list[Estimate]:
+    """`ErrorStateFilter.smoothed` of filters that are `alike`."""
+    return [one.estimate("rts", known) for one, known in zip(filters, backward_together(filters), strict=True)]
+
+
+def _back(
+    recursion: ErrorStateRecursion, departed: Sequence[Gaussian], steps: Sequence[Step], following: Sequence[Gaussian]
+) -> list[Gaussian]:
+    """The smoothed states of keyframes, given those of the ones after them."""
+    predicted, size = [step.predicted for step in steps], recursion.error.size
+    delta, basis = recursion.local(predicted, following)
+    # of places, those that both know: one that was forgotten since moves with what it is correlated with
+    ours, theirs, shift = common(predicted[0].places, following[0].places)
+    here, there = columns(size, ours), columns(size, theirs)
+    delta, basis = np.concatenate([delta, np.tile(shift, (len(delta), 1))], axis=1), extended(basis, len(here))
+    F, Q = np.array([step.F[here] for step in steps]), np.array([step.Q[np.ix_(here, here)] for step in steps])
+    P_predicted = np.array([one.P[np.ix_(here, here)] for one in predicted])
+    P_following = np.array([one.P[np.ix_(there, there)] for one in following])
+    P = np.array([one.P for one in departed])
+    sd = np.sqrt(np.diagonal(P_predicted, axis1=1, axis2=2))[..., None]  # metres beside rad/s: solved with unit sds
+    G = transpose(np.linalg.solve(P_predicted / (sd * transpose(sd)), F @ P / sd) / sd)
+    kept = np.eye(P.shape[1]) - G @ F
+    P = kept @ P @ transpose(kept) + G @ (basis @ P_following @ transpose(basis) + Q) @ transpose(G)
+    return recursion.corrected(departed, (G @ delta[..., None])[..., 0], P)
+
+
+def alike(some: Beginning, other: Beginning) -> bool:
+    """Whether filters of two dives can go side by side: but for the start they know the same, and of no places."""
+    config = other.config.model_copy(update={"start": some.config.start})
+    sensors = list(some.instruments)
+    return config == some.config and list(other.instruments) == sensors and "place" not in sensors
+
+
 def replay(
     intervals: Sequence[Interval],
     beginning: Beginning,
@@ -192,8 +230,28 @@ def replay(
 ) -> ErrorStateFilter:
     """A filter that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
     estimator = ErrorStateFilter(beginning, renew_at)
-    for interval in intervals:
-        estimator.step(interval)
-        if interval.index % PROGRESS_EVERY == 0:
-            progress(interval.index / len(intervals))
+    replay_together([estimator], [intervals], progress)
     return estimator
+
+
+def replay_together(
+    filters: Sequence[ErrorStateFilter],
+    dives: Sequence[Sequence[Interval]],
+    progress: Callable[[float], None] = lambda done: None,
+) -> None:
+    """Let filters that are `alike` take the intervals of a dive each."""
+    longest = max(len(intervals) for intervals in dives)
+    for index in range(longest):
+        left = [k for k, intervals in enumerate(dives) if index < len(intervals)]
+        step_together([filters[k] for k in left], [dives[k][index] for k in left])
+        if index % PROGRESS_EVERY == 0:
+            progress(index / longest)
+
+
+def step_together(filters: Sequence[ErrorStateFilter], intervals: Sequence[Interval]) -> list[list[Used]]:
+    """`ErrorStateFilter.step` of filters that are `alike` and have taken equally many intervals."""
+    known, gates = [one.known for one in filters], [one.gates for one in filters]
+    passages = filters[0].recursion.through_together(intervals, known, gates)
+    for one, interval, passage in zip(filters, intervals, passages, strict=True):
+        one.passed(interval, passage)
+    return [passage.used for passage in passages]

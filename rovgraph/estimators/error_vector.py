@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from rovgraph.calibration import TABLE
-from rovgraph.geometry import Array, exp_rotation, log_rotation, rotate, transpose
+from rovgraph.geometry import Array, exp_rotation, identity, log_rotation, rotate, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.model_aiding import WaterVelocity
 from rovgraph.sensors import SensorModel, innovation
@@ -34,7 +34,6 @@ SEEN = {
     "thruster": "current",
     "dvl_water": "current",
 }
-_NO_RATE = np.zeros((2, 3))
 
 
 def seen_model(model: SensorModel) -> SensorModel:
@@ -43,7 +42,7 @@ def seen_model(model: SensorModel) -> SensorModel:
 
 
 class ErrorVector:
-    """Layout and geometry of the error of a state of one epoch.
+    """Layout and geometry of the error of a state.
 
     Parameters
     ----------
@@ -74,59 +73,61 @@ class ErrorVector:
         return out
 
     def retract(self, state: State, delta: Array) -> tuple[State, Array]:
-        """The state that lies ``delta`` away.
+        """The states that lie ``delta`` away.
 
         Parameters
         ----------
-        state : State of one epoch
-        delta : ndarray, shape (size,)
+        state : State of n epochs
+        delta : ndarray, shape (n, size)
 
         Returns
         -------
-        state : State of one epoch
-        basis : ndarray, shape (size, size), takes an error about the old state over to the new one,
+        state : State of n epochs
+        basis : ndarray, shape (n, size, size), takes an error about the old state over to the new one,
             to first order in ``delta``
         """
-        moved = self._straight(state, delta)
+        n, moved = len(state), self._straight(state, delta)
         both, basis = self._both(state, moved), self._turned(state, moved)
         for model, variable, columns in self._seen:
-            z, H = model.predict(both, _NO_RATE)
-            before, after = self.matrix(H)
-            inverse = np.linalg.inv(after[:, columns])
-            missing = innovation(model, z[0] + before @ delta, z[1])
-            moved = moved.retract(variable, inverse @ missing)
-            basis[columns] = _seen_alike(before, after, columns, inverse, basis)
+            z, H = model.predict(both, np.zeros((2 * n, 3)))
+            jacobian = self.matrix(H)
+            before, after = jacobian[:n], jacobian[n:]
+            inverse = _inverse(after[..., columns])
+            missing = innovation(model, z[:n] + rotate(before, delta), z[n:])
+            moved = moved.retract(variable, rotate(inverse, missing))
+            basis[:, columns] = _seen_alike(before, after, columns, inverse, basis)
         return moved, basis
 
     def local(self, state: State, other: State) -> tuple[Array, Array]:
-        """The error that leads from one state to another: the inverse of `retract`.
+        """The errors that lead from some states to others: the inverse of `retract`.
 
         Parameters
         ----------
-        state, other : State of one epoch each
+        state, other : State of n epochs each
 
         Returns
         -------
-        delta : ndarray, shape (size,)
-        basis : ndarray, shape (size, size), takes an error about ``other`` over to ``state``
+        delta : ndarray, shape (n, size)
+        basis : ndarray, shape (n, size, size), takes an error about ``other`` over to ``state``
         """
-        delta = self._difference(state, other)
+        n, delta = len(state), self._difference(state, other)
         both, basis = self._both(state, other), self._turned(other, state)
         for model, _, columns in self._seen:
-            z, H = model.predict(both, _NO_RATE)
-            at_state, at_other = self.matrix(H)
-            inverse = np.linalg.inv(at_state[:, columns])
-            missing = innovation(model, z[1], z[0]) - at_state @ delta
-            delta[columns] += inverse @ missing
-            basis[columns] = _seen_alike(at_other, at_state, columns, inverse, basis)
+            z, H = model.predict(both, np.zeros((2 * n, 3)))
+            jacobian = self.matrix(H)
+            at_state, at_other = jacobian[:n], jacobian[n:]
+            inverse = _inverse(at_state[..., columns])
+            missing = innovation(model, z[n:], z[:n]) - rotate(at_state, delta)
+            delta[:, columns] += rotate(inverse, missing)
+            basis[:, columns] = _seen_alike(at_other, at_state, columns, inverse, basis)
         return delta, basis
 
     def _straight(self, state: State, delta: Array) -> State:
         """All variables moved by themselves."""
-        part = {name: delta[columns] for name, columns in self.columns.items()}
+        part = {name: delta[:, columns] for name, columns in self.columns.items()}
         return State(
-            state.R_nb @ exp_rotation(part[POSE][None, :3]),
-            state.p_n + rotate(state.R_nb, part[POSE][3:]),
+            state.R_nb @ exp_rotation(part[POSE][:, :3]),
+            state.p_n + rotate(state.R_nb, part[POSE][:, 3:]),
             state.v_n + part[VELOCITY],
             state.bias + part[BIAS],
             {**state.calibration, **{name: state.calibration[name] + part[name] for name in self._estimated}},
@@ -135,19 +136,18 @@ class ErrorVector:
     def _difference(self, state: State, other: State) -> Array:
         """The inverse of `_straight`."""
         R_bn = transpose(state.R_nb)
-        return np.concatenate(
-            [
-                log_rotation(R_bn @ other.R_nb)[0],
-                rotate(R_bn, other.p_n - state.p_n)[0],
-                other.v_n[0] - state.v_n[0],
-                other.bias[0] - state.bias[0],
-                *(other.calibration[name] - state.calibration[name] for name in self._estimated),
-            ]
+        of_motion = (
+            log_rotation(R_bn @ other.R_nb),
+            rotate(R_bn, other.p_n - state.p_n),
+            other.v_n - state.v_n,
+            other.bias - state.bias,
         )
+        own = [_of_each(other, name) - _of_each(state, name) for name in self._estimated]
+        return np.concatenate([*of_motion, *own], axis=1)
 
     def _both(self, state: State, other: State) -> State:
-        """Two states of one epoch as one `State`; what is not estimated stays as it is."""
-        own = {name: np.array([state.calibration[name], other.calibration[name]]) for name in self._estimated}
+        """The states of n epochs after those of n others; what is not estimated stays as it is."""
+        own = {name: np.concatenate([_of_each(state, name), _of_each(other, name)]) for name in self._estimated}
         return State(
             np.concatenate([state.R_nb, other.R_nb]),
             np.concatenate([state.p_n, other.p_n]),
@@ -158,9 +158,20 @@ class ErrorVector:
 
     def _turned(self, state: State, other: State) -> Array:
         """The change of basis from one state to another, attitude and position in n staying; no more is known yet."""
-        basis = np.eye(self.size)
-        basis[:3, :3] = basis[3:6, 3:6] = other.R_nb[0].T @ state.R_nb[0]
+        basis = np.tile(identity(self.size), (len(state), 1, 1))
+        basis[:, :3, :3] = basis[:, 3:6, 3:6] = transpose(other.R_nb) @ state.R_nb
         return basis
+
+
+def _of_each(state: State, name: str) -> Array:
+    """A calibration variable of every epoch, shape (n, dim)."""
+    value = state.calibration[name]
+    return value if value.ndim == 2 else np.tile(value, (len(state), 1))
+
+
+def _inverse(matrices: Array) -> Array:
+    """Of shape (n, d, d); a reciprocal where d is 1."""
+    return np.asarray(1.0 / matrices if matrices.shape[-1] == 1 else np.linalg.inv(matrices))
 
 
 def _seen_alike(before: Array, after: Array, columns: slice, inverse: Array, basis: Array) -> Array:
@@ -168,10 +179,10 @@ def _seen_alike(before: Array, after: Array, columns: slice, inverse: Array, bas
 
     Parameters
     ----------
-    before, after : ndarray, shape (dim, size), the instrument's Jacobians at the two states
+    before, after : ndarray, shape (n, dim, size), the instrument's Jacobians at the two states
     columns, inverse : place of the variable, and the inverse of its part of ``after``
-    basis : ndarray, shape (size, size), complete for all else that the instrument depends on
+    basis : ndarray, shape (n, size, size), complete for all else that the instrument depends on
     """
     others = after.copy()
-    others[:, columns] = 0.0
+    others[..., columns] = 0.0
     return np.asarray(inverse @ (before - others @ basis))

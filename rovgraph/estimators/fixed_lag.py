@@ -208,13 +208,12 @@ class FixedLag:
         """Take intervals that are complete, and forget what the lag has passed."""
         if not intervals:
             return
-        known = self.marks[-1].known if self.marks else None
+        known = self.marks[-1].known if self.marks else self.recursion.start()
         taken, passed = self._forgotten + self._taken, []
         for interval in intervals:
             passage = self.recursion.through(interval, known, self._gates)
             known = passage.filtered
             passed.append((interval, known, dict(self._gates), passage.used))
-        assert known is not None
         self._assembler.stamps.assume(known.state.calibration)
         assembler = self._assembler.copy()
         self.marks += [Mark(*one, assembler, taken) for one in passed]

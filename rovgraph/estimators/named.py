@@ -3,26 +3,34 @@
 An estimator is a chain of stages: the first takes a log and a configuration, each of the
 others what the stage before made. Estimators whose chains begin alike share what those
 stages made (filter and smoother of one pass, everything that needs the same keyframes),
-and each is charged for the whole of its chain. The thesis's filters have no chain: those of
-one kind go side by side, over all dives that are asked for together, and each is charged
-for its share of that, by the seconds of its log.
+and each is charged for the whole of its chain. Filters go side by side over all dives that
+are asked for together, and each is charged for its share of that, by the seconds of its log:
+the error-state filters (`Replay`), and the thesis's of one kind, which have no chain.
 
 Headings, as the thesis letters them: a = magnetometer and the DVL's compass, b = the
 DVL's compass, c = the magnetometer.
 """
 
+import contextlib
 import difflib
 import fnmatch
 import itertools
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import assemble
-from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter, replay
+from rovgraph.estimators.error_state import (
+    RENEW_AT_S,
+    ErrorStateFilter,
+    alike,
+    replay,
+    replay_together,
+    smoothed_together,
+)
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.kalman import FILTERS, Asked, Filter, run_filters
@@ -30,6 +38,7 @@ from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.log import Log
 
 Stage = Callable[[Any], Any]
+Made = dict[tuple[object, ...], tuple[Any, float]]  # by chain of stages: what it made, and its processor time [s]
 
 SHORTEST_S = 1e-3  # for which a log counts where time is shared
 
@@ -76,6 +85,11 @@ class Named:
     def shared(self) -> Hashable:
         """The same for estimators that are best asked for together."""
         return self.variant.kind if self.variant else (self.headings, self.misalignment, self.stages[0])
+
+    @property
+    def knowing(self) -> tuple[object, ...]:
+        """The same for estimators that work with the same configuration."""
+        return self.headings, self.misalignment, self.hydrodynamics
 
     def __call__(self, log: Log, config: Config) -> Estimate:
         """The estimate of one dive.
@@ -146,21 +160,84 @@ def outcomes_of_dives(estimators: Sequence[Named], dives: Sequence[Task]) -> Ite
     index of the dive, Outcome : dive by dive, in the order of ``estimators``
     """
     side_by_side: dict[Filter, dict[tuple[int, str], Outcome]] = {}
+    made: list[Made] = [{} for _ in dives]
+    _replay_side_by_side(estimators, dives, made)
     for k, dive in enumerate(dives):
-        made: dict[tuple[object, ...], tuple[Any, float]] = {}
         for named in estimators:
             if named.variant is not None:
                 kind = named.variant.kind
                 if kind not in side_by_side:
-                    alike = [n for n in estimators if n.variant is not None and n.variant.kind == kind]
-                    side_by_side[kind] = _side_by_side(alike, dives)
+                    those = [n for n in estimators if n.variant is not None and n.variant.kind == kind]
+                    side_by_side[kind] = _side_by_side(those, dives)
                 yield k, side_by_side[kind].pop((k, named.name))
                 continue
             try:
-                result, seconds = _run_chain(named, dive.log, dive.config, made)
+                result, seconds = _run_chain(named, named.stages, dive, made[k])
                 yield k, Outcome(named, result, None, seconds)
             except Exception as error:  # whatever an estimator runs into is a result of the comparison
                 yield k, Outcome(named, None, error, float("nan"))
+        made[k].clear()
+
+
+def _replay_side_by_side(estimators: Sequence[Named], dives: Sequence[Task], made: Sequence[Made]) -> None:
+    """Make what `Replay` makes, and its smoothers, all that is alike at once; what fails is left to be run alone."""
+    asked: dict[tuple[object, ...], list[Named]] = {}
+    for named in estimators:
+        if any(isinstance(stage, Replay) for stage in named.stages):
+            asked.setdefault(named.knowing, []).append(named)
+    for knowing, those in asked.items():
+        stages = {stage for named in those for stage in named.stages}
+        batches: dict[int, BatchSmoother] = {}
+        for k, dive in enumerate(dives):
+            with contextlib.suppress(Exception):  # it is met again, and told, where the estimator itself is run
+                batches[k], _ = _run_chain(those[0], (assembled,), dive, made[k])
+        for group in _groups(batches):
+            with contextlib.suppress(Exception):
+                for (k, chain), result in _replayed(group, stages, dives).items():
+                    made[k][(*knowing, assembled, *chain)] = result
+
+
+def _groups(batches: Mapping[int, BatchSmoother]) -> list[dict[int, BatchSmoother]]:
+    """Dives whose filters can go side by side; where they cannot a dive is left out."""
+    groups: list[dict[int, BatchSmoother]] = []
+    for k, batch in batches.items():
+        own = [group for group in groups if alike(next(iter(group.values())).beginning, batch.beginning)]
+        if own:
+            own[0][k] = batch
+        elif alike(batch.beginning, batch.beginning):
+            groups.append({k: batch})
+    return groups
+
+
+def _replayed(
+    batches: Mapping[int, BatchSmoother], stages: Set[Stage], dives: Sequence[Task]
+) -> dict[tuple[int, tuple[Stage, ...]], tuple[Any, float]]:
+    """Filters of dives that are alike, and their smoothers; by dive and stages, each with its share of the time."""
+    filters: dict[tuple[int, Replay], ErrorStateFilter] = {
+        (k, stage): ErrorStateFilter(batch.beginning, stage.renew_at)
+        for k, batch in batches.items()
+        for stage in (STEPPED, RENEWED)
+        if stage in stages
+    }
+    began = time.process_time()
+    replay_together(list(filters.values()), [batches[k].intervals for k, _ in filters])
+    shares = _shares(time.process_time() - began, [dives[k] for k, _ in filters])
+    out: dict[tuple[int, tuple[Stage, ...]], tuple[Any, float]] = {}
+    for (k, stage), share in zip(filters, shares, strict=True):
+        out[k, (stage,)] = filters[k, stage], share
+    if ErrorStateFilter.smoothed in stages:
+        began = time.process_time()
+        smoothed = smoothed_together([filters[k, STEPPED] for k in batches])
+        shares = _shares(time.process_time() - began, [dives[k] for k in batches])
+        for k, estimate, share in zip(batches, smoothed, shares, strict=True):
+            out[k, (STEPPED, ErrorStateFilter.smoothed)] = estimate, share
+    return out
+
+
+def _shares(spent: float, dives: Sequence[Task]) -> list[float]:
+    """Time by the seconds of logs that share it."""
+    recorded = [_recorded_s(dive.log) for dive in dives]
+    return [spent * seconds / sum(recorded) for seconds in recorded]
 
 
 def _side_by_side(estimators: Sequence[Named], dives: Sequence[Task]) -> dict[tuple[int, str], Outcome]:
@@ -197,14 +274,11 @@ def _recorded_s(log: Log) -> float:
     return max(float(time[-1] - time[0]), SHORTEST_S)
 
 
-def _run_chain(
-    named: Named, log: Log, config: Config, made: dict[tuple[object, ...], tuple[Any, float]]
-) -> tuple[Any, float]:
-    """The result of a chain and its processor time; ``made`` keeps results by the chain that led to them."""
-    result: Any = named.task(log, config)
-    chain: tuple[object, ...] = (named.headings, named.misalignment, named.hydrodynamics)
-    total = 0.0
-    for stage in named.stages:
+def _run_chain(named: Named, stages: Sequence[Stage], dive: Task, made: Made) -> tuple[Any, float]:
+    """The result of stages of an estimator and its processor time; ``made`` keeps results by what led to them."""
+    result: Any = named.task(dive.log, dive.config)
+    chain, total = named.knowing, 0.0
+    for stage in stages:
         chain = (*chain, stage)
         if chain not in made:
             began = time.process_time()
@@ -251,14 +325,25 @@ def assembled(task: Task) -> BatchSmoother:
     return assemble(task.log, initialise(task.log, task.config))
 
 
-def stepped(batch: BatchSmoother) -> ErrorStateFilter:
-    """The error-state filter over the same keyframes."""
-    return replay(batch.intervals, batch.beginning)
+@dataclass(frozen=True)
+class Replay:
+    """The error-state filter over the same keyframes.
+
+    Those of several dives go side by side, and so do those with other renewals.
+
+    Attributes
+    ----------
+    renew_at : of `rovgraph.estimators.error_state.ErrorStateFilter`
+    """
+
+    renew_at: tuple[float, ...] = ()
+
+    def __call__(self, batch: BatchSmoother) -> ErrorStateFilter:
+        return replay(batch.intervals, batch.beginning, self.renew_at)
 
 
-def filtered(batch: BatchSmoother) -> Estimate:
-    """The error-state filter over the same keyframes, renewed from the graph of the dive so far."""
-    return replay(batch.intervals, batch.beginning, RENEW_AT_S).solve()
+STEPPED, RENEWED = Replay(), Replay(RENEW_AT_S)
+_RENEWED_WORDS = "filter renewed from the graph of the dive so far"
 
 
 _LETTERS = {(True, True): "a", (False, True): "b", (True, False): "c"}  # magnetometer, compass
@@ -302,11 +387,18 @@ ESTIMATORS: dict[str, Named] = {
             (assembled, BatchSmoother.dead_reckoning),
         ),
         *(_of_the_thesis(variant) for variant in FILTERS.values()),
-        *_variants("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
-        *_variants("rts", "error state", "its Rauch-Tung-Striebel smoother", True, stepped, ErrorStateFilter.smoothed),
-        *_variants("graph-filtered", "graph", "filter renewed from the graph of the dive so far", False, filtered),
+        *_variants("ekf", "error state", "error-state Kalman filter", False, STEPPED, ErrorStateFilter.solve),
+        *_variants("rts", "error state", "its Rauch-Tung-Striebel smoother", True, STEPPED, ErrorStateFilter.smoothed),
+        *_variants(
+            "graph-filtered",
+            "graph",
+            _RENEWED_WORDS,
+            False,
+            RENEWED,
+            ErrorStateFilter.solve,
+        ),
         *_variants("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
-        _driven("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
+        _driven("ekf", "error state", "error-state Kalman filter", False, STEPPED, ErrorStateFilter.solve),
         _driven("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
     )
 }

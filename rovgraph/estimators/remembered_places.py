@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rovgraph.estimators.robust_update import normalised_squared
+from rovgraph.estimators.innovations import normalised_squared
 from rovgraph.geometry import Array
 from rovgraph.state import PLACE_DIM
 
@@ -50,16 +50,18 @@ def columns(size: int, chosen: Sequence[int]) -> Array:
 
 
 def padded(H: Array, size: int) -> Array:
-    """Jacobian of what depends on no place, shape (dim, size)."""
-    return H if H.shape[1] == size else np.pad(H, ((0, 0), (0, size - H.shape[1])))
+    """Jacobian of what depends on no place, shape (..., size)."""
+    missing = size - H.shape[-1]
+    return np.concatenate([H, np.zeros((*H.shape[:-1], missing))], axis=-1) if missing else H
 
 
 def extended(basis: Array, size: int) -> Array:
-    """A change of basis, or a transition, that leaves places alone; shape (size, size)."""
-    if len(basis) == size:
+    """Changes of basis that leave places alone; shape (n, size, size)."""
+    n, own, _ = basis.shape
+    if own == size:
         return basis
-    out = np.eye(size)
-    out[: len(basis), : len(basis)] = basis
+    out = np.tile(np.eye(size), (n, 1, 1))
+    out[:, :own, :own] = basis
     return out
 
 

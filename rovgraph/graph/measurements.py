@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from rovgraph.geometry import Array, rotate
+from rovgraph.geometry import Array, identity, rotate
 from rovgraph.graph.assembly import Attached
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.scale import COLUMNS, SCALES, biased
@@ -248,8 +248,8 @@ def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
     """
     gain = instrument.rate_gain
     if not gain.any():
-        return np.eye(sd.shape[1]) / sd[:, :, None]
-    covariance = np.eye(sd.shape[1]) * sd[:, :, None] ** 2 + (gain @ gain.T) * rate_sd[:, None, None] ** 2
+        return identity(sd.shape[1]) / sd[:, :, None]
+    covariance = identity(sd.shape[1]) * sd[:, :, None] ** 2 + (gain @ gain.T) * rate_sd[:, None, None] ** 2
     return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
