@@ -19,7 +19,7 @@ from rovgraph.estimators.observability import (
     relative_covariance,
     without_noise,
 )
-from rovgraph.graph.batch import covariance, make_values, marginals
+from rovgraph.graph.batch import covariances, make_values, marginals
 from rovgraph.graph.information import knowledge
 from rovgraph.graph.keys import key
 from rovgraph.simulate import CALM, SCENARIOS, Style, scenario
@@ -95,9 +95,9 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
 
 def test_information_at_the_end_is_that_of_the_smoother(straight):
     _, dive = straight
-    tree = marginals(dive.problem, dive.solution)
+    known = covariances(marginals(dive.problem, dive.solution))
     last = knowledge(dive.problem, dive.solution.values, dive.solution.gates, [dive.problem.count - 1])
-    expected = np.concatenate([np.sqrt(np.diag(covariance(tree, key(n)))) for n in dive.problem.unknowns.estimated])
+    expected = np.concatenate([np.sqrt(np.diag(known[key(n)])) for n in dive.problem.unknowns.estimated])
     np.testing.assert_allclose(np.sqrt(np.diag(last.calibration[0])), expected, rtol=1e-8)
 
 

@@ -32,7 +32,7 @@ from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Attached, Sighting
-from rovgraph.graph.batch import covariance, marginals, newest_covariance
+from rovgraph.graph.batch import covariances, marginals, newest_covariance
 from rovgraph.graph.information import OTHERS, knowledge
 from rovgraph.graph.keys import key, key_name
 from rovgraph.graph.places import matched
@@ -275,10 +275,10 @@ def test_a_renewed_filter_knows_the_places_as_the_graph_does(lost):
     best = batch(lost.log, lost.config).optimum()
     numbers = sorted(set(best.problem.blocks["place"].place.tolist()))
     P = newest_covariance(best.problem, best.solution, numbers)
-    tree = marginals(best.problem, best.solution)
+    known = covariances(marginals(best.problem, best.solution))
     for k, number in enumerate(numbers[::-1]):
         own = P[len(P) - 2 * (k + 1) :, len(P) - 2 * (k + 1) :][:2, :2]
-        np.testing.assert_allclose(own, covariance(tree, key("place", number)), rtol=1e-5)
+        np.testing.assert_allclose(own, known[key("place", number)], rtol=1e-5)
     estimator = filtered(lost.log, lost.config)
     assert {p.number for p in estimator.filtered[-1].places} == set(numbers)
     for place, true in zip(sorted(estimator.filtered[-1].places, key=lambda p: p.name), SMALL["places"], strict=True):
@@ -311,9 +311,9 @@ def test_information_about_the_calibration_is_the_graphs_with_places_in_it(lost)
     end, solution = best.problem.count - 1, best.solution
     seen = knowledge(best.problem, solution.values, solution.gates, [end // 3, 2 * end // 3, end])
     names, column = best.problem.unknowns.estimated, OTHERS
-    tree = marginals(best.problem, solution)
+    known = covariances(marginals(best.problem, solution))
     for name in names:
-        P = covariance(tree, best.problem.unknowns.key(name, int(best.problem.segment[-1])))
+        P = known[best.problem.unknowns.key(name, int(best.problem.segment[-1]))]
         own = slice(column, column + len(P))
         np.testing.assert_allclose(seen.covariance[-1][own, own], P, rtol=1e-4)
         column += len(P)

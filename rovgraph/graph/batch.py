@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 
 import gtsam
 import numpy as np
@@ -22,7 +23,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Attached, Interval
 from rovgraph.graph.factors import Start, drift, motion, priors, unseen_place
-from rovgraph.graph.keys import Unknowns, key, key_name, unknowns
+from rovgraph.graph.keys import Unknowns, dimension, key, key_name, unknowns
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state, states_from
@@ -227,7 +228,7 @@ def _minimise(
     cost = problem.cost(values, gates)
     for iteration in range(1, MAX_ITERATIONS + 1):
         delta = _eliminate(problem.linearize(values, gates), ordering)
-        trial, trial_cost = _search(problem, values, gates, delta, cost)
+        trial, trial_cost = _search(problem, values, gates, delta, cost, tolerance)
         decrease = cost - trial_cost
         values, cost = trial, trial_cost
         if decrease <= tolerance * (1.0 + cost):
@@ -236,7 +237,7 @@ def _minimise(
 
 
 def _search(
-    problem: Problem, values: gtsam.Values, gates: Gates, delta: gtsam.VectorValues, cost: float
+    problem: Problem, values: gtsam.Values, gates: Gates, delta: gtsam.VectorValues, cost: float, tolerance: float
 ) -> tuple[gtsam.Values, float]:
     """The best of the steps 1, 2, 4... along ``delta``, or the first of 1/2, 1/4... that lowers the cost.
 
@@ -250,6 +251,8 @@ def _search(
 
     step, best = 1.0, at(1.0)
     if best[1] < cost:
+        if cost - best[1] <= tolerance * (1.0 + cost):  # it was the last
+            return best
         while (longer := at(2.0 * step))[1] < best[1]:
             step, best = 2.0 * step, longer
         return best
@@ -322,15 +325,31 @@ def newest_covariance(problem: Problem, solution: Solution, places: Sequence[int
     return np.asarray(root @ root.T)
 
 
-def covariance(tree: gtsam.GaussianBayesTree, of: int) -> Array:
-    """Marginal covariance of a key, from the square root that QR leaves."""
-    A = tree.marginalFactor(of, gtsam.EliminateQR).jacobian()[0]
-    root = np.linalg.inv(np.linalg.qr(A, mode="r"))
-    return np.asarray(root @ root.T)
+def covariances(tree: gtsam.GaussianBayesTree) -> dict[int, Array]:
+    """Marginal covariances of all variables, by key, shape (d, d).
 
-
-def covariances(tree: gtsam.GaussianBayesTree, variable: str, count: int) -> Array:
-    """Marginal covariance of a state variable at every keyframe, shape (count, d, d)."""
-    roots = [tree.marginalFactor(key(variable, i), gtsam.EliminateQR).jacobian()[0] for i in range(count)]
-    inverse = np.linalg.inv(np.linalg.qr(np.array(roots), mode="r"))
-    return np.asarray(inverse @ np.swapaxes(inverse, 1, 2))
+    From the roots down, as a clique's separator lies in its parent: with R x_f + S x_s = noise of unit
+    variance, P_ff = R^-1 (1 + S P_ss S') R^-T and P_fs = -R^-1 S P_ss.
+    """
+    out: dict[int, Array] = {}
+    todo: list[tuple[gtsam.GaussianBayesTreeClique, dict[int, slice], Array]] = [
+        (root, {}, np.empty((0, 0))) for root in tree.roots()
+    ]
+    while todo:
+        clique, above, P_above = todo.pop()
+        conditional = clique.conditional()
+        keys, RS = conditional.keys(), conditional.jacobian()[0]
+        ends = list(accumulate(map(dimension, keys)))
+        parts = {k: slice(end - dimension(k), end) for k, end in zip(keys, ends, strict=True)}
+        m, size = RS.shape
+        shared = np.concatenate([np.r_[above[k]] for k in keys if parts[k].start >= m] or [np.empty(0, int)])
+        root = np.linalg.inv(RS[:, :m])
+        gain = root @ RS[:, m:]
+        P = np.empty((size, size))
+        P[m:, m:] = P_above[np.ix_(shared, shared)]
+        P[:m, m:] = -gain @ P[m:, m:]
+        P[m:, :m] = P[:m, m:].T
+        P[:m, :m] = root @ root.T - P[:m, m:] @ gain.T
+        out |= {k: P[part, part] for k, part in parts.items() if part.stop <= m}
+        todo += [(clique[child], parts, P) for child in range(clique.nrChildren())]
+    return out

@@ -8,6 +8,7 @@ the optimum by what is held, P = P(held known) + K P(prior) K'.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -43,11 +44,15 @@ class Marginals:
 
     def covariances(self, variable: str, count: int) -> Array:
         """Of a state variable at every keyframe, of calibration in every segment; shape (count, d, d)."""
-        known = covariances(self.tree, variable, count)
+        known = np.array([self._of_each[key(variable, i)] for i in range(count)])
         if not self.held:
             return known
         K = np.array([self.moves[key(variable, i)] for i in range(count)]) * np.concatenate(list(self.held.values()))
         return np.asarray(known + K @ np.swapaxes(K, 1, 2))
+
+    @cached_property
+    def _of_each(self) -> dict[int, Array]:
+        return covariances(self.tree)
 
     def newest(self, name: str, walk: float) -> Array:
         """Covariance of an estimated calibration variable at the end, shape (dim, dim)."""

@@ -7,11 +7,15 @@ import gtsam
 
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.geometry import Array
-from rovgraph.state import BIAS, DIMENSION, PLACE, POSE, VELOCITY
+from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
 _LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n"} | {v.name: v.letter for v in TABLE.values()}
 _FIRST = {variable: int(gtsam.symbol(letter, 0)) for variable, letter in _LETTER.items()}
 _INDICES = 1 << 56  # of a letter
+_DIMENSION = {
+    _FIRST[variable] // _INDICES: dim
+    for variable, dim in (DIMENSION | {PLACE: PLACE_DIM} | {v.name: v.dim for v in TABLE.values()}).items()
+}
 _STATES = {_FIRST[variable] // _INDICES for variable in DIMENSION}
 
 
@@ -24,6 +28,11 @@ def key(variable: str, index: int = 0) -> int:
     index : keyframe; number of a place; for a calibration variable that walks its segment, else 0
     """
     return _FIRST[variable] + index  # consecutive, as gtsam.symbol makes them
+
+
+def dimension(key: int) -> int:
+    """Of the variable that a key is of, in its tangent space."""
+    return _DIMENSION[key // _INDICES]
 
 
 def is_place(key: int) -> bool:

@@ -17,8 +17,8 @@ from rovgraph.studies.runs import Case, Run
 from rovgraph.workers import cores, in_workers
 
 Progress = Callable[[float], None]
-SIDE_BY_SIDE = 5  # runs of a task: more of them gain little, and a worker holds them all
-TASKS_EACH = 3  # of a process at least, so that all end at about the same time
+SIDE_BY_SIDE = 8  # runs of a task: more of them gain little, and a worker holds them all
+TASKS_EACH = 2  # of a process at least, so that all end at about the same time
 REFERENCE = "reference"  # in the place of an estimator's name
 
 # columns that every row has, in the order of the file; others follow as far as any row has them
