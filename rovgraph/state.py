@@ -83,8 +83,15 @@ def stack_states(states: Sequence[State]) -> State:
         np.concatenate([s.p_n for s in states]),
         np.concatenate([s.v_n for s in states]),
         np.concatenate([s.bias for s in states]),
-        {name: np.array([s.calibration[name] for s in states]) for name in names},
+        {name: _stacked([s.calibration[name] for s in states]) for name in names},
     )
+
+
+def _stacked(values: list[Array]) -> Array:
+    """One after the other, shape (n, dim); at no cost where it is one and the same."""
+    if all(value is values[0] for value in values):
+        return np.broadcast_to(values[0], (len(values), *values[0].shape))
+    return np.array(values)
 
 
 @dataclass(frozen=True)
