@@ -1,6 +1,7 @@
 """Work spread over the machine's cores, in processes that end when they are no longer wanted."""
 
 import contextlib
+import gc
 import multiprocessing
 import multiprocessing.process
 import os
@@ -20,6 +21,9 @@ Result = TypeVar("Result")
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
+
+
+GARBAGE = 100_000  # objects made and not freed before the collector looks; Python's own is 700
 
 
 def cores() -> int:
@@ -97,7 +101,11 @@ def in_workers(
 
 
 def _prepare() -> None:
-    """In a worker: leave interrupts to the parent, and end when the parent has ended, however it did."""
+    """In a worker: leave interrupts to the parent, and end when the parent has ended, however it did.
+
+    The collector of cycles would look at a million objects of a dive again and again, and hardly find any.
+    """
+    gc.set_threshold(GARBAGE)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
 

@@ -182,6 +182,25 @@ def test_filters_of_several_dives_go_side_by_side_and_share_the_time(recorded):
     assert 3.9 < seconds[0] / seconds[2] < 4.1, "a log of 40 s, and 10 s of it"
 
 
+def test_error_state_filters_of_several_dives_are_each_as_they_are_alone(recorded):
+    lacking = Task(without(recorded.log, "dvl_heading"), recorded.config)
+    short = Task(kept(recorded.log, "imu", recorded.log["imu"].time < 15.0), recorded.config)
+    depth = recorded.config.depth.model_copy(update={"sd_m": 0.5})
+    other = Task(recorded.log, recorded.config.model_copy(update={"depth": depth}))
+    dives = [Task(recorded.log, recorded.config), lacking, short, other]
+    names = ["ekf-b", "rts-b", "graph-filtered-b"]
+    done = {(k, o.named.name): o for k, o in outcomes_of_dives(select(names), dives)}
+    assert len(done) == 12
+    for (k, name), outcome in done.items():
+        if k == 1:
+            assert "no compass of the DVL" in str(outcome.error)
+            continue
+        alone = ESTIMATORS[name](dives[k].log, dives[k].config)
+        assert outcome.estimate is not None and outcome.seconds > 0.0
+        np.testing.assert_array_equal(outcome.estimate.trajectory.p_n, alone.trajectory.p_n)
+        np.testing.assert_array_equal(outcome.estimate.trajectory.cov_p, alone.trajectory.cov_p)
+
+
 def test_a_dive_without_an_imu_does_not_stop_the_others(recorded):
     dives = [Task(without(recorded.log, "imu"), recorded.config), Task(recorded.log, recorded.config)]
     lacking, good = (outcome for _, outcome in outcomes_of_dives(select(["4.3b"]), dives))

@@ -11,9 +11,11 @@ from dives import (
     altered,
     attitude_errors,
     batch,
+    beginning,
     changed,
     falcon,
     fed,
+    kept,
     position_errors,
     rms,
     simulated,
@@ -26,7 +28,7 @@ from test_consistency import OVERCONFIDENT, band, drawn, nees
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
 from rovgraph.estimators import error_vector
-from rovgraph.estimators.error_state import ErrorStateFilter, replay
+from rovgraph.estimators.error_state import ErrorStateFilter, alike, replay, replay_together, smoothed_together
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.innovations import Innovations
@@ -205,9 +207,8 @@ def problem(rng: np.random.Generator, spoilt: float = 0.0) -> tuple[Array, list[
 def updated(P: Array, r: list[Array], H: list[Array], loss: str) -> tuple[Array, Array, list[float]]:
     ends = np.cumsum([0, *map(len, r)]).tolist()
     parts = [slice(*pair) for pair in pairwise(ends)]
-    said = Innovations(P[None], np.concatenate(r)[None], np.vstack(H)[None], [parts])
-    [delta], [posterior], [weights] = said.update([[loss] * len(r)])
-    return delta, posterior, weights
+    said = Innovations(P[None], [np.concatenate(r)], [np.vstack(H)], [parts])
+    return said.update([[loss] * len(r)])[0]
 
 
 def test_an_update_without_losses_is_kalmans():
@@ -330,6 +331,46 @@ def test_feeding_measurements_and_replaying_intervals_are_the_same(case, estimat
     again = replay(batch(case.log, case.config).intervals, initialise(case.log, case.config))
     np.testing.assert_allclose(again.solve().trajectory.p_n, estimator.solve().trajectory.p_n, atol=1e-12)
     np.testing.assert_array_equal(again.latest().p_n, again.filtered[-1].state.p_n)
+
+
+def spoilt_logs(case: Simulated) -> list[Log]:
+    """The dive; one that ends early; one without pings for a while; one whose pings jump and come back."""
+    dvl, imu = case.log["dvl"], case.log["imu"]
+    data = dvl.data.copy()
+    jumps = (dvl.time > 20.0) & (dvl.time < 26.0)
+    data[jumps, 0] += 2.0
+    return [
+        case.log,
+        kept(case.log, "imu", imu.time < 31.0),
+        kept(case.log, "dvl", (dvl.time < 15.0) | (dvl.time > 19.0)),
+        altered(case.log, "dvl", data),
+    ]
+
+
+def test_filters_side_by_side_are_each_as_they_are_alone(case):
+    batches = [batch(log, case.config) for log in spoilt_logs(case)]
+    both = [(b, renew_at) for b in batches for renew_at in ((), (10.0,))]
+    together = [ErrorStateFilter(b.beginning, renew_at) for b, renew_at in both]
+    replay_together(together, [b.intervals for b, _ in both])
+    alone = [replay(b.intervals, b.beginning, renew_at) for b, renew_at in both]
+    for one, other in zip(together, alone, strict=True):
+        for a, b in zip(one.filtered, other.filtered, strict=True):
+            np.testing.assert_array_equal(a.state.p_n, b.state.p_n)
+            np.testing.assert_array_equal(a.P, b.P)
+        assert one.solve().summary == other.solve().summary
+    assert together[6].solve().summary["nis"]["dvl"]["rejected"] > 10
+    smoothed = smoothed_together(together[::2])
+    for one, other in zip(smoothed, alone[::2], strict=True):
+        np.testing.assert_array_equal(one.trajectory.p_n, other.smoothed().trajectory.p_n)
+
+
+def test_filters_are_alike_that_differ_in_their_start_alone(case):
+    short, other = beginning(spoilt_logs(case)[1], case.config), changed(case.config, depth={"sd_m": 0.5})
+    first = beginning(case.log, case.config)
+    turned = first.config.model_copy(update={"start": first.config.start.model_copy(update={"heading_deg": 90.0})})
+    assert alike(first, short) and alike(first, replace(first, config=turned))
+    assert not alike(first, beginning(case.log, other))
+    assert not alike(first, beginning(without(case.log, "depth"), case.config))
 
 
 def test_innovations_are_normal_with_the_covariance_predicted(case, estimator):

@@ -243,7 +243,9 @@ class ErrorStateRecursion:
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
         return make_block(attached, instrument, gravity, self.unknowns)
 
-    def linearize(self, state: State, attached: Sequence[Sequence[Attached]]) -> tuple[Array, Array, list[list[slice]]]:
+    def linearize(
+        self, state: State, attached: Sequence[Sequence[Attached]]
+    ) -> tuple[list[Array], list[Array], list[list[slice]]]:
         """Whitened innovations and Jacobians of the measurements of a keyframe of each of n filters.
 
         A place is taken to be at the origin, and to be known.
@@ -257,12 +259,12 @@ class ErrorStateRecursion:
 
         Returns
         -------
-        r, H : ndarray, shapes (n, m) and (n, m, size); where one has fewer than m rows the last are zero
+        r, H : of each filter an ndarray, shapes (m,) and (m, size)
         parts : for each its measurements' rows
         """
         parts, flat = self._rows(attached)
-        rows = max(own[-1].stop for own in parts if own)
-        r, H = np.zeros((len(state), rows)), np.zeros((len(state), rows, self.error.size))
+        rows = [own[-1].stop if own else 0 for own in parts]
+        r, H = [np.empty(m) for m in rows], [np.empty((m, self.error.size)) for m in rows]
         here, F = state.at([k for k, _, _ in flat]), None
         there = here
         if any(a.motion.dt for _, _, a in flat):
@@ -277,7 +279,7 @@ class ErrorStateRecursion:
                 own_r, own_H = self._of_sensor(there.at(which), None if F is None else F[which], those)
             for i, one_r, one_H in zip(chosen, own_r, own_H, strict=True):
                 k, part, _ = flat[i]
-                r[k, part], H[k, part] = one_r, one_H
+                r[k][part], H[k][part] = one_r, one_H
         return r, H, parts
 
     def _rows(
@@ -335,7 +337,10 @@ class ErrorStateRecursion:
 
     def corrected(self, before: Sequence[Gaussian], delta: Array, P: Array) -> list[Gaussian]:
         """n estimates moved by corrections, shape (n, d); ``P``, shape (n, d, d), are the covariances after them."""
-        return self._corrected(self._together(before), delta, P)
+        size, known = self.error.size, self._together(before)
+        state, basis = self.error.retract(known.state, delta[:, :size])
+        basis = extended(basis, P.shape[1])
+        return _Together(state, basis @ P @ transpose(basis), moved(known.places, delta[0, size:])).apart()
 
     def local(self, some: Sequence[Gaussian], others: Sequence[Gaussian]) -> tuple[Array, Array]:
         """`ErrorVector.local` from n estimates to n others."""
@@ -401,31 +406,33 @@ class ErrorStateRecursion:
             return before
         known = self._together(before)
         r, H, parts = self.linearize(known.state, attached)
-        said = Innovations(known.P, r, padded(H, known.P.shape[1]), parts)
-        admitted = []
+        said = Innovations(known.P, r, [padded(own, known.P.shape[1]) for own in H], parts)
+        admitted: dict[int, list[tuple[int, Attached, float]]] = {}
         for k, (one, own) in enumerate(zip(before, attached, strict=True)):
             for j, (a, part) in enumerate(zip(own, parts[k], strict=True)):
                 nis = said.nis(k, part)
                 if self._admit(a, nis, gates[k]):
-                    admitted.append((k, j, a, nis))
-                else:
-                    used[k].append(Used(a, one.state, nis, 0.0))
-                    self._left_out(said, k, part, a, gates[k], one.state)
+                    admitted.setdefault(k, []).append((j, a, nis))
+                    continue
+                used[k].append(Used(a, one.state, nis, 0.0))
+                instrument = self.beginning.instruments[a.sensor]
+                if a.time - gates[k][a.sensor] > instrument.readmit_s:
+                    said.doubt(k, part, padded(self._seen(instrument.model, one.state).T, known.P.shape[1]).T)
+                said.leave_out(k, part)
+        after = [replace(one, P=said.P(k)) for k, one in enumerate(before)]
         if not admitted:
-            return known.apart()
-        losses = [[self.beginning.instruments[a.sensor].loss for a in own] for own in attached]
-        delta, P, weights = said.update(losses)
-        for k, j, a, nis in admitted:
-            used[k].append(Used(a, before[k].state, nis, weights[k][j]))
-        return self._corrected(known, delta, P)
-
-    def _left_out(self, said: Innovations, k: int, part: slice, a: Attached, gates: Gates, state: State) -> None:
-        """Leave a measurement out, and after long enough doubt what its sensor sees."""
-        instrument = self.beginning.instruments[a.sensor]
-        if a.time - gates[a.sensor] > instrument.readmit_s:
-            seen = padded(self._seen(instrument.model, state).T, said.P.shape[1]).T
-            said.doubt(k, doubted(said.P[k], said.r[k, part], said.H[k, part], seen))
-        said.leave_out(k, part)
+            return after
+        updates = said.update([[self.beginning.instruments[a.sensor].loss for a in own] for own in attached])
+        for k, own_admitted in admitted.items():
+            used[k].extend(Used(a, before[k].state, nis, updates[k][2][j]) for j, a, nis in own_admitted)
+        corrected = self.corrected(
+            [before[k] for k in admitted],
+            np.array([updates[k][0] for k in admitted]),
+            np.array([updates[k][1] for k in admitted]),
+        )
+        for k, one in zip(admitted, corrected, strict=True):
+            after[k] = one
+        return after
 
     def _sighted(self, before: Gaussian, a: Attached, used: list[Used]) -> Gaussian:
         """The state corrected by a place that is seen again, or with one place more."""
@@ -436,12 +443,11 @@ class ErrorStateRecursion:
         match = nearest(before.P, r, H, a.sd, size, before.places, sighting.name)
         gate = instrument.gate_sd or np.inf
         if match is not None and match.nis <= gate**2:
-            said = Innovations(together.P, match.r[None], match.H[None], [[part]])
-            delta, P, [[weight]] = said.update([[instrument.loss]])
+            [(delta, P, [weight])] = Innovations(together.P, [match.r], [match.H], [[part]]).update([[instrument.loss]])
             place = before.places[match.index]
             seen = replace(a, sighting=sighting._replace(number=place.number))
             used.append(Used(seen, before.state.seeing(place.position), match.nis, weight))
-            [after] = self._corrected(together, delta, P)
+            [after] = self.corrected([before], delta[None], P[None])
             return replace(after, places=seen_at(after.places, match.index, a.time))
         place = Place(sighting.name, sighting.number, -a.sd * r, a.time)
         other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
@@ -449,28 +455,7 @@ class ErrorStateRecursion:
         P, places = with_another(before.P, before.places, place, a.sd[:, None] * H, a.sd)
         return Gaussian(before.state, *without_oldest(P, places, size, self.beginning.config.place.remembered))
 
-    def _corrected(self, before: _Together, delta: Array, P: Array) -> list[Gaussian]:
-        size = self.error.size
-        state, basis = self.error.retract(before.state, delta[:, :size])
-        basis = extended(basis, P.shape[1])
-        return _Together(state, basis @ P @ transpose(basis), moved(before.places, delta[0, size:])).apart()
-
 
 def _kind(a: Attached) -> tuple[str, bool, bool]:
     """Of which measurements can be linearised together."""
     return a.sensor, a.track is None, a.felt is None
-
-
-def doubted(P: Array, r: Array, H: Array, seen: Array) -> Array:
-    """The covariance after something that no model knows has moved what a sensor sees, by as much as it shows.
-
-    As a knock does to the velocity, without doubt about anything else.
-
-    Parameters
-    ----------
-    P : ndarray, shape (size, size)
-    r, H : whitened innovation and Jacobian of a rejected measurement, shapes (dim,) and (dim, size)
-    seen : ndarray, shape (size, k), directions of the error that the sensor sees
-    """
-    moved = np.linalg.lstsq(H @ seen, r)[0]
-    return np.asarray(P + float(moved @ moved) * seen @ seen.T)

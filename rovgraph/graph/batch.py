@@ -8,7 +8,8 @@ taken out, and it is solved again until the gates rest.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -78,11 +79,19 @@ class Problem:
         """State of every keyframe."""
         return states_from(values, self.segment, self.unknowns)
 
-    def seen(self, values: gtsam.Values) -> Iterator[tuple[str, Block, State]]:
+    def seen(self, values: gtsam.Values) -> list[tuple[str, Block, State]]:
         """Every sensor's block, with the state of each measurement's keyframe."""
+        for known, seen in self._newest_seen:
+            if known is values:
+                return seen
         states = self.states(values)
-        for sensor, block in self.blocks.items():
-            yield sensor, block, block.with_places(states.at(block.keyframe), values)
+        seen = [(s, block, block.with_places(states.at(block.keyframe), values)) for s, block in self.blocks.items()]
+        self._newest_seen.append((values, seen))
+        return seen
+
+    @cached_property
+    def _newest_seen(self) -> deque[tuple[gtsam.Values, list[tuple[str, Block, State]]]]:
+        return deque(maxlen=2)  # reading GTSAM's values takes as long as a cost; a step is searched, then linearised
 
     def open_gates(self) -> Gates:
         return {sensor: np.ones(len(block), dtype=bool) for sensor, block in self.blocks.items()}
@@ -201,11 +210,14 @@ def solve(problem: Problem, values: gtsam.Values) -> Solution:
     InputError : the data do not determine some variable, which is named
     """
     gates, iterations = problem.believed(), 0
+    first = problem.linearize(values, gates)
     # of the whole graph, as METIS crashes on a variable that the gates have cut off
-    ordering = gtsam.Ordering.MetisGaussianFactorGraph(problem.linearize(values, gates))
+    ordering = gtsam.Ordering.MetisGaussianFactorGraph(first)
+    linear: gtsam.GaussianFactorGraph | None = first
     tolerance, gatings = COARSE_DECREASE, 0
     while True:
-        values, cost, steps, converged = _minimise(problem, values, gates, tolerance, ordering)
+        values, cost, steps, converged = _minimise(problem, values, gates, tolerance, ordering, linear)
+        linear = None
         iterations, renewed = iterations + steps, problem.gates(values)
         rest = gatings >= MAX_GATINGS or all(np.array_equal(renewed[s], gates[s]) for s in gates)
         if rest and tolerance == RELATIVE_DECREASE:
@@ -222,12 +234,18 @@ def solution_at(problem: Problem, values: gtsam.Values) -> Solution:
 
 
 def _minimise(
-    problem: Problem, values: gtsam.Values, gates: Gates, tolerance: float, ordering: gtsam.Ordering
+    problem: Problem,
+    values: gtsam.Values,
+    gates: Gates,
+    tolerance: float,
+    ordering: gtsam.Ordering,
+    linear: gtsam.GaussianFactorGraph | None,
 ) -> tuple[gtsam.Values, float, int, bool]:
-    """Gauss-Newton with step halving for fixed gates."""
+    """Gauss-Newton with step halving for fixed gates; ``linear`` at ``values`` where it is at hand."""
     cost = problem.cost(values, gates)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        delta = _eliminate(problem.linearize(values, gates), ordering)
+        delta = _eliminate(problem.linearize(values, gates) if linear is None else linear, ordering)
+        linear = None
         trial, trial_cost = _search(problem, values, gates, delta, cost, tolerance)
         decrease = cost - trial_cost
         values, cost = trial, trial_cost
@@ -246,7 +264,7 @@ def _search(
     """
 
     def at(step: float) -> tuple[gtsam.Values, float]:
-        moved = values.retract(delta.scale(step))
+        moved = values.retract(delta if step == 1.0 else delta.scale(step))
         return moved, problem.cost(moved, gates)
 
     step, best = 1.0, at(1.0)
