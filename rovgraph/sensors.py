@@ -31,7 +31,7 @@ from typing import Protocol
 import numpy as np
 
 from rovgraph.calibration import MOUNT
-from rovgraph.geometry import Array, cross, identity, matrix_from_rpy, rotate, skew, transpose, wrap_angle
+from rovgraph.geometry import Array, cross, identities, identity, matrix_from_rpy, rotate, skew, transpose, wrap_angle
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 
 
@@ -336,7 +336,7 @@ class Position:
         z, H = point[:, rows], {POSE: pose[:, rows, :]}
         if self.offset is not None:
             z = z + state.calibration[self.offset]
-            H[self.offset] = np.tile(identity(self.dim), (len(state), 1, 1))
+            H[self.offset] = identities(len(state), self.dim)
         return z, H
 
 
@@ -361,5 +361,5 @@ class PlaceOffset:
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         point, pose = _point(state, self.lever_arm_b)
-        by_place = np.tile(-identity(PLACE_DIM), (len(state), 1, 1))
+        by_place = -identities(len(state), PLACE_DIM)
         return point[:, :PLACE_DIM] - state.calibration[PLACE], {POSE: pose[:, :PLACE_DIM], PLACE: by_place}

@@ -207,8 +207,7 @@ def problem(rng: np.random.Generator, spoilt: float = 0.0) -> tuple[Array, list[
 def updated(P: Array, r: list[Array], H: list[Array], loss: str) -> tuple[Array, Array, list[float]]:
     ends = np.cumsum([0, *map(len, r)]).tolist()
     parts = [slice(*pair) for pair in pairwise(ends)]
-    said = Innovations(P[None], [np.concatenate(r)], [np.vstack(H)], [parts])
-    return said.update([[loss] * len(r)])[0]
+    return Innovations(P[None], [np.concatenate(r)], [np.vstack(H)], [parts], [[loss] * len(r)]).update()[0]
 
 
 def test_an_update_without_losses_is_kalmans():

@@ -33,7 +33,7 @@ from rovgraph.estimators.remembered_places import (
     without_oldest,
 )
 from rovgraph.estimators.results import body_trajectory
-from rovgraph.geometry import Array, identity, rotate, transpose
+from rovgraph.geometry import Array, identities, rotate, transpose
 from rovgraph.graph.assembly import Attached, Interval
 from rovgraph.graph.coasting import BLIND_S, coasted, coasting
 from rovgraph.graph.factors import predict
@@ -43,7 +43,7 @@ from rovgraph.graph.places import ORIGIN
 from rovgraph.graph.scale import COLUMNS, SCALES
 from rovgraph.graph.transition import transitions
 from rovgraph.sensors import Position, SensorModel, innovation
-from rovgraph.state import POSE, VELOCITY, State, propagate_with_jacobian, stack_states
+from rovgraph.state import PLACE, POSE, VELOCITY, State, propagate_with_jacobian, stack_states
 from rovgraph.trajectory import Trajectory
 
 RETURN_SD = 3.0  # a sensor that was kept out for long returns with an innovation within this many sd
@@ -219,7 +219,7 @@ class ErrorStateRecursion:
         """The next keyframes of some filters; as `predict`."""
         size, P = self.error.size, np.array([known.P for known in before])
         states = [predict(interval, known.state) for interval, known in zip(intervals, before, strict=True)]
-        F, Q = np.tile(identity(P.shape[1]), (len(P), 1, 1)), np.zeros_like(P)
+        F, Q = identities(*P.shape[:2]), np.zeros_like(P)
         F[:, :15, :15], own_Q = transitions(intervals, [known.state for known in before], states)
         for k, (interval, known) in enumerate(zip(intervals, before, strict=True)):
             assert interval.pim is not None
@@ -265,22 +265,30 @@ class ErrorStateRecursion:
         parts, flat = self._rows(attached)
         rows = [own[-1].stop if own else 0 for own in parts]
         r, H = [np.empty(m) for m in rows], [np.empty((m, self.error.size)) for m in rows]
-        here, F = state.at([k for k, _, _ in flat]), None
-        there = here
-        if any(a.motion.dt for _, _, a in flat):
-            moved = motions([a for _, _, a in flat])
-            there, F = propagate_with_jacobian(here, moved, self.beginning.config.environment.gravity_mps2)
-        for _, group in groupby(range(len(flat)), lambda i: _kind(flat[i][2])):
-            chosen = list(group)
-            those, which = [flat[i][2] for i in chosen], slice(chosen[0], chosen[-1] + 1)
-            if those[0].track is not None or those[0].felt is not None:
-                own_r, own_H = self._of_block(here.at(which), those)
+        filters, those = [k for k, _, _ in flat], [a for _, _, a in flat]
+        there, F = State(state.R_nb[filters], state.p_n[filters], state.v_n[filters], state.bias[filters]), None
+        if any(a.motion.dt for a in those):
+            gravity = self.beginning.config.environment.gravity_mps2
+            there, F = propagate_with_jacobian(there, motions(those), gravity)
+        ends = list(accumulate(len(list(group)) for _, group in groupby(those, _kind)))
+        for begin, end in pairwise([0, *ends]):
+            which, own = slice(begin, end), those[begin:end]
+            if own[0].track is not None or own[0].felt is not None:
+                own_r, own_H = self._of_block(state.at(filters[which]), own)
             else:
-                own_r, own_H = self._of_sensor(there.at(which), None if F is None else F[which], those)
-            for i, one_r, one_H in zip(chosen, own_r, own_H, strict=True):
-                k, part, _ = flat[i]
+                calibration = self._calibration(state, own[0], filters[which])
+                known = State(there.R_nb[which], there.p_n[which], there.v_n[which], there.bias[which], calibration)
+                own_r, own_H = self._of_sensor(known, None if F is None else F[which], own)
+            for (k, part, _), one_r, one_H in zip(flat[which], own_r, own_H, strict=True):
                 r[k][part], H[k][part] = one_r, one_H
         return r, H, parts
+
+    def _calibration(self, state: State, a: Attached, filters: list[int]) -> dict[str, Array]:
+        """What a measurement's model reads, of some filters."""
+        if a.sighting is not None:
+            return {PLACE: ORIGIN}
+        values = {name: state.calibration[name] for name in self.beginning.instruments[a.sensor].model.calibration}
+        return {name: value if value.ndim == 1 else value[filters] for name, value in values.items()}
 
     def _rows(
         self, attached: Sequence[Sequence[Attached]]
@@ -309,15 +317,16 @@ class ErrorStateRecursion:
         F : ndarray, shape (m, 15, 15), its derivative by that of the keyframe, where it is another
         """
         instrument = self.beginning.instruments[attached[0].sensor]
-        if attached[0].sighting is not None:
-            state = state.seeing(ORIGIN)
         predicted, jacobians = instrument.model.predict(state, np.array([a.rate_b for a in attached]))
         H = self.error.matrix(jacobians)
         if F is not None:
             H[..., :15] = H[..., :15] @ F
-        W = whitening(instrument, np.array([a.sd for a in attached]), np.array([a.rate_sd for a in attached]))
-        z = np.array([a.z for a in attached])
-        return rotate(W, innovation(instrument.model, z, predicted)), W @ H
+        r = innovation(instrument.model, np.array([a.z for a in attached]), predicted)
+        sd = np.array([a.sd for a in attached])
+        if not instrument.rate_gain.any():
+            return r / sd, H / sd[..., None]
+        W = whitening(instrument, sd, np.array([a.rate_sd for a in attached]))
+        return rotate(W, r), W @ H
 
     def trajectory(self, intervals: Sequence[Interval], known: Sequence[Gaussian]) -> Trajectory:
         """The body's origin at keyframes, at least one, in n, with its covariance.
@@ -337,10 +346,13 @@ class ErrorStateRecursion:
 
     def corrected(self, before: Sequence[Gaussian], delta: Array, P: Array) -> list[Gaussian]:
         """n estimates moved by corrections, shape (n, d); ``P``, shape (n, d, d), are the covariances after them."""
-        size, known = self.error.size, self._together(before)
-        state, basis = self.error.retract(known.state, delta[:, :size])
+        return self._corrected(self._together(before), delta, P)
+
+    def _corrected(self, before: _Together, delta: Array, P: Array) -> list[Gaussian]:
+        size = self.error.size
+        state, basis = self.error.retract(before.state, delta[:, :size])
         basis = extended(basis, P.shape[1])
-        return _Together(state, basis @ P @ transpose(basis), moved(known.places, delta[0, size:])).apart()
+        return _Together(state, basis @ P @ transpose(basis), moved(before.places, delta[0, size:])).apart()
 
     def local(self, some: Sequence[Gaussian], others: Sequence[Gaussian]) -> tuple[Array, Array]:
         """`ErrorVector.local` from n estimates to n others."""
@@ -406,7 +418,8 @@ class ErrorStateRecursion:
             return before
         known = self._together(before)
         r, H, parts = self.linearize(known.state, attached)
-        said = Innovations(known.P, r, [padded(own, known.P.shape[1]) for own in H], parts)
+        losses = [[self.beginning.instruments[a.sensor].loss for a in own] for own in attached]
+        said = Innovations(known.P, r, [padded(own, known.P.shape[1]) for own in H], parts, losses)
         admitted: dict[int, list[tuple[int, Attached, float]]] = {}
         for k, (one, own) in enumerate(zip(before, attached, strict=True)):
             for j, (a, part) in enumerate(zip(own, parts[k], strict=True)):
@@ -419,17 +432,16 @@ class ErrorStateRecursion:
                 if a.time - gates[k][a.sensor] > instrument.readmit_s:
                     said.doubt(k, part, padded(self._seen(instrument.model, one.state).T, known.P.shape[1]).T)
                 said.leave_out(k, part)
-        after = [replace(one, P=said.P(k)) for k, one in enumerate(before)]
+        after = [one if k in admitted else replace(one, P=said.P(k)) for k, one in enumerate(before)]
         if not admitted:
             return after
-        updates = said.update([[self.beginning.instruments[a.sensor].loss for a in own] for own in attached])
+        updates = said.update()
         for k, own_admitted in admitted.items():
             used[k].extend(Used(a, before[k].state, nis, updates[k][2][j]) for j, a, nis in own_admitted)
-        corrected = self.corrected(
-            [before[k] for k in admitted],
-            np.array([updates[k][0] for k in admitted]),
-            np.array([updates[k][1] for k in admitted]),
-        )
+        if len(admitted) < len(before):
+            known = self._together([before[k] for k in admitted])
+        delta, P, _ = zip(*(updates[k] for k in admitted), strict=True)
+        corrected = self._corrected(known, np.array(delta), np.array(P))
         for k, one in zip(admitted, corrected, strict=True):
             after[k] = one
         return after
@@ -443,7 +455,9 @@ class ErrorStateRecursion:
         match = nearest(before.P, r, H, a.sd, size, before.places, sighting.name)
         gate = instrument.gate_sd or np.inf
         if match is not None and match.nis <= gate**2:
-            [(delta, P, [weight])] = Innovations(together.P, [match.r], [match.H], [[part]]).update([[instrument.loss]])
+            [(delta, P, [weight])] = Innovations(
+                together.P, [match.r], [match.H], [[part]], [[instrument.loss]]
+            ).update()
             place = before.places[match.index]
             seen = replace(a, sighting=sighting._replace(number=place.number))
             used.append(Used(seen, before.state.seeing(place.position), match.nis, weight))

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from rovgraph.calibration import TABLE
-from rovgraph.geometry import Array, exp_rotation, identity, log_rotation, rotate, transpose
+from rovgraph.geometry import Array, exp_rotation, identities, log_rotation, rotate, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.model_aiding import WaterVelocity
 from rovgraph.sensors import SensorModel, innovation
@@ -158,7 +158,7 @@ class ErrorVector:
 
     def _turned(self, state: State, other: State) -> Array:
         """The change of basis from one state to another, attitude and position in n staying; no more is known yet."""
-        basis = np.tile(identity(self.size), (len(state), 1, 1))
+        basis = identities(len(state), self.size)
         basis[:, :3, :3] = basis[:, 3:6, 3:6] = transpose(other.R_nb) @ state.R_nb
         return basis
 

@@ -4,9 +4,9 @@ Of n filters side by side, each with measurements of its own.
 """
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, identity, transpose
 from rovgraph.graph.measurements import loss_weight
@@ -36,26 +36,33 @@ def _normalised_squared(r: Array, S: Array) -> float:
 class Innovations:
     """Whitened innovations of n filters, with the covariance before they enter.
 
-    Filters with equally many rows are one computation, and none gets rows of others: what comes of it is
-    the same to the last bit whatever goes beside it.
+    Filters with measurements of the same kinds are one computation, and none gets rows of others: what comes
+    of it is the same to the last bit whatever goes beside it.
 
     Parameters
     ----------
     P : ndarray, shape (n, d, d)
-    r : for each filter an ndarray, shape (m,)
-    H : for each filter an ndarray, shape (m, d)
+    r, H : for each filter an ndarray, shapes (m,) and (m, d)
     parts : for each filter the rows of each of its measurements
+    losses : "none", "huber" or "cauchy", of each of its measurements
     """
 
-    def __init__(self, P: Array, r: Sequence[Array], H: Sequence[Array], parts: Sequence[Sequence[slice]]) -> None:
-        by_rows: dict[int, list[int]] = {}
-        for k, own in enumerate(r):
-            by_rows.setdefault(len(own), []).append(k)
+    def __init__(
+        self,
+        P: Array,
+        r: Sequence[Array],
+        H: Sequence[Array],
+        parts: Sequence[Sequence[slice]],
+        losses: Sequence[Sequence[str]],
+    ) -> None:
+        by_kinds: dict[tuple[tuple[int, str], ...], list[int]] = {}
+        for k, (own, lost) in enumerate(zip(parts, losses, strict=True)):
+            kinds = tuple((part.stop - part.start, loss) for part, loss in zip(own, lost, strict=True))
+            by_kinds.setdefault(kinds, []).append(k)
         self._groups: list[tuple[list[int], _Alike]] = []
         self._place: dict[int, tuple[_Alike, int]] = {}
-        for chosen in by_rows.values():
-            own_r, own_H = np.array([r[k] for k in chosen]), np.array([H[k] for k in chosen])
-            group = _Alike(P[chosen], own_r, own_H, [parts[k] for k in chosen])
+        for kinds, chosen in by_kinds.items():
+            group = _Alike(P[chosen], np.array([r[k] for k in chosen]), np.array([H[k] for k in chosen]), kinds)
             self._groups.append((chosen, group))
             self._place |= {k: (group, i) for i, k in enumerate(chosen)}
 
@@ -91,15 +98,11 @@ class Innovations:
         group.PHt[i] = group.P[i] @ group.H[i].T
         group.S[i] = group.H[i] @ group.PHt[i]
 
-    def update(self, losses: Sequence[Sequence[str]]) -> list[tuple[Array, Array, list[float]]]:
+    def update(self) -> list[tuple[Array, Array, list[float]]]:
         """Minimise the robust cost of the measurements and of a prior of covariance P.
 
         By reweighting: weights follow from the residuals after the update, as in the graph's cost,
         not from the innovations, which a vague prior makes large.
-
-        Parameters
-        ----------
-        losses : "none", "huber" or "cauchy", of each filter's measurements
 
         Returns
         -------
@@ -110,36 +113,37 @@ class Innovations:
         """
         out: dict[int, tuple[Array, Array, list[float]]] = {}
         for chosen, group in self._groups:
-            out |= dict(zip(chosen, group.update([losses[k] for k in chosen]), strict=True))
+            out |= dict(zip(chosen, group.update(), strict=True))
         return [out[k] for k in range(len(out))]
 
 
 class _Alike:
-    """Those of filters with equally many rows: P (n, d, d), r (n, m), H (n, m, d), PHt = P H', S = H P H'."""
+    """Those of n filters with measurements of the same kinds.
 
-    def __init__(self, P: Array, r: Array, H: Array, parts: Sequence[Sequence[slice]]) -> None:
-        self.P, self.r, self.H, self.parts = P, r, H, parts
+    P (n, d, d), r (n, m), H (n, m, d), PHt = P H', S = H P H'; kinds: dimension and loss of each measurement.
+    """
+
+    def __init__(self, P: Array, r: Array, H: Array, kinds: tuple[tuple[int, str], ...]) -> None:
+        self.P, self.r, self.H, self.kinds = P, r, H, kinds
         self.PHt = P @ transpose(H)
         self.S = H @ self.PHt
 
-    def update(self, losses: Sequence[Sequence[str]]) -> list[tuple[Array, Array, list[float]]]:
+    def update(self) -> list[tuple[Array, Array, list[float]]]:
         """As `Innovations.update`."""
-        if not self.r.size:
+        if not self.kinds:
             return [(np.zeros(len(P)), P, []) for P in self.P]
-        rows = self.r.shape[1]
-        owner, kinds = self._owners(losses)
-        weights: Array = np.ones(owner.shape[:2])
+        rows, dims = identity(self.r.shape[1]), [dim for dim, _ in self.kinds]
+        begun = list(accumulate(dims[:-1], initial=0))
+        weights: Array = np.ones((len(self.r), len(dims)))
         renewed = weights
-        settled = np.zeros((len(owner), 1), bool)  # filters do not wait for each other: what has settled stays
+        settled = np.zeros((len(self.r), 1), bool)  # filters do not wait for each other: what has settled stays
         for _ in range(MAX_REWEIGHTINGS):
-            root = np.asarray(np.sqrt(_times(transpose(owner), weights)))
-            inverse = np.linalg.inv(root[:, :, None] * self.S * root[:, None, :] + identity(rows))
+            root = np.asarray(np.sqrt(weights).repeat(dims, axis=1))
+            inverse = np.linalg.inv(root[:, :, None] * self.S * root[:, None, :] + rows)
             gain = root * _times(inverse, root * self.r)
-            squared = _times(owner, (self.r - _times(self.S, gain)) ** 2)
-            latest = np.ones_like(squared)
-            for (loss, dim), chosen in kinds.items():
-                latest[chosen] = loss_weight(squared[chosen], loss, dim)
-            renewed = np.where(settled, renewed, latest)
+            squared = np.add.reduceat((self.r - _times(self.S, gain)) ** 2, begun, axis=1)
+            latest = [loss_weight(own, loss, dim) for own, (dim, loss) in zip(squared.T, self.kinds, strict=True)]
+            renewed = np.where(settled, renewed, np.transpose(latest))
             settled |= np.abs(renewed - weights).max(axis=1, keepdims=True) < SETTLED
             if settled.all():
                 break
@@ -147,22 +151,7 @@ class _Alike:
         K = (self.PHt * root[:, None, :]) @ inverse
         kept = identity(self.P.shape[1]) - K @ (root[:, :, None] * self.H)
         P = kept @ self.P @ transpose(kept) + K @ transpose(K)
-        of_each = [row[: len(parts)] for row, parts in zip(renewed.tolist(), self.parts, strict=True)]
-        return list(zip(_times(self.PHt, gain), P, of_each, strict=True))
-
-    def _owners(self, losses: Sequence[Sequence[str]]) -> tuple[Array, dict[tuple[str, int], NDArray[np.bool_]]]:
-        """Which rows are whose: 1 or 0, shape (n, most, m); and the measurements of each loss and dimension."""
-        n, most = len(self.parts), max(len(parts) for parts in self.parts)
-        owner = np.zeros((n, most, self.r.shape[1]))
-        kinds: dict[tuple[str, int], NDArray[np.bool_]] = {}
-        for k, parts in enumerate(self.parts):
-            for j, (part, loss) in enumerate(zip(parts, losses[k], strict=True)):
-                owner[k, j, part] = 1.0
-                kind = loss, part.stop - part.start
-                if kind not in kinds:
-                    kinds[kind] = np.zeros((n, most), bool)
-                kinds[kind][k, j] = True
-        return owner, kinds
+        return list(zip(_times(self.PHt, gain), P, renewed.tolist(), strict=True))
 
 
 def _times(M: Array, v: Array) -> Array:

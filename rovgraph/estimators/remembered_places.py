@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.estimators.innovations import normalised_squared
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, identities
 from rovgraph.state import PLACE_DIM
 
 
@@ -60,7 +60,7 @@ def extended(basis: Array, size: int) -> Array:
     n, own, _ = basis.shape
     if own == size:
         return basis
-    out = np.tile(np.eye(size), (n, 1, 1))
+    out = identities(n, size)
     out[:, :own, :own] = basis
     return out
 

@@ -112,4 +112,6 @@ def predict(interval: Interval, state: State) -> State:
     bias = gtsam.imuBias.ConstantBias(felt.bias[0, :3], felt.bias[0, 3:])
     before = gtsam.NavState(gtsam.Rot3(state.R_nb[0]), state.p_n[0], state.v_n[0])
     after = interval.pim.predict(before, bias)
-    return replace(state, R_nb=after.attitude().matrix()[None], p_n=after.position()[None], v_n=after.velocity()[None])
+    # in rows: products of matrices in columns round otherwise, and filters side by side are to be as each alone
+    R_nb = np.ascontiguousarray(after.attitude().matrix())
+    return replace(state, R_nb=R_nb[None], p_n=after.position()[None], v_n=after.velocity()[None])
