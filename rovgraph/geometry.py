@@ -45,7 +45,8 @@ def skew(v: ArrayLike) -> Array:
     ndarray, shape (..., 3, 3)
     """
     v = np.asarray(v, dtype=float)
-    return np.asarray((v @ _SKEW).reshape(*v.shape, 3))
+    out: Array = (v @ _SKEW).reshape(*v.shape, 3)
+    return out
 
 
 _SKEW = np.zeros((3, 9))  # from x, y, z to the flattened matrix
@@ -224,7 +225,7 @@ _EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
 
 def transpose(R: Array) -> Array:
     """Transpose of the last two axes."""
-    return np.swapaxes(R, -1, -2)
+    return R.swapaxes(-1, -2)
 
 
 def rotate(R: Array, v: ArrayLike) -> Array:
@@ -239,4 +240,5 @@ def rotate(R: Array, v: ArrayLike) -> Array:
     -------
     ndarray, shape (..., m)
     """
-    return np.asarray((R @ np.asarray(v)[..., None])[..., 0])
+    out: Array = (R @ np.asarray(v)[..., None])[..., 0]
+    return out

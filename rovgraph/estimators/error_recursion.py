@@ -360,11 +360,16 @@ class ErrorStateRecursion:
 
     def _together(self, known: Sequence[Gaussian]) -> _Together:
         states = [one.state for one in known]
-        own = {name: np.array([s.calibration[name] for s in states]) for name in self.unknowns.estimated}
-        R_nb, p_n, v_n, bias = (
-            np.concatenate([getattr(s, name) for s in states]) for name in ("R_nb", "p_n", "v_n", "bias")
-        )
-        state = State(R_nb, p_n, v_n, bias, {**states[0].calibration, **own})
+        state, names = states[0], self.unknowns.estimated
+        if len(states) == 1:
+            own = {name: state.calibration[name][None] for name in names}
+            R_nb, p_n, v_n, bias = state.R_nb, state.p_n, state.v_n, state.bias
+        else:
+            own = {name: np.array([s.calibration[name] for s in states]) for name in names}
+            R_nb, p_n, v_n, bias = (
+                np.concatenate([getattr(s, name) for s in states]) for name in ("R_nb", "p_n", "v_n", "bias")
+            )
+        state = State(R_nb, p_n, v_n, bias, {**state.calibration, **own})
         return _Together(state, np.array([one.P for one in known]), known[0].places)
 
     def _update(

@@ -143,7 +143,7 @@ class _Alike:
             gain = root * _times(inverse, root * self.r)
             squared = np.add.reduceat((self.r - _times(self.S, gain)) ** 2, begun, axis=1)
             latest = [loss_weight(own, loss, dim) for own, (dim, loss) in zip(squared.T, self.kinds, strict=True)]
-            renewed = np.where(settled, renewed, np.transpose(latest))
+            renewed = np.where(settled, renewed, np.array(latest).T)
             settled |= np.abs(renewed - weights).max(axis=1, keepdims=True) < SETTLED
             if settled.all():
                 break
@@ -156,4 +156,5 @@ class _Alike:
 
 def _times(M: Array, v: Array) -> Array:
     """Matrices times vectors, shapes (n, a, b) and (n, b)."""
-    return np.asarray((M @ v[..., None])[..., 0])
+    out: Array = (M @ v[..., None])[..., 0]
+    return out
