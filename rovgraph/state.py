@@ -89,6 +89,8 @@ def stack_states(states: Sequence[State]) -> State:
 
 def _stacked(values: list[Array]) -> Array:
     """One after the other, shape (n, dim); at no cost where it is one and the same."""
+    if len(values) == 1:
+        return values[0][None]
     if all(value is values[0] for value in values):
         return np.broadcast_to(values[0], (len(values), *values[0].shape))
     return np.array(values)
