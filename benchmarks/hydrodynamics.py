@@ -10,8 +10,9 @@ import argparse
 import numpy as np
 
 from rovgraph.config import Config
+from rovgraph.estimators.chains import Named, outcomes
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.named import ESTIMATORS, Named, outcomes, select
+from rovgraph.estimators.named import ESTIMATORS, select
 from rovgraph.evaluate import normalised_error
 from rovgraph.geometry import Array
 from rovgraph.log import Log, log_from_frame

@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.special import gammaincinv
 
 from rovgraph import thesis
-from rovgraph.estimators.named import Named
+from rovgraph.estimators.chains import Named
 
 BAND = 0.95
 

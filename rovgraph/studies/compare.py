@@ -10,7 +10,8 @@ import pandas as pd
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError, in_one_line
-from rovgraph.estimators.named import Named, Outcome, Task, outcomes_of_dives, select
+from rovgraph.estimators.chains import Named, Outcome, Task, outcomes_of_dives
+from rovgraph.estimators.named import select
 from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.measures import measures, misalignment_history, velocity_history
 from rovgraph.studies.runs import Case, Run

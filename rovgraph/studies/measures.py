@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config
+from rovgraph.estimators.chains import Named
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.named import Named
 from rovgraph.evaluate import WITHIN_ELLIPSE, evaluate, normalised_error
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.studies.runs import Case

@@ -1,0 +1,340 @@
+"""Estimators as chains of stages, and how those of one dive or of many are run.
+
+The first stage of a chain takes a log and a configuration, each of the others what the stage
+before made. Estimators whose chains begin alike share what those stages made (filter and
+smoother of one pass, everything that needs the same keyframes), and each is charged for the
+whole of its chain. Filters go side by side over all dives that are asked for together, and
+each is charged for its share of that, by the seconds of its log: the error-state filters
+(`Replay`), and the thesis's of one kind, which have no chain.
+"""
+
+import contextlib
+import itertools
+import time
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
+from typing import Any
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.estimators.dive import assemble
+from rovgraph.estimators.error_state import (
+    RENEW_AT_S,
+    ErrorStateFilter,
+    alike,
+    replay,
+    replay_together,
+    smoothed_together,
+)
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.kalman import Asked, Filter, run_filters
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.log import Log
+
+Stage = Callable[[Any], Any]
+Made = dict[tuple[object, ...], tuple[Any, float]]  # by chain of stages: what it made, and its processor time [s]
+
+SHORTEST_S = 1e-3  # for which a log counts where time is shared
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the first stage of a chain takes."""
+
+    log: Log
+    config: Config
+
+
+@dataclass(frozen=True)
+class Named:
+    """An estimator that can be asked for by name.
+
+    Attributes
+    ----------
+    name : key of `rovgraph.estimators.named.ESTIMATORS`
+    family : "dead reckoning", "thesis", "error state", "graph"
+    about : one line of what it is
+    headings : "a", "b", "c", or "" for those of the configuration
+    misalignment : whether the DVL's misalignment is estimated
+    smoothing : whether an epoch is estimated from what came after it, too
+    hydrodynamics : whether thrusters and drag are a source of velocity; False leaves it to the configuration
+    whitened : its residuals are normalised by the innovation's own covariance, so that their
+        squares sum to the NIS; otherwise by the measurement's noise alone
+    stages : the chain, from `Task` to `Estimate`
+    variant : one of the thesis's filters, which has no chain
+    """
+
+    name: str
+    family: str
+    about: str
+    headings: str
+    misalignment: bool
+    smoothing: bool
+    stages: tuple[Stage, ...]
+    whitened: bool = False
+    hydrodynamics: bool = False
+    variant: Filter | None = None
+
+    @property
+    def shared(self) -> Hashable:
+        """The same for estimators that are best asked for together."""
+        return self.variant.kind if self.variant else (self.headings, self.misalignment, self.stages[0])
+
+    @property
+    def knowing(self) -> tuple[object, ...]:
+        """The same for estimators that work with the same configuration."""
+        return self.headings, self.misalignment, self.hydrodynamics
+
+    def __call__(self, log: Log, config: Config) -> Estimate:
+        """The estimate of one dive.
+
+        Raises
+        ------
+        InputError : the log lacks what the estimator needs
+        """
+        outcome = next(outcomes([self], log, config))
+        if outcome.error is not None:
+            raise outcome.error
+        assert outcome.estimate is not None
+        return outcome.estimate
+
+    def task(self, log: Log, config: Config) -> Task:
+        """The log with the configuration that this estimator works with.
+
+        Raises
+        ------
+        InputError : the log lacks a source of heading
+        """
+        if self.headings:
+            config = with_headings(log, config, self.headings)
+        if self.hydrodynamics:
+            config = with_hydrodynamics(config)
+        return Task(log, with_misalignment(config, self.misalignment))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an estimator on one log.
+
+    Attributes
+    ----------
+    named : the estimator
+    estimate : or None where it failed
+    error : why it failed, or None
+    seconds : processor time of its chain, shared stages included, or its share of those that
+        went side by side [s]
+    """
+
+    named: Named
+    estimate: Estimate | None
+    error: Exception | None
+    seconds: float
+
+
+def outcomes(estimators: Sequence[Named], log: Log, config: Config) -> Iterator[Outcome]:
+    """Run estimators on one log; one that fails does not stop the others.
+
+    Parameters
+    ----------
+    estimators : those of which `Named.shared` is the same are best asked for together
+    log, config : the dive, and what is believed of vehicle and sensors
+
+    Yields
+    ------
+    Outcome : in the order of ``estimators``
+    """
+    return (outcome for _, outcome in outcomes_of_dives(estimators, [Task(log, config)]))
+
+
+def outcomes_of_dives(estimators: Sequence[Named], dives: Sequence[Task]) -> Iterator[tuple[int, Outcome]]:
+    """Run estimators on several logs, as `outcomes` does on one; so the thesis's filters take less time.
+
+    Yields
+    ------
+    index of the dive, Outcome : dive by dive, in the order of ``estimators``
+    """
+    side_by_side: dict[Filter, dict[tuple[int, str], Outcome]] = {}
+    made: list[Made] = [{} for _ in dives]
+    _replay_side_by_side(estimators, dives, made)
+    for k, dive in enumerate(dives):
+        for named in estimators:
+            if named.variant is not None:
+                kind = named.variant.kind
+                if kind not in side_by_side:
+                    those = [n for n in estimators if n.variant is not None and n.variant.kind == kind]
+                    side_by_side[kind] = _side_by_side(those, dives)
+                yield k, side_by_side[kind].pop((k, named.name))
+                continue
+            try:
+                result, seconds = _run_chain(named, named.stages, dive, made[k])
+                yield k, Outcome(named, result, None, seconds)
+            except Exception as error:  # whatever an estimator runs into is a result of the comparison
+                yield k, Outcome(named, None, error, float("nan"))
+        made[k].clear()
+
+
+def _replay_side_by_side(estimators: Sequence[Named], dives: Sequence[Task], made: Sequence[Made]) -> None:
+    """Make what `Replay` makes, and its smoothers, all that is alike at once; what fails is left to be run alone."""
+    asked: dict[tuple[object, ...], list[Named]] = {}
+    for named in estimators:
+        if any(isinstance(stage, Replay) for stage in named.stages):
+            asked.setdefault(named.knowing, []).append(named)
+    for knowing, those in asked.items():
+        stages = {stage for named in those for stage in named.stages}
+        batches: dict[int, BatchSmoother] = {}
+        for k, dive in enumerate(dives):
+            with contextlib.suppress(Exception):  # it is met again, and told, where the estimator itself is run
+                batches[k], _ = _run_chain(those[0], (assembled,), dive, made[k])
+        for group in _groups(batches):
+            with contextlib.suppress(Exception):
+                for (k, chain), result in _replayed(group, stages, dives).items():
+                    made[k][(*knowing, assembled, *chain)] = result
+
+
+def _groups(batches: Mapping[int, BatchSmoother]) -> list[dict[int, BatchSmoother]]:
+    """Dives whose filters can go side by side; where they cannot a dive is left out."""
+    groups: list[dict[int, BatchSmoother]] = []
+    for k, batch in batches.items():
+        own = [group for group in groups if alike(next(iter(group.values())).beginning, batch.beginning)]
+        if own:
+            own[0][k] = batch
+        elif alike(batch.beginning, batch.beginning):
+            groups.append({k: batch})
+    return groups
+
+
+def _replayed(
+    batches: Mapping[int, BatchSmoother], stages: Set[Stage], dives: Sequence[Task]
+) -> dict[tuple[int, tuple[Stage, ...]], tuple[Any, float]]:
+    """Filters of dives that are alike, and their smoothers; by dive and stages, each with its share of the time."""
+    filters: dict[tuple[int, Replay], ErrorStateFilter] = {
+        (k, stage): ErrorStateFilter(batch.beginning, stage.renew_at)
+        for k, batch in batches.items()
+        for stage in (STEPPED, RENEWED)
+        if stage in stages
+    }
+    began = time.process_time()
+    replay_together(list(filters.values()), [batches[k].intervals for k, _ in filters])
+    shares = _shares(time.process_time() - began, [dives[k] for k, _ in filters])
+    out: dict[tuple[int, tuple[Stage, ...]], tuple[Any, float]] = {}
+    for (k, stage), share in zip(filters, shares, strict=True):
+        out[k, (stage,)] = filters[k, stage], share
+    if ErrorStateFilter.smoothed in stages:
+        began = time.process_time()
+        smoothed = smoothed_together([filters[k, STEPPED] for k in batches])
+        shares = _shares(time.process_time() - began, [dives[k] for k in batches])
+        for k, estimate, share in zip(batches, smoothed, shares, strict=True):
+            out[k, (STEPPED, ErrorStateFilter.smoothed)] = estimate, share
+    return out
+
+
+def _shares(spent: float, dives: Sequence[Task]) -> list[float]:
+    """Time by the seconds of logs that share it."""
+    recorded = [_recorded_s(dive.log) for dive in dives]
+    return [spent * seconds / sum(recorded) for seconds in recorded]
+
+
+def _side_by_side(estimators: Sequence[Named], dives: Sequence[Task]) -> dict[tuple[int, str], Outcome]:
+    """Filters of one kind on all dives; by index of the dive and name."""
+    out: dict[tuple[int, str], Outcome] = {}
+    asked: dict[tuple[int, str], tuple[Named, Asked]] = {}
+    for (k, dive), named in itertools.product(enumerate(dives), estimators):
+        try:
+            task = named.task(dive.log, dive.config)
+            assert named.variant is not None
+            asked[k, named.name] = named, Asked(named.variant, task.log, task.config)
+        except Exception as error:
+            out[k, named.name] = Outcome(named, None, error, float("nan"))
+    began = time.process_time()
+    done: list[Estimate | Exception]
+    try:
+        done = run_filters([a for _, a in asked.values()])
+    except Exception as error:
+        done = [error] * len(asked)
+    spent = time.process_time() - began
+    recorded = [
+        0.0 if isinstance(d, Exception) else _recorded_s(a.log) for d, (_, a) in zip(done, asked.values(), strict=True)
+    ]
+    for (key, (named, _)), result, seconds in zip(asked.items(), done, recorded, strict=True):
+        if isinstance(result, Exception):
+            out[key] = Outcome(named, None, result, float("nan"))
+        else:
+            out[key] = Outcome(named, result, None, spent * seconds / sum(recorded))
+    return out
+
+
+def _recorded_s(log: Log) -> float:
+    time = log["imu"].time
+    return max(float(time[-1] - time[0]), SHORTEST_S)
+
+
+def _run_chain(named: Named, stages: Sequence[Stage], dive: Task, made: Made) -> tuple[Any, float]:
+    """The result of stages of an estimator and its processor time; ``made`` keeps results by what led to them."""
+    result: Any = named.task(dive.log, dive.config)
+    chain, total = named.knowing, 0.0
+    for stage in stages:
+        chain = (*chain, stage)
+        if chain not in made:
+            began = time.process_time()
+            made[chain] = stage(result), time.process_time() - began
+        result, seconds = made[chain]
+        total += seconds
+    return result, total
+
+
+def with_headings(log: Log, config: Config, letter: str) -> Config:
+    """A configuration with the heading sources that a letter stands for.
+
+    The magnetometer's heading is the IMU's own (``ahrs``, which is made from it) where the
+    log has no samples of the field, or the configuration prefers it.
+
+    Raises
+    ------
+    InputError : the log lacks one of them
+    """
+    given = config.heading.sources or ()
+    own = "mag" not in log or ("ahrs" in given and "mag" not in given)
+    magnetometer, compass = ("ahrs" if own else "mag"), "dvl"
+    if letter in "ac" and magnetometer not in log:
+        raise InputError(f"{log.source}: no magnetometer (mag_x, mag_y, mag_z, or ahrs_yaw)")
+    if letter in "ab" and "dvl_heading" not in log:
+        raise InputError(f"{log.source}: no compass of the DVL (dvl_heading)")
+    sources = {"a": (magnetometer, compass), "b": (compass,), "c": (magnetometer,)}[letter]
+    return config.model_copy(update={"heading": config.heading.model_copy(update={"sources": sources})})
+
+
+def with_misalignment(config: Config, estimate: bool) -> Config:
+    """A configuration that estimates the DVL's yaw, or holds it at its mean."""
+    entry = config.calibration.dvl_yaw.model_copy(update={"estimate": estimate})  # type: ignore[attr-defined]
+    return config.model_copy(update={"calibration": config.calibration.model_copy(update={"dvl_yaw": entry})})
+
+
+def with_hydrodynamics(config: Config) -> Config:
+    """A configuration that uses thrusters and drag."""
+    return config.model_copy(update={"graph": config.graph.model_copy(update={"hydrodynamics": True})})
+
+
+def assembled(task: Task) -> BatchSmoother:
+    """Keyframes of a log and what lies between them."""
+    return assemble(task.log, initialise(task.log, task.config))
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The error-state filter over the same keyframes.
+
+    Those of several dives go side by side, and so do those with other renewals.
+
+    Attributes
+    ----------
+    renew_at : of `rovgraph.estimators.error_state.ErrorStateFilter`
+    """
+
+    renew_at: tuple[float, ...] = ()
+
+    def __call__(self, batch: BatchSmoother) -> ErrorStateFilter:
+        return replay(batch.intervals, batch.beginning, self.renew_at)
+
+
+STEPPED, RENEWED = Replay(), Replay(RENEW_AT_S)
