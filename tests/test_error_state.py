@@ -139,9 +139,9 @@ def test_all_measurements_of_a_keyframe_together_are_linearised_as_each_alone(es
     state = estimator.filtered[interval.index].state
     assert len(interval.attached) > 2
     assert any(a.motion.dt for a in interval.attached)
-    (r,), (H,), [parts] = estimator.recursion.linearize(state, [interval.attached])
+    (r,), (H,), [parts] = estimator.recursion.measurements.linearize(state, [interval.attached])
     for attached, part in zip(interval.attached, parts, strict=True):
-        alone, jacobians = estimator.recursion.block([attached]).linearize(state)
+        alone, jacobians = estimator.recursion.measurements.block([attached]).linearize(state)
         np.testing.assert_allclose(r[part], alone[0], atol=1e-9)
         np.testing.assert_allclose(H[part], estimator.error.matrix(jacobians)[0], atol=1e-9)
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from dives import Simulated, falcon, fed, simulated
 
-from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.error_state import ErrorStateFilter
 from rovgraph.estimators.fixed_lag import FixedLag, Taken
 from rovgraph.estimators.initialise import Beginning, initialise
+from rovgraph.estimators.passage import Gaussian
 from rovgraph.estimators.refiner import Refiner
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.log import Measurement

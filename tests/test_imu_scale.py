@@ -7,7 +7,8 @@ from dives import Simulated, batch, falcon, renewed, simulated, started, true_at
 from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gaussian
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
+from rovgraph.estimators.passage import Gaussian
 from rovgraph.geometry import log_rotation, rotate, transpose
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.factors import motion, predict

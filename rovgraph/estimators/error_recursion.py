@@ -14,7 +14,6 @@ updates it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, groupby, pairwise
 
 import numpy as np
 
@@ -22,6 +21,8 @@ from rovgraph.config import beliefs
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.innovations import Innovations
+from rovgraph.estimators.linearization import Linearization
+from rovgraph.estimators.passage import Gates, Gaussian, Passage, Step, Used
 from rovgraph.estimators.remembered_places import (
     Place,
     extended,
@@ -33,90 +34,18 @@ from rovgraph.estimators.remembered_places import (
     without_oldest,
 )
 from rovgraph.estimators.results import body_trajectory
-from rovgraph.geometry import Array, identities, rotate, transpose
+from rovgraph.geometry import Array, identities, transpose
 from rovgraph.graph.assembly import Attached, Interval
 from rovgraph.graph.coasting import BLIND_S, coasted, coasting
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
-from rovgraph.graph.measurements import Block, make_block, motions, whitening
-from rovgraph.graph.places import ORIGIN
 from rovgraph.graph.scale import COLUMNS, SCALES
 from rovgraph.graph.transition import transitions
-from rovgraph.sensors import Position, SensorModel, innovation
-from rovgraph.state import PLACE, POSE, VELOCITY, State, propagate_with_jacobian, stack_states
+from rovgraph.sensors import Position, SensorModel
+from rovgraph.state import POSE, VELOCITY, State, stack_states
 from rovgraph.trajectory import Trajectory
 
 RETURN_SD = 3.0  # a sensor that was kept out for long returns with an innovation within this many sd
-
-Gates = dict[str, float]  # sensor that is being kept out -> since when [s]
-
-
-@dataclass(frozen=True)
-class Gaussian:
-    """A state with the covariance of its error, in the order of `ErrorVector`.
-
-    Attributes
-    ----------
-    state : State of one epoch
-    P : ndarray, shape (size + 2 m, size + 2 m), the places at the end
-    places : m places that are remembered
-    """
-
-    state: State
-    P: Array
-    places: tuple[Place, ...] = ()
-
-
-@dataclass(frozen=True)
-class Step:
-    """What a smoother needs of a keyframe.
-
-    Attributes
-    ----------
-    F, Q : ndarray, shapes as that of P, transition from the keyframe before, and its noise
-    predicted : before anything that was measured at the keyframe
-    """
-
-    F: Array
-    Q: Array
-    predicted: Gaussian
-
-
-@dataclass(frozen=True)
-class Used:
-    """A measurement as the filter met it.
-
-    Attributes
-    ----------
-    attached : the measurement
-    state : of its keyframe, before it entered
-    nis : normalised innovation squared
-    weight : 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits none of its
-        name counts as rejected, and is remembered as another
-    """
-
-    attached: Attached
-    state: State
-    nis: float
-    weight: float
-
-
-@dataclass(frozen=True)
-class Passage:
-    """Through one interval, from one keyframe to the next.
-
-    Attributes
-    ----------
-    departed : the keyframe before, with what was measured after it; None at the first keyframe
-    step : the way from there; None at the first keyframe
-    filtered : the keyframe that ends the interval
-    used : the measurements
-    """
-
-    departed: Gaussian | None
-    step: Step | None
-    filtered: Gaussian
-    used: list[Used]
 
 
 @dataclass(frozen=True)
@@ -158,6 +87,7 @@ class ErrorStateRecursion:
     ----------
     beliefs, unknowns : priors of the calibration, and what of it is estimated
     error : layout and geometry of the error
+    measurements : as they are linearised
     """
 
     def __init__(self, beginning: Beginning) -> None:
@@ -165,6 +95,7 @@ class ErrorStateRecursion:
         self.beliefs = beliefs(beginning.config)
         self.unknowns = unknowns(self.beliefs, beginning.instruments)
         self.error = ErrorVector(self.unknowns.estimated, beginning.instruments)
+        self.measurements = Linearization(beginning, self.error, self.unknowns)
         self._walk = np.zeros((self.error.size, self.error.size))  # what walking adds to Q in a second
         for name, walk in self.unknowns.walks.items():
             columns = self.error.columns[name]
@@ -236,97 +167,6 @@ class ErrorStateRecursion:
         P = 0.5 * (P + transpose(P))
         predicted = [Gaussian(*one) for one in zip(states, P, (known.places for known in before), strict=True)]
         return [Step(*one) for one in zip(F, Q, predicted, strict=True)]
-
-    def block(self, attached: Sequence[Attached]) -> Block:
-        """Measurements of one sensor."""
-        b = self.beginning
-        instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
-        return make_block(attached, instrument, gravity, self.unknowns)
-
-    def linearize(
-        self, state: State, attached: Sequence[Sequence[Attached]]
-    ) -> tuple[list[Array], list[Array], list[list[slice]]]:
-        """Whitened innovations and Jacobians of the measurements of a keyframe of each of n filters.
-
-        A place is taken to be at the origin, and to be known.
-
-        What `Block.linearize` says of many keyframes and one sensor, for one keyframe and many sensors.
-
-        Parameters
-        ----------
-        state : State of n epochs
-        attached : measurements of each; at least one of them all
-
-        Returns
-        -------
-        r, H : of each filter an ndarray, shapes (m,) and (m, size)
-        parts : for each its measurements' rows
-        """
-        parts, flat = self._rows(attached)
-        rows = [own[-1].stop if own else 0 for own in parts]
-        r, H = [np.empty(m) for m in rows], [np.empty((m, self.error.size)) for m in rows]
-        filters, those = [k for k, _, _ in flat], [a for _, _, a in flat]
-        there, F = State(state.R_nb[filters], state.p_n[filters], state.v_n[filters], state.bias[filters]), None
-        if any(a.motion.dt for a in those):
-            gravity = self.beginning.config.environment.gravity_mps2
-            there, F = propagate_with_jacobian(there, motions(those), gravity)
-        ends = list(accumulate(len(list(group)) for _, group in groupby(those, _kind)))
-        for begin, end in pairwise([0, *ends]):
-            which, own = slice(begin, end), those[begin:end]
-            if own[0].track is not None or own[0].felt is not None:
-                own_r, own_H = self._of_block(state.at(filters[which]), own)
-            else:
-                calibration = self._calibration(state, own[0], filters[which])
-                known = State(there.R_nb[which], there.p_n[which], there.v_n[which], there.bias[which], calibration)
-                own_r, own_H = self._of_sensor(known, None if F is None else F[which], own)
-            for (k, part, _), one_r, one_H in zip(flat[which], own_r, own_H, strict=True):
-                r[k][part], H[k][part] = one_r, one_H
-        return r, H, parts
-
-    def _calibration(self, state: State, a: Attached, filters: list[int]) -> dict[str, Array]:
-        """What a measurement's model reads, of some filters."""
-        if a.sighting is not None:
-            return {PLACE: ORIGIN}
-        values = {name: state.calibration[name] for name in self.beginning.instruments[a.sensor].model.calibration}
-        return {name: value if value.ndim == 1 else value[filters] for name, value in values.items()}
-
-    def _rows(
-        self, attached: Sequence[Sequence[Attached]]
-    ) -> tuple[list[list[slice]], list[tuple[int, slice, Attached]]]:
-        """Rows of each filter's measurements; and all of them with filter and rows, those of one kind together."""
-        parts, flat = [], []
-        for k, own in enumerate(attached):
-            ends = accumulate((self.beginning.instruments[a.sensor].model.dim for a in own), initial=0)
-            parts.append([slice(*pair) for pair in pairwise(ends)])
-            flat += [(k, part, a) for part, a in zip(parts[-1], own, strict=True)]
-        return parts, sorted(flat, key=lambda one: _kind(one[2]))
-
-    def _of_block(self, state: State, attached: Sequence[Attached]) -> tuple[Array, Array]:
-        """Whitened innovations, shape (m, dim), and Jacobians, shape (m, dim, size), of m measurements of a sensor."""
-        if attached[0].sighting is not None:
-            state = state.seeing(ORIGIN)
-        r, jacobians = self.block(attached).linearize(state)
-        return r, self.error.matrix(jacobians)
-
-    def _of_sensor(self, state: State, F: Array | None, attached: Sequence[Attached]) -> tuple[Array, Array]:
-        """The same at less cost, of measurements that are where their stamps say, with an IMU of exact scale.
-
-        Parameters
-        ----------
-        state : State where the measurements are
-        F : ndarray, shape (m, 15, 15), its derivative by that of the keyframe, where it is another
-        """
-        instrument = self.beginning.instruments[attached[0].sensor]
-        predicted, jacobians = instrument.model.predict(state, np.array([a.rate_b for a in attached]))
-        H = self.error.matrix(jacobians)
-        if F is not None:
-            H[..., :15] = H[..., :15] @ F
-        r = innovation(instrument.model, np.array([a.z for a in attached]), predicted)
-        sd = np.array([a.sd for a in attached])
-        if not instrument.rate_gain.any():
-            return r / sd, H / sd[..., None]
-        W = whitening(instrument, sd, np.array([a.rate_sd for a in attached]))
-        return rotate(W, r), W @ H
 
     def trajectory(self, intervals: Sequence[Interval], known: Sequence[Gaussian]) -> Trajectory:
         """The body's origin at keyframes, at least one, in n, with its covariance.
@@ -422,7 +262,7 @@ class ErrorStateRecursion:
         if not any(attached):
             return before
         known = self._together(before)
-        r, H, parts = self.linearize(known.state, attached)
+        r, H, parts = self.measurements.linearize(known.state, attached)
         losses = [[self.beginning.instruments[a.sensor].loss for a in own] for own in attached]
         said = Innovations(known.P, r, [padded(own, known.P.shape[1]) for own in H], parts, losses)
         admitted: dict[int, list[tuple[int, Attached, float]]] = {}
@@ -456,7 +296,7 @@ class ErrorStateRecursion:
         assert a.sighting is not None
         instrument, size, sighting = self.beginning.instruments[a.sensor], self.error.size, a.sighting
         together = self._together([before])
-        (r,), (H,), [[part]] = self.linearize(together.state, [[a]])
+        (r,), (H,), [[part]] = self.measurements.linearize(together.state, [[a]])
         match = nearest(before.P, r, H, a.sd, size, before.places, sighting.name)
         gate = instrument.gate_sd or np.inf
         if match is not None and match.nis <= gate**2:
@@ -473,8 +313,3 @@ class ErrorStateRecursion:
         used.append(Used(a, before.state.seeing(other.position), nis, 1.0 if match is None else 0.0))
         P, places = with_another(before.P, before.places, place, a.sd[:, None] * H, a.sd)
         return Gaussian(before.state, *without_oldest(P, places, size, self.beginning.config.place.remembered))
-
-
-def _kind(a: Attached) -> tuple[str, bool, bool]:
-    """Of which measurements can be linearised together."""
-    return a.sensor, a.track is None, a.felt is None

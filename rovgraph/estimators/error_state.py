@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Passage, Step, Used
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.passage import Gates, Gaussian, Passage, Step, Used
 from rovgraph.estimators.remembered_places import columns, common, extended
 from rovgraph.estimators.renewal import renewed
 from rovgraph.estimators.results import (
@@ -148,7 +149,7 @@ class ErrorStateFilter:
         """
         blocks, here, weights = {}, {}, {}
         for sensor, rows in self._used.items():
-            blocks[sensor] = block = self.recursion.block([used.attached for used in rows])
+            blocks[sensor] = block = self.recursion.measurements.block([used.attached for used in rows])
             here[sensor] = stack_states([used.state for used in rows])
             if smoothed is not None:
                 places = here[sensor].calibration.get(PLACE)

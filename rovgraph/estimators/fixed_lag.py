@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian, Used
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.passage import Gates, Gaussian, Used
 from rovgraph.estimators.remembered_places import Place
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
-from rovgraph.estimators.error_recursion import Gaussian, Used
 from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.passage import Gaussian, Used
 from rovgraph.estimators.smoother import smoothed
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.graph.batch import make_problem, solution_at

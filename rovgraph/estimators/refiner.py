@@ -13,9 +13,10 @@ from typing import Any
 
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gates, Gaussian
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.error_state import RENEW_AT_S
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.passage import Gates, Gaussian
 from rovgraph.estimators.renewal import renewed
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement

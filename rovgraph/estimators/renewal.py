@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.estimators.error_recursion import ErrorStateRecursion, Gaussian
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
+from rovgraph.estimators.passage import Gaussian
 from rovgraph.estimators.remembered_places import Place
 from rovgraph.graph.assembly import Interval
 from rovgraph.graph.batch import newest_covariance

@@ -15,10 +15,10 @@ import numpy as np
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import Beginning, restored
+from rovgraph.estimators.passage import Gaussian
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults

@@ -4,9 +4,9 @@ import time as host
 from dataclasses import dataclass, field
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.error_recursion import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.passage import Gaussian
 from rovgraph.estimators.refiner import Refiner, due_times
 from rovgraph.log import Measurement
 
