@@ -148,7 +148,7 @@ def outcomes(estimators: Sequence[Named], log: Log, config: Config) -> Iterator[
 
 
 def outcomes_of_dives(estimators: Sequence[Named], dives: Sequence[Task]) -> Iterator[tuple[int, Outcome]]:
-    """Run estimators on several logs, as `outcomes` does on one; so the thesis's filters take less time.
+    """Run estimators on several logs, as `outcomes` does on one; so filters take less time.
 
     Yields
     ------
