@@ -29,8 +29,9 @@ from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.dive import smooth
 from rovgraph.graph import batch as solver
-from rovgraph.graph.batch import Problem, covariances, make_problem, make_values, marginals, solve
+from rovgraph.graph.batch import Problem, make_problem, make_values, solve
 from rovgraph.graph.keys import key
+from rovgraph.graph.marginals import covariances, marginals
 from rovgraph.graph.measurements import loss_and_weight
 from rovgraph.log import Log
 from rovgraph.simulate import CALM, Style, scenario

@@ -19,9 +19,10 @@ from rovgraph.estimators.observability import (
     relative_covariance,
     without_noise,
 )
-from rovgraph.graph.batch import covariances, make_values, marginals
+from rovgraph.graph.batch import make_values
 from rovgraph.graph.information import knowledge
 from rovgraph.graph.keys import key
+from rovgraph.graph.marginals import covariances, marginals
 from rovgraph.simulate import CALM, SCENARIOS, Style, scenario
 from rovgraph.simulate.files import write_log
 from rovgraph.state import State

@@ -32,9 +32,9 @@ from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, Attached, Sighting
-from rovgraph.graph.batch import covariances, marginals, newest_covariance
 from rovgraph.graph.information import OTHERS, knowledge
 from rovgraph.graph.keys import key, key_name
+from rovgraph.graph.marginals import covariances, marginals, newest_covariance
 from rovgraph.graph.places import matched
 from rovgraph.graph.preintegration import Snapshot
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint

@@ -9,8 +9,8 @@ from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.passage import Gaussian
 from rovgraph.estimators.remembered_places import Place
 from rovgraph.graph.assembly import Interval
-from rovgraph.graph.batch import newest_covariance
 from rovgraph.graph.keys import key
+from rovgraph.graph.marginals import newest_covariance
 from rovgraph.graph.places import Optimum, optimum
 from rovgraph.state import PLACE, PLACE_DIM, State
 

@@ -15,9 +15,10 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, Solution, covariances, marginals, solve
+from rovgraph.graph.batch import Problem, Solution, solve
 from rovgraph.graph.information import sensitivity
 from rovgraph.graph.keys import key
+from rovgraph.graph.marginals import covariances, marginals
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,81 @@
+"""How certain the optimum of a dive is: marginal covariances from its Bayes tree."""
+
+from collections.abc import Sequence
+from itertools import accumulate
+
+import gtsam
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.graph.batch import Problem, Solution, indeterminate
+from rovgraph.graph.keys import dimension, key
+from rovgraph.state import DIMENSION, PLACE
+
+
+def marginals(problem: Problem, solution: Solution) -> gtsam.GaussianBayesTree:
+    """The optimum's Bayes tree, which gives marginal covariances.
+
+    By QR, since small covariances come of large and nearly dependent rows; calibration
+    is eliminated last, since all keyframes share it.
+    """
+    linear = problem.linearize(solution.values, solution.gates)
+    last = [key(name) for name, walk in problem.unknowns.walks.items() if not walk]
+    ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last)
+    try:
+        return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+    except RuntimeError as error:
+        raise InputError(indeterminate(error)) from None
+
+
+def newest_covariance(problem: Problem, solution: Solution, places: Sequence[int] = ()) -> Array:
+    """Joint covariance of the newest keyframe, of the calibration there, and of places.
+
+    Returns
+    -------
+    ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Problem.unknowns`,
+        then the places in the order of their numbers as given
+    """
+    linear = problem.linearize(solution.values, solution.gates)
+    last = [key(v, problem.count - 1) for v in DIMENSION]
+    last += [problem.unknowns.key(name, int(problem.segment[-1])) for name in problem.unknowns.estimated]
+    last += [key(PLACE, number) for number in places]
+    before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
+    for one in last:
+        order.push_back(one)
+    try:
+        _, ends = linear.eliminatePartialMultifrontal(sorted(before), gtsam.EliminateQR)
+    except RuntimeError as error:
+        raise InputError(indeterminate(error)) from None
+    root = np.linalg.inv(np.linalg.qr(ends.jacobian(order)[0], mode="r"))
+    return np.asarray(root @ root.T)
+
+
+def covariances(tree: gtsam.GaussianBayesTree) -> dict[int, Array]:
+    """Marginal covariances of all variables, by key, shape (d, d).
+
+    From the roots down, as a clique's separator lies in its parent: with R x_f + S x_s = noise of unit
+    variance, P_ff = R^-1 (1 + S P_ss S') R^-T and P_fs = -R^-1 S P_ss.
+    """
+    out: dict[int, Array] = {}
+    todo: list[tuple[gtsam.GaussianBayesTreeClique, dict[int, slice], Array]] = [
+        (root, {}, np.empty((0, 0))) for root in tree.roots()
+    ]
+    while todo:
+        clique, above, P_above = todo.pop()
+        conditional = clique.conditional()
+        keys, RS = conditional.keys(), conditional.jacobian()[0]
+        ends = list(accumulate(map(dimension, keys)))
+        parts = {k: slice(end - dimension(k), end) for k, end in zip(keys, ends, strict=True)}
+        m, size = RS.shape
+        shared = np.concatenate([np.r_[above[k]] for k in keys if parts[k].start >= m] or [np.empty(0, int)])
+        root = np.linalg.inv(RS[:, :m])
+        gain = root @ RS[:, m:]
+        P = np.empty((size, size))
+        P[m:, m:] = P_above[np.ix_(shared, shared)]
+        P[:m, m:] = -gain @ P[m:, m:]
+        P[m:, :m] = P[:m, m:].T
+        P[:m, :m] = root @ root.T - P[:m, m:] @ gain.T
+        out |= {k: P[part, part] for k, part in parts.items() if part.stop <= m}
+        todo += [(clique[child], parts, P) for child in range(clique.nrChildren())]
+    return out
