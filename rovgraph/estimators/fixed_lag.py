@@ -95,11 +95,14 @@ class FixedLag:
 
     def add(self, measurement: Measurement) -> Taken:
         """Take a measurement, whenever it arrives."""
-        record, own = self._record, place(measurement)
-        position = len(record) if not record or own > place(record[-1]) else bisect_right(record, own, key=place)
+        record, position, again = self._record, len(self._record), False
+        if record and measurement.time <= record[-1].time:
+            own = place(measurement)
+            position = bisect_right(record, own, key=place)
+            again = position > 0 and place(record[position - 1]) == own
         if position < self._settled:
             return Taken.LATE
-        if position and place(record[position - 1]) == own:
+        if again:
             return Taken.AGAIN
         record.insert(position, measurement)
         if position < self._taken:

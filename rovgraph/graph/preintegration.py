@@ -93,20 +93,20 @@ def preintegrate(
     """
     t = imu[:, 0]
     inside = t[(t > start) & (t < end)]
-    grid = np.unique(np.concatenate([[start], inside, stops, [end]]))
+    grid = np.array(sorted({start, end, *inside.tolist(), *stops.tolist()}))  # np.unique takes five times as long
     middle, dt = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
     signal = _between(imu, middle)
     acc, gyr = signal[:, :3], signal[:, 3:]
     acc = acc + 0.5 * dt[:, None] * cross(gyr - bias[3:], acc - bias[:3])
 
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
-    wanted = set(np.searchsorted(grid, stops).tolist())
+    wanted = grid.searchsorted(stops).tolist()
     taken = {0: _snapshot(pim)} if 0 in wanted else {}
-    for k in range(len(dt)):
-        pim.integrateMeasurement(acc[k], gyr[k], dt[k])
-        if k + 1 in wanted:
-            taken[k + 1] = _snapshot(pim)
-    return pim, [taken[k] for k in np.searchsorted(grid, stops).tolist()]
+    for k, step in enumerate(zip(acc, gyr, dt.tolist(), strict=True), 1):
+        pim.integrateMeasurement(*step)
+        if k in wanted:
+            taken[k] = _snapshot(pim)
+    return pim, [taken[k] for k in wanted]
 
 
 def _between(imu: Array, time: Array) -> Array:

@@ -87,7 +87,9 @@ class Faults:
 
     def look(self, m: Measurement) -> Verdict:
         """Whether a measurement is one."""
-        watch = self.watches.setdefault(m.sensor, Watch())
+        watch = self.watches.get(m.sensor)
+        if watch is None:
+            watch = self.watches[m.sensor] = Watch()
         values = m.values.tobytes()
         if values == watch.values:
             watch.equal += 1

@@ -1,7 +1,6 @@
 """What a source says at one time, and from the cells of a row to readings."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +25,7 @@ class Reading(NamedTuple):
     values: Array
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """What one source said at one time.
 
     Attributes

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from rovgraph.live.message import Message
@@ -104,4 +104,4 @@ def paced(messages: Iterable[Message], pace: float, stop: threading.Event) -> It
             first, offset = message.arrival, time.time() - message.arrival
         if stop.wait(max(0.0, begin + (message.arrival - first) / pace - time.monotonic())):
             return
-        yield replace(message, arrival=message.arrival + offset) if pace == 1.0 else message
+        yield message._replace(arrival=message.arrival + offset) if pace == 1.0 else message
