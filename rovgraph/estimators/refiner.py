@@ -20,6 +20,7 @@ from rovgraph.estimators.passage import Gates, Gaussian
 from rovgraph.estimators.renewal import renewed
 from rovgraph.graph.assembly import Assembler, Interval
 from rovgraph.log import Measurement
+from rovgraph.log.packing import pack, unpack
 from rovgraph.workers import companion
 
 DUE_LATER = 0.4  # a renewal takes up to this part of its time
@@ -53,7 +54,7 @@ class Refiner:
 
     def take(self, measurements: Sequence[Measurement]) -> None:
         """Hand on measurements, in order."""
-        self._work.put(list(measurements))
+        self._work.put(pack(measurements))  # one by one they take fifteen times as long, from this process's time
 
     def ask(self, index: int) -> None:
         """Ask for the estimate of a keyframe; of one question at a time."""
@@ -145,7 +146,7 @@ def _refine(renew_at: tuple[float, ...], learn_noise: bool, work: Any, answers: 
             elif isinstance(item, int):
                 answers.send(dive.known(item))
             else:
-                for measurement in item:
+                for measurement in unpack(item):
                     dive.add(measurement)
     except Exception as error:  # whatever it is, the first process goes on without this one
         answers.send(str(error) or type(error).__name__)
