@@ -8,7 +8,6 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import siegelslopes
 
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
@@ -239,5 +238,7 @@ def _robust_first(time: Array, values: Array) -> float:
     """The first of some values, by the line that half of them cannot turn; of two the first (Siegel 1982)."""
     if len(time) < 3:
         return float(values[0])
+    from scipy.stats import siegelslopes  # half a second to import, which a second process need not wait for
+
     slope, intercept = siegelslopes(values, time)
     return float(intercept + slope * time[0])

@@ -125,14 +125,19 @@ class FixedLag:
         self._go_on(self._newest - self.hold_s)
 
     def adopt(self, index: int, known: Gaussian) -> bool:
-        """Go on from a better estimate of a keyframe; False = the lag has passed it."""
+        """Go on from a better estimate of a keyframe, by the intervals since; False = the lag has passed it."""
         if not any(mark.interval.index == index for mark in self.marks):
             return False
+        later: list[Mark] = []
         while self.marks[-1].interval.index != index:
-            self.marks.pop()
+            later.append(self.marks.pop())
         self.marks[-1] = replace(self.marks[-1], known=known)
-        self._back_to(self.marks[-1].taken - self._forgotten)
-        self._go_on(self._newest - self.hold_s)
+        self._gates = dict(self.marks[-1].gates)
+        for mark in reversed(later):
+            passage = self.recursion.through(mark.interval, self.marks[-1].known, self._gates)
+            after = replace(mark, known=passage.filtered, gates=dict(self._gates), used=passage.used)
+            self.marks.append(after)
+        self._assembler.stamps.assume(self.marks[-1].known.state.calibration)
         return True
 
     def oldest(self) -> Mark:
