@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.config import beliefs
+from rovgraph.estimators.alignment import aligned
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.innovations import Innovations
@@ -135,7 +136,11 @@ class ErrorStateRecursion:
         predicted = before
         if intervals[0].pim is not None:
             between = [[a for a in i.attached if a.keyframe < i.index] for i in intervals]
-            departed = left = self._update(before, between, gates, used)
+            gravity = self.beginning.config.environment.gravity_mps2
+            start = [
+                aligned(*own, self.measurements, gravity) for own in zip(before, intervals, between, strict=True)
+            ]
+            departed = left = self._update(start, between, gates, used)
             steps = made = self.predict_together(intervals, left)
             predicted = [step.predicted for step in made]
         here = [[a for a in i.attached if a.keyframe == i.index] for i in intervals]

@@ -28,6 +28,7 @@ class Linearization:
 
     def __init__(self, beginning: Beginning, error: ErrorVector, unknowns: Unknowns) -> None:
         self._beginning, self._error, self._unknowns = beginning, error, unknowns
+        self.size = error.size
 
     def block(self, attached: Sequence[Attached]) -> Block:
         """Measurements of one sensor."""

@@ -35,6 +35,7 @@ from rovgraph.model_aiding import ModelAiding
 from rovgraph.state import State
 
 DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
+SHORTEST_S = 1e-3  # an interval
 LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
@@ -175,8 +176,10 @@ class Assembler:
             elif self._admissible(measurement):
                 insort(self._waiting, self.stamps.placed(measurement), key=_time)
             return []
-        self._samples.add(measurement)
+        again = self._samples.add(measurement)
         done: list[Interval] = []
+        if again:
+            insort(self._waiting, self.stamps.placed(measurement), key=_time)
         if self._index < 0:
             self._before_first(measurement.time)
             done.append(self._close(measurement.time, None))
@@ -239,7 +242,9 @@ class Assembler:
         while self._waiting and self._waiting[0].time <= time:
             m = self._waiting.pop(0)
             done += self._silence(m.time)
-            if m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
+            if m.sensor == "imu":
+                done += [self._close(m.time, None)] if m.time - self._start > SHORTEST_S else []
+            elif m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
                 done.append(self._close(m.time, m))
             else:
                 self._between.append(m)
@@ -252,7 +257,7 @@ class Assembler:
             return []
         done = self._take_until(end)
         self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
-        if end - self._start < 1e-3:
+        if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
             return done
         return [*done, self._close(end, None)]

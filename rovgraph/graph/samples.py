@@ -55,15 +55,21 @@ class Samples:
         self._periods: list[float] = []
         self.longest_step = np.inf
 
-    def add(self, m: Measurement) -> None:
+    def add(self, m: Measurement) -> bool:
         """Take a sample; times must not decrease.
+
+        Returns
+        -------
+        bool : samples were missing before it
 
         Raises
         ------
         InputError : a gap longer than ``imu.max_gap_s``
         """
+        missing = False
         if self._count:
             period = m.time - self.newest
+            missing = period > self.longest_step
             if period > self._config.imu.max_gap_s:
                 raise InputError(
                     f"row {m.row}: the IMU is silent for {period:.1f} s before {m.time:.3f} s, longer than "
@@ -77,6 +83,7 @@ class Samples:
         row = self._rows[self._count]
         row[0], row[1:] = m.time, self._in_body(m.values[:6])
         self._count += 1
+        return missing
 
     @property
     def table(self) -> Array:
@@ -112,7 +119,7 @@ class Samples:
 
     def gap(self, table: Array) -> bool:
         """Whether samples are missing."""
-        return bool(np.diff(table[:, 0]).max() > self.longest_step)
+        return bool(np.diff(table[:, 0]).max(initial=0.0) > self.longest_step)
 
     def integrated(
         self, table: Array, bias: Array, start: float, stops: Array, end: float, learn: bool
@@ -125,7 +132,8 @@ class Samples:
         bias, start, stops, end : as `rovgraph.graph.preintegration.preintegrate` takes them
         learn : its samples tell of the noise
         """
-        bridged = self.gap(table)
+        t = table[:, 0]
+        bridged = self.gap(table[max(int(t.searchsorted(start, side="right")) - 1, 0) : int(t.searchsorted(end)) + 1])
         params = self._bridge if bridged else self._params_for(table) if learn else self.params
         return *preintegrate(params, bias, table, start, stops, end), bridged
 
@@ -178,7 +186,7 @@ class Samples:
 
     def _params_for(self, table: Array) -> gtsam.PreintegrationCombinedParams:
         """The believed noise, or where a knock shakes the samples far more, what they show."""
-        if len(table) < 3:
+        if len(table) < 3 or self.gap(table):
             return self.params
         odd = scatter(table[:, 0], table[:, 1:])
         if self._learn_noise:
