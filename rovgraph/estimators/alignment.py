@@ -15,7 +15,6 @@ from rovgraph.estimators.linearization import Linearization
 from rovgraph.estimators.passage import Gaussian
 from rovgraph.geometry import Array, exp_rotation, identity, skew, transpose
 from rovgraph.graph.assembly import Attached, Interval
-from rovgraph.state import State
 
 HEADINGS = {"mag", "ahrs", "dvl_heading"}
 VAGUE_TILT, VAGUE_HEADING = np.deg2rad(5.0), np.deg2rad(15.0)  # sd from which a tangent does harm
@@ -23,10 +22,18 @@ STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
 AT_REST = 0.2  # share of gravity by which a mean specific force may differ from it and still show where down is
 
 
+def vague(known: Gaussian) -> bool:
+    """Whether tilt or heading is hardly known."""
+    if known.P[0, 0] + known.P[1, 1] + known.P[2, 2] < VAGUE_TILT**2:
+        return False
+    tilt, heading = _variances(known)
+    return tilt > VAGUE_TILT**2 or heading > VAGUE_HEADING**2
+
+
 def aligned(
     known: Gaussian, interval: Interval, between: Sequence[Attached], measurements: Linearization, gravity: float
 ) -> Gaussian:
-    """The keyframe before an interval, levelled and turned if its attitude is vague.
+    """The keyframe before an interval, levelled and turned to its compasses where it is `vague`.
 
     Parameters
     ----------
@@ -36,66 +43,66 @@ def aligned(
     measurements : of the filter
     gravity : [m/s^2]
     """
-    if float(known.P[0, 0] + known.P[1, 1] + known.P[2, 2]) < VAGUE_TILT**2:
-        return known
-    known = _turned(known, _levelling(known, interval, gravity))
+    tilt, heading = _variances(known)
+    if tilt > VAGUE_TILT**2:
+        known = facing(known, _levelled(known, interval, gravity))
     compasses = [a for a in between if a.sensor in HEADINGS]
-    return _turned(known, _turning(known, compasses, measurements)) if compasses else known
+    if compasses and heading > VAGUE_HEADING**2:
+        known = facing(known, _towards(known, compasses, measurements))
+    return known
 
 
-def _levelling(known: Gaussian, interval: Interval, gravity: float) -> Array:
-    """The rotation about n's axes, shape (3,), by which a vague tilt becomes that of the mean specific force."""
-    R_nb, nothing = known.state.R_nb[0], np.zeros(3)
-    tilt = np.diag(R_nb @ known.P[:3, :3] @ R_nb.T)[:2]
-    if interval.pim is None or interval.bridged or tilt.max() < VAGUE_TILT**2:
-        return nothing
+def facing(known: Gaussian, R_nb: Array) -> Gaussian:
+    """The same with another attitude, shape (3, 3); the covariance of attitude stays along the body's axes.
+
+    A velocity that is better known along these axes turns with them.
+    """
+    state, columns = known.state, [0, 1, 2, 6, 7, 8]
+    before, v_n, basis = state.R_nb[0], state.v_n, np.eye(len(known.P))
+    basis[3:6, 3:6] = R_nb.T @ before  # position stays along n's
+    along_body = np.concatenate([skew(v_n[0]) @ before, np.eye(3)], axis=1)
+    if np.trace(along_body @ known.P[np.ix_(columns, columns)] @ along_body.T) < np.trace(known.P[6:9, 6:9]):
+        basis[6:9, 6:9] = turn = R_nb @ before.T
+        v_n = v_n @ turn.T
+    return replace(known, state=replace(state, R_nb=R_nb[None], v_n=v_n), P=basis @ known.P @ basis.T)
+
+
+def _variances(known: Gaussian) -> tuple[float, float]:
+    """Of the tilt, the larger one, and of the heading [rad^2]."""
+    R_nb = known.state.R_nb[0]
+    north, east, down = np.diag(R_nb @ known.P[:3, :3] @ R_nb.T).tolist()
+    return max(north, east), down
+
+
+def _levelled(known: Gaussian, interval: Interval, gravity: float) -> Array:
+    """The attitude whose down is that of the interval's mean specific force, where that can be gravity's."""
+    R_nb = known.state.R_nb[0]
+    if interval.pim is None or interval.bridged:
+        return R_nb
     excess = known.state.bias[0, :3] - interval.pim.biasHat().accelerometer()
     force_n = R_nb @ (interval.pim.deltaVij() / interval.pim.deltaTij() - excess)
-    length = float(np.linalg.norm(force_n))
-    if abs(length / gravity - 1.0) > AT_REST:
-        return nothing
+    if abs(float(np.linalg.norm(force_n)) / gravity - 1.0) > AT_REST:
+        return R_nb
     axis = np.cross(force_n, [0.0, 0.0, -1.0])
     sine = float(np.linalg.norm(axis))
-    return axis * (np.arctan2(sine, -force_n[2]) / sine) if sine > 0.0 else nothing
+    return exp_rotation(axis * (np.arctan2(sine, -force_n[2]) / sine)) @ R_nb if sine > 0.0 else R_nb
 
 
-def _turning(known: Gaussian, compasses: Sequence[Attached], measurements: Linearization) -> Array:
-    """The rotation about n's axes, shape (3,), by which a vague heading becomes the one that compasses make likeliest.
+def _towards(known: Gaussian, compasses: Sequence[Attached], measurements: Linearization) -> Array:
+    """The attitude with the heading that compasses make likeliest.
 
     Headings all around the believed one are tried, calibration and tilt being as sure as they are.
     """
-    P, nothing = known.P[: measurements.size, : measurements.size], np.zeros(3)
-    down_b = known.state.R_nb[0, 2]
-    by_heading = P[:, :3] @ down_b
-    variance = float(down_b @ by_heading[:3])
-    if variance < VAGUE_HEADING**2:
-        return nothing
+    state, P = known.state, known.P[: measurements.size, : measurements.size]
+    by_heading = P[:, :3] @ state.R_nb[0, 2]
+    variance = float(state.R_nb[0, 2] @ by_heading[:3])
     reach = min(REACH_SD * np.sqrt(variance), np.pi)
     angles = np.linspace(-reach, reach, 2 * int(np.ceil(reach / STEP)) + 1)
-    turns = np.column_stack([0.0 * angles, 0.0 * angles, angles])
-    R_nb = exp_rotation(turns) @ known.state.R_nb
-    r, H, _ = measurements.linearize(replace(known.state.at([0] * len(angles)), R_nb=R_nb), [compasses] * len(angles))
+    R_nb = exp_rotation(np.column_stack([0.0 * angles, 0.0 * angles, angles])) @ state.R_nb
+    turned = replace(state.at([0] * len(angles)), R_nb=R_nb)
+    r, H, _ = measurements.linearize(turned, [compasses] * len(angles))
     misfit, by = np.array(r), np.array(H)
     S = by @ (P - np.outer(by_heading, by_heading) / variance) @ transpose(by) + identity(misfit.shape[1])
     nis = (misfit * np.linalg.solve(S, misfit[..., None])[..., 0]).sum(axis=1)
     likeliest = (nis + np.linalg.slogdet(S)[1] + angles**2 / variance).argmin()
-    return np.asarray(turns[likeliest])
-
-
-def _turned(known: Gaussian, turn_n: Array) -> Gaussian:
-    """Turned about n's axes by a rotation vector, shape (3,); the covariance of its attitude stays along the body's.
-
-    A velocity that is better known along the body's axes turns with them.
-    """
-    if not turn_n.any():
-        return known
-    state, turn = known.state, exp_rotation(turn_n)
-    R_nb, v_n = turn @ state.R_nb[0], state.v_n[0]
-    basis = np.eye(len(known.P))
-    basis[3:6, 3:6] = R_nb.T @ state.R_nb[0]  # position stays along n's
-    along_body = np.concatenate([skew(v_n) @ state.R_nb[0], np.eye(3)], axis=1)
-    columns = [0, 1, 2, 6, 7, 8]
-    if np.trace(along_body @ known.P[np.ix_(columns, columns)] @ along_body.T) < np.trace(known.P[6:9, 6:9]):
-        v_n, basis[6:9, 6:9] = turn @ v_n, turn
-    turned = State(R_nb[None], state.p_n, v_n[None], state.bias, state.calibration)
-    return replace(known, state=turned, P=basis @ known.P @ basis.T)
+    return np.asarray(R_nb[likeliest])

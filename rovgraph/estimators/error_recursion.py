@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.config import beliefs
-from rovgraph.estimators.alignment import aligned
+from rovgraph.estimators.alignment import aligned, facing, vague
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.estimators.innovations import Innovations
@@ -136,11 +136,8 @@ class ErrorStateRecursion:
         predicted = before
         if intervals[0].pim is not None:
             between = [[a for a in i.attached if a.keyframe < i.index] for i in intervals]
-            gravity = self.beginning.config.environment.gravity_mps2
-            start = [
-                aligned(*own, self.measurements, gravity) for own in zip(before, intervals, between, strict=True)
-            ]
-            departed = left = self._update(start, between, gates, used)
+            near = [self._aligned(*own) for own in zip(before, intervals, between, gates, strict=True)]
+            departed = left = self._update(near, between, gates, used)
             steps = made = self.predict_together(intervals, left)
             predicted = [step.predicted for step in made]
         here = [[a for a in i.attached if a.keyframe == i.index] for i in intervals]
@@ -231,6 +228,16 @@ class ErrorStateRecursion:
         for a in sighted:
             known = [self._sighted(known[0], a, used[0])]
         return known
+
+    def _aligned(
+        self, known: Gaussian, interval: Interval, between: Sequence[Attached], gates: Gates
+    ) -> Gaussian:
+        """The keyframe before an interval; if its attitude is vague, with the one that its measurements lead to."""
+        if not vague(known):
+            return known
+        near = aligned(known, interval, between, self.measurements, self.beginning.config.environment.gravity_mps2)
+        [after] = self._update([near], [between], [dict(gates)], [[]])
+        return facing(known, after.state.R_nb[0])
 
     def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
         """Whether a measurement lies within its gate."""
