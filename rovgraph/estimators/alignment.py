@@ -27,7 +27,7 @@ def vague(known: Gaussian) -> bool:
     if known.P[0, 0] + known.P[1, 1] + known.P[2, 2] < VAGUE_TILT**2:
         return False
     tilt, heading = _variances(known)
-    return tilt > VAGUE_TILT**2 or heading > VAGUE_HEADING**2
+    return bool(tilt > VAGUE_TILT**2 or heading > VAGUE_HEADING**2)
 
 
 def aligned(
@@ -76,7 +76,7 @@ def _variances(known: Gaussian) -> tuple[float, float]:
 
 def _levelled(known: Gaussian, interval: Interval, gravity: float) -> Array:
     """The attitude whose down is that of the interval's mean specific force, where that can be gravity's."""
-    R_nb = known.state.R_nb[0]
+    R_nb: Array = known.state.R_nb[0]
     if interval.pim is None or interval.bridged:
         return R_nb
     excess = known.state.bias[0, :3] - interval.pim.biasHat().accelerometer()
@@ -85,7 +85,7 @@ def _levelled(known: Gaussian, interval: Interval, gravity: float) -> Array:
         return R_nb
     axis = np.cross(force_n, [0.0, 0.0, -1.0])
     sine = float(np.linalg.norm(axis))
-    return exp_rotation(axis * (np.arctan2(sine, -force_n[2]) / sine)) @ R_nb if sine > 0.0 else R_nb
+    return np.asarray(exp_rotation(axis * (np.arctan2(sine, -force_n[2]) / sine)) @ R_nb) if sine > 0.0 else R_nb
 
 
 def _towards(known: Gaussian, compasses: Sequence[Attached], measurements: Linearization) -> Array:

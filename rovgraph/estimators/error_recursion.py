@@ -229,9 +229,7 @@ class ErrorStateRecursion:
             known = [self._sighted(known[0], a, used[0])]
         return known
 
-    def _aligned(
-        self, known: Gaussian, interval: Interval, between: Sequence[Attached], gates: Gates
-    ) -> Gaussian:
+    def _aligned(self, known: Gaussian, interval: Interval, between: Sequence[Attached], gates: Gates) -> Gaussian:
         """The keyframe before an interval; if its attitude is vague, with the one that its measurements lead to."""
         if not vague(known):
             return known
