@@ -83,7 +83,7 @@ def interval_of(samples: Array, seconds: float, bias: Array, config: Config) -> 
     noise = config.imu.noise
     params = preintegration_params(config, noise.acc, noise.gyr)
     pim, _ = preintegrate(params, bias, samples, 0.0, np.empty(0), seconds)
-    return Interval(1, seconds, 0, np.zeros(3), 0.0, pim, False, [])
+    return Interval(1, seconds, 0, np.zeros(3), 0.0, pim, 0.0, [])
 
 
 def difference(state: State, other: State) -> Array:

@@ -158,7 +158,7 @@ class ErrorStateRecursion:
             assert interval.pim is not None
             duration = interval.pim.deltaTij()
             Q[k, :size, :size] = self._walk * duration
-            if interval.bridged and duration > BLIND_S:
+            if interval.gap_s > BLIND_S:
                 states[k] = coasted(known.state, states[k], duration)
                 F[k, :15, :15], own_Q[k] = coasting(known.state, states[k], duration, known.P)
             if interval.felt is not None:

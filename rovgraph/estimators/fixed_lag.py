@@ -175,7 +175,7 @@ class FixedLag:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         index, time, segment, rate_sd = state["keyframe"]
-        interval = Interval(index, time, segment, state["rate_b"], rate_sd, None, False, [])
+        interval = Interval(index, time, segment, state["rate_b"], rate_sd, None, 0.0, [])
         here = State(*(state[name] for name in ("R_nb", "p_n", "v_n", "bias", "calibration")))
         places = tuple(Place(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         assembler = self._fresh()

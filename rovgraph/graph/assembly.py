@@ -104,7 +104,7 @@ class Interval:
     rate_b, rate_sd : ndarray, shape (3,), float: measured rate at the keyframe, bias still
         in it, and its noise [rad/s]
     pim : preintegrated motion, None for the first keyframe
-    bridged : there was a gap in the IMU
+    gap_s : how long the IMU was silent, where that lies in the interval or reaches into it, or 0 [s]
     attached : measurements at the keyframe itself, and between the keyframe before and it
     felt : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
     """
@@ -115,9 +115,14 @@ class Interval:
     rate_b: Array
     rate_sd: float
     pim: gtsam.PreintegratedCombinedMeasurements | None
-    bridged: bool
+    gap_s: float
     attached: list[Attached]
     felt: Array | None = None
+
+    @property
+    def bridged(self) -> bool:
+        """Whether samples of the IMU are missing."""
+        return self.gap_s > 0.0
 
 
 @dataclass
@@ -232,9 +237,9 @@ class Assembler:
         """
         force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
         table = self._samples.ahead(samples, time, np.concatenate([force, np.zeros(3)]) + state.bias[0])
-        pim, _, bridged = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
+        pim, _, gap_s = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
         rate_b, rate_sd = self._samples.rate(table, time)
-        return Interval(self._index + 1, time, self._segment, rate_b, rate_sd, pim, bridged, [])
+        return Interval(self._index + 1, time, self._segment, rate_b, rate_sd, pim, gap_s, [])
 
     def _take_until(self, time: float) -> list[Interval]:
         """Place what has waited for the IMU up to a time."""
@@ -297,10 +302,10 @@ class Assembler:
         """Make a keyframe at ``time`` and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
-        pim, bridged = None, False
+        pim, gap_s = None, 0.0
         attached: list[Attached] = []
         if self._index >= 0:
-            pim, bridged, attached = self._integrate(samples, every, time)
+            pim, gap_s, attached = self._integrate(samples, every, time)
         before = self._start
         self._index, self._start, self._between = self._index + 1, time, []
         if time - self._segment_start >= self.config.graph.segment_s:
@@ -310,11 +315,11 @@ class Assembler:
             attached += self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd, every)
         scaled = self._felt(samples, before, time) if pim is not None else None
         self._samples.forget(time, self._around)
-        return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, bridged, attached, scaled)
+        return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, gap_s, attached, scaled)
 
     def _integrate(
         self, samples: Array, every: Array, time: float
-    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, bool, list[Attached]]:
+    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, float, list[Attached]]:
         taken, seen = [], set()
         for m in self._between:
             if m.sensor not in seen:
@@ -325,11 +330,11 @@ class Assembler:
             aiding = self._aiding.between(self._start, time, samples, lambda t: self._samples.rate(samples, t)[0])
             taken = sorted(taken + [Placed(*m, m.time) for m in aiding], key=_time)
         stops = np.array([m.time for m in taken])
-        pim, motions, bridged = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
+        pim, motions, gap_s = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
         attached: list[Attached] = []
         for m, motion in zip(taken, motions, strict=True):
             attached += self._attach(m, motion, *self._rate_for(m, samples), every)
-        return pim, bridged, attached
+        return pim, gap_s, attached
 
     def _rate_for(self, m: Placed, samples: Array) -> tuple[Array, float]:
         """The rate, for those instruments that it reaches: by a lever arm, or by the motion of a turning body."""

@@ -1,4 +1,4 @@
-"""Motion while neither the IMU nor the DVL says anything.
+"""Motion while the IMU says nothing.
 
 Integrating an interpolated specific force needs the attitude, and an attitude that nobody
 measures would turn gravity into motion: after five seconds, by tens of metres, of which no
@@ -13,7 +13,7 @@ from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, transpose
 from rovgraph.graph.preintegration import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.state import State
 
-BLIND_S = 0.75  # an interval with a gap in the IMU that is longer is coasted through
+BLIND_S = 0.75  # intervals in a gap of the IMU that is longer are coasted through
 TILT_SD = np.deg2rad(8.0)  # of a vehicle that rights itself, against its tilt before
 
 

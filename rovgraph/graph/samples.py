@@ -117,14 +117,15 @@ class Samples:
             rows.append(np.concatenate([[time], at_rest])[None])
         return np.concatenate(rows)
 
-    def gap(self, table: Array) -> bool:
-        """Whether samples are missing."""
-        return bool(np.diff(table[:, 0]).max(initial=0.0) > self.longest_step)
+    def gap(self, table: Array) -> float:
+        """The longest time without samples that is longer than it should be, or 0 [s]."""
+        longest = float(np.diff(table[:, 0]).max(initial=0.0))
+        return longest if longest > self.longest_step else 0.0
 
     def integrated(
         self, table: Array, bias: Array, start: float, stops: Array, end: float, learn: bool
-    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, list[Snapshot], bool]:
-        """The motion from one time to another, that to every stop on the way, and whether a gap was bridged.
+    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, list[Snapshot], float]:
+        """The motion from one time to another, that to every stop on the way, and the gap that was bridged [s].
 
         Parameters
         ----------
@@ -133,9 +134,9 @@ class Samples:
         learn : its samples tell of the noise
         """
         t = table[:, 0]
-        bridged = self.gap(table[max(int(t.searchsorted(start, side="right")) - 1, 0) : int(t.searchsorted(end)) + 1])
-        params = self._bridge if bridged else self._params_for(table) if learn else self.params
-        return *preintegrate(params, bias, table, start, stops, end), bridged
+        gap_s = self.gap(table[max(int(t.searchsorted(start, side="right")) - 1, 0) : int(t.searchsorted(end)) + 1])
+        params = self._bridge if gap_s else self._params_for(table) if learn else self.params
+        return *preintegrate(params, bias, table, start, stops, end), gap_s
 
     def rate(self, table: Array, time: float) -> tuple[Array, float]:
         """Rate at a time, shape (3,), and the sd of its noise.
