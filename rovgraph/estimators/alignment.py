@@ -17,7 +17,7 @@ from rovgraph.geometry import Array, exp_rotation, identity, skew, transpose
 from rovgraph.graph.assembly import Attached, Interval
 
 HEADINGS = {"mag", "ahrs", "dvl_heading"}
-VAGUE_TILT, VAGUE_HEADING = np.deg2rad(5.0), np.deg2rad(15.0)  # sd from which a tangent does harm
+VAGUE_TILT, VAGUE_HEADING = np.deg2rad(4.0), np.deg2rad(10.0)  # sd from which a tangent does harm
 STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
 AT_REST = 0.2  # share of gravity by which a mean specific force may differ from it and still show where down is
 

@@ -136,7 +136,7 @@ class ErrorStateRecursion:
         predicted = before
         if intervals[0].pim is not None:
             between = [[a for a in i.attached if a.keyframe < i.index] for i in intervals]
-            near = [self._aligned(*own) for own in zip(before, intervals, between, gates, strict=True)]
+            near = [self._aligned(*own) for own in zip(before, intervals, between, strict=True)]
             departed = left = self._update(near, between, gates, used)
             steps = made = self.predict_together(intervals, left)
             predicted = [step.predicted for step in made]
@@ -218,10 +218,10 @@ class ErrorStateRecursion:
         self,
         before: Sequence[Gaussian],
         attached: Sequence[Sequence[Attached]],
-        gates: Sequence[Gates],
+        gates: Sequence[Gates | None],
         used: Sequence[list[Used]],
     ) -> Sequence[Gaussian]:
-        """The estimates corrected by what belongs to their keyframes, places last."""
+        """The estimates corrected by what belongs to their keyframes, places last; without gates all of it counts."""
         known = self._measured(before, [[a for a in own if a.sighting is None] for own in attached], gates, used)
         sighted = [a for own in attached for a in own if a.sighting is not None]
         assert not sighted or len(known) == 1
@@ -229,12 +229,12 @@ class ErrorStateRecursion:
             known = [self._sighted(known[0], a, used[0])]
         return known
 
-    def _aligned(self, known: Gaussian, interval: Interval, between: Sequence[Attached], gates: Gates) -> Gaussian:
+    def _aligned(self, known: Gaussian, interval: Interval, between: Sequence[Attached]) -> Gaussian:
         """The keyframe before an interval; if its attitude is vague, with the one that its measurements lead to."""
         if not vague(known):
             return known
         near = aligned(known, interval, between, self.measurements, self.beginning.config.environment.gravity_mps2)
-        [after] = self._update([near], [between], [dict(gates)], [[]])
+        [after] = self._update([near], [between], [None], [[]])
         return facing(known, after.state.R_nb[0])
 
     def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
@@ -265,7 +265,7 @@ class ErrorStateRecursion:
         self,
         before: Sequence[Gaussian],
         attached: Sequence[Sequence[Attached]],
-        gates: Sequence[Gates],
+        gates: Sequence[Gates | None],
         used: Sequence[list[Used]],
     ) -> Sequence[Gaussian]:
         """The estimates corrected by measurements that belong to their keyframes, of no places."""
@@ -279,12 +279,13 @@ class ErrorStateRecursion:
         for k, (one, own) in enumerate(zip(before, attached, strict=True)):
             for j, (a, part) in enumerate(zip(own, parts[k], strict=True)):
                 nis = said.nis(k, part)
-                if self._admit(a, nis, gates[k]):
+                shut = gates[k]
+                if shut is None or self._admit(a, nis, shut):
                     admitted.setdefault(k, []).append((j, a, nis))
                     continue
                 used[k].append(Used(a, one.state, nis, 0.0))
                 instrument = self.beginning.instruments[a.sensor]
-                if a.time - gates[k][a.sensor] > instrument.readmit_s:
+                if a.time - shut[a.sensor] > instrument.readmit_s:
                     said.doubt(k, part, padded(self._seen(instrument.model, one.state).T, known.P.shape[1]).T)
                 said.leave_out(k, part)
         after = [one if k in admitted else replace(one, P=said.P(k)) for k, one in enumerate(before)]
