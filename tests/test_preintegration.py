@@ -186,6 +186,25 @@ def test_keyframes_stand_at_the_pings_within_a_gap_of_the_imu():
     assert np.isin(pings[(pings > 20.1) & (pings < 22.9)], times).all()
 
 
+def test_a_keyframe_stands_where_samples_come_again_and_what_follows_is_whole():
+    """What is measured after a gap would otherwise be carried through it from the keyframe before."""
+    case, log = silent(3.0)
+    intervals = batch(log, case.config).intervals
+    again = log["imu"].time[log["imu"].time > 20.0][0]
+    [at] = [k for k, i in enumerate(intervals) if i.time == again]
+    assert intervals[at].gap_s == pytest.approx(3.02, abs=0.02)
+    assert intervals[at + 1].gap_s == 0.0
+    carried = [a.motion.dt for a in intervals[at + 1].attached if a.keyframe == at]
+    assert carried and max(carried) < 0.2
+
+
+def test_every_interval_in_a_gap_knows_how_long_it_is():
+    case, log = silent(3.0)
+    inside = [i for i in batch(log, case.config).intervals if 20.1 < i.time <= 23.0]
+    assert len(inside) > 5
+    assert [i.gap_s for i in inside] == pytest.approx([3.02] * len(inside), abs=0.02)
+
+
 def test_a_gap_longer_than_allowed_is_refused_with_row_and_remedy():
     case, log = silent(3.0, max_gap_s=2.0)
     after = int(np.searchsorted(log["imu"].time, 21.0))
