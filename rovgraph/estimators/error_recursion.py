@@ -37,7 +37,6 @@ from rovgraph.estimators.remembered_places import (
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import Array, identities, transpose
 from rovgraph.graph.assembly import Attached, Interval
-from rovgraph.graph.coasting import BLIND_S, coasted, coasting
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.scale import COLUMNS, SCALES
@@ -154,13 +153,9 @@ class ErrorStateRecursion:
         states = [predict(interval, known.state) for interval, known in zip(intervals, before, strict=True)]
         F, Q = identities(*P.shape[:2]), np.zeros_like(P)
         F[:, :15, :15], own_Q = transitions(intervals, [known.state for known in before], states)
-        for k, (interval, known) in enumerate(zip(intervals, before, strict=True)):
+        for k, interval in enumerate(intervals):
             assert interval.pim is not None
-            duration = interval.pim.deltaTij()
-            Q[k, :size, :size] = self._walk * duration
-            if interval.gap_s > BLIND_S:
-                states[k] = coasted(known.state, states[k], duration)
-                F[k, :15, :15], own_Q[k] = coasting(known.state, states[k], duration, known.P)
+            Q[k, :size, :size] = self._walk * interval.pim.deltaTij()
             if interval.felt is not None:
                 for name in set(SCALES) & set(self.error.columns):  # they move as the bias does, but for itself
                     F[k, :9, self.error.columns[name]] = F[k, :9, 9:15] @ interval.felt[:, COLUMNS[name]]

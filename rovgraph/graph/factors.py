@@ -12,6 +12,7 @@ import numpy as np
 from rovgraph.calibration import Belief
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Interval
+from rovgraph.graph.coasting import blind, coasted, coasting_factor
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.scale import SCALES, biased, scaled_factor
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
@@ -67,9 +68,11 @@ def unseen_place(number: int) -> Factor:
 
 
 def motion(interval: Interval, unknowns: Unknowns) -> list[Factor]:
-    """The IMU's factor between the keyframe before and the one that ends the interval."""
+    """The factor between the keyframe before and the one that ends the interval: the IMU's, or of coasting."""
     if interval.pim is None:
         return []
+    if blind(interval):
+        return [coasting_factor(interval)]
     if interval.felt is None:
         return [unscaled(interval)]
     keys = {name: unknowns.key(name, interval.segment) for name in SCALES if name in unknowns.walks}
@@ -100,13 +103,15 @@ def drift(unknowns: Unknowns, segment: int, duration: float) -> list[Factor]:
 
 
 def predict(interval: Interval, state: State) -> State:
-    """The state at the end of an interval, from the IMU alone.
+    """The state at the end of an interval, from the IMU alone, or from nothing while it is silent.
 
     Parameters
     ----------
     interval : with motion
     state : State of one epoch, of the keyframe before
     """
+    if blind(interval):
+        return coasted(interval, state)
     assert interval.pim is not None
     felt = state if interval.felt is None else biased(state, interval.felt[None])
     bias = gtsam.imuBias.ConstantBias(felt.bias[0, :3], felt.bias[0, 3:])

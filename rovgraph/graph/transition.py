@@ -1,6 +1,6 @@
 """The IMU's motion over intervals as linear transitions with noise, for Kalman filters.
 
-Taken from the graph's own factor, so that a filter believes of the IMU exactly what the graph does.
+Taken from the graph's own factors, so that a filter believes of the IMU exactly what the graph does.
 """
 
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ import numpy as np
 
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.assembly import Interval
+from rovgraph.graph.coasting import blind, coasting
 from rovgraph.graph.factors import unscaled
 from rovgraph.graph.scale import biased
 from rovgraph.graph.values import gtsam_state
@@ -33,6 +34,9 @@ def transitions(intervals: Sequence[Interval], before: Sequence[State], after: S
     A = np.zeros((2, len(intervals), 15, 15)).swapaxes(2, 3)  # columns in a row, where GTSAM writes them
     S = np.empty((len(intervals), 15, 15))
     for k, (interval, one, other) in enumerate(zip(intervals, before, after, strict=True)):
+        if blind(interval):
+            _, A[0, k], A[1, k], S[k] = coasting(interval, one, other)
+            continue
         assert interval.pim is not None
         if interval.felt is not None:
             one, other = biased(one, interval.felt[None]), biased(other, interval.felt[None])
