@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dives import batch, falcon, kept, position_errors, renewed, simulated, started
+from dives import batch, falcon, incremental, kept, position_errors, renewed, simulated, started
 
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
 from rovgraph.graph.assembly import Interval
@@ -112,3 +112,10 @@ def test_a_silence_of_everything_bends_neither_the_smoothed_track_nor_the_filter
         assert error.max() < 0.5 * seconds
         assert (error < 3.0 * sd + 0.05).all()
         assert sd.max() < 1.0 * seconds
+
+
+def test_isam2_and_the_batch_smoother_coast_alike():
+    case = simulated(falcon(imu={"max_gap_s": 60.0}), 50.0, seed=3, dvl_rate=4.0)
+    log, config = quiet(case.log, 20.0, 6.0), started(case)
+    a, b = (make(log, config).solve().trajectory for make in (batch, incremental))
+    np.testing.assert_allclose(a.p_n, b.p_n, atol=0.01)

@@ -26,8 +26,8 @@ from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 BLIND_S = 0.75  # intervals in a gap of the IMU that is longer are coasted through
 TILT_SD = np.deg2rad(8.0)  # of a vehicle that rights itself
-ENDS = [6, 9, 15, 21, 24]  # of pose, velocity, bias of two keyframes side by side
 RIGHTS_ITSELF_S = 2.0 * TILT_SD**2 / BRIDGE_GYR**2  # so that at first it tilts as any ROV turns
+_ENDS = [6, 9, 15, 21, 24]  # of pose, velocity, bias of two keyframes side by side
 
 
 def blind(interval: Interval) -> bool:
@@ -93,7 +93,7 @@ def coasting_factor(interval: Interval) -> gtsam.CustomFactor:
         before, after = state(values, keys[0], keys[1], keys[4]), state(values, keys[2], keys[3], keys[5])
         residual, A_i, A_j = coasting(interval, before, after)[:3]
         if H is not None:
-            pose_i, velocity_i, bias_i, pose_j, velocity_j, bias_j = np.split(np.hstack([A_i, A_j]), ENDS, axis=1)
+            pose_i, velocity_i, bias_i, pose_j, velocity_j, bias_j = np.split(np.hstack([A_i, A_j]), _ENDS, axis=1)
             for place, part in enumerate((pose_i, velocity_i, pose_j, velocity_j, bias_i, bias_j)):
                 H[place] = part
         return residual

@@ -93,7 +93,7 @@ def preintegrate(
     """
     t = imu[:, 0]
     inside = t[(t > start) & (t < end)]
-    grid = np.array(sorted({start, end, *inside.tolist(), *stops.tolist()}))  # np.unique takes five times as long
+    grid = np.array(sorted({start, end, *inside.tolist(), *stops.tolist()}))  # half of np.unique's time
     middle, dt = 0.5 * (grid[1:] + grid[:-1]), np.diff(grid)
     signal = _between(imu, middle)
     acc, gyr = signal[:, :3], signal[:, 3:]
