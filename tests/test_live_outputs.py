@@ -360,16 +360,16 @@ def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(
     quick, received = socket.create_connection(("127.0.0.1", port)), []
     reading = threading.Thread(target=lambda: received.extend(lines_of(quick, 1000)))
     reading.start()
-    slowest = 0.0
+    took = []
     for k in range(1000):
         begin = time.monotonic()
         out.send(at(k))
-        slowest = max(slowest, time.monotonic() - begin)
+        took.append(time.monotonic() - begin)
         time.sleep(0.0005)
     reading.join(5.0)
     assert [r["time"] for r in received] == list(range(1000))
-    assert slowest < 0.2
     assert out.dropped > 500
+    assert sum(t > 0.2 for t in took) < 10, "waits for the reader: more than 500 times, where a busy machine does once"
     assert [kind for _, kind, _ in said] == ["slow reader"]
     closing = threading.Thread(target=out.close)
     closing.start()
