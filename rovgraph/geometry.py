@@ -109,6 +109,21 @@ def rpy_from_matrix(R: ArrayLike) -> Array:
     )
 
 
+def level_from_force(force_b: Array) -> Array:
+    """Roll and pitch [rad] at which a specific force is that of a vehicle at rest.
+
+    Parameters
+    ----------
+    force_b : ndarray, shape (..., 3), body axes, any unit
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+    """
+    x, y, z = force_b[..., 0], force_b[..., 1], force_b[..., 2]
+    return np.stack([np.arctan2(-y, -z), np.arctan2(x, np.hypot(y, z))], axis=-1)
+
+
 def rpy_jacobian(rpy: ArrayLike) -> Array:
     """Derivative of roll, pitch, yaw with respect to a rotation vector in n.
 

@@ -16,6 +16,7 @@ from rovgraph.model_aiding import ModelAiding
 from rovgraph.sensors import CompassHeading, DvlVelocity, MagneticField, PlaceOffset, Position, SensorModel
 from rovgraph.vehicle import Hydrodynamics
 
+HEADING_STREAMS = ("mag", "ahrs", "dvl_heading")  # log streams that give heading, in order
 DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
 
 
@@ -63,7 +64,7 @@ def heading_sources(config: Config, available: set[str]) -> list[str]:
         wanted = [stream[s] for s in config.heading.sources]
     else:
         wanted = ["mag" if "mag" in available else "ahrs", "dvl_heading"]
-    return [s for s in ("mag", "ahrs", "dvl_heading") if s in wanted and s in available]
+    return [s for s in HEADING_STREAMS if s in wanted and s in available]
 
 
 def instruments(config: Config, origin_b: ArrayLike = (0.0, 0.0, 0.0)) -> dict[str, Instrument]:

@@ -66,6 +66,14 @@ def kept(log: Log, sensor: str, keep: Array) -> Log:
     return Log(log.source, {**log.streams, sensor: stream}, log.origin)
 
 
+def interrupted(log: Log, begin: float, seconds: float, *sensors: str) -> Log:
+    """A log in which some sensors, or all, are silent for a while."""
+    for sensor in sensors or tuple(log.sensors):
+        time = log[sensor].time
+        log = kept(log, sensor, (time < begin) | (time >= begin + seconds))
+    return log
+
+
 def level_log(seconds: float, acc: Array, gyr: Array, rate: float = 100.0, **sensors: tuple[Array, Array]) -> Log:
     """A log of an IMU with constant signals, and other sensors as ``name=(time, data)``."""
     time = np.round(np.arange(int(seconds * rate) + 1) / rate, 4)

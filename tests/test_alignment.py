@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dives import attitude_errors, falcon, fed, position_errors, simulated
+from dives import attitude_errors, falcon, fed, interrupted, position_errors, simulated
 
 import rovgraph.estimators.alignment as alignment
 from rovgraph.estimators.alignment import aligned, facing, vague
 from rovgraph.estimators.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rpy_from_matrix
-from rovgraph.log import Log
 
 GRAVITY = 9.81
 
@@ -93,15 +92,6 @@ def test_a_velocity_that_is_known_in_n_alone_does_not_turn(met):
     turned = facing(lost, exp_rotation(np.array([0.0, 0.0, 1.2])) @ lost.state.R_nb[0])
     np.testing.assert_array_equal(turned.state.v_n, lost.state.v_n)
     np.testing.assert_array_equal(turned.P[6:9, 6:9], lost.P[6:9, 6:9])
-
-
-def interrupted(log: Log, begin: float, seconds: float, *sensors: str) -> Log:
-    """A log in which some sensors are silent for a while."""
-    streams = {}
-    for name, stream in log.streams.items():
-        away = (stream.time >= begin) & (stream.time < begin + seconds) & (name in sensors)
-        streams[name] = stream.take(~away)
-    return Log(log.source, streams, log.origin)
 
 
 EVERY = ("imu", "dvl", "mag", "dvl_heading", "depth")

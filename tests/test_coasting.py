@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dives import batch, falcon, incremental, kept, position_errors, renewed, simulated, started
+from dives import batch, falcon, incremental, interrupted, position_errors, renewed, simulated, started
 
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
 from rovgraph.graph.assembly import Interval
@@ -10,7 +10,6 @@ from rovgraph.graph.coasting import RIGHTS_ITSELF_S, TILT_SD, blind, coasted, co
 from rovgraph.graph.preintegration import BRIDGE_ACC, BRIDGE_GYR, preintegrate, preintegration_params
 from rovgraph.graph.transition import transitions
 from rovgraph.graph.values import state_values
-from rovgraph.log import Log
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 SECONDS = 0.9
@@ -94,18 +93,11 @@ def test_a_tilt_that_is_as_vague_as_a_vehicles_stays_so(interval):
     assert np.sqrt(P[2, 2]) == pytest.approx(BRIDGE_GYR * np.sqrt(10 * SECONDS), rel=1e-3)
 
 
-def quiet(log: Log, begin: float, seconds: float) -> Log:
-    for sensor in log.sensors:
-        time = log[sensor].time
-        log = kept(log, sensor, (time < begin) | (time >= begin + seconds))
-    return log
-
-
 @pytest.mark.parametrize("seconds", [3.0, 9.0])
 def test_a_silence_of_everything_bends_neither_the_smoothed_track_nor_the_filtered_one(seconds):
     """Bridged by an interpolated specific force both were tens of metres off after nine seconds."""
     case = simulated(falcon(imu={"max_gap_s": 60.0}), 60.0, seed=3, dvl_rate=4.0)
-    log, config = quiet(case.log, 20.0, seconds), started(case)
+    log, config = interrupted(case.log, 20.0, seconds), started(case)
     for estimate in (batch(log, config).solve(), renewed(log, config).solve()):
         error = position_errors(estimate.trajectory, case)
         sd = np.sqrt(np.trace(estimate.trajectory.cov_p, axis1=1, axis2=2))
@@ -116,6 +108,6 @@ def test_a_silence_of_everything_bends_neither_the_smoothed_track_nor_the_filter
 
 def test_isam2_and_the_batch_smoother_coast_alike():
     case = simulated(falcon(imu={"max_gap_s": 60.0}), 50.0, seed=3, dvl_rate=4.0)
-    log, config = quiet(case.log, 20.0, 6.0), started(case)
+    log, config = interrupted(case.log, 20.0, 6.0), started(case)
     a, b = (make(log, config).solve().trajectory for make in (batch, incremental))
     np.testing.assert_allclose(a.p_n, b.p_n, atol=0.01)

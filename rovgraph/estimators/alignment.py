@@ -1,9 +1,10 @@
 """Where to linearise an attitude that is hardly known, as after a silence of all sensors.
 
 A heading that may be off by half a right angle cannot be corrected along a tangent: a magnetic field
-that turns by forty degrees there grows by a third, which the filter would take for hard iron and
+that turns by forty degrees there grows by a fifth, which the filter would take for hard iron and
 tilt. So gravity and the compasses are looked at first, and the estimate is turned to where they fit.
-That is no measurement: the covariance stays, and they enter afterwards as they always do.
+That is no measurement: the covariance stays, and they enter afterwards as they always do. It is what the
+iterated Kalman filter does (Bell and Cathey 1993), for the attitude alone, and begun where it can converge.
 """
 
 from collections.abc import Sequence
@@ -13,10 +14,19 @@ import numpy as np
 
 from rovgraph.estimators.linearization import Linearization
 from rovgraph.estimators.passage import Gaussian
-from rovgraph.geometry import Array, exp_rotation, identity, skew, transpose
+from rovgraph.geometry import (
+    Array,
+    exp_rotation,
+    identity,
+    level_from_force,
+    matrix_from_rpy,
+    rpy_from_matrix,
+    skew,
+    transpose,
+)
 from rovgraph.graph.assembly import Attached, Interval
+from rovgraph.instruments import HEADING_STREAMS
 
-HEADINGS = {"mag", "ahrs", "dvl_heading"}
 VAGUE_TILT, VAGUE_HEADING = np.deg2rad(4.0), np.deg2rad(10.0)  # sd from which a tangent does harm
 STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
 AT_REST = 0.2  # share of gravity by which a mean specific force may differ from it and still show where down is
@@ -46,7 +56,7 @@ def aligned(
     tilt, heading = _variances(known)
     if tilt > VAGUE_TILT**2:
         known = facing(known, _levelled(known, interval, gravity))
-    compasses = [a for a in between if a.sensor in HEADINGS]
+    compasses = [a for a in between if a.sensor in HEADING_STREAMS]
     if compasses and heading > VAGUE_HEADING**2:
         known = facing(known, _towards(known, compasses, measurements))
     return known
@@ -80,12 +90,10 @@ def _levelled(known: Gaussian, interval: Interval, gravity: float) -> Array:
     if interval.pim is None or interval.bridged:
         return R_nb
     excess = known.state.bias[0, :3] - interval.pim.biasHat().accelerometer()
-    force_n = R_nb @ (interval.pim.deltaVij() / interval.pim.deltaTij() - excess)
-    if abs(float(np.linalg.norm(force_n)) / gravity - 1.0) > AT_REST:
+    force_b = interval.pim.deltaVij() / interval.pim.deltaTij() - excess
+    if abs(float(np.linalg.norm(force_b)) / gravity - 1.0) > AT_REST:
         return R_nb
-    axis = np.cross(force_n, [0.0, 0.0, -1.0])
-    sine = float(np.linalg.norm(axis))
-    return np.asarray(exp_rotation(axis * (np.arctan2(sine, -force_n[2]) / sine)) @ R_nb) if sine > 0.0 else R_nb
+    return matrix_from_rpy([*level_from_force(force_b), rpy_from_matrix(R_nb)[2]])
 
 
 def _towards(known: Gaussian, compasses: Sequence[Attached], measurements: Linearization) -> Array:

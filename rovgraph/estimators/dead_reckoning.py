@@ -13,6 +13,7 @@ from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
 from rovgraph.estimators.initialise import Beginning
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
 from rovgraph.graph.assembly import Interval
+from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.sensors import dvl_mount
 from rovgraph.state import State
 
@@ -53,7 +54,7 @@ def dead_reckon(intervals: Sequence[Interval], beginning: Beginning, calibration
 
 
 def _compass(beginning: Beginning) -> str | None:
-    sources: list[str] = [s for s in ("mag", "ahrs", "dvl_heading") if s in beginning.instruments]
+    sources: list[str] = [s for s in HEADING_STREAMS if s in beginning.instruments]
     return next(iter(trusted_first(beginning.config, sources)), None)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
-from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix
+from rovgraph.geometry import Array, level_from_force, matrix_from_rpy, rpy_from_matrix
 from rovgraph.graph.factors import Start
 from rovgraph.graph.noise_floor import NOISIER
 from rovgraph.graph.preintegration import scatter
@@ -200,9 +200,9 @@ def _attitude(
     assumptions: list[str],
 ) -> tuple[Array, Array]:
     """R_nb of the first epoch and the sd of roll, pitch, yaw."""
-    start, f_b = config.start, first.force_b
-    roll = np.arctan2(-f_b[1], -f_b[2]) if start.roll_deg is None else np.deg2rad(start.roll_deg)
-    pitch = np.arctan2(f_b[0], np.hypot(f_b[1], f_b[2])) if start.pitch_deg is None else np.deg2rad(start.pitch_deg)
+    start = config.start
+    stated, felt = (start.roll_deg, start.pitch_deg), level_from_force(first.force_b).tolist()
+    roll, pitch = (own if said is None else float(np.deg2rad(said)) for said, own in zip(stated, felt, strict=True))
     tilt_sd = np.deg2rad(start.tilt_sd_deg)
     if not first.quiet and (start.roll_deg is None or start.pitch_deg is None):
         tilt_sd = max(tilt_sd, MOVING_TILT_SD)

@@ -24,6 +24,10 @@ class Linearization:
     beginning : instruments and configuration
     error : layout of the error
     unknowns : what of the calibration is estimated
+
+    Attributes
+    ----------
+    size : length of the error
     """
 
     def __init__(self, beginning: Beginning, error: ErrorVector, unknowns: Unknowns) -> None:

@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-from rovgraph.estimators.remembered_places import (
-    Place,
-)
+from rovgraph.estimators.remembered_places import Place
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Attached
 from rovgraph.state import State

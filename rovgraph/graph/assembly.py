@@ -181,10 +181,9 @@ class Assembler:
             elif self._admissible(measurement):
                 insort(self._waiting, self.stamps.placed(measurement), key=_time)
             return []
-        again = self._samples.add(measurement)
-        done: list[Interval] = []
-        if again:
+        if self._samples.add(measurement):  # after a gap: a keyframe here, so that nothing is carried through it
             insort(self._waiting, self.stamps.placed(measurement), key=_time)
+        done: list[Interval] = []
         if self._index < 0:
             self._before_first(measurement.time)
             done.append(self._close(measurement.time, None))

@@ -4,7 +4,7 @@ Integrating an interpolated specific force needs the attitude, and an attitude t
 measures would turn gravity into motion: after five seconds, by tens of metres, of which no
 linear filter recovers. A vehicle that is heavy below and light above does not roll over
 meanwhile. So it is taken to go on as it went, with a velocity that walks, a heading that
-walks, and a tilt that rights itself:
+walks, and a tilt that rights itself, a first-order Gauss-Markov process (Gelb 1974):
 
     tilt_j = a tilt_i + w,  a = exp(-dt / RIGHTS_ITSELF_S),  var w = (1 - a^2) TILT_SD^2
     yaw_j = yaw_i + dyaw + w,  p_j = p_i + dt v_i + w,  v_j = v_i + w,  bias_j = bias_i + w

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rovgraph.geometry import Array
+from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.live.solution import Event
 from rovgraph.log import Measurement
 
@@ -25,7 +26,6 @@ FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sen
 TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
 LONGEST_STEP_S = 1.0  # of the gyro, over which a turn is reckoned
 OCCASIONAL = {"place"}  # sensors that speak when there is something to be seen
-HEADINGS = {"ahrs", "dvl_heading", "mag"}
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Faults:
         if m.sensor == "dvl":
             return self._ping(m, watch)
         frozen = watch.equal >= FROZEN.get(m.sensor, np.inf) or (
-            watch.equal > 2 and m.sensor in HEADINGS and np.abs(self._turned - watch.turned).max() > TURNED
+            watch.equal > 2 and m.sensor in HEADING_STREAMS and np.abs(self._turned - watch.turned).max() > TURNED
         )
         return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
 

@@ -13,7 +13,7 @@ import numpy as np
 from rovgraph.calibration import Belief
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, matrix_from_rpy
+from rovgraph.geometry import Array, level_from_force, matrix_from_rpy
 from rovgraph.log import Log
 from rovgraph.trajectory import Trajectory
 
@@ -48,7 +48,7 @@ def known_motion(log: Log, config: Config, beliefs: dict[str, Belief], gyr_bias_
     InputError : the log has neither the IMU's attitude nor a magnetometer
     """
     imu, R_bs = log["imu"], mount_matrix(config.imu.mount_rpy_deg)
-    level = _levelled(imu.data[:, :3] @ R_bs.T)
+    level = level_from_force(imu.data[:, :3] @ R_bs.T)
     if "ahrs" in log:
         R_nb, source = _fused(log, config, beliefs, level), "the IMU's own attitude"
     elif "mag" in log:
@@ -60,11 +60,6 @@ def known_motion(log: Log, config: Config, beliefs: dict[str, Belief], gyr_bias_
             "or the magnetometer mag_x, mag_y, mag_z"
         )
     return KnownMotion(R_nb, imu.data[:, 3:] @ R_bs.T - gyr_bias_b, source)
-
-
-def _levelled(f_b: Array) -> Array:
-    """Roll and pitch of specific forces, as if only gravity were felt; shape (n, 2)."""
-    return np.column_stack([np.arctan2(-f_b[:, 1], -f_b[:, 2]), np.arctan2(f_b[:, 0], np.hypot(f_b[:, 1], f_b[:, 2]))])
 
 
 def _undeviated(magnetic: Array, offset: Array, curve: Array) -> Array:
