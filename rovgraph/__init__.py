@@ -36,7 +36,7 @@ Layers (imports go downwards only)
 ----------------------------------
 cli / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph /
 instruments / config, log, trajectory / sensors, model_aiding / vehicle /
-state, calibration, thesis / geometry, workers / errors.
+state, calibration, thesis / kernels / geometry, workers / errors.
 """
 
 __version__ = "0.1.0"

@@ -1,0 +1,126 @@
+"""Compiles kernels with numba, once per machine, into a cache folder that can be written.
+
+The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_CACHE_DIR``, this package's
+``__pycache__`` and the user's cache directory; where there is none, kernels are compiled anew in each process.
+Below it, one folder stands for each state of the kernels' sources, so that a kernel which calls another one in
+a changed module is compiled again, which numba's own cache does not notice.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import rovgraph
+from rovgraph.errors import InputError
+
+try:
+    import numba
+    from numba import njit
+except ImportError as error:
+    raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61'") from None
+
+F = TypeVar("F", bound=Callable[..., Any])
+config: Any = numba.config
+logger = logging.getLogger("rovgraph")
+
+
+def helper(function: F) -> F:
+    """A function that is compiled into the kernels that call it; it cannot be called often from Python."""
+    return cast(F, njit(error_model="numpy")(function))
+
+
+def kernel(signature: str) -> Callable[[F], F]:
+    """An entry point, compiled for one signature when its module is imported, or loaded from the cache.
+
+    Parameters
+    ----------
+    signature : numba's, such as ``"void(f8[:, ::1], f8[::1])"``
+
+    Raises
+    ------
+    InputError : numba cannot compile it
+    """
+
+    def decorate(function: F) -> F:
+        folder = cache_folder()
+        try:
+            with _cache_in(folder):
+                compiled = njit(signature, cache=folder is not None, nogil=True, error_model="numpy")(function)
+        except OSError:  # the folder went away, or the disk is full
+            compiled = njit(signature, nogil=True, error_model="numpy")(function)
+        except numba.core.errors.NumbaError as error:
+            raise InputError(
+                f"numba {numba.__version__} cannot compile {function.__name__} ({_first_line(error)}): "
+                "pip install --upgrade numba"
+            ) from None
+        return cast(F, compiled)
+
+    return decorate
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Where compiled kernels are kept, or None where nothing can be written; says when they are not there yet."""
+    if config.DISABLE_JIT:
+        return None
+    state = _state_of_sources()
+    for parent in _candidates():
+        folder = parent / f"rovgraph-{state}"
+        if _writable(folder):
+            if not any(folder.rglob("*.nbi")):
+                logger.warning("compiling rovgraph's kernels, once: this takes about 20 s")
+            return folder
+    logger.warning("compiling rovgraph's kernels, as no cache folder can be written; set ROVGRAPH_CACHE_DIR to one")
+    return None
+
+
+def _candidates() -> Iterator[Path]:
+    for name in ("ROVGRAPH_CACHE_DIR", "NUMBA_CACHE_DIR"):
+        if os.environ.get(name):
+            yield Path(os.environ[name])
+    yield Path(__file__).parent / "__pycache__"
+    if sys.platform == "win32":
+        yield Path(os.environ.get("LOCALAPPDATA", Path.home()))
+    else:
+        yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+def _writable(folder: Path) -> bool:
+    probe = folder / f"probe-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except (OSError, RuntimeError):
+        return False
+    return True
+
+
+def _state_of_sources() -> str:
+    """A digest of all kernels, and of what compiles them."""
+    digest = hashlib.sha256(f"{rovgraph.__version__} {numba.__version__} {sys.version}".encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@contextlib.contextmanager
+def _cache_in(folder: Path | None) -> Iterator[None]:
+    """Have numba cache there what is decorated meanwhile, and nothing else."""
+    before = config.CACHE_DIR
+    if folder is not None:
+        config.CACHE_DIR = str(folder)
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = before
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0][:200]
