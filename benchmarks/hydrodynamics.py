@@ -10,7 +10,7 @@ import argparse
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.estimators.chains import Named, outcomes
+from rovgraph.estimators.chains import EstimatorSpec, outcomes
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.named import ESTIMATORS, select
 from rovgraph.evaluate import normalised_error
@@ -22,7 +22,7 @@ GAP = {"vattern": (120.0, 180.0), "excited": (150.0, 210.0)}  # without bottom l
 DRAG = ("drag_linear", "drag_quadratic")
 
 
-def estimates(estimators: list[Named], log: Log, config: Config) -> list[Estimate]:
+def estimates(estimators: list[EstimatorSpec], log: Log, config: Config) -> list[Estimate]:
     """One estimate of each; a failure is raised."""
     found = []
     for outcome in outcomes(estimators, log, config):

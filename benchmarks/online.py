@@ -24,11 +24,11 @@ from rovgraph.estimators.initialise import initialise
 from rovgraph.evaluate import evaluate, read_reference
 from rovgraph.geometry import log_rotation, transpose
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import RATE_HZ, Session
 from rovgraph.live.solution import Solution
+from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, log_from_frame, read_log
 from rovgraph.simulate import Choices, simulated
 from rovgraph.simulate.named import falcon
@@ -55,7 +55,7 @@ def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
     log = log_from_frame(dive.log_frame)
     del dive
     navigator = Navigator(config, patient=True, smooth=kind == "isam2", clocks=Clocks(trust=True))
-    session = Session(navigator, [], Complaints(), rate)
+    session = Session(navigator, [], Warnings(), rate)
     begin, memory = float(log["imu"].time[0]), {}
 
     def watch(solution: Solution) -> None:
@@ -84,18 +84,18 @@ def callbacks(seconds: float, seed: int) -> None:
     log = log_from_frame(dive.log_frame)
     beginning = initialise(log, config)
     batch = assemble(log, beginning)
-    recursion, gates, passages = ErrorStateRecursion(beginning), dict[str, float](), []
+    recursion, gates, filter_steps = ErrorStateRecursion(beginning), dict[str, float](), []
     known = recursion.start()
     for interval in batch.intervals:
-        passages.append(recursion.through(interval, known, gates))
-        known = passages[-1].filtered
+        filter_steps.append(recursion.through(interval, known, gates))
+        known = filter_steps[-1].filtered
     for kept, period in ((True, UPDATE_S), (False, UPDATE_S), (False, 0.0)):
         isam2 = IncrementalEstimator(beginning, period)
         if not kept:
             isam2.engine.copy_values()
         began = time.process_time()
-        for interval, passage in zip(batch.intervals, passages, strict=True):
-            isam2.take(interval, passage.filtered, passage.used)
+        for interval, filter_step in zip(batch.intervals, filter_steps, strict=True):
+            isam2.take(interval, filter_step.filtered, filter_step.used)
         values = "kept" if kept else "copied for each callback"
         often = f"once in {period:g} s" if period else "for each keyframe"
         print(f"values {values}, updates {often}: {time.process_time() - began:.1f} s of CPU", flush=True)
@@ -134,7 +134,7 @@ def recorded(path: Path, config_path: Path, reference: Path, after: float) -> No
     config = load_config(config_path)
     log = read_log(path, config.columns, config.units)
     navigator = Navigator(config, patient=True, clocks=Clocks(trust=True))
-    session = Session(navigator, [], Complaints(), RATE_HZ)
+    session = Session(navigator, [], Warnings(), RATE_HZ)
     began = time.perf_counter()
     session.run(messages(log))
     wall = time.perf_counter() - began

@@ -34,7 +34,7 @@ class Instrument:
     components : names of the components, dim of them
     rate_gain : ndarray, shape (dim, 3), how an error of the measured rate [rad/s] enters:
         through the DVL's lever arm, at the nominal mounting
-    lateness : name of the calibration variable that says how late its stamps are, or None
+    time_offset : name of the calibration variable that says how late its stamps are, or None
     """
 
     model: SensorModel
@@ -44,13 +44,13 @@ class Instrument:
     readmit_s: float
     components: tuple[str, ...]
     rate_gain: Array
-    lateness: str | None = None
+    time_offset: str | None = None
 
     @property
     def calibration(self) -> tuple[str, ...]:
         """Calibration variables that its measurements depend on."""
         own = self.model.calibration
-        return own if self.lateness is None else (*own, self.lateness)
+        return own if self.time_offset is None else (*own, self.time_offset)
 
 
 def heading_sources(config: Config, available: set[str]) -> list[str]:

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config, load_config
-from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
+from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import Beginning, initialise
+from rovgraph.estimators.initialise import InitialConditions, initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
 from rovgraph.log import STREAMS, Log, Stream, log_from_frame
@@ -133,7 +133,7 @@ def incremental(log: Log, config: Config) -> IncrementalEstimator:
 
 def renewed(log: Log, config: Config) -> ErrorStateFilter:
     """The filter of `rovgraph smooth` that has taken a whole log."""
-    return fed(ErrorStateFilter(initialise(log, config), RENEW_AT_S), log)
+    return fed(ErrorStateFilter(initialise(log, config), REINITIALISE_AT_S), log)
 
 
 def fed(estimator: Any, log: Log) -> Any:
@@ -147,7 +147,7 @@ def smoothed(log: Log, config: Config) -> Estimate:
     return batch(log, config).solve()
 
 
-def beginning(log: Log, config: Config) -> Beginning:
+def beginning(log: Log, config: Config) -> InitialConditions:
     return initialise(log, config)
 
 

@@ -7,7 +7,7 @@ import pytest
 from dives import attitude_errors, falcon, fed, interrupted, position_errors, simulated
 
 import rovgraph.estimators.alignment as alignment
-from rovgraph.estimators.alignment import aligned, facing, vague
+from rovgraph.estimators.alignment import aligned, attitude_poorly_known, with_attitude
 from rovgraph.estimators.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rpy_from_matrix
@@ -22,7 +22,7 @@ def met():
     estimator = fed(ErrorStateFilter(initialise(case.log, case.config)), case.log)
     index = 80
     interval = estimator.intervals[index + 1]
-    between = [a for a in interval.attached if a.keyframe == index]
+    between = [a for a in interval.measurements if a.keyframe == index]
     true = case.truth.R_nb[np.searchsorted(case.truth.time, estimator.intervals[index].time)]
     return estimator, estimator.filtered[index], interval, between, true
 
@@ -38,10 +38,10 @@ def doubted(known, turn_n: Array, sd: Array):
 
 def test_an_attitude_is_vague_from_a_tilt_of_four_degrees_or_a_heading_of_ten(met):
     _, known, *_ = met
-    assert not vague(known)
-    assert not vague(doubted(known, np.zeros(3), np.deg2rad([3.9, 3.9, 9.9])))
-    assert vague(doubted(known, np.zeros(3), np.deg2rad([0.1, 4.1, 0.1])))
-    assert vague(doubted(known, np.zeros(3), np.deg2rad([0.1, 0.1, 10.1])))
+    assert not attitude_poorly_known(known)
+    assert not attitude_poorly_known(doubted(known, np.zeros(3), np.deg2rad([3.9, 3.9, 9.9])))
+    assert attitude_poorly_known(doubted(known, np.zeros(3), np.deg2rad([0.1, 4.1, 0.1])))
+    assert attitude_poorly_known(doubted(known, np.zeros(3), np.deg2rad([0.1, 0.1, 10.1])))
 
 
 @pytest.mark.parametrize("off", [-130.0, -60.0, 25.0, 90.0, 170.0])
@@ -77,7 +77,7 @@ def test_facing_elsewhere_knows_no_more_and_no_less(met):
     """The body's attitude, position along n, and a velocity that a DVL sees are as sure as before."""
     _, known, *_ = met
     R_nb = exp_rotation(np.array([0.0, 0.0, 1.2])) @ known.state.R_nb[0]
-    turned = facing(known, R_nb)
+    turned = with_attitude(known, R_nb)
     np.testing.assert_array_equal(turned.state.R_nb[0], R_nb)
     np.testing.assert_allclose(turned.P[:3, :3], known.P[:3, :3])
     here, there = known.state.R_nb[0], R_nb
@@ -89,7 +89,7 @@ def test_facing_elsewhere_knows_no_more_and_no_less(met):
 def test_a_velocity_that_is_known_in_n_alone_does_not_turn(met):
     _, known, *_ = met
     lost = doubted(replace(known, state=replace(known.state, v_n=np.array([[0.5, 0.1, 0.0]]))), np.zeros(3), [1, 1, 1])
-    turned = facing(lost, exp_rotation(np.array([0.0, 0.0, 1.2])) @ lost.state.R_nb[0])
+    turned = with_attitude(lost, exp_rotation(np.array([0.0, 0.0, 1.2])) @ lost.state.R_nb[0])
     np.testing.assert_array_equal(turned.state.v_n, lost.state.v_n)
     np.testing.assert_array_equal(turned.P[6:9, 6:9], lost.P[6:9, 6:9])
 
@@ -127,7 +127,7 @@ def test_after_a_silence_no_sensor_is_kept_out_for_long_and_attitude_is_as_sure_
 
 
 def test_linearised_where_it_stands_a_vague_attitude_would_be_believed_and_sensors_kept_out(monkeypatch):
-    monkeypatch.setattr(alignment, "VAGUE_TILT", np.inf)
+    monkeypatch.setattr(alignment, "POORLY_KNOWN_TILT", np.inf)
     kept_out, _, heading = after_silences(range(2, 4))
     assert kept_out > 40 and np.mean(heading > 5.0) > 0.3
 
@@ -135,6 +135,6 @@ def test_linearised_where_it_stands_a_vague_attitude_would_be_believed_and_senso
 def test_facing_elsewhere_and_back_is_where_it_was(met):
     _, known, *_ = met
     R_nb = exp_rotation(np.array([0.1, -0.2, 2.0])) @ known.state.R_nb[0]
-    back = facing(facing(known, R_nb), known.state.R_nb[0])
+    back = with_attitude(with_attitude(known, R_nb), known.state.R_nb[0])
     np.testing.assert_allclose(back.P, known.P, atol=1e-12)
     np.testing.assert_allclose(back.state.v_n, known.state.v_n, atol=1e-12)

@@ -5,17 +5,17 @@ import pytest
 from dives import level_log
 
 from rovgraph.config import Config
-from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 
 G = np.array([0.0, 0.0, -9.81])
 
 
-def assembled(log: Log, config: Config | None = None) -> tuple[list[Interval], Assembler]:
+def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInterval], Assembler]:
     config = config or Config()
     assembler = Assembler(config, instruments(config), np.zeros(6))
-    done: list[Interval] = []
+    done: list[KeyframeInterval] = []
     for measurement in log.measurements():
         done += assembler.add(measurement)
     return done + assembler.finish(), assembler
@@ -33,12 +33,12 @@ def scalar(times) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(times, float), np.arange(len(times), dtype=float)[:, None]
 
 
-def times(intervals: list[Interval]) -> list[float]:
+def times(intervals: list[KeyframeInterval]) -> list[float]:
     return [round(i.time, 6) for i in intervals]
 
 
-def found(intervals: list[Interval], sensor: str):
-    return [(i.index, a) for i in intervals for a in i.attached if a.sensor == sensor]
+def found(intervals: list[KeyframeInterval], sensor: str):
+    return [(i.index, a) for i in intervals for a in i.measurements if a.sensor == sensor]
 
 
 def test_a_keyframe_stands_at_every_ping_and_at_both_ends_of_the_imu():
@@ -168,10 +168,10 @@ def test_every_measurement_is_attached_thinned_or_counted():
     fixes = np.sort(rng.uniform(-0.5, 10.5, 40)).round(4)
     log = log_of(10.0, pings, fix=(fixes, np.tile([0.0, 0.0, np.nan], (40, 1))))
     intervals, assembler = assembled(log)
-    attached = [(a.sensor, a.time) for i in intervals for a in i.attached]
+    attached = [(a.sensor, a.time) for i in intervals for a in i.measurements]
     assert len(attached) == len(set(attached))
     assert len(attached) + sum(assembler.left_out.values()) == 100
-    assert all(a.time >= intervals[a.keyframe].time for i in intervals for a in i.attached)
+    assert all(a.time >= intervals[a.keyframe].time for i in intervals for a in i.measurements)
 
 
 def test_sensors_that_are_not_in_use_are_ignored():
@@ -179,7 +179,7 @@ def test_sensors_that_are_not_in_use_are_ignored():
     assembler = Assembler(config, {"dvl": instruments(config)["dvl"]}, np.zeros(6))
     intervals = [i for m in log_of(2.0, [0.5], depth=scalar([0.7])).measurements() for i in assembler.add(m)]
     assert not assembler.left_out
-    assert [a.sensor for i in [*intervals, *assembler.finish()] for a in i.attached] == ["dvl"]
+    assert [a.sensor for i in [*intervals, *assembler.finish()] for a in i.measurements] == ["dvl"]
 
 
 def test_an_interval_is_given_once_the_imu_is_half_a_window_past_its_ping():

@@ -93,7 +93,7 @@ def test_batch_finds_any_time_offset_and_the_track_is_as_good_as_without(offset)
 def isam2(log: Log, config: Config) -> IncrementalEstimator:
     """As `smooth` has it: a second time, with the pings where the first has found them to belong."""
     first = incremental(log, config)
-    anew = batch(log, config).placed_anew(first.latest().calibration)
+    anew = batch(log, config).placed_again(first.latest().calibration)
     if anew is None:
         return first
     again = IncrementalEstimator(anew.beginning)

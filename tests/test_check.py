@@ -79,7 +79,7 @@ def without(log: Log, *sensors: str) -> Log:
     return replace(log, streams={k: s for k, s in log.streams.items() if k not in sensors})
 
 
-def complaints(log: Log, config: Config | None = None, level: str = "warning", sensor: str | None = None) -> str:
+def messages(log: Log, config: Config | None = None, level: str = "warning", sensor: str | None = None) -> str:
     return "\n".join(f.text for f in examine(log, config).at(level) if sensor in (None, f.sensor))
 
 
@@ -97,7 +97,7 @@ def test_a_sound_dive_has_no_complaint(sound):
 
 
 def test_what_sensors_agree_on_is_said_with_numbers(sound):
-    said = complaints(sound, level="ok")
+    said = messages(sound, level="ok")
     for sensor in ("ahrs_yaw", "dvl_heading", "the field's direction"):
         assert f"{sensor} turns with the gyro (slope 1" in said
     assert "vertical velocity agrees with the change of depth (slope 1" in said
@@ -125,7 +125,7 @@ def test_timing_counts_rate_gap_and_repeats():
     ],
 )
 def test_a_missing_sensor_is_named_with_its_consequence(sound, absent, level, said):
-    assert said in complaints(without(sound, *absent), level=level)
+    assert said in messages(without(sound, *absent), level=level)
 
 
 def test_a_gap_is_found_where_it_is_and_a_long_one_of_the_imu_is_refused(sound):
@@ -134,26 +134,26 @@ def test_a_gap_is_found_where_it_is_and_a_long_one_of_the_imu_is_refused(sound):
         k = (s.time < a) | (s.time > b)
         return replace(log, streams={**log.streams, sensor: replace(s, time=s.time[k], data=s.data[k], row=s.row[k])})
 
-    assert "the longest 20.2 s from 99.9 s on" in complaints(cut(sound, "dvl", 100, 120), sensor="dvl")
-    assert "1 gaps" in complaints(cut(sound, "imu", 100, 120), sensor="imu")
-    assert "imu.max_gap_s = 30" in complaints(cut(sound, "imu", 100, 140), level="error")
+    assert "the longest 20.2 s from 99.9 s on" in messages(cut(sound, "dvl", 100, 120), sensor="dvl")
+    assert "1 gaps" in messages(cut(sound, "imu", 100, 120), sensor="imu")
+    assert "imu.max_gap_s = 30" in messages(cut(sound, "imu", 100, 140), level="error")
 
 
 def test_milliseconds_taken_for_seconds_are_noticed(sound):
     slow = {k: replace(s, time=s.time * 1000) for k, s in sound.streams.items()}
-    assert "units: {time: ms}" in complaints(replace(sound, streams=slow), sensor="imu")
+    assert "units: {time: ms}" in messages(replace(sound, streams=slow), sensor="imu")
 
 
 def test_clocks_of_different_epochs_are_refused(sound):
     late = replace(sound["dvl"], time=sound["dvl"].time + 1e6)
     log = replace(sound, streams={**sound.streams, "dvl": late})
-    assert "no time in common" in complaints(log, level="error", sensor="dvl")
+    assert "no time in common" in messages(log, level="error", sensor="dvl")
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1 / 9.80665, "g"), (1000 / 9.80665, "mg")])
 def test_acceleration_in_g_is_refused_with_the_unit(sound, factor, unit):
     log = scaled(sound, "imu", slice(0, 3), factor)
-    assert f"units: {{acc: {unit}}}" in complaints(log, level="error", sensor="imu")
+    assert f"units: {{acc: {unit}}}" in messages(log, level="error", sensor="imu")
     with pytest.raises(InputError, match=r"^dive.csv: imu: "):
         warn(log)
 
@@ -166,63 +166,63 @@ def test_the_mounting_that_is_suggested_turns_gravity_upright(sound, axis):
     def turn(data, _):
         data[:] = data @ np.kron(np.eye(2), mount_matrix(UPRIGHT[axis]))
 
-    turned = complaints(changed(sound, "imu", turn), sensor="imu")
+    turned = messages(changed(sound, "imu", turn), sensor="imu")
     assert (f"IMU's {axis} axis" in turned) == (axis != "-z")
     mounted = Config.model_validate({"imu": {"mount_rpy_deg": UPRIGHT[axis]}})
-    assert complaints(without(changed(sound, "imu", turn), "mag"), mounted) == ""
+    assert messages(without(changed(sound, "imu", turn), "mag"), mounted) == ""
 
 
 @pytest.mark.parametrize("with_heading", [True, False])
 def test_a_gyro_in_degrees_is_refused(sound, with_heading):
     log = scaled(sound, "imu", slice(3, 6), np.rad2deg(1.0))
     log = log if with_heading else without(log, "mag", "ahrs", "dvl_heading")
-    assert "units: {gyr: deg/s}" in complaints(log, level="error")
+    assert "units: {gyr: deg/s}" in messages(log, level="error")
 
 
 def test_a_slow_gyro_in_degrees_is_refused_by_its_heading():
     log = scaled(dive(turning=0.03), "imu", slice(3, 6), np.rad2deg(1.0))
-    assert "the gyro is 57 times too fast" in complaints(log, level="error", sensor="ahrs")
+    assert "the gyro is 57 times too fast" in messages(log, level="error", sensor="ahrs")
 
 
 def test_a_gyro_converted_twice_is_refused(sound):
     log = scaled(sound, "imu", slice(3, 6), np.deg2rad(1.0))
-    assert "the gyro is 57 times too slow" in complaints(log, level="error", sensor="dvl_heading")
+    assert "the gyro is 57 times too slow" in messages(log, level="error", sensor="dvl_heading")
 
 
 @pytest.mark.parametrize("sensor", ["ahrs", "dvl_heading"])
 def test_a_heading_in_degrees_is_refused(sound, sensor):
     log = scaled(sound, sensor, slice(0, 1), np.rad2deg(1.0))
-    assert f"units: {{{sensor}: deg}}" in complaints(log, level="error", sensor=sensor)
+    assert f"units: {{{sensor}: deg}}" in messages(log, level="error", sensor=sensor)
 
 
 def test_a_heading_converted_twice_is_refused(sound):
     log = scaled(sound, "dvl_heading", slice(0, 1), np.deg2rad(1.0))
-    assert "dvl_heading is 57 times too small" in complaints(log, level="error", sensor="dvl_heading")
+    assert "dvl_heading is 57 times too small" in messages(log, level="error", sensor="dvl_heading")
 
 
 def test_a_heading_that_counts_on_past_a_circle_is_fine(sound):
     def unwrap(data, _):
         data[:, 0] = np.unwrap(data[:, 0]) + 20.0
 
-    assert complaints(changed(sound, "ahrs", unwrap)) == complaints(changed(sound, "ahrs", unwrap), level="error") == ""
+    assert messages(changed(sound, "ahrs", unwrap)) == messages(changed(sound, "ahrs", unwrap), level="error") == ""
 
 
 def test_tilt_in_degrees_is_refused(sound):
     def tilt(data, time):
         data[:, 1] = 8.0 * np.sin(time)
 
-    assert "roll or pitch reaches 8 rad" in complaints(changed(sound, "ahrs", tilt), level="error")
+    assert "roll or pitch reaches 8 rad" in messages(changed(sound, "ahrs", tilt), level="error")
 
 
 def test_a_heading_that_counts_anticlockwise_is_named(sound):
     log = scaled(sound, "dvl_heading", slice(0, 1), -1.0)
-    assert "dvl_heading turns against the gyro (slope -1" in complaints(log, sensor="dvl_heading")
-    assert complaints(log, sensor="ahrs") == ""
+    assert "dvl_heading turns against the gyro (slope -1" in messages(log, sensor="dvl_heading")
+    assert messages(log, sensor="ahrs") == ""
 
 
 def test_a_late_compass_is_measured(sound):
     late = replace(sound["dvl_heading"], time=sound["dvl_heading"].time + 0.8)
-    said = complaints(replace(sound, streams={**sound.streams, "dvl_heading": late}), sensor="dvl_heading")
+    said = messages(replace(sound, streams={**sound.streams, "dvl_heading": late}), sensor="dvl_heading")
     assert any(f"comes {x} s later than the gyro's" in said for x in ("0.79", "0.80", "0.81"))
 
 
@@ -240,22 +240,22 @@ def gentle_dive(seed: int, late: float = 0.0) -> Log:
 
 
 def test_noise_of_a_heading_is_not_taken_for_a_clock_that_is_late():
-    warned = [seed for seed in range(30) if "do the clocks disagree" in complaints(gentle_dive(seed), sensor="ahrs")]
+    warned = [seed for seed in range(30) if "do the clocks disagree" in messages(gentle_dive(seed), sensor="ahrs")]
     assert len(warned) <= 1
-    late = [seed for seed in range(30) if "do the clocks disagree" in complaints(gentle_dive(seed, 0.6), sensor="ahrs")]
+    late = [seed for seed in range(30) if "do the clocks disagree" in messages(gentle_dive(seed, 0.6), sensor="ahrs")]
     assert len(late) > 20
 
 
 def test_half_a_second_between_clocks_is_found_on_a_dive_that_turns(sound):
     for sensor in ("ahrs", "dvl_heading"):
         late = replace(sound[sensor], time=sound[sensor].time - 0.5)
-        said = complaints(replace(sound, streams={**sound.streams, sensor: late}), sensor=sensor)
+        said = messages(replace(sound, streams={**sound.streams, sensor: late}), sensor=sensor)
         assert "s earlier than the gyro's (sd 0.0" in said
 
 
 def test_a_late_dvl_is_measured_against_depth(sound):
     late = replace(sound["dvl"], time=sound["dvl"].time + 1.5)
-    said = complaints(replace(sound, streams={**sound.streams, "dvl": late}), sensor="dvl")
+    said = messages(replace(sound, streams={**sound.streams, "dvl": late}), sensor="dvl")
     assert any(f"vertical velocity comes {x} s later" in said for x in ("1.48", "1.49", "1.50", "1.51", "1.52"))
 
 
@@ -265,51 +265,51 @@ def test_noise_of_depth_on_a_level_dive_is_not_taken_for_a_mounting(sound, sd):
         data[:, 0] = 5.0 + np.random.default_rng(3).normal(0, sd, len(time))
 
     flat = changed(sound, "dvl", lambda data, _: data.__setitem__((slice(None), 2), 0.0))
-    assert complaints(changed(flat, "depth", level), sensor="dvl") == ""
-    assert "does not follow depth" in complaints(flat, sensor="dvl")
+    assert messages(changed(flat, "depth", level), sensor="dvl") == ""
+    assert "does not follow depth" in messages(flat, sensor="dvl")
 
 
 def test_a_dvl_that_looks_up_is_named_by_depth_and_by_fixes(sound):
     log = scaled(sound, "dvl", slice(1, 3), -1.0)
-    assert "Then dvl.mount_rpy_deg is [180, 0, 0]" in complaints(without(log, "fix"), sensor="dvl")
-    assert "better with y mirrored" in complaints(without(log, "depth"), sensor="dvl")
-    assert complaints(log, Config.model_validate(FLIPPED)) == ""
-    assert "Then dvl.mount_rpy_deg is [0, 0, 0]" in complaints(sound, Config.model_validate(FLIPPED), sensor="dvl")
+    assert "Then dvl.mount_rpy_deg is [180, 0, 0]" in messages(without(log, "fix"), sensor="dvl")
+    assert "better with y mirrored" in messages(without(log, "depth"), sensor="dvl")
+    assert messages(log, Config.model_validate(FLIPPED)) == ""
+    assert "Then dvl.mount_rpy_deg is [0, 0, 0]" in messages(sound, Config.model_validate(FLIPPED), sensor="dvl")
 
 
 def test_a_dvl_turned_by_40_degrees_is_measured_against_fixes(sound):
     turned = Config.model_validate({"dvl": {"mount_rpy_deg": [0, 0, 40]}})
-    said = complaints(without(sound, "dvl_heading"), turned, sensor="dvl")
+    said = messages(without(sound, "dvl_heading"), turned, sensor="dvl")
     assert "turned by -40 deg and scaled by 1.0" in said
 
 
 def test_velocities_in_millimetres_are_refused(sound):
-    assert "units: {dvl: mm/s}" in complaints(scaled(sound, "dvl", slice(0, 3), 1e3), level="error", sensor="dvl")
+    assert "units: {dvl: mm/s}" in messages(scaled(sound, "dvl", slice(0, 3), 1e3), level="error", sensor="dvl")
 
 
 def test_little_bottom_lock_is_counted(sound):
     def lose(data, time):
         data[time < 100, 3] = 0.0
 
-    assert "bottom lock 75.0%" in complaints(changed(sound, "dvl", lose), sensor="dvl")
+    assert "bottom lock 75.0%" in messages(changed(sound, "dvl", lose), sensor="dvl")
 
 
 def test_depth_upwards_is_named(sound):
-    assert "depth counts downwards" in complaints(scaled(sound, "depth", slice(0, 1), -1.0), sensor="depth")
+    assert "depth counts downwards" in messages(scaled(sound, "depth", slice(0, 1), -1.0), sensor="depth")
 
 
 def test_hard_iron_larger_than_the_field_is_named(sound):
     def magnetise(data, _):
         data[:, 0] += 3.0
 
-    assert "hard iron" in complaints(changed(sound, "mag", magnetise), sensor="mag")
+    assert "hard iron" in messages(changed(sound, "mag", magnetise), sensor="mag")
 
 
 def test_an_imu_that_repeats_itself_is_named(sound):
     def hold(data, time):
         data[(time > 50) & (time < 70)] = data[0]
 
-    said = complaints(changed(sound, "imu", hold), sensor="imu")
+    said = messages(changed(sound, "imu", hold), sensor="imu")
     assert "acc repeats one value exactly for 20.0 s from 50.0 s on" in said
     assert "gyr repeats" in said
 
@@ -318,14 +318,14 @@ def test_samples_written_twice_are_named(sound):
     def twice(data, _):
         data[1::2] = data[::2]
 
-    assert "50% of the measurements repeat" in complaints(changed(sound, "imu", twice), sensor="imu")
+    assert "50% of the measurements repeat" in messages(changed(sound, "imu", twice), sensor="imu")
 
 
 def test_a_heading_that_stands_still_in_a_turn_is_named(sound):
     def hold(data, time):
         data[(time > 50) & (time < 70), 0] = 1.0
 
-    assert "while the gyro turns by" in complaints(changed(sound, "dvl_heading", hold), sensor="dvl_heading")
+    assert "while the gyro turns by" in messages(changed(sound, "dvl_heading", hold), sensor="dvl_heading")
 
 
 def zeroed(log: Log, first: float, last: float) -> Log:
@@ -338,13 +338,13 @@ def zeroed(log: Log, first: float, last: float) -> Log:
 def test_zeros_that_begin_at_speed_are_a_frozen_dvl(sound):
     ((first, last),) = dvl_frozen_intervals(zeroed(sound, 100.0, 120.0))
     assert (first, last) == pytest.approx((100.14, 119.94))
-    assert "exactly zero for 19.8 s from 100.1 s on although it moves at" in complaints(zeroed(sound, 100.0, 120.0))
+    assert "exactly zero for 19.8 s from 100.1 s on although it moves at" in messages(zeroed(sound, 100.0, 120.0))
 
 
 def test_zeros_all_along_are_frozen_when_others_see_motion(sound):
     assert len(dvl_frozen_intervals(zeroed(sound, -1, 1e9))) == 1
     still = changed(zeroed(sound, -1, 1e9), "imu", lambda data, _: data.__setitem__((slice(None), 5), 1e-3))
-    assert "fixes move" in complaints(still, sensor="dvl")
+    assert "fixes move" in messages(still, sensor="dvl")
     assert dvl_frozen_intervals(without(still, "fix")) == []
 
 
@@ -375,7 +375,7 @@ def test_pings_without_bottom_lock_may_hold_anything_and_do_not_count_as_repeate
         data[lost, :3], data[lost, 3] = held, 0.0
 
     log = changed(sound, "dvl", lose)
-    (said,) = complaints(log, sensor="dvl").split("\n")
+    (said,) = messages(log, sensor="dvl").split("\n")
     assert said.startswith("bottom lock 75")
     assert timing(log["dvl"]).repeats == 0
 
@@ -389,13 +389,13 @@ def test_keyframes_are_pings_and_what_fills_gaps():
 
 
 def test_assumptions_and_absent_heading_sources_are_said(sound):
-    said = complaints(sound, level="ok", sensor="configuration")
+    said = messages(sound, level="ok", sensor="configuration")
     assert "heading from mag, dvl_heading" in said
     assert "start.heading_deg is not given: taken from the first samples of mag" in said
     assert "dvl.mount_rpy_deg is not given" in said
     given = Config.model_validate({"heading": {"sources": ["dvl", "mag"]}, "dvl": {"mount_rpy_deg": [0, 0, 0]}})
-    assert "dvl.mount_rpy_deg" not in complaints(sound, given, level="ok")
-    assert "heading.sources names dvl" in complaints(without(sound, "dvl_heading"), given)
+    assert "dvl.mount_rpy_deg" not in messages(sound, given, level="ok")
+    assert "heading.sources names dvl" in messages(without(sound, "dvl_heading"), given)
 
 
 def test_warn_issues_what_examine_finds(sound):
@@ -423,6 +423,6 @@ def test_the_real_dive_raises_no_false_alarm():
     (only,) = report.at("warning")
     assert only.sensor == "dvl_heading"
     assert "s later than the gyro's" in only.text
-    assert "bottom lock 98.3% of 5045 pings" in complaints(log, level="ok")
+    assert "bottom lock 98.3% of 5045 pings" in messages(log, level="ok")
     assert dvl_frozen_intervals(log) == []
-    assert "y to port? Then dvl.mount_rpy_deg is [180, 0, 0]" in complaints(log, sensor="dvl")
+    assert "y to port? Then dvl.mount_rpy_deg is [180, 0, 0]" in messages(log, sensor="dvl")

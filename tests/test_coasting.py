@@ -5,8 +5,8 @@ import pytest
 from dives import batch, falcon, incremental, interrupted, position_errors, renewed, simulated, started
 
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
-from rovgraph.graph.assembly import Interval
-from rovgraph.graph.coasting import RIGHTS_ITSELF_S, TILT_SD, blind, coasted, coasting, coasting_factor
+from rovgraph.graph.assembly import KeyframeInterval
+from rovgraph.graph.coasting import RIGHTS_ITSELF_S, TILT_SD, coasted, coasting, coasting_factor, in_outage
 from rovgraph.graph.preintegration import BRIDGE_ACC, BRIDGE_GYR, preintegrate, preintegration_params
 from rovgraph.graph.transition import transitions
 from rovgraph.graph.values import state_values
@@ -16,12 +16,12 @@ SECONDS = 0.9
 
 
 @pytest.fixture(scope="module")
-def interval() -> Interval:
+def interval() -> KeyframeInterval:
     """Of which nothing is known but that the vehicle turned at 0.3 rad/s before and after."""
     params = preintegration_params(falcon(), BRIDGE_ACC, BRIDGE_GYR)
     samples = np.array([[t, 0.3, 0.1, -9.8, 0.02, -0.05, 0.3] for t in (-0.1, SECONDS + 0.1)])
     pim, _ = preintegrate(params, np.zeros(6), samples, 0.0, np.empty(0), SECONDS)
-    return Interval(1, SECONDS, 0, np.zeros(3), 0.0, pim, SECONDS + 0.2, [])
+    return KeyframeInterval(1, SECONDS, 0, np.zeros(3), 0.0, pim, SECONDS + 0.2, [])
 
 
 def state(rpy: list[float], p_n: list[float], v_n: list[float]) -> State:
@@ -33,8 +33,8 @@ BEFORE, AFTER = state([0.1, -0.2, 2.0], [3, -2, 5], [0.4, -0.2, 0.1]), state([0.
 
 
 def test_an_interval_is_blind_where_the_imu_was_silent_for_more_than_three_quarters_of_a_second(interval):
-    assert blind(interval)
-    assert not blind(Interval(1, SECONDS, 0, np.zeros(3), 0.0, interval.pim, 0.7, []))
+    assert in_outage(interval)
+    assert not in_outage(KeyframeInterval(1, SECONDS, 0, np.zeros(3), 0.0, interval.pim, 0.7, []))
 
 
 def test_it_goes_on_as_it_went_turns_as_it_turned_and_rights_itself(interval):

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
-from rovgraph.estimators.chains import Named, Task, outcomes, outcomes_of_dives
+from rovgraph.estimators.chains import EstimatorSpec, Task, outcomes, outcomes_of_dives
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.named import ESTIMATORS, select
 from rovgraph.estimators.results import residual_frame
@@ -140,8 +140,8 @@ def test_an_estimator_that_fails_has_its_row_and_the_others_go_on(recorded):
     assert np.isnan(table["end_mean_m"]["graph-smoothed-c"])
 
 
-def chain(name: str, *stages: object) -> Named:
-    return Named(name, "graph", "of a test", "", False, False, stages)  # type: ignore[arg-type]
+def chain(name: str, *stages: object) -> EstimatorSpec:
+    return EstimatorSpec(name, "graph", "of a test", "", False, False, stages)  # type: ignore[arg-type]
 
 
 def test_estimators_share_the_stages_they_have_in_common(recorded):

@@ -33,7 +33,7 @@ from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.innovations import Innovations
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
-from rovgraph.graph.assembly import Interval
+from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.factors import predict
 from rovgraph.graph.measurements import loss_and_weight
 from rovgraph.graph.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
@@ -79,11 +79,11 @@ def moving(seconds: float, rate: float = 100.0) -> tuple[State, Array]:
     return State(attitude, np.array([[3.0, -2.0, 5.0]]), np.array([[0.4, -0.2, 0.1]]), bias), np.column_stack([t, f, w])
 
 
-def interval_of(samples: Array, seconds: float, bias: Array, config: Config) -> Interval:
+def interval_of(samples: Array, seconds: float, bias: Array, config: Config) -> KeyframeInterval:
     noise = config.imu.noise
     params = preintegration_params(config, noise.acc, noise.gyr)
     pim, _ = preintegrate(params, bias, samples, 0.0, np.empty(0), seconds)
-    return Interval(1, seconds, 0, np.zeros(3), 0.0, pim, 0.0, [])
+    return KeyframeInterval(1, seconds, 0, np.zeros(3), 0.0, pim, 0.0, [])
 
 
 def difference(state: State, other: State) -> Array:
@@ -135,12 +135,12 @@ def test_process_noise_is_that_of_noisy_samples():
 
 
 def test_all_measurements_of_a_keyframe_together_are_linearised_as_each_alone(estimator):
-    interval = max(estimator.intervals, key=lambda i: len({a.sensor for a in i.attached}))
+    interval = max(estimator.intervals, key=lambda i: len({a.sensor for a in i.measurements}))
     state = estimator.filtered[interval.index].state
-    assert len(interval.attached) > 2
-    assert any(a.motion.dt for a in interval.attached)
-    (r,), (H,), [parts] = estimator.recursion.measurements.linearize(state, [interval.attached])
-    for attached, part in zip(interval.attached, parts, strict=True):
+    assert len(interval.measurements) > 2
+    assert any(a.motion.dt for a in interval.measurements)
+    (r,), (H,), [parts] = estimator.recursion.measurements.linearize(state, [interval.measurements])
+    for attached, part in zip(interval.measurements, parts, strict=True):
         alone, jacobians = estimator.recursion.measurements.block([attached]).linearize(state)
         np.testing.assert_allclose(r[part], alone[0], atol=1e-9)
         np.testing.assert_allclose(H[part], estimator.error.matrix(jacobians)[0], atol=1e-9)
@@ -348,10 +348,10 @@ def spoilt_logs(case: Simulated) -> list[Log]:
 
 def test_filters_side_by_side_are_each_as_they_are_alone(case):
     batches = [batch(log, case.config) for log in spoilt_logs(case)]
-    both = [(b, renew_at) for b in batches for renew_at in ((), (10.0,))]
-    together = [ErrorStateFilter(b.beginning, renew_at) for b, renew_at in both]
+    both = [(b, reinitialise_at) for b in batches for reinitialise_at in ((), (10.0,))]
+    together = [ErrorStateFilter(b.beginning, reinitialise_at) for b, reinitialise_at in both]
     replay_together(together, [b.intervals for b, _ in both])
-    alone = [replay(b.intervals, b.beginning, renew_at) for b, renew_at in both]
+    alone = [replay(b.intervals, b.beginning, reinitialise_at) for b, reinitialise_at in both]
     for one, other in zip(together, alone, strict=True):
         for a, b in zip(one.filtered, other.filtered, strict=True):
             np.testing.assert_array_equal(a.state.p_n, b.state.p_n)

@@ -5,9 +5,9 @@ import pytest
 from dives import Simulated, falcon, fed, simulated
 
 from rovgraph.estimators.error_state import ErrorStateFilter
-from rovgraph.estimators.fixed_lag import FixedLag, Taken
-from rovgraph.estimators.initialise import Beginning, initialise
-from rovgraph.estimators.passage import Gaussian
+from rovgraph.estimators.filter_step import Gaussian
+from rovgraph.estimators.fixed_lag import FixedLag, InsertResult
+from rovgraph.estimators.initialise import InitialConditions, initialise
 from rovgraph.estimators.refiner import Refiner
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.log import Measurement
@@ -21,7 +21,7 @@ def case() -> Simulated:
 
 
 @pytest.fixture(scope="module")
-def beginning(case) -> Beginning:
+def beginning(case) -> InitialConditions:
     return initialise(case.log, case.config)
 
 
@@ -35,7 +35,9 @@ def reference(case, beginning) -> ErrorStateFilter:
     return fed(ErrorStateFilter(beginning), case.log)
 
 
-def live(beginning: Beginning, measurements: list[Measurement], hold: float = HOLD) -> tuple[FixedLag, list[Gaussian]]:
+def live(
+    beginning: InitialConditions, measurements: list[Measurement], hold: float = HOLD
+) -> tuple[FixedLag, list[Gaussian]]:
     """The filter after all measurements, and its estimate of every keyframe."""
     known: list[Gaussian] = []
     engine = FixedLag(beginning, LAG, hold, passed=lambda mark: known.append(mark.known))
@@ -85,18 +87,18 @@ def test_pings_that_are_found_to_be_late_are_put_where_they_belong_from_then_on(
     engine, known = live(beginning, list(case.log.measurements()))
     recorded = fed(ErrorStateFilter(beginning), case.log)
     same(known, recorded.filtered, 1e-12)
-    assert engine._assembler.stamps.off(known[-1].state.calibration) < 0.02
+    assert engine._assembler.time_offsets.off(known[-1].state.calibration) < 0.02
     assert abs(known[-1].state.calibration["dvl_time_offset"][0] - 0.1) < 0.02
 
 
 def test_what_is_later_than_the_lag_or_repeated_is_left_out_and_said(beginning, measurements):
     engine = FixedLag(beginning, LAG, HOLD)
     cut = next(k for k, m in enumerate(measurements) if m.time > 15.0)
-    assert {engine.add(m) for m in measurements[:cut]} == {Taken.IN}
+    assert {engine.add(m) for m in measurements[:cut]} == {InsertResult.IN}
     ping = next(m for m in measurements if m.sensor == "dvl" and m.time > 5.0)
     recent = next(m for m in measurements if m.sensor == "dvl" and m.time > 13.0)
-    assert engine.add(ping) == Taken.LATE
-    assert engine.add(recent) == Taken.AGAIN
+    assert engine.add(ping) == InsertResult.LATE
+    assert engine.add(recent) == InsertResult.AGAIN
 
 
 def test_retracted_pings_leave_no_trace(case, beginning, measurements):

@@ -9,7 +9,7 @@ from dives import altered, as_log, batch, beginning, changed, kept, rms, without
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.chains import outcomes
-from rovgraph.estimators.error_state import RENEW_AT_S, replay
+from rovgraph.estimators.error_state import REINITIALISE_AT_S, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.named import ESTIMATORS, select
@@ -131,7 +131,7 @@ def test_the_water_seen_from_the_vehicle_has_the_derivatives_of_its_differences(
 
 def at_truth(case: Case, graph: BatchSmoother) -> Array:
     """Measured less predicted specific force at the true motion, shape (n, 3) [m/s^2]."""
-    attached = [a for i in graph.intervals for a in i.attached if a.sensor == "thruster"]
+    attached = [a for i in graph.intervals for a in i.measurements if a.sensor == "thruster"]
     motion = case.dive.path.motion(np.array([a.time for a in attached]))
     arm = rotate(motion.R_nb, np.cross(motion.w_b, case.config.imu.lever_arm_m))
     truth = dict.fromkeys(COEFFICIENTS, np.full(3, TRUE_DRAG - 1.0)) | {"current": CURRENT}
@@ -151,13 +151,13 @@ def test_true_motion_explains_the_specific_force_also_while_it_turns_and_reverse
 
 def test_pieces_are_short_where_keyframes_are_far_apart_and_their_noise_is_that_of_their_length(graph):
     for before, interval in zip(graph.intervals, graph.intervals[1:], strict=False):
-        pieces = [a for a in interval.attached if a.sensor == "thruster"]
+        pieces = [a for a in interval.measurements if a.sensor == "thruster"]
         length = (interval.time - before.time) / max(len(pieces), 1)
         assert length <= PIECE_S + 1e-9
         for piece in pieces:
             np.testing.assert_allclose(piece.sd, BELIEVED_SD / np.sqrt(length), rtol=1e-6)
     lost = [i for i in graph.intervals if LOST[0] + 2.0 < i.time < LOST[1]]
-    assert {len([a for a in i.attached if a.sensor == "thruster"]) for i in lost} == {4}
+    assert {len([a for a in i.measurements if a.sensor == "thruster"]) for i in lost} == {4}
 
 
 # estimates
@@ -169,7 +169,7 @@ def test_drag_current_and_track_are_recovered_without_noise(still, graph, smooth
     current = [c.value for c in smoothed.calibration if c.label.startswith("current")]
     np.testing.assert_allclose(current, CURRENT, atol=2e-3)
     assert still.errors(smoothed).max() < 0.05
-    filtered = replay(graph.intervals, graph.beginning, RENEW_AT_S).solve()
+    filtered = replay(graph.intervals, graph.beginning, REINITIALISE_AT_S).solve()
     np.testing.assert_allclose(coefficients(filtered)[0], TRUE_DRAG - 1.0, atol=0.1)
 
 
@@ -199,7 +199,7 @@ def test_no_thrusters_or_too_few_are_refused_in_one_line(still):
 def test_signals_that_stop_or_start_late_are_left_out_and_counted(still):
     time = still.log["thruster"].time
     some = batch(kept(still.log, "thruster", (time > 10.0) & (time < 30.0)), still.config)
-    used = np.array([a.time for i in some.intervals for a in i.attached if a.sensor == "thruster"])
+    used = np.array([a.time for i in some.intervals for a in i.measurements if a.sensor == "thruster"])
     assert 10.0 < used.min() < 11.0 and 29.0 < used.max() < 30.0 + OLDEST_SIGNAL_S
     reasons = {reason for sensor, reason in some.assembler.left_out if sensor == "thruster"}
     assert reasons == {"pieces before the first signal", f"pieces without a signal for {OLDEST_SIGNAL_S:g} s"}
@@ -211,7 +211,7 @@ def test_without_hydrodynamics_signals_change_nothing(still):
     start = beginning(still.log, config)
     assert "thruster" not in start.instruments
     for a, b in zip(batch(still.log, config).intervals, batch(noisy, config).intervals, strict=True):
-        assert a.time == b.time and len(a.attached) == len(b.attached)
+        assert a.time == b.time and len(a.measurements) == len(b.measurements)
 
 
 # comparison

@@ -8,9 +8,9 @@ from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
-from rovgraph.estimators.passage import Gaussian
+from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.geometry import log_rotation, rotate, transpose
-from rovgraph.graph.assembly import Interval
+from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.factors import motion, predict
 from rovgraph.graph.keys import Unknowns, unknowns
 from rovgraph.graph.values import insert_calibration, insert_state
@@ -46,7 +46,7 @@ def test_scales_that_are_known_are_held_and_fit():
     assert fitted.summary["cost"] < 1e-2 * misfit.summary["cost"]
 
 
-def interval_and_states() -> tuple[Interval, Unknowns, State, State]:
+def interval_and_states() -> tuple[KeyframeInterval, Unknowns, State, State]:
     """A lively interval, with states that do not quite fit it."""
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))

@@ -20,7 +20,7 @@ from dives import (
 )
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter, replay
+from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, transpose
@@ -93,7 +93,7 @@ def test_filtered_errors_lie_within_what_is_said_of_them(case, filtered):
 
 
 def test_feeding_measurements_and_replaying_intervals_are_the_same(case, filtered):
-    again = replay(batch(case.log, case.config).intervals, initialise(case.log, case.config), RENEW_AT_S)
+    again = replay(batch(case.log, case.config).intervals, initialise(case.log, case.config), REINITIALISE_AT_S)
     a, b = filtered.solve(), again.solve()
     np.testing.assert_allclose(a.trajectory.p_n, b.trajectory.p_n, atol=1e-9)
     np.testing.assert_allclose(a.trajectory.cov_p, b.trajectory.cov_p, atol=1e-9)
@@ -102,7 +102,7 @@ def test_feeding_measurements_and_replaying_intervals_are_the_same(case, filtere
 def test_the_future_does_not_change_what_was_filtered(case, filtered):
     half = Log(case.log.source, {s: _until(stream, 40.0) for s, stream in case.log.streams.items()})
     # the start resolves the log's own noise and field, so both are told the same
-    estimator = fed(ErrorStateFilter(filtered.beginning, RENEW_AT_S), half)
+    estimator = fed(ErrorStateFilter(filtered.beginning, REINITIALISE_AT_S), half)
     short, full = estimator.solve().trajectory, filtered.solve().trajectory
     n = int(np.searchsorted(full.time, 39.0))
     np.testing.assert_allclose(short.p_n[:n], full.p_n[:n], atol=1e-9)

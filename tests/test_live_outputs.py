@@ -17,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs import FORMS, open_output
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.mavlink_messages import gps_input, vision_position_estimate
@@ -25,6 +24,7 @@ from rovgraph.live.outputs.nmea import gga, hdt
 from rovgraph.live.outputs.standard import StandardOutput
 from rovgraph.live.outputs.url import parsed
 from rovgraph.live.solution import Event, SensorHealth, Solution
+from rovgraph.live.warnings import Warnings
 
 pynmea2 = pytest.importorskip("pynmea2", reason="pynmea2 is not installed")
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
@@ -58,8 +58,8 @@ def said():
 
 
 @pytest.fixture
-def complaints(said):
-    return Complaints(lambda *about: said.append(about))
+def warnings(said):
+    return Warnings(lambda *about: said.append(about))
 
 
 def free_port(kind=socket.SOCK_STREAM) -> int:
@@ -192,7 +192,7 @@ def test_a_missing_library_names_the_extra(monkeypatch):
 
 
 def test_complaints_come_once_per_kind_and_period(said):
-    limited = Complaints(lambda *about: said.append(about), period=0.2).complain
+    limited = Warnings(lambda *about: said.append(about), period=0.2).complain
     for _ in range(2):
         for _ in range(50):
             limited("a", "slow", "text")
@@ -206,11 +206,11 @@ def test_complaints_come_once_per_kind_and_period(said):
 PRINTS = """
 import sys, time
 import numpy as np
-from rovgraph.live.complaints import Complaints
+from rovgraph.live.warnings import Warnings
 from rovgraph.live.outputs import open_output
 from rovgraph.live.solution import Solution
 v = np.zeros(3)
-out = open_output("-", Complaints(lambda *about: print(*about, file=sys.stderr)), patient=sys.argv[2] == "patient")
+out = open_output("-", Warnings(lambda *about: print(*about, file=sys.stderr)), patient=sys.argv[2] == "patient")
 slowest = 0.0
 for k in range(int(sys.argv[1])):
     begin = time.monotonic()
@@ -271,11 +271,11 @@ def test_a_closed_pipe_is_complained_of_once_and_is_no_error(how):
     assert outcome(err)["dropped"] == 300
 
 
-def test_a_line_that_was_begun_is_ended_before_the_next(said, complaints):
+def test_a_line_that_was_begun_is_ended_before_the_next(said, warnings):
     """A pipe that takes a part of a line, as a full disk does."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-    out = StandardOutput(parsed("-"), complaints, patient=True, descriptor=writing)
+    out = StandardOutput(parsed("-"), warnings, patient=True, descriptor=writing)
     taken = []
 
     def read_late():
@@ -313,8 +313,8 @@ def test_udp_to_nobody_raises_nothing():
     out.close()
 
 
-def test_a_datagram_that_cannot_be_sent_is_dropped_and_counted(said, complaints):
-    out = open_output("udp://127.0.0.1:9", complaints)
+def test_a_datagram_that_cannot_be_sent_is_dropped_and_counted(said, warnings):
+    out = open_output("udp://127.0.0.1:9", warnings)
     for k in range(3):
         out.send(replace(at(k), events=(Event(0.0, "", "", "x" * 70_000),)))
     assert out.dropped == 3
@@ -351,9 +351,9 @@ def test_tcp_serves_every_reader_on_the_loopback_only():
     out.close()
 
 
-def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(said, complaints):
+def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(said, warnings):
     port = free_port()
-    out = open_output(f"tcp://:{port}", complaints)
+    out = open_output(f"tcp://:{port}", warnings)
     slow = socket.socket()
     slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     slow.connect(("127.0.0.1", port))
@@ -385,9 +385,9 @@ def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(
     quick.close()
 
 
-def test_readers_come_and_go(said, complaints):
+def test_readers_come_and_go(said, warnings):
     port = free_port()
-    out = open_output(f"tcp://:{port}", complaints)
+    out = open_output(f"tcp://:{port}", warnings)
     for k in range(20):
         reader = socket.create_connection(("127.0.0.1", port))
         if k % 2:  # cut off at once, as a crash does
@@ -454,8 +454,8 @@ def test_sentences_hold_what_was_given_wherever_on_earth(latitude, longitude, ya
 
 
 @pytest.mark.parametrize("latitude", [None, NAN])
-def test_without_an_origin_only_the_heading_is_sent_and_that_is_said_once(datagrams, said, complaints, latitude):
-    out = open_output(f"nmea-udp://127.0.0.1:{datagrams.getsockname()[1]}", complaints)
+def test_without_an_origin_only_the_heading_is_sent_and_that_is_said_once(datagrams, said, warnings, latitude):
+    out = open_output(f"nmea-udp://127.0.0.1:{datagrams.getsockname()[1]}", warnings)
     for _ in range(3):
         out.send(replace(SOLUTION, latitude=latitude))
     assert all(datagrams.recv(1000).startswith(b"$GPHDT,331.35,T*") for _ in range(3))
@@ -540,18 +540,18 @@ def test_any_solution_makes_a_message_or_none(solution):
             message.pack(common.MAVLink(None))
 
 
-def test_without_an_origin_gps_input_says_so_once(said, complaints):
-    out = open_output("mavlink:udpout:127.0.0.1:9?message=GPS_INPUT", complaints)
+def test_without_an_origin_gps_input_says_so_once(said, warnings):
+    out = open_output("mavlink:udpout:127.0.0.1:9?message=GPS_INPUT", warnings)
     for _ in range(3):
         out.send(replace(SOLUTION, latitude=None))
     out.close()
     assert [kind for _, kind, _ in said] == ["not known"]
 
 
-def test_a_tcp_connection_is_waited_for_and_taken_up_again(said, complaints, monkeypatch, capfd):
+def test_a_tcp_connection_is_waited_for_and_taken_up_again(said, warnings, monkeypatch, capfd):
     monkeypatch.setattr("rovgraph.live.outputs.mavlink.RETRY_S", 0.05)
     port = free_port()
-    out = open_output(f"mavlink:tcp:127.0.0.1:{port}", complaints)
+    out = open_output(f"mavlink:tcp:127.0.0.1:{port}", warnings)
     out.send(SOLUTION)
     for _ in range(2):
         with socket.create_server(("127.0.0.1", port)) as server:

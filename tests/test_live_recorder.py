@@ -16,9 +16,9 @@ from hypothesis.extra import numpy as nps
 
 from rovgraph.errors import InputError
 from rovgraph.live.checkpoint import ARRAY, read_checkpoint, write_checkpoint
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.recorder import HEADER, Recorder
+from rovgraph.live.warnings import Warnings
 from rovgraph.log import STREAMS, read_log
 
 EPOCH = 1.7e9
@@ -178,11 +178,11 @@ def test_a_place_that_cannot_be_written_is_refused(tmp_path):
 FULL_DISK = """
 import json, resource, sys, time
 import numpy as np
-from rovgraph.live.complaints import Complaints
+from rovgraph.live.warnings import Warnings
 from rovgraph.live.message import Reading
 from rovgraph.live.recorder import Recorder
 said = []
-recorder = Recorder(sys.argv[1], Complaints(lambda *about: said.append(about)))
+recorder = Recorder(sys.argv[1], Warnings(lambda *about: said.append(about)))
 _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
 for k in range(1000):
@@ -223,7 +223,7 @@ def test_a_disk_that_stays_full_keeps_what_it_took_and_the_loss_is_counted(tmp_p
 
 def test_a_ninth_thruster_is_complained_of(tmp_path):
     said = []
-    recorder = Recorder(tmp_path / "r.csv", Complaints(lambda *about: said.append(about)))
+    recorder = Recorder(tmp_path / "r.csv", Warnings(lambda *about: said.append(about)))
     for t in (1.0, 2.0):
         recorder.write(t, EPOCH, [Reading("thruster", np.ones(9))])
     recorder.close()

@@ -37,7 +37,6 @@ from wire import (
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.feed import Feed
 from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.sources import Source, links, open_source, open_sources
@@ -48,6 +47,7 @@ from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.preferred import PATIENCE_S
 from rovgraph.live.sources.source import LinkSource, paced
 from rovgraph.live.sources.waterlinked import waterlinked
+from rovgraph.live.warnings import Warnings
 from rovgraph.log import read_log
 
 ROOT = Path(__file__).parents[1]
@@ -126,44 +126,42 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-# Complaints
+# Warnings
 
 
 def test_a_complaint_is_said_once_per_period_with_the_count_since():
     now, said = [0.0], []
-    complaints = Complaints(lambda *line: said.append(line), period=60.0, clock=lambda: now[0])
+    warnings = Warnings(lambda *line: said.append(line), period=60.0, clock=lambda: now[0])
     for _ in range(5):
-        complaints.complain("a", "noise", "what is this")
-    complaints.complain("b", "noise", "what is that")
+        warnings.complain("a", "noise", "what is this")
+    warnings.complain("b", "noise", "what is that")
     now[0] = 60.0
-    complaints.complain("a", "noise", "and this")
+    warnings.complain("a", "noise", "and this")
     assert said == [
         ("a", "noise", "what is this"),
         ("b", "noise", "what is that"),
         ("a", "noise", "and this (4 more since the last)"),
     ]
-    assert complaints.counts == {("a", "noise"): 6, ("b", "noise"): 1}
+    assert warnings.counts == {("a", "noise"): 6, ("b", "noise"): 1}
 
 
 def test_what_is_to_be_said_once_is_counted_all_the_same():
     now, said = [0.0], []
-    complaints = Complaints(lambda *line: said.append(line), clock=lambda: now[0])
+    warnings = Warnings(lambda *line: said.append(line), clock=lambda: now[0])
     for now[0] in (0.0, 100.0, 200.0):
-        complaints.complain("a", "unknown key", "foo", once=True)
+        warnings.complain("a", "unknown key", "foo", once=True)
     assert len(said) == 1
-    assert complaints.counts == {("a", "unknown key"): 3}
+    assert warnings.counts == {("a", "unknown key"): 3}
 
 
 def test_no_complaint_is_lost_between_threads():
-    complaints = Complaints()
-    work = [
-        threading.Thread(target=lambda: [complaints.complain("a", "b", "c") for _ in range(2000)]) for _ in range(4)
-    ]
+    warnings = Warnings()
+    work = [threading.Thread(target=lambda: [warnings.complain("a", "b", "c") for _ in range(2000)]) for _ in range(4)]
     for thread in work:
         thread.start()
     for thread in work:
         thread.join()
-    assert complaints.counts == {("a", "b"): 8000}
+    assert warnings.counts == {("a", "b"): 8000}
 
 
 # URLs
@@ -318,19 +316,19 @@ def test_a_bad_line_is_counted_by_kind_and_the_next_one_read(line, kind, size, h
 
 def test_an_unknown_key_is_counted_and_said_once_with_the_one_that_is_meant():
     said = []
-    complaints = Complaints(lambda *line: said.append(line))
-    decoder = open_source("-", complaints).decoder
+    warnings = Warnings(lambda *line: said.append(line))
+    decoder = open_source("-", warnings).decoder
     assert len(decoded(decoder, b'{"depth": 1, "gyro_x": 2, "note": "hello"}\n' * 10)) == 10
-    assert sorted(complaints.counts.values()) == [10, 10]
+    assert sorted(warnings.counts.values()) == [10, 10]
     assert len(said) == 2
     assert "gyr_x" in "".join(text for _, _, text in said)
 
 
 def test_unknown_keys_without_end_do_not_fill_the_memory():
-    complaints = Complaints()
-    decoded(open_source("-", complaints).decoder, *(b'{"k%d": 1}\n' % i for i in range(1000)))
-    assert len(complaints.counts) < 30
-    assert sum(complaints.counts.values()) == 1000
+    warnings = Warnings()
+    decoded(open_source("-", warnings).decoder, *(b'{"k%d": 1}\n' % i for i in range(1000)))
+    assert len(warnings.counts) < 30
+    assert sum(warnings.counts.values()) == 1000
 
 
 def test_a_rate_alone_takes_the_last_acceleration_of_half_a_second(heard):
@@ -397,17 +395,17 @@ def test_every_live_source_stops_within_half_a_second(pipe, heard, impatient):
 
 def test_a_tcp_source_connects_again_and_drops_the_line_that_was_cut(impatient):
     lines = iter([b'{"depth": 1}\n{"dep', b'{"depth": 2}\n'])
-    complaints = Complaints()
+    warnings = Warnings()
     with server(lambda connection: connection.sendall(next(lines)), connections=2) as port:
         url = f"tcp://127.0.0.1:{port}"
-        messages = take(open_source(url, complaints), 2)
+        messages = take(open_source(url, warnings), 2)
     assert [m.readings[0].values[0] for m in messages] == [1.0, 2.0]
-    assert complaints.counts == {(url, "disconnected"): 1}
+    assert warnings.counts == {(url, "disconnected"): 1}
 
 
 def test_a_host_that_is_not_there_is_complained_of_until_it_is(impatient):
-    port, complaints = free_port(), Complaints()
-    source = open_source(f"tcp://localhost:{port}", complaints)
+    port, warnings = free_port(), Warnings()
+    source = open_source(f"tcp://localhost:{port}", warnings)
     started: list[list[Message]] = []
     reader = threading.Thread(target=lambda: started.append(take(source, 1)), daemon=True)
     reader.start()
@@ -415,13 +413,13 @@ def test_a_host_that_is_not_there_is_complained_of_until_it_is(impatient):
     with server(lambda connection: connection.sendall(b'{"depth": 5}\n'), port=port):
         reader.join(5.0)
     assert [len(messages) for messages in started] == [1]
-    assert complaints.counts[source.url, "unreachable"] >= 2
+    assert warnings.counts[source.url, "unreachable"] >= 2
 
 
 @pytest.mark.parametrize("host", ["no-such-host.invalid", "a..b", "x" * 70])
 def test_a_name_that_does_not_resolve_is_complained_of(host, impatient):
     said = []
-    source = open_source(f"tcp://{host}:9", Complaints(lambda *line: said.append(line)))
+    source = open_source(f"tcp://{host}:9", Warnings(lambda *line: said.append(line)))
     assert take(source, 1, within=0.3) == []
     assert [kind for _, kind, _ in said] == ["unreachable"]
 
@@ -448,15 +446,15 @@ def test_a_port_that_is_taken_is_refused_at_once(form):
 def test_a_serial_port_is_read_and_a_lost_one_tried_again(impatient):
     pty = pytest.importorskip("pty")
     master, slave = pty.openpty()
-    complaints = Complaints()
-    source = open_source(f"nmea:{os.ttyname(slave)}?baud=9600", complaints)
+    warnings = Warnings()
+    source = open_source(f"nmea:{os.ttyname(slave)}?baud=9600", warnings)
     threading.Timer(0.2, lambda: os.write(master, sentence("HEHDT,90.0,T"))).start()
     _, reading = only(take(source, 1))
     assert reading.values[0] == pytest.approx(np.pi / 2)
     os.close(slave)
     os.close(master)
     assert take(source, 1, within=0.3) == []
-    assert complaints.counts[source.url, "unreachable"] >= 1
+    assert warnings.counts[source.url, "unreachable"] >= 1
 
 
 # Water Linked
@@ -526,12 +524,12 @@ def test_a_dvl_that_sends_partial_lines_dies_and_comes_back_is_read_all_along(im
                 time.sleep(0.005)
         connection.sendall(report()[:50])
 
-    complaints = Complaints()
+    warnings = Warnings()
     with server(dvl, connections=2) as port:
-        source = open_source(f"waterlinked://127.0.0.1:{port}", complaints)
+        source = open_source(f"waterlinked://127.0.0.1:{port}", warnings)
         messages = take(source, 6)
     assert [m.readings[0].values[0] for m in messages] == [0.0, 1.0, 2.0, 10.0, 11.0, 12.0]
-    assert set(complaints.counts) == {(source.url, "disconnected")}
+    assert set(warnings.counts) == {(source.url, "disconnected")}
 
 
 def test_the_port_of_a_dvl_need_not_be_written():
@@ -686,8 +684,8 @@ def real_tlog() -> Path:
 
 
 def test_a_real_telemetry_log_is_read_whole(real_tlog):
-    complaints = Complaints()
-    source = open_source(f"mavlink:{real_tlog}?surface=1013.25", complaints, speed="max")
+    warnings = Warnings()
+    source = open_source(f"mavlink:{real_tlog}?surface=1013.25", warnings, speed="max")
     messages = list(source.messages(threading.Event()))
     found = {sensor: np.array(values) for sensor, values in by_sensor(messages).items()}
     # as counted with pymavlink's own reader; the second IMU says zeros, fixes repeat
@@ -700,7 +698,7 @@ def test_a_real_telemetry_log_is_read_whole(real_tlog):
     stamps = np.array([m.stamp for m in messages])
     assert {m.clock for m in messages} == {"boot"}
     np.testing.assert_allclose(arrivals - stamps, np.median(arrivals - stamps), atol=2.0)
-    assert complaints.counts == {(source.url, "bad data"): 4}
+    assert warnings.counts == {(source.url, "bad data"): 4}
 
 
 # NMEA
@@ -799,11 +797,11 @@ def test_a_file_of_sentences_arrives_at_the_times_it_tells(tmp_path):
     path = tmp_path / "dive.nmea"
     heading, fix = sentence("HEHDT,90.0,T"), "GPRMC,2213%02d.00,A,5818.000,N,01506.000,E,1,0,141123,,,A"
     path.write_bytes(heading + sentence(fix % 20) + heading + sentence(fix % 21) + heading)
-    complaints = Complaints()
-    source = open_source(f"nmea:{path}?speed=max", complaints)
+    warnings = Warnings()
+    source = open_source(f"nmea:{path}?speed=max", warnings)
     arrivals = [m.arrival for m in source.messages(threading.Event())]
     np.testing.assert_allclose(arrivals, np.array([0, 0, 1, 1]) + ARRIVAL)
-    assert complaints.counts == {(source.url, "no time"): 1}
+    assert warnings.counts == {(source.url, "no time"): 1}
 
 
 # Files
@@ -929,21 +927,21 @@ def test_a_source_that_can_wait_is_kept_waiting():
 
 
 def test_a_source_that_cannot_wait_loses_messages_and_it_is_complained_of():
-    complaints = Complaints()
-    feed = iter(Feed([Scripted("a", list(range(1000)), lossy=True)], complaints, size=10))
+    warnings = Warnings()
+    feed = iter(Feed([Scripted("a", list(range(1000)), lossy=True)], warnings, size=10))
     first = next(feed)
     time.sleep(0.2)
     kept = [first, *(m for m in feed if m is not None)]
-    lost = complaints.counts["a", "flood"]
+    lost = warnings.counts["a", "flood"]
     assert lost > 0
     assert len(kept) + lost == 1000
 
 
 def test_a_source_that_fails_ends_alone():
-    complaints = Complaints()
-    messages = list(Feed([Scripted("a", [1], fails=True), Scripted("b", [2], wait=0.2)], complaints))
+    warnings = Warnings()
+    messages = list(Feed([Scripted("a", [1], fails=True), Scripted("b", [2], wait=0.2)], warnings))
     assert sorted(m.arrival for m in messages if m is not None) == [1, 2]
-    assert complaints.counts == {("a", "failed"): 1}
+    assert warnings.counts == {("a", "failed"): 1}
 
 
 def test_closing_ends_the_iteration_and_the_threads():

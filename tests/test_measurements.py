@@ -13,8 +13,9 @@ from rovgraph.calibration import TABLE
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation
-from rovgraph.graph.assembly import Attached, Sighting
+from rovgraph.graph.assembly import KeyframeMeasurement, LandmarkObservation
 from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.late_stamp_window import KNOT_S, LateStampWindow
 from rovgraph.graph.measurements import (
     Block,
     loss_and_weight,
@@ -25,8 +26,7 @@ from rovgraph.graph.measurements import (
 )
 from rovgraph.graph.preintegration import Snapshot
 from rovgraph.graph.rows import Rows
-from rovgraph.graph.scale import felt
-from rovgraph.graph.track import KNOT_S, Track
+from rovgraph.graph.scale import scale_to_bias
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
 
@@ -50,15 +50,15 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         motion = motion if moving else _STILL
         rate, z = rng.standard_normal(3), rng.standard_normal(instrument.model.dim)
         sd = instrument.sd * rng.uniform(0.5, 2.0, instrument.model.dim)
-        track = track_of(motion, bias, rng) if instrument.lateness else None
-        S = felt(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
-        seen = Sighting(1.0, 7) if sensor == "place" else None
+        track = track_of(motion, bias, rng) if instrument.time_offset else None
+        S = scale_to_bias(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
+        seen = LandmarkObservation(1.0, 7) if sensor == "place" else None
         place = (sensor, k, k // 2, 0.2 * k, 10 + k)
-        attached.append(Attached(*place, z, sd, rate, 0.01, motion, bias, track, S, seen))
+        attached.append(KeyframeMeasurement(*place, z, sd, rate, 0.01, motion, bias, track, S, seen))
     return make_block(attached, instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 
 
-def track_of(motion: Snapshot, bias: Array, rng: np.random.Generator) -> Track:
+def track_of(motion: Snapshot, bias: Array, rng: np.random.Generator) -> LateStampWindow:
     """A lively motion around a stamp."""
     lag = KNOT_S * np.arange(-60, 61)
     turn, dv, dp, rate = (wave(lag, rng) for _ in range(4))
@@ -66,7 +66,7 @@ def track_of(motion: Snapshot, bias: Array, rng: np.random.Generator) -> Track:
         Snapshot(motion.dt - t, motion.dR @ exp_rotation(a), motion.dv + v, motion.dp + p)
         for t, a, v, p in zip(lag, turn, dv, dp, strict=True)
     ]
-    return Track.of(_STILL, knots, lag, rate, bias)
+    return LateStampWindow.of(_STILL, knots, lag, rate, bias)
 
 
 def wave(time: Array, rng: np.random.Generator) -> Array:
@@ -203,7 +203,7 @@ def test_whitening_takes_in_the_noise_of_the_rate_at_the_lever_arm():
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_block_predicts_at_the_measurements_own_time(sensor):
     block, state = block_of(sensor)
-    block = replace(block, track=None, felt=None)
+    block = replace(block, window=None, scale_to_bias=None)
     there = propagate(state, block.motion, block.gravity)
     expected = block.instrument.model.predict(there, block.rate_b)[0]
     np.testing.assert_allclose(block.predicted(state), expected, atol=1e-12)
@@ -231,9 +231,9 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     swing = np.einsum("nij,nj->ni", motion.R_nb, np.cross(motion.w_b, arm))
     p_n, zero = motion.p_n + motion.R_nb @ arm, np.zeros((len(motion), 6))
     truth = State(motion.R_nb, p_n, motion.v_n + swing, zero, case.dive.hidden["calibration"])
-    by_sensor: dict[str, list[Attached]] = {}
+    by_sensor: dict[str, list[KeyframeMeasurement]] = {}
     for interval in smoother.intervals:
-        for a in interval.attached:
+        for a in interval.measurements:
             by_sensor.setdefault(a.sensor, []).append(a)
     assert set(by_sensor) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
     for sensor, attached in by_sensor.items():

@@ -17,7 +17,7 @@ from rovgraph.estimators.observability import (
     UNOBSERVABLE_ABOVE,
     data_information,
     relative_covariance,
-    without_noise,
+    without_spurious_information,
 )
 from rovgraph.graph.batch import make_values
 from rovgraph.graph.information import knowledge
@@ -122,7 +122,7 @@ def test_what_noise_pretends_is_taken_off(straight):
         return data_information(knowledge(problem, values, solution.gates, end).calibration, sd)
 
     truth, claimed = seen(at_truth(case, dive)), seen(solution.values)
-    corrected = without_noise(problem, solution, end, claimed, sd[None])
+    corrected = without_spurious_information(problem, solution, end, claimed, sd[None])
     true, told, own = (np.sqrt(np.diag(relative_covariance(D)))[0] for D in (truth[0], claimed[0], corrected[0]))
     assert problem.unknowns.estimated[0] == "dvl_yaw"
     assert true > 0.99

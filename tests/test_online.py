@@ -24,10 +24,10 @@ from wire import packed, report
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.files import Files
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import Session
+from rovgraph.live.warnings import Warnings
 from rovgraph.log import read_log
 from rovgraph.simulate.files import write_dive
 from rovgraph.trajectory import Trajectory
@@ -228,7 +228,7 @@ def test_bad_input_is_counted_and_said_once_and_the_estimate_goes_on(lines, case
             process.send_signal(signal.SIGTERM)
             _, said = process.communicate(timeout=START_S)
             assert process.returncode == 0
-    counts = counted(summary(out), "complaints")
+    counts = counted(summary(out), "warnings")
     for kind in ("not JSON", "not UTF-8", "NaN or Infinity", "string", "no object", "stamp", "unreachable"):
         assert counts[kind] > 1
         assert said.decode().count(f": {kind}: ") <= 2, "one for each source"
@@ -327,11 +327,11 @@ class Full:
 def test_a_disk_that_is_full_for_a_while_costs_nothing(case, tmp_path, monkeypatch):
     monkeypatch.setattr("rovgraph.live.files.KEEP_S", 0.0)
     said: list[str] = []
-    complaints = Complaints(lambda source, kind, text: said.append(text))
+    warnings = Warnings(lambda source, kind, text: said.append(text))
     nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
-    files = Files(tmp_path, case.config, complaints)
+    files = Files(tmp_path, case.config, warnings)
     full = Full(monkeypatch, nav, 15.0, 25.0)
-    Session(nav, [], complaints, 2.0, files).run(message(m) for m in case.log.measurements())
+    Session(nav, [], warnings, 2.0, files).run(message(m) for m in case.log.measurements())
     files.close()
     assert full.refused > 1
     assert any("No space left" in text for text in said)
@@ -344,19 +344,19 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(case, tmp_path, monkeypat
 
 
 def test_a_checkpoint_that_is_damaged_is_said_in_one_line(case, tmp_path):
-    files = Files(tmp_path, case.config, Complaints())
+    files = Files(tmp_path, case.config, Warnings())
     files.close()
     (tmp_path / "checkpoint").write_bytes(b"rovgraph checkpoint 2 0000\nx")
     with pytest.raises(InputError, match="damaged"):
-        Files(tmp_path, case.config, Complaints(), resume=True)
+        Files(tmp_path, case.config, Warnings(), resume=True)
 
 
 def recorded(folder: Path, case: Simulated, until: float) -> None:
     """A run that was ended at some time."""
-    complaints = Complaints()
+    warnings = Warnings()
     nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
-    files = Files(folder, case.config, complaints)
-    Session(nav, [], complaints, 2.0, files).run(message(m) for m in case.log.measurements() if m.time < until)
+    files = Files(folder, case.config, warnings)
+    Session(nav, [], warnings, 2.0, files).run(message(m) for m in case.log.measurements() if m.time < until)
     files.close()
 
 
@@ -367,15 +367,15 @@ def test_a_recording_that_cannot_be_read_is_said_and_the_track_before_stands(cas
     recording[500] = b"\0" * 80
     (tmp_path / "received.csv").write_bytes(b"\n".join(recording))
     with pytest.raises(InputError, match="line 501 holds binary data"):
-        Files(tmp_path, case.config, Complaints(), resume=True)
+        Files(tmp_path, case.config, Warnings(), resume=True)
     assert (tmp_path / "trajectory_filtered.csv").read_bytes() == track
 
 
 def test_resuming_what_received_nothing_begins_anew_and_writes_what_is_json(case, tmp_path):
     recorded(tmp_path, case, 0.0)
     nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
-    files = Files(tmp_path, case.config, Complaints(), resume=True)
-    session = Session(nav, [], Complaints(), 2.0, files)
+    files = Files(tmp_path, case.config, Warnings(), resume=True)
+    session = Session(nav, [], Warnings(), 2.0, files)
     session.resume()
     session.run(message(m) for m in case.log.measurements() if m.time < 20.0)
     files.close()

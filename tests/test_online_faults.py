@@ -15,12 +15,12 @@ from rovgraph.errors import InputError
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.refiner import due_times
 from rovgraph.live.clocks import Clocks
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.files import Files
 from rovgraph.live.intake import Intake
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import Session
+from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, Measurement, Stream
 
 AT = 20.0  # when something fails
@@ -257,8 +257,8 @@ def test_a_track_that_cannot_be_smoothed_leaves_the_filter_running(case, tmp_pat
 
     monkeypatch.setattr(IncrementalEstimator, "solve", fails)
     nav = Navigator(case.config, renew=False, smooth=True, clocks=Clocks(trust=True))
-    files = Files(tmp_path, case.config, Complaints())
-    session = Session(nav, [], Complaints(), 2.0, files)
+    files = Files(tmp_path, case.config, Warnings())
+    session = Session(nav, [], Warnings(), 2.0, files)
     session.run(message(m) for m in case.log.measurements() if m.time < 20.0)
     files.close()
     assert nav.isam2 is None

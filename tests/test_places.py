@@ -26,12 +26,12 @@ from scipy.stats import chi2
 from rovgraph.check import examine
 from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
+from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import Assembler, Attached, Sighting
+from rovgraph.graph.assembly import Assembler, KeyframeMeasurement, LandmarkObservation
 from rovgraph.graph.information import OTHERS, knowledge
 from rovgraph.graph.keys import key, key_name
 from rovgraph.graph.marginals import covariances, marginals, newest_covariance
@@ -88,7 +88,9 @@ def square(seed: int, false: float, sd: float = SD) -> tuple[Simulated, Config]:
 
 def filtered(log: Log, config: Config, renew: bool = True) -> ErrorStateFilter:
     """The filter that has taken a log."""
-    estimator: ErrorStateFilter = fed(ErrorStateFilter(initialise(log, config), RENEW_AT_S if renew else ()), log)
+    estimator: ErrorStateFilter = fed(
+        ErrorStateFilter(initialise(log, config), REINITIALISE_AT_S if renew else ()), log
+    )
     return estimator
 
 
@@ -141,7 +143,7 @@ def lost() -> Simulated:
 
 @pytest.fixture(scope="module")
 def misled() -> Simulated:
-    """The same dive with as many false sightings as true ones."""
+    """The same dive with as many false landmarks as true ones."""
     return circle(dropouts=((53.0, 77.0),), false_places=0.5)
 
 
@@ -151,7 +153,7 @@ def of_places(estimate: Estimate) -> pd.DataFrame:
 
 
 def is_false(case: Simulated) -> dict[float, bool]:
-    """Whether the vehicle is elsewhere, at every sighting."""
+    """Whether the vehicle is elsewhere, at every landmark."""
     stream, out = case.log["place"], {}
     for time, name in zip(stream.time, stream["place_id"], strict=True):
         where = true_at(case, np.array([time])).p_n[0, :2]
@@ -166,7 +168,7 @@ def test_without_noise_the_dive_is_found_and_every_sighting_fits():
     rows = of_places(estimate)
     assert len(rows) == 2 * len(case.log["place"]) > 8
     off = np.column_stack([rows.loc[rows["component"] == c, "predicted"] for c in ("north", "east")])
-    where = true_at(case, case.log["place"].time).p_n[:, :2] - off  # each place, as its sightings have it
+    where = true_at(case, case.log["place"].time).p_n[:, :2] - off  # each place, as its landmarks have it
     for name in (1.0, 2.0):
         assert np.ptp(where[case.log["place"]["place_id"] == name], axis=0).max() < 0.01
     assert (rows["weight"] > 0.5).all()
@@ -229,11 +231,13 @@ def test_a_false_first_sighting_spoils_none_of_those_that_follow(lost):
 
 
 def walked(offsets: Array, sd: Array, names: Array) -> list[int]:
-    """Numbers of sightings on a random walk whose steps have a standard deviation of 1 m."""
+    """Numbers of landmarks on a random walk whose steps have a standard deviation of 1 m."""
     m = len(offsets)
     still = (Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3)), np.zeros(6))
     seen = [
-        Attached("place", k, 0, float(k), k, np.zeros(2), sd, np.zeros(3), 0.0, *still, sighting=Sighting(name, k))
+        KeyframeMeasurement(
+            "place", k, 0, float(k), k, np.zeros(2), sd, np.zeros(3), 0.0, *still, landmark=LandmarkObservation(name, k)
+        )
         for k, name in enumerate(names)
     ]
     steps = np.minimum.outer(np.arange(m), np.arange(m)) + 1.0
@@ -329,8 +333,8 @@ def test_a_place_that_stays_in_view_counts_once(lost):
     log = Log("dive.csv", {**lost.log.streams, "place": stream})
     assembler = Assembler(beginning.config, beginning.instruments, beginning.start.state.bias[0])
     intervals = [i for m in log.measurements() for i in assembler.add(m)]
-    seen = [a for i in intervals for a in i.attached if a.sensor == "place"]
-    assert [a.time for a in seen] == [50.0, 55.0] and [a.sighting.number for a in seen] == [1, 2]
+    seen = [a for i in intervals for a in i.measurements if a.sensor == "place"]
+    assert [a.time for a in seen] == [50.0, 55.0] and [a.landmark.number for a in seen] == [1, 2]
     assert all((a.sd == 0.3).all() for a in seen)
     assert assembler.left_out["place", "still in view"] == len(time) - 2
     assert key_name(key("place", 2)) == "place 2"

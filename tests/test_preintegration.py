@@ -175,7 +175,7 @@ def test_a_gap_in_the_imu_is_bridged_with_an_inflated_covariance():
     assert rotation_density(bridged[1]) == pytest.approx(BRIDGE_GYR, rel=0.1)
     assert rotation_density(bridged[1]) > 50 * np.median([rotation_density(i) for i in whole])
     # and a ping in the gap knows that its rate is a guess
-    inside = [a for i in bridged for a in i.attached if a.sensor == "dvl" and 20.2 < a.time < 22.9]
+    inside = [a for i in bridged for a in i.measurements if a.sensor == "dvl" and 20.2 < a.time < 22.9]
     assert inside and all(a.rate_sd == BRIDGE_GYR for a in inside)
 
 
@@ -194,7 +194,7 @@ def test_a_keyframe_stands_where_samples_come_again_and_what_follows_is_whole():
     [at] = [k for k, i in enumerate(intervals) if i.time == again]
     assert intervals[at].gap_s == pytest.approx(3.02, abs=0.02)
     assert intervals[at + 1].gap_s == 0.0
-    carried = [a.motion.dt for a in intervals[at + 1].attached if a.keyframe == at]
+    carried = [a.motion.dt for a in intervals[at + 1].measurements if a.keyframe == at]
     assert carried and max(carried) < 0.2
 
 

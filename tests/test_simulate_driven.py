@@ -66,8 +66,8 @@ def test_motion_obeys_the_hydrodynamics(world, wavy):
     R_bn = transpose(motion.R_nb)
     water, pull = sea.velocity(motion.time), [0, 0, 9.81] - sea.acceleration(motion.time)
     v_b = rotate(R_bn, motion.v_n - water)
-    felt = rotate(R_bn, motion.a_n - sea.acceleration(motion.time)) - cross(motion.w_b, v_b)
-    error = felt - world.vehicle.acceleration(v_b, motion.w_b, force)[0]
+    scale_to_bias = rotate(R_bn, motion.a_n - sea.acceleration(motion.time)) - cross(motion.w_b, v_b)
+    error = scale_to_bias - world.vehicle.acceleration(v_b, motion.w_b, force)[0]
     noise = np.sqrt(np.diag(R_MTI))
     assert np.all(np.sqrt(np.mean(error**2, axis=0)) < 0.1 * noise[:3])
     assert np.all(np.abs(error.mean(axis=0)) < 1e-4)
@@ -85,9 +85,9 @@ def test_wrong_drag_would_be_seen(wavy):
     motion = path.motion(STEP_S * steps)
     R_bn = transpose(motion.R_nb)
     v_b = rotate(R_bn, motion.v_n - sea.velocity(motion.time))
-    felt = rotate(R_bn, motion.a_n - sea.acceleration(motion.time)) - cross(motion.w_b, v_b)
+    scale_to_bias = rotate(R_bn, motion.a_n - sea.acceleration(motion.time)) - cross(motion.w_b, v_b)
     force = VEHICLE.force_and_moment(delayed(path)[steps])[0]
-    assert np.abs((felt - VEHICLE.acceleration(v_b, motion.w_b, force)[0]).mean(axis=0)).max() > 1e-2
+    assert np.abs((scale_to_bias - VEHICLE.acceleration(v_b, motion.w_b, force)[0]).mean(axis=0)).max() > 1e-2
 
 
 def test_thrusters_rise_in_a_hundred_and_twenty_milliseconds():

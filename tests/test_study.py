@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from errands import errand
 from scipy.stats import chi2
+from tasks import errand
 
 from rovgraph.cli.app import main
 from rovgraph.errors import DataWarning, InputError

@@ -31,7 +31,7 @@ from rovgraph import thesis
 from rovgraph.config import Config, beliefs, load_config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate
-from rovgraph.estimators.kalman import FILTERS, Asked, Filter, run_filter, run_filters
+from rovgraph.estimators.kalman import FILTERS, Filter, FilterJob, run_filter, run_filters
 from rovgraph.estimators.kalman import quaternion as quat
 from rovgraph.estimators.kalman.dvl import DvlModel, Ping
 from rovgraph.estimators.kalman.known import KnownMotion
@@ -334,7 +334,7 @@ def test_clean_dive_is_recovered(name, path):
 
 
 def test_what_waves_do_to_a_clean_dive_is_the_angular_acceleration_that_3_1_neglects():
-    """Roll at the MTi's lever arm is felt as acceleration, and becomes bias, tilt and heading."""
+    """Roll at the MTi's lever arm is scale_to_bias as acceleration, and becomes bias, tilt and heading."""
     worst = {}
     for arm in (CONFIG.imu.lever_arm_m, (0.0, 0.0, 0.0)):
         config = falcon(imu={"lever_arm_m": list(arm)})
@@ -674,7 +674,7 @@ def dives_of_many_kinds() -> list[tuple[Log, Config]]:
 
 @pytest.mark.parametrize("names", ["4.1", "4.1-no-accelerometer", "4.3a 4.3b 4.3c", "4.4a 4.4b 4.4c", "4.5"])
 def test_filters_side_by_side_do_what_each_does_alone(names):
-    asked = [Asked(FILTERS[name], *dive) for dive in dives_of_many_kinds() for name in names.split()]
+    asked = [FilterJob(FILTERS[name], *dive) for dive in dives_of_many_kinds() for name in names.split()]
     for each, together in zip(asked, run_filters(asked), strict=True):
         assert isinstance(together, Estimate)
         assert_same(together, run_filter(each.variant, each.log, each.config))
@@ -686,7 +686,7 @@ def test_filters_with_switches_do_so_too(switch):
     log = kept(case.log, "imu", case.log["imu"].time < 8.0)
     loud = FILTERS["4.3c"].with_numbers(acceleration=(1e-3, 1e-5, 1e-5))
     variants = [replace(f, noise_frame="earth", **switch) for f in (FILTERS["4.3a"], FILTERS["4.3b"], loud)]
-    asked = [Asked(f, log, started(case), case.truth) for f in variants]
+    asked = [FilterJob(f, log, started(case), case.truth) for f in variants]
     for each, together in zip(asked, run_filters(asked), strict=True):
         assert isinstance(together, Estimate)
         alone = run_filter(each.variant, each.log, each.config, each.truth)
@@ -700,8 +700,10 @@ def test_vehicles_side_by_side_do_what_each_does_alone():
     log, _ = thruster_dive(20.0)
     config = changed(CONFIG, start={"heading_deg": float(np.rad2deg(0.5))})
     heavy = changed(config, vehicle={"mass_kg": 90.0, "drag_linear": (50.0, 150.0, 80.0)})
-    asked = [Asked(FILTERS["4.2"], kept(log, "imu", log["imu"].time < end), c) for end, c in ((9, heavy), (20, config))]
-    asked.append(Asked(FILTERS["4.2"], kept(log, "dvl", log["dvl"].time < 5.0), heavy))
+    asked = [
+        FilterJob(FILTERS["4.2"], kept(log, "imu", log["imu"].time < end), c) for end, c in ((9, heavy), (20, config))
+    ]
+    asked.append(FilterJob(FILTERS["4.2"], kept(log, "dvl", log["dvl"].time < 5.0), heavy))
     for each, together in zip(asked, run_filters(asked), strict=True):
         assert isinstance(together, Estimate)
         assert_same(together, run_filter("4.2", each.log, each.config))
@@ -712,7 +714,7 @@ def test_one_that_fails_does_not_touch_the_others():
     config, log = started(case), kept(case.log, "imu", case.log["imu"].time < 15.0)
     absurd = altered(log, "imu", np.where(log["imu"].time[:, None] > 10.0, 1e200, 1.0) * log["imu"].data)
     logs = [log, absurd, without(log, "mag"), without(log, "dvl_heading")]
-    asked = [Asked(FILTERS[name], each, config) for each in logs for name in ("4.3a", "4.3b", "4.3c")]
+    asked = [FilterJob(FILTERS[name], each, config) for each in logs for name in ("4.3a", "4.3b", "4.3c")]
     done = run_filters(asked)
     words = [None] * 3 + ["diverges at 10."] * 3 + ["mag_x", None, "mag_x"] + ["dvl_heading"] * 2 + [None]
     for each, outcome, word in zip(asked, done, words, strict=True):
@@ -862,7 +864,7 @@ def real_log() -> tuple[Config, Log]:
 def test_fifteen_side_by_side_take_less_than_two_thirds_of_the_time():
     case = lively_dive()
     log = kept(case.log, "imu", case.log["imu"].time < 8.0)
-    asked = [Asked(FILTERS[f"4.3{letter}"], log, started(case)) for letter in "abc"]
+    asked = [FilterJob(FILTERS[f"4.3{letter}"], log, started(case)) for letter in "abc"]
     spent = []
     for many in (5 * asked, asked[:1]):
         runs = []

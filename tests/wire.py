@@ -15,7 +15,7 @@ ARRIVAL = 1_700_000_000.0
 
 
 class Heard:
-    """Complaints of a test, by kind."""
+    """Warnings of a test, by kind."""
 
     def __init__(self) -> None:
         self.kinds: Counter[str] = Counter()

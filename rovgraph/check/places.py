@@ -21,7 +21,7 @@ def places(log: Log, config: Config) -> Iterator[Finding]:
         text = f"{len(names)} places and none of them seen again: they tell nothing; is place_id the same each time?"
         yield Finding("place", "warning", text)
         return
-    counted = f"{len(stream)} sightings of {len(names)} places, {again.sum()} of them seen again"
+    counted = f"{len(stream)} landmarks of {len(names)} places, {again.sum()} of them seen again"
     text = f"{counted}, up to {spans.max():.0f} s later"
     if not again.all():
         text += f"; {(~again).sum()} seen only once tell nothing"

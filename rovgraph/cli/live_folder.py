@@ -79,7 +79,7 @@ def finished(out: Path, session: "Session", refine: bool) -> None:
             "calibration": {name: list(pair) for name, pair in solution.calibration.items()},
             "solutions": session.solutions,
             "left_out": [[*key, count] for key, count in sorted(navigator.left_out.items())],
-            "complaints": [[*key, count] for key, count in sorted(session.complaints.counts.items())],
+            "warnings": [[*key, count] for key, count in sorted(session.warnings.counts.items())],
             "updates": session.updates(),
         },
     )

@@ -44,31 +44,31 @@ def online(
     from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
     from rovgraph.errors import InputError
     from rovgraph.live.clocks import Clocks
-    from rovgraph.live.complaints import Complaints
     from rovgraph.live.feed import Feed
     from rovgraph.live.files import Files
     from rovgraph.live.navigator import Navigator
     from rovgraph.live.outputs import open_output
     from rovgraph.live.session import Session
     from rovgraph.live.sources import open_sources
+    from rovgraph.live.warnings import Warnings
     from rovgraph.report.status import StatusLine
 
     if resume and out is None:
         raise InputError("--resume needs the folder to go on with, --out")
-    settings, complaints = configured(config, out, resume), Complaints(_say)
+    settings, warnings = configured(config, out, resume), Warnings(_say)
     warn_of_unused(config, *(url for url in sources if url.startswith("file:") and not resume))
-    opened = open_sources(sources, complaints, settings, speed)
+    opened = open_sources(sources, warnings, settings, speed)
     if resume and any(source.pace == 1.0 for source in opened):
         raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
-    feed = Feed(opened, complaints)
+    feed = Feed(opened, warnings)
     wanted = output if output is not None else ([] if sys.stdout.isatty() else ["-"])
-    outputs = [open_output(url, complaints, patient=feed.recorded) for url in wanted]
+    outputs = [open_output(url, warnings, patient=feed.recorded) for url in wanted]
     files = None
     if out is not None:
         prepared(out, force, resume, sources)
-        files = Files(out, settings, complaints, resume, anew=engine is Engine.isam2)
+        files = Files(out, settings, warnings, resume, anew=engine is Engine.isam2)
     navigator = Navigator(settings, feed.recorded, smooth=engine is Engine.isam2, clocks=Clocks(trust=feed.replayed))
-    session = Session(navigator, [each.send for each in outputs], complaints, rate, files)
+    session = Session(navigator, [each.send for each in outputs], warnings, rate, files)
     asked_by_signal(session.want_smoothed)
     with ended_by_signals(feed.close):
         try:

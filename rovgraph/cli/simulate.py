@@ -53,7 +53,7 @@ def simulate(
         list[str] | None,
         typer.Option(help="A place that a camera recognises, in m, as 10:-5; may be repeated.", metavar="NORTH:EAST"),
     ] = None,
-    false_places: Annotated[float, typer.Option(help="Share of its sightings that are false, below 1.")] = 0.0,
+    false_places: Annotated[float, typer.Option(help="Share of its landmarks that are false, below 1.")] = 0.0,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Noise, biases and drawn calibration.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an older folder.")] = False,
 ) -> None:

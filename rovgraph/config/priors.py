@@ -9,7 +9,7 @@ from pydantic import BaseModel, BeforeValidator, Field, create_model
 from pydantic_core import PydanticCustomError
 
 from rovgraph.calibration import MOUNT, TABLE, Variable
-from rovgraph.config.complaints import count
+from rovgraph.config.error_messages import count
 from rovgraph.config.sections import NotNegative, Positive, Section
 
 

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from rovgraph.calibration import MOUNT, TABLE, Belief
-from rovgraph.config.complaints import complaint
+from rovgraph.config.error_messages import complaint
 from rovgraph.config.priors import Calibration
 from rovgraph.config.sections import (
     Depth,

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.linearization import Linearization
-from rovgraph.estimators.passage import Gaussian
 from rovgraph.geometry import (
     Array,
     exp_rotation,
@@ -24,26 +24,30 @@ from rovgraph.geometry import (
     skew,
     transpose,
 )
-from rovgraph.graph.assembly import Attached, Interval
+from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.instruments import HEADING_STREAMS
 
-VAGUE_TILT, VAGUE_HEADING = np.deg2rad(4.0), np.deg2rad(10.0)  # sd from which a tangent does harm
+POORLY_KNOWN_TILT, POORLY_KNOWN_HEADING = np.deg2rad(4.0), np.deg2rad(10.0)  # sd from which a tangent does harm
 STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
 AT_REST = 0.2  # share of gravity by which a mean specific force may differ from it and still show where down is
 
 
-def vague(known: Gaussian) -> bool:
+def attitude_poorly_known(known: Gaussian) -> bool:
     """Whether tilt or heading is hardly known."""
-    if known.P[0, 0] + known.P[1, 1] + known.P[2, 2] < VAGUE_TILT**2:
+    if known.P[0, 0] + known.P[1, 1] + known.P[2, 2] < POORLY_KNOWN_TILT**2:
         return False
     tilt, heading = _variances(known)
-    return bool(tilt > VAGUE_TILT**2 or heading > VAGUE_HEADING**2)
+    return bool(tilt > POORLY_KNOWN_TILT**2 or heading > POORLY_KNOWN_HEADING**2)
 
 
 def aligned(
-    known: Gaussian, interval: Interval, between: Sequence[Attached], measurements: Linearization, gravity: float
+    known: Gaussian,
+    interval: KeyframeInterval,
+    between: Sequence[KeyframeMeasurement],
+    measurements: Linearization,
+    gravity: float,
 ) -> Gaussian:
-    """The keyframe before an interval, levelled and turned to its compasses where it is `vague`.
+    """The keyframe before an interval, levelled and turned to its compasses where it is `attitude_poorly_known`.
 
     Parameters
     ----------
@@ -54,15 +58,15 @@ def aligned(
     gravity : [m/s^2]
     """
     tilt, heading = _variances(known)
-    if tilt > VAGUE_TILT**2:
-        known = facing(known, _levelled(known, interval, gravity))
+    if tilt > POORLY_KNOWN_TILT**2:
+        known = with_attitude(known, _levelled(known, interval, gravity))
     compasses = [a for a in between if a.sensor in HEADING_STREAMS]
-    if compasses and heading > VAGUE_HEADING**2:
-        known = facing(known, _towards(known, compasses, measurements))
+    if compasses and heading > POORLY_KNOWN_HEADING**2:
+        known = with_attitude(known, _towards(known, compasses, measurements))
     return known
 
 
-def facing(known: Gaussian, R_nb: Array) -> Gaussian:
+def with_attitude(known: Gaussian, R_nb: Array) -> Gaussian:
     """The same with another attitude, shape (3, 3); the covariance of attitude stays along the body's axes.
 
     A velocity that is better known along these axes turns with them.
@@ -84,7 +88,7 @@ def _variances(known: Gaussian) -> tuple[float, float]:
     return max(north, east), down
 
 
-def _levelled(known: Gaussian, interval: Interval, gravity: float) -> Array:
+def _levelled(known: Gaussian, interval: KeyframeInterval, gravity: float) -> Array:
     """The attitude whose down is that of the interval's mean specific force, where that can be gravity's."""
     R_nb: Array = known.state.R_nb[0]
     if interval.pim is None or interval.bridged:
@@ -96,7 +100,7 @@ def _levelled(known: Gaussian, interval: Interval, gravity: float) -> Array:
     return matrix_from_rpy([*level_from_force(force_b), rpy_from_matrix(R_nb)[2]])
 
 
-def _towards(known: Gaussian, compasses: Sequence[Attached], measurements: Linearization) -> Array:
+def _towards(known: Gaussian, compasses: Sequence[KeyframeMeasurement], measurements: Linearization) -> Array:
     """The attitude with the heading that compasses make likeliest.
 
     Headings all around the believed one are tried, calibration and tilt being as sure as they are.

@@ -19,7 +19,7 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.error_state import (
-    RENEW_AT_S,
+    REINITIALISE_AT_S,
     ErrorStateFilter,
     alike,
     replay,
@@ -28,7 +28,7 @@ from rovgraph.estimators.error_state import (
 )
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.kalman import Asked, Filter, run_filters
+from rovgraph.estimators.kalman import Filter, FilterJob, run_filters
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.log import Log
 
@@ -47,7 +47,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Named:
+class EstimatorSpec:
     """An estimator that can be asked for by name.
 
     Attributes
@@ -82,7 +82,7 @@ class Named:
         return self.variant.kind if self.variant else (self.headings, self.misalignment, self.stages[0])
 
     @property
-    def knowing(self) -> tuple[object, ...]:
+    def configuration_key(self) -> tuple[object, ...]:
         """The same for estimators that work with the same configuration."""
         return self.headings, self.misalignment, self.hydrodynamics
 
@@ -126,18 +126,18 @@ class Outcome:
         went side by side [s]
     """
 
-    named: Named
+    named: EstimatorSpec
     estimate: Estimate | None
     error: Exception | None
     seconds: float
 
 
-def outcomes(estimators: Sequence[Named], log: Log, config: Config) -> Iterator[Outcome]:
+def outcomes(estimators: Sequence[EstimatorSpec], log: Log, config: Config) -> Iterator[Outcome]:
     """Run estimators on one log; one that fails does not stop the others.
 
     Parameters
     ----------
-    estimators : those of which `Named.shared` is the same are best asked for together
+    estimators : those of which `EstimatorSpec.shared` is the same are best asked for together
     log, config : the dive, and what is believed of vehicle and sensors
 
     Yields
@@ -147,7 +147,7 @@ def outcomes(estimators: Sequence[Named], log: Log, config: Config) -> Iterator[
     return (outcome for _, outcome in outcomes_of_dives(estimators, [Task(log, config)]))
 
 
-def outcomes_of_dives(estimators: Sequence[Named], dives: Sequence[Task]) -> Iterator[tuple[int, Outcome]]:
+def outcomes_of_dives(estimators: Sequence[EstimatorSpec], dives: Sequence[Task]) -> Iterator[tuple[int, Outcome]]:
     """Run estimators on several logs, as `outcomes` does on one; so filters take less time.
 
     Yields
@@ -174,13 +174,13 @@ def outcomes_of_dives(estimators: Sequence[Named], dives: Sequence[Task]) -> Ite
         made[k].clear()
 
 
-def _replay_side_by_side(estimators: Sequence[Named], dives: Sequence[Task], made: Sequence[Made]) -> None:
+def _replay_side_by_side(estimators: Sequence[EstimatorSpec], dives: Sequence[Task], made: Sequence[Made]) -> None:
     """Make what `Replay` makes, and its smoothers, all that is alike at once; what fails is left to be run alone."""
-    asked: dict[tuple[object, ...], list[Named]] = {}
+    asked: dict[tuple[object, ...], list[EstimatorSpec]] = {}
     for named in estimators:
         if any(isinstance(stage, Replay) for stage in named.stages):
-            asked.setdefault(named.knowing, []).append(named)
-    for knowing, those in asked.items():
+            asked.setdefault(named.configuration_key, []).append(named)
+    for configuration_key, those in asked.items():
         stages = {stage for named in those for stage in named.stages}
         batches: dict[int, BatchSmoother] = {}
         for k, dive in enumerate(dives):
@@ -189,7 +189,7 @@ def _replay_side_by_side(estimators: Sequence[Named], dives: Sequence[Task], mad
         for group in _groups(batches):
             with contextlib.suppress(Exception):
                 for (k, chain), result in _replayed(group, stages, dives).items():
-                    made[k][(*knowing, assembled, *chain)] = result
+                    made[k][(*configuration_key, assembled, *chain)] = result
 
 
 def _groups(batches: Mapping[int, BatchSmoother]) -> list[dict[int, BatchSmoother]]:
@@ -209,7 +209,7 @@ def _replayed(
 ) -> dict[tuple[int, tuple[Stage, ...]], tuple[Any, float]]:
     """Filters of dives that are alike, and their smoothers; by dive and stages, each with its share of the time."""
     filters: dict[tuple[int, Replay], ErrorStateFilter] = {
-        (k, stage): ErrorStateFilter(batch.beginning, stage.renew_at)
+        (k, stage): ErrorStateFilter(batch.beginning, stage.reinitialise_at)
         for k, batch in batches.items()
         for stage in (STEPPED, RENEWED)
         if stage in stages
@@ -235,15 +235,15 @@ def _shares(spent: float, dives: Sequence[Task]) -> list[float]:
     return [spent * seconds / sum(recorded) for seconds in recorded]
 
 
-def _side_by_side(estimators: Sequence[Named], dives: Sequence[Task]) -> dict[tuple[int, str], Outcome]:
+def _side_by_side(estimators: Sequence[EstimatorSpec], dives: Sequence[Task]) -> dict[tuple[int, str], Outcome]:
     """Filters of one kind on all dives; by index of the dive and name."""
     out: dict[tuple[int, str], Outcome] = {}
-    asked: dict[tuple[int, str], tuple[Named, Asked]] = {}
+    asked: dict[tuple[int, str], tuple[EstimatorSpec, FilterJob]] = {}
     for (k, dive), named in itertools.product(enumerate(dives), estimators):
         try:
             task = named.task(dive.log, dive.config)
             assert named.variant is not None
-            asked[k, named.name] = named, Asked(named.variant, task.log, task.config)
+            asked[k, named.name] = named, FilterJob(named.variant, task.log, task.config)
         except Exception as error:
             out[k, named.name] = Outcome(named, None, error, float("nan"))
     began = time.process_time()
@@ -269,10 +269,10 @@ def _recorded_s(log: Log) -> float:
     return max(float(time[-1] - time[0]), SHORTEST_S)
 
 
-def _run_chain(named: Named, stages: Sequence[Stage], dive: Task, made: Made) -> tuple[Any, float]:
+def _run_chain(named: EstimatorSpec, stages: Sequence[Stage], dive: Task, made: Made) -> tuple[Any, float]:
     """The result of stages of an estimator and its processor time; ``made`` keeps results by what led to them."""
     result: Any = named.task(dive.log, dive.config)
-    chain, total = named.knowing, 0.0
+    chain, total = named.configuration_key, 0.0
     for stage in stages:
         chain = (*chain, stage)
         if chain not in made:
@@ -328,13 +328,13 @@ class Replay:
 
     Attributes
     ----------
-    renew_at : of `rovgraph.estimators.error_state.ErrorStateFilter`
+    reinitialise_at : of `rovgraph.estimators.error_state.ErrorStateFilter`
     """
 
-    renew_at: tuple[float, ...] = ()
+    reinitialise_at: tuple[float, ...] = ()
 
     def __call__(self, batch: BatchSmoother) -> ErrorStateFilter:
-        return replay(batch.intervals, batch.beginning, self.renew_at)
+        return replay(batch.intervals, batch.beginning, self.reinitialise_at)
 
 
-STEPPED, RENEWED = Replay(), Replay(RENEW_AT_S)
+STEPPED, RENEWED = Replay(), Replay(REINITIALISE_AT_S)

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
-from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
-from rovgraph.graph.assembly import Interval
+from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.sensors import dvl_mount
 from rovgraph.state import State
@@ -22,7 +22,9 @@ COMPASS_S = 5.0  # and of following the compass
 FIRST_DOWN = np.array([0.0, 0.0, 1.0])
 
 
-def dead_reckon(intervals: Sequence[Interval], beginning: Beginning, calibration: Mapping[str, Array]) -> State:
+def dead_reckon(
+    intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]
+) -> State:
     """The state at every keyframe, at the IMU.
 
     Parameters
@@ -53,7 +55,7 @@ def dead_reckon(intervals: Sequence[Interval], beginning: Beginning, calibration
     return State(R_nb, p_n, v_n, np.array(biases), dict(calibration))
 
 
-def _compass(beginning: Beginning) -> str | None:
+def _compass(beginning: InitialConditions) -> str | None:
     sources: list[str] = [s for s in HEADING_STREAMS if s in beginning.instruments]
     return next(iter(trusted_first(beginning.config, sources)), None)
 
@@ -61,8 +63,8 @@ def _compass(beginning: Beginning) -> str | None:
 def _turn(
     R: Array,
     bias: Array,
-    interval: Interval,
-    beginning: Beginning,
+    interval: KeyframeInterval,
+    beginning: InitialConditions,
     compass: str | None,
     calibration: Mapping[str, Array],
 ) -> tuple[Array, Array]:
@@ -73,7 +75,7 @@ def _turn(
     excess = bias - pim.biasHatVector()
     turn = pim.deltaRij().matrix() @ exp_rotation(-dt * excess[3:])
     correction_n = np.zeros(3)
-    for a in interval.attached:
+    for a in interval.measurements:
         if a.sensor == compass and a.keyframe == interval.index - 1:
             there = State((R @ a.motion.dR)[None], np.zeros((1, 3)), np.zeros((1, 3)), bias[None], calibration)
             error = yaw_correction(beginning.instruments[compass], a.z[None], there)[0]
@@ -88,10 +90,14 @@ def _turn(
 
 
 def _velocities(
-    intervals: Sequence[Interval], R_nb: Array, biases: Array, beginning: Beginning, calibration: Mapping[str, Array]
+    intervals: Sequence[KeyframeInterval],
+    R_nb: Array,
+    biases: Array,
+    beginning: InitialConditions,
+    calibration: Mapping[str, Array],
 ) -> Array:
     """Velocity of the IMU in n from the pings at keyframes, held or interpolated between them."""
-    pings = [(i.index, a) for i in intervals for a in i.attached if a.sensor == "dvl" and a.keyframe == i.index]
+    pings = [(i.index, a) for i in intervals for a in i.measurements if a.sensor == "dvl" and a.keyframe == i.index]
     if not pings:
         return np.zeros((len(intervals), 3))
     index = np.array([k for k, _ in pings])
@@ -106,10 +112,10 @@ def _velocities(
 
 
 def _depths(
-    intervals: Sequence[Interval], integrated: Array, R_nb: Array, beginning: Beginning, offset: float
+    intervals: Sequence[KeyframeInterval], integrated: Array, R_nb: Array, beginning: InitialConditions, offset: float
 ) -> Array:
     """Depth of the IMU from the pressure sensor, where there is one."""
-    found = [(a.time, a.z[0]) for i in intervals for a in i.attached if a.sensor == "depth"]
+    found = [(a.time, a.z[0]) for i in intervals for a in i.measurements if a.sensor == "depth"]
     if not found:
         return integrated
     time, depth = np.array(found).T

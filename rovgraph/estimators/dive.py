@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from functools import partial
 
 from rovgraph.config import Config
-from rovgraph.estimators.error_state import PROGRESS_EVERY, RENEW_AT_S, ErrorStateFilter, replay
+from rovgraph.estimators.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import Beginning, initialise
+from rovgraph.estimators.initialise import InitialConditions, initialise
 from rovgraph.estimators.smoother import BatchSmoother
-from rovgraph.graph.assembly import Interval
+from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.log import Log
 from rovgraph.workers import starting, workers
 
@@ -33,7 +33,7 @@ class Dive:
     """
 
     estimates: list[Estimate]
-    beginning: Beginning
+    beginning: InitialConditions
     left_out: dict[tuple[str, str], int]
 
     @property
@@ -77,7 +77,7 @@ def smooth(
     return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
 
 
-def assemble(log: Log, beginning: Beginning) -> BatchSmoother:
+def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
     """All keyframes of a log and what lies between them."""
     batch = BatchSmoother(beginning)
     for measurement in log.measurements():
@@ -90,20 +90,20 @@ def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
     progress("smoothing", 0.1)
     if batch.beginning.config.graph.solver == "isam2":
         solver = run(batch.intervals, batch.beginning, progress)
-        anew = batch.placed_anew(solver.latest().calibration)
+        anew = batch.placed_again(solver.latest().calibration)
         return (solver if anew is None else run(anew.intervals, anew.beginning, progress)).solve()
     return batch.solve()
 
 
-def _filtered(log: Log, beginning: Beginning) -> Estimate:
+def _filtered(log: Log, beginning: InitialConditions) -> Estimate:
     return _filter(assemble(log, beginning))
 
 
 def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:
     filtering = partial(progress, "filtering")
     if not batch.measurements:
-        return replay(batch.intervals, batch.beginning, RENEW_AT_S, filtering).solve()
-    estimator = ErrorStateFilter(batch.beginning, RENEW_AT_S)  # learns how late they are while they come
+        return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering).solve()
+    estimator = ErrorStateFilter(batch.beginning, REINITIALISE_AT_S)  # learns how late they are while they come
     for k, measurement in enumerate(batch.measurements):
         if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:
             filtering(k / len(batch.measurements))
@@ -111,7 +111,9 @@ def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:
     return estimator.solve()
 
 
-def run(intervals: Sequence[Interval], beginning: Beginning, progress: Progress = no_progress) -> IncrementalEstimator:
+def run(
+    intervals: Sequence[KeyframeInterval], beginning: InitialConditions, progress: Progress = no_progress
+) -> IncrementalEstimator:
     """Feed intervals to iSAM2."""
     estimator = IncrementalEstimator(beginning)
     for interval in intervals:

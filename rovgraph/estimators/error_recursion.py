@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.config import beliefs
-from rovgraph.estimators.alignment import aligned, facing, vague
+from rovgraph.estimators.alignment import aligned, attitude_poorly_known, with_attitude
 from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, Step
+from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.innovations import Innovations
 from rovgraph.estimators.linearization import Linearization
-from rovgraph.estimators.passage import Gates, Gaussian, Passage, Step, Used
 from rovgraph.estimators.remembered_places import (
     Place,
     extended,
@@ -36,7 +36,7 @@ from rovgraph.estimators.remembered_places import (
 )
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import Array, identities, transpose
-from rovgraph.graph.assembly import Attached, Interval
+from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.graph.factors import predict
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.scale import COLUMNS, SCALES
@@ -90,7 +90,7 @@ class ErrorStateRecursion:
     measurements : as they are linearised
     """
 
-    def __init__(self, beginning: Beginning) -> None:
+    def __init__(self, beginning: InitialConditions) -> None:
         self.beginning = beginning
         self.beliefs = beliefs(beginning.config)
         self.unknowns = unknowns(self.beliefs, beginning.instruments)
@@ -111,7 +111,7 @@ class ErrorStateRecursion:
         P[:3, :3], P[3:6, 3:6] = (transpose(R_nb) @ P[i : i + 3, i : i + 3] @ R_nb for i in (0, 3))
         return Gaussian(replace(start.state, calibration=self.unknowns.fixed), P)
 
-    def through(self, interval: Interval, before: Gaussian, gates: Gates) -> Passage:
+    def through(self, interval: KeyframeInterval, before: Gaussian, gates: Gates) -> FilterStep:
         """Take one interval.
 
         Parameters
@@ -123,31 +123,31 @@ class ErrorStateRecursion:
         return self.through_together([interval], [before], [gates])[0]
 
     def through_together(
-        self, intervals: Sequence[Interval], before: Sequence[Gaussian], gates: Sequence[Gates]
-    ) -> list[Passage]:
+        self, intervals: Sequence[KeyframeInterval], before: Sequence[Gaussian], gates: Sequence[Gates]
+    ) -> list[FilterStep]:
         """Take one interval of each of some filters; `through` says of what.
 
         All of them are at their first keyframe, or none is; where there are several, none has seen a place.
         """
-        used: list[list[Used]] = [[] for _ in intervals]
+        used: list[list[ProcessedMeasurement]] = [[] for _ in intervals]
         departed: Sequence[Gaussian | None] = [None] * len(intervals)
         steps: Sequence[Step | None] = [None] * len(intervals)
         predicted = before
         if intervals[0].pim is not None:
-            between = [[a for a in i.attached if a.keyframe < i.index] for i in intervals]
+            between = [[a for a in i.measurements if a.keyframe < i.index] for i in intervals]
             near = [self._aligned(*own) for own in zip(before, intervals, between, strict=True)]
             departed = left = self._update(near, between, gates, used)
             steps = made = self.predict_together(intervals, left)
             predicted = [step.predicted for step in made]
-        here = [[a for a in i.attached if a.keyframe == i.index] for i in intervals]
+        here = [[a for a in i.measurements if a.keyframe == i.index] for i in intervals]
         filtered = self._update(predicted, here, gates, used)
-        return [Passage(*one) for one in zip(departed, steps, filtered, used, strict=True)]
+        return [FilterStep(*one) for one in zip(departed, steps, filtered, used, strict=True)]
 
-    def predict(self, interval: Interval, before: Gaussian) -> Step:
+    def predict(self, interval: KeyframeInterval, before: Gaussian) -> Step:
         """The next keyframe, from the IMU alone; calibration walks."""
         return self.predict_together([interval], [before])[0]
 
-    def predict_together(self, intervals: Sequence[Interval], before: Sequence[Gaussian]) -> list[Step]:
+    def predict_together(self, intervals: Sequence[KeyframeInterval], before: Sequence[Gaussian]) -> list[Step]:
         """The next keyframes of some filters; as `predict`."""
         size, P = self.error.size, np.array([known.P for known in before])
         states = [predict(interval, known.state) for interval, known in zip(intervals, before, strict=True)]
@@ -156,16 +156,16 @@ class ErrorStateRecursion:
         for k, interval in enumerate(intervals):
             assert interval.pim is not None
             Q[k, :size, :size] = self._walk * interval.pim.deltaTij()
-            if interval.felt is not None:
+            if interval.scale_to_bias is not None:
                 for name in set(SCALES) & set(self.error.columns):  # they move as the bias does, but for itself
-                    F[k, :9, self.error.columns[name]] = F[k, :9, 9:15] @ interval.felt[:, COLUMNS[name]]
+                    F[k, :9, self.error.columns[name]] = F[k, :9, 9:15] @ interval.scale_to_bias[:, COLUMNS[name]]
         Q[:, :15, :15] = own_Q
         P = F @ P @ transpose(F) + Q
         P = 0.5 * (P + transpose(P))
         predicted = [Gaussian(*one) for one in zip(states, P, (known.places for known in before), strict=True)]
         return [Step(*one) for one in zip(F, Q, predicted, strict=True)]
 
-    def trajectory(self, intervals: Sequence[Interval], known: Sequence[Gaussian]) -> Trajectory:
+    def trajectory(self, intervals: Sequence[KeyframeInterval], known: Sequence[Gaussian]) -> Trajectory:
         """The body's origin at keyframes, at least one, in n, with its covariance.
 
         Parameters
@@ -212,27 +212,27 @@ class ErrorStateRecursion:
     def _update(
         self,
         before: Sequence[Gaussian],
-        attached: Sequence[Sequence[Attached]],
+        attached: Sequence[Sequence[KeyframeMeasurement]],
         gates: Sequence[Gates | None],
-        used: Sequence[list[Used]],
+        used: Sequence[list[ProcessedMeasurement]],
     ) -> Sequence[Gaussian]:
         """The estimates corrected by what belongs to their keyframes, places last; without gates all of it counts."""
-        known = self._measured(before, [[a for a in own if a.sighting is None] for own in attached], gates, used)
-        sighted = [a for own in attached for a in own if a.sighting is not None]
+        known = self._measured(before, [[a for a in own if a.landmark is None] for own in attached], gates, used)
+        sighted = [a for own in attached for a in own if a.landmark is not None]
         assert not sighted or len(known) == 1
         for a in sighted:
             known = [self._sighted(known[0], a, used[0])]
         return known
 
-    def _aligned(self, known: Gaussian, interval: Interval, between: Sequence[Attached]) -> Gaussian:
-        """The keyframe before an interval; if its attitude is vague, with the one that its measurements lead to."""
-        if not vague(known):
+    def _aligned(self, known: Gaussian, interval: KeyframeInterval, between: Sequence[KeyframeMeasurement]) -> Gaussian:
+        """The keyframe before an interval; with a new attitude where it is poorly known."""
+        if not attitude_poorly_known(known):
             return known
         near = aligned(known, interval, between, self.measurements, self.beginning.config.environment.gravity_mps2)
         [after] = self._update([near], [between], [None], [[]])
-        return facing(known, after.state.R_nb[0])
+        return with_attitude(known, after.state.R_nb[0])
 
-    def _admit(self, a: Attached, nis: float, gates: Gates) -> bool:
+    def _admit(self, a: KeyframeMeasurement, nis: float, gates: Gates) -> bool:
         """Whether a measurement lies within its gate."""
         instrument = self.beginning.instruments[a.sensor]
         gate, since = instrument.gate_sd, gates.get(a.sensor)
@@ -259,9 +259,9 @@ class ErrorStateRecursion:
     def _measured(
         self,
         before: Sequence[Gaussian],
-        attached: Sequence[Sequence[Attached]],
+        attached: Sequence[Sequence[KeyframeMeasurement]],
         gates: Sequence[Gates | None],
-        used: Sequence[list[Used]],
+        used: Sequence[list[ProcessedMeasurement]],
     ) -> Sequence[Gaussian]:
         """The estimates corrected by measurements that belong to their keyframes, of no places."""
         if not any(attached):
@@ -270,7 +270,7 @@ class ErrorStateRecursion:
         r, H, parts = self.measurements.linearize(known.state, attached)
         losses = [[self.beginning.instruments[a.sensor].loss for a in own] for own in attached]
         said = Innovations(known.P, r, [padded(own, known.P.shape[1]) for own in H], parts, losses)
-        admitted: dict[int, list[tuple[int, Attached, float]]] = {}
+        admitted: dict[int, list[tuple[int, KeyframeMeasurement, float]]] = {}
         for k, (one, own) in enumerate(zip(before, attached, strict=True)):
             for j, (a, part) in enumerate(zip(own, parts[k], strict=True)):
                 nis = said.nis(k, part)
@@ -278,7 +278,7 @@ class ErrorStateRecursion:
                 if shut is None or self._admit(a, nis, shut):
                     admitted.setdefault(k, []).append((j, a, nis))
                     continue
-                used[k].append(Used(a, one.state, nis, 0.0))
+                used[k].append(ProcessedMeasurement(a, one.state, nis, 0.0))
                 instrument = self.beginning.instruments[a.sensor]
                 if a.time - shut[a.sensor] > instrument.readmit_s:
                     said.doubt(k, part, padded(self._seen(instrument.model, one.state).T, known.P.shape[1]).T)
@@ -288,7 +288,9 @@ class ErrorStateRecursion:
             return after
         updates = said.update()
         for k, own_admitted in admitted.items():
-            used[k].extend(Used(a, before[k].state, nis, updates[k][2][j]) for j, a, nis in own_admitted)
+            used[k].extend(
+                ProcessedMeasurement(a, before[k].state, nis, updates[k][2][j]) for j, a, nis in own_admitted
+            )
         if len(admitted) < len(before):
             known = self._together([before[k] for k in admitted])
         delta, P, _ = zip(*(updates[k] for k in admitted), strict=True)
@@ -297,25 +299,25 @@ class ErrorStateRecursion:
             after[k] = one
         return after
 
-    def _sighted(self, before: Gaussian, a: Attached, used: list[Used]) -> Gaussian:
+    def _sighted(self, before: Gaussian, a: KeyframeMeasurement, used: list[ProcessedMeasurement]) -> Gaussian:
         """The state corrected by a place that is seen again, or with one place more."""
-        assert a.sighting is not None
-        instrument, size, sighting = self.beginning.instruments[a.sensor], self.error.size, a.sighting
+        assert a.landmark is not None
+        instrument, size, landmark = self.beginning.instruments[a.sensor], self.error.size, a.landmark
         together = self._together([before])
         (r,), (H,), [[part]] = self.measurements.linearize(together.state, [[a]])
-        match = nearest(before.P, r, H, a.sd, size, before.places, sighting.name)
+        match = nearest(before.P, r, H, a.sd, size, before.places, landmark.name)
         gate = instrument.gate_sd or np.inf
         if match is not None and match.nis <= gate**2:
             [(delta, P, [weight])] = Innovations(
                 together.P, [match.r], [match.H], [[part]], [[instrument.loss]]
             ).update()
             place = before.places[match.index]
-            seen = replace(a, sighting=sighting._replace(number=place.number))
-            used.append(Used(seen, before.state.seeing(place.position), match.nis, weight))
+            seen = replace(a, landmark=landmark._replace(number=place.number))
+            used.append(ProcessedMeasurement(seen, before.state.seeing(place.position), match.nis, weight))
             [after] = self.corrected([before], delta[None], P[None])
             return replace(after, places=seen_at(after.places, match.index, a.time))
-        place = Place(sighting.name, sighting.number, -a.sd * r, a.time)
+        place = Place(landmark.name, landmark.number, -a.sd * r, a.time)
         other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
-        used.append(Used(a, before.state.seeing(other.position), nis, 1.0 if match is None else 0.0))
+        used.append(ProcessedMeasurement(a, before.state.seeing(other.position), nis, 1.0 if match is None else 0.0))
         P, places = with_another(before.P, before.places, place, a.sd[:, None] * H, a.sd)
         return Gaussian(before.state, *without_oldest(P, places, size, self.beginning.config.place.remembered))

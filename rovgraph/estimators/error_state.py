@@ -13,10 +13,10 @@ import numpy as np
 
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.passage import Gates, Gaussian, Passage, Step, Used
+from rovgraph.estimators.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, Step
+from rovgraph.estimators.initialise import InitialConditions
+from rovgraph.estimators.reinitialisation import renewed
 from rovgraph.estimators.remembered_places import columns, common, extended
-from rovgraph.estimators.renewal import renewed
 from rovgraph.estimators.results import (
     bias_histories,
     calibration_estimates,
@@ -24,14 +24,14 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array, transpose
-from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.graph.measurements import Block
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, PLACE, State, stack_states
 
-# since the start, for `ErrorStateFilter.renew_at`: while heading, mounting and compasses are known to
+# since the start, for `ErrorStateFilter.reinitialise_at`: while heading, mounting and compasses are known to
 # several degrees only, what was linearised once misstates what it knows by the square of that
-RENEW_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+REINITIALISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 PROGRESS_EVERY = 50  # keyframes
 
 
@@ -42,7 +42,7 @@ class ErrorStateFilter:
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
-    renew_at : times since the start at which the dive so far is solved as a graph, and the filter
+    reinitialise_at : times since the start at which the dive so far is solved as a graph, and the filter
         goes on from there [s]
     learn_noise : of the IMU, from its newest samples
     filtered : Gaussian of each keyframe so far, from all data up to it
@@ -51,28 +51,28 @@ class ErrorStateFilter:
     gates : sensors that are being kept out
     """
 
-    beginning: Beginning
-    renew_at: tuple[float, ...] = ()
+    beginning: InitialConditions
+    reinitialise_at: tuple[float, ...] = ()
     learn_noise: bool = False
 
     def __post_init__(self) -> None:
         b = self.beginning
         self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=self.learn_noise)
-        self.intervals: list[Interval] = []
+        self.intervals: list[KeyframeInterval] = []
         self.recursion = ErrorStateRecursion(b)
         self.error = self.recursion.error
         self.filtered: list[Gaussian] = []
         self.departed: list[Gaussian] = []
         self.steps: list[Step] = []
         self.gates: Gates = {}
-        self._renewals = list(self.renew_at)
-        self._used: dict[str, list[Used]] = {}
+        self._renewals = list(self.reinitialise_at)
+        self._used: dict[str, list[ProcessedMeasurement]] = {}
 
-    def add(self, measurement: Measurement) -> list[Interval]:
+    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
         return self._take(self.assembler.add(measurement))
 
-    def finish(self) -> list[Interval]:
+    def finish(self) -> list[KeyframeInterval]:
         """Close the last interval."""
         return self._take(self.assembler.finish())
 
@@ -80,24 +80,24 @@ class ErrorStateFilter:
         """The newest keyframe's state, at the IMU, calibration included."""
         return self.filtered[-1].state
 
-    def step(self, interval: Interval) -> list[Used]:
+    def step(self, interval: KeyframeInterval) -> list[ProcessedMeasurement]:
         """Take one interval: update, predict, update; the measurements that entered, or did not."""
         return step_together([self], [interval])[0]
 
-    def passed(self, interval: Interval, passage: Passage) -> None:
+    def passed(self, interval: KeyframeInterval, filter_step: FilterStep) -> None:
         """Keep what came of an interval."""
-        if passage.departed is not None and passage.step is not None and not self.renew_at:
-            self.departed.append(passage.departed)
-            self.steps.append(passage.step)
-        self.filtered.append(passage.filtered)
-        for used in passage.used:
-            self._used.setdefault(used.attached.sensor, []).append(used)
+        if filter_step.departed is not None and filter_step.step is not None and not self.reinitialise_at:
+            self.departed.append(filter_step.departed)
+            self.steps.append(filter_step.step)
+        self.filtered.append(filter_step.filtered)
+        for used in filter_step.used:
+            self._used.setdefault(used.measurement.sensor, []).append(used)
         self.intervals.append(interval)
         if self._renewals and interval.time - self.intervals[0].time >= self._renewals[0]:
             self._renewals.pop(0)
             states = stack_states([known.state for known in self.filtered])
             self.filtered[-1] = renewed(self.recursion, self.intervals, states)
-        self.assembler.stamps.assume(self.latest().calibration)
+        self.assembler.time_offsets.assume(self.latest().calibration)
 
     @property
     def known(self) -> Gaussian:
@@ -106,7 +106,7 @@ class ErrorStateFilter:
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""
-        return self.estimate("filtered" if self.renew_at else "ekf", self.filtered)
+        return self.estimate("filtered" if self.reinitialise_at else "ekf", self.filtered)
 
     def smoothed(self) -> Estimate:
         """The smoother's estimate of every keyframe so far; not of a filter that was renewed."""
@@ -120,7 +120,7 @@ class ErrorStateFilter:
         """
         return backward_together([self])[0]
 
-    def _take(self, intervals: list[Interval]) -> list[Interval]:
+    def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
         for interval in intervals:
             self.step(interval)
         return intervals
@@ -149,7 +149,7 @@ class ErrorStateFilter:
         """
         blocks, here, weights = {}, {}, {}
         for sensor, rows in self._used.items():
-            blocks[sensor] = block = self.recursion.measurements.block([used.attached for used in rows])
+            blocks[sensor] = block = self.recursion.measurements.block([used.measurement for used in rows])
             here[sensor] = stack_states([used.state for used in rows])
             if smoothed is not None:
                 places = here[sensor].calibration.get(PLACE)
@@ -216,7 +216,7 @@ def _back(
     return recursion.corrected(departed, (G @ delta[..., None])[..., 0], P)
 
 
-def alike(some: Beginning, other: Beginning) -> bool:
+def alike(some: InitialConditions, other: InitialConditions) -> bool:
     """Whether filters of two dives can go side by side: but for the start they know the same, and of no places."""
     config = other.config.model_copy(update={"start": some.config.start})
     sensors = list(some.instruments)
@@ -224,20 +224,20 @@ def alike(some: Beginning, other: Beginning) -> bool:
 
 
 def replay(
-    intervals: Sequence[Interval],
-    beginning: Beginning,
-    renew_at: tuple[float, ...] = (),
+    intervals: Sequence[KeyframeInterval],
+    beginning: InitialConditions,
+    reinitialise_at: tuple[float, ...] = (),
     progress: Callable[[float], None] = lambda done: None,
 ) -> ErrorStateFilter:
     """A filter that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
-    estimator = ErrorStateFilter(beginning, renew_at)
+    estimator = ErrorStateFilter(beginning, reinitialise_at)
     replay_together([estimator], [intervals], progress)
     return estimator
 
 
 def replay_together(
     filters: Sequence[ErrorStateFilter],
-    dives: Sequence[Sequence[Interval]],
+    dives: Sequence[Sequence[KeyframeInterval]],
     progress: Callable[[float], None] = lambda done: None,
 ) -> None:
     """Let filters that are `alike` take the intervals of a dive each."""
@@ -249,10 +249,12 @@ def replay_together(
             progress(index / longest)
 
 
-def step_together(filters: Sequence[ErrorStateFilter], intervals: Sequence[Interval]) -> list[list[Used]]:
+def step_together(
+    filters: Sequence[ErrorStateFilter], intervals: Sequence[KeyframeInterval]
+) -> list[list[ProcessedMeasurement]]:
     """`ErrorStateFilter.step` of filters that are `alike` and have taken equally many intervals."""
     known, gates = [one.known for one in filters], [one.gates for one in filters]
-    passages = filters[0].recursion.through_together(intervals, known, gates)
-    for one, interval, passage in zip(filters, intervals, passages, strict=True):
-        one.passed(interval, passage)
-    return [passage.used for passage in passages]
+    filter_steps = filters[0].recursion.through_together(intervals, known, gates)
+    for one, interval, filter_step in zip(filters, intervals, filter_steps, strict=True):
+        one.passed(interval, filter_step)
+    return [filter_step.used for filter_step in filter_steps]

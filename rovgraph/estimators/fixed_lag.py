@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
-from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.passage import Gates, Gaussian, Used
+from rovgraph.estimators.filter_step import Gates, Gaussian, ProcessedMeasurement
+from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.remembered_places import Place
-from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.log.streams import precedence
 from rovgraph.state import State
 
 
-class Taken(StrEnum):
+class InsertResult(StrEnum):
     """What became of a measurement."""
 
     IN = "taken"
@@ -41,7 +41,7 @@ def place(measurement: Measurement) -> tuple[float, int, str]:
 
 
 @dataclass(frozen=True)
-class Mark:
+class FilterSnapshot:
     """The filter as it was after a keyframe.
 
     Attributes
@@ -54,10 +54,10 @@ class Mark:
     taken : count of measurements that had been taken
     """
 
-    interval: Interval
+    interval: KeyframeInterval
     known: Gaussian
     gates: Gates
-    used: list[Used]
+    used: list[ProcessedMeasurement]
     assembler: Assembler
     taken: int
 
@@ -71,18 +71,18 @@ class FixedLag:
     beginning : of `rovgraph.estimators.initialise.initialise`
     lag_s : how late a measurement may be against the newest of the IMU [s]
     hold_s : how long measurements are held back before they are taken; later ones cost more [s]
-    passed : called with each `Mark` that the lag has passed, for good
+    passed : called with each `FilterSnapshot` that the lag has passed, for good
     learn_noise : of the IMU, from its newest samples
     settled : called with measurements, in order, that nothing can come before any more
     """
 
-    beginning: Beginning
+    beginning: InitialConditions
     lag_s: float
     hold_s: float
-    passed: Callable[[Mark], None] = lambda mark: None
+    passed: Callable[[FilterSnapshot], None] = lambda mark: None
     settled: Callable[[list[Measurement]], None] = lambda measurements: None
     learn_noise: bool = False
-    marks: deque[Mark] = field(default_factory=deque)
+    marks: deque[FilterSnapshot] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
         self.recursion = ErrorStateRecursion(self.beginning)
@@ -93,7 +93,7 @@ class FixedLag:
         self._taken = 0
         self._newest = -float("inf")  # of the IMU
 
-    def add(self, measurement: Measurement) -> Taken:
+    def add(self, measurement: Measurement) -> InsertResult:
         """Take a measurement, whenever it arrives."""
         record, position, again = self._record, len(self._record), False
         if record and measurement.time <= record[-1].time:
@@ -101,16 +101,16 @@ class FixedLag:
             position = bisect_right(record, own, key=place)
             again = position > 0 and place(record[position - 1]) == own
         if position < self._settled:
-            return Taken.LATE
+            return InsertResult.LATE
         if again:
-            return Taken.AGAIN
+            return InsertResult.AGAIN
         record.insert(position, measurement)
         if position < self._taken:
             self._back_to(position)
         if measurement.sensor == "imu":
             self._newest = max(self._newest, measurement.time)
         self._go_on(self._newest - self.hold_s)
-        return Taken.IN
+        return InsertResult.IN
 
     def retract(self, sensor: str, since: float) -> None:
         """Take back a sensor's measurements from a time on, as far as the lag goes."""
@@ -128,19 +128,19 @@ class FixedLag:
         """Go on from a better estimate of a keyframe, by the intervals since; False = the lag has passed it."""
         if not any(mark.interval.index == index for mark in self.marks):
             return False
-        later: list[Mark] = []
+        later: list[FilterSnapshot] = []
         while self.marks[-1].interval.index != index:
             later.append(self.marks.pop())
         self.marks[-1] = replace(self.marks[-1], known=known)
         self._gates = dict(self.marks[-1].gates)
         for mark in reversed(later):
-            passage = self.recursion.through(mark.interval, self.marks[-1].known, self._gates)
-            after = replace(mark, known=passage.filtered, gates=dict(self._gates), used=passage.used)
+            filter_step = self.recursion.through(mark.interval, self.marks[-1].known, self._gates)
+            after = replace(mark, known=filter_step.filtered, gates=dict(self._gates), used=filter_step.used)
             self.marks.append(after)
-        self._assembler.stamps.assume(self.marks[-1].known.state.calibration)
+        self._assembler.time_offsets.assume(self.marks[-1].known.state.calibration)
         return True
 
-    def oldest(self) -> Mark:
+    def oldest(self) -> FilterSnapshot:
         """The oldest mark that the filter can go on from: the last of those that came at once."""
         ends = (a for a, b in pairwise(self.marks) if a.taken != b.taken)
         return next(ends, self.marks[-1])
@@ -175,12 +175,14 @@ class FixedLag:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         index, time, segment, rate_sd = state["keyframe"]
-        interval = Interval(index, time, segment, state["rate_b"], rate_sd, None, 0.0, [])
+        interval = KeyframeInterval(index, time, segment, state["rate_b"], rate_sd, None, 0.0, [])
         here = State(*(state[name] for name in ("R_nb", "p_n", "v_n", "bias", "calibration")))
         places = tuple(Place(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         assembler = self._fresh()
         assembler.restore(state["assembler"])
-        self.marks = deque([Mark(interval, Gaussian(here, state["P"], places), state["gates"], [], assembler, 0)])
+        self.marks = deque(
+            [FilterSnapshot(interval, Gaussian(here, state["P"], places), state["gates"], [], assembler, 0)]
+        )
         self._record, self._forgotten, self._taken = [], 0, 0
         self._back_to(0)
         for measurement in unpack(state["record"]):
@@ -198,7 +200,7 @@ class FixedLag:
         while self.marks:
             self.passed(self.marks.popleft())
 
-    def ahead(self, time: float) -> tuple[Interval, Gaussian]:
+    def ahead(self, time: float) -> tuple[KeyframeInterval, Gaussian]:
         """The newest keyframe's estimate, carried on to a time with the IMU alone."""
         mark = self.marks[-1]
         if time <= mark.interval.time:
@@ -213,19 +215,19 @@ class FixedLag:
             self._taken += 1
             self._step(self._assembler.add(self._record[self._taken - 1]))
 
-    def _step(self, intervals: list[Interval]) -> None:
+    def _step(self, intervals: list[KeyframeInterval]) -> None:
         """Take intervals that are complete, and forget what the lag has passed."""
         if not intervals:
             return
         known = self.marks[-1].known if self.marks else self.recursion.start()
         taken, passed = self._forgotten + self._taken, []
         for interval in intervals:
-            passage = self.recursion.through(interval, known, self._gates)
-            known = passage.filtered
-            passed.append((interval, known, dict(self._gates), passage.used))
-        self._assembler.stamps.assume(known.state.calibration)
+            filter_step = self.recursion.through(interval, known, self._gates)
+            known = filter_step.filtered
+            passed.append((interval, known, dict(self._gates), filter_step.used))
+        self._assembler.time_offsets.assume(known.state.calibration)
         assembler = self._assembler.copy()
-        self.marks += [Mark(*one, assembler, taken) for one in passed]
+        self.marks += [FilterSnapshot(*one, assembler, taken) for one in passed]
         while self.marks[0].interval.time < self.marks[-1].interval.time - self.lag_s:
             self.passed(self.marks.popleft())
         if self._settled > len(self._record) // 2:

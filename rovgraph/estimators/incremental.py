@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
-from rovgraph.estimators.error_state import RENEW_AT_S, ErrorStateFilter
+from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.passage import Gaussian, Used
+from rovgraph.estimators.filter_step import Gaussian, ProcessedMeasurement
+from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.smoother import smoothed
-from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.graph.batch import make_problem, solution_at
-from rovgraph.graph.factors import drift, motion, priors, unseen_place
+from rovgraph.graph.factors import drift, landmark_prior, motion, priors
 from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import make_block
@@ -43,7 +43,7 @@ class IncrementalEstimator:
     updated : newest keyframe that iSAM2 has, -1 = none
     """
 
-    beginning: Beginning
+    beginning: InitialConditions
     update_s: float = UPDATE_S
 
     def __post_init__(self) -> None:
@@ -52,30 +52,30 @@ class IncrementalEstimator:
         self.unknowns = unknowns(self.beliefs, b.instruments)
         self.engine = Incremental(self.unknowns)
         self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
-        self.intervals: list[Interval] = []
+        self.intervals: list[KeyframeInterval] = []
         self._filter: ErrorStateFilter | None = None
         self._places: set[int] = set()  # that iSAM2 knows
         self._begun = 0.0  # when the newest segment began [s]
         self.updated = -1
 
-    def add(self, measurement: Measurement) -> list[Interval]:
+    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
         return self._take(self.assembler.add(measurement))
 
-    def finish(self) -> list[Interval]:
+    def finish(self) -> list[KeyframeInterval]:
         """Close the last interval."""
         done = self._take(self.assembler.finish())
         self.update()
         return done
 
-    def step(self, interval: Interval) -> None:
+    def step(self, interval: KeyframeInterval) -> None:
         """Take an interval by way of a filter of its own."""
         if self._filter is None:
-            self._filter = ErrorStateFilter(self.beginning, RENEW_AT_S)
+            self._filter = ErrorStateFilter(self.beginning, REINITIALISE_AT_S)
         used = self._filter.step(interval)
         self.take(interval, self._filter.filtered[-1], used)
 
-    def take(self, interval: Interval, known: Gaussian, used: Sequence[Used]) -> None:
+    def take(self, interval: KeyframeInterval, known: Gaussian, used: Sequence[ProcessedMeasurement]) -> None:
         """Take a keyframe of a filter.
 
         Parameters
@@ -92,18 +92,18 @@ class IncrementalEstimator:
             insert_calibration(values, known.state.calibration, self.unknowns, segment)
             self._begun = interval.time
         for one in used:
-            sighting = one.attached.sighting
-            if one.weight > 0.0 or sighting is not None:  # a place that fits none of its name is one by itself
-                instrument = b.instruments[one.attached.sensor]
-                block = make_block([one.attached], instrument, b.config.environment.gravity_mps2, self.unknowns)
+            landmark = one.measurement.landmark
+            if one.weight > 0.0 or landmark is not None:  # a place that fits none of its name is one by itself
+                instrument = b.instruments[one.measurement.sensor]
+                block = make_block([one.measurement], instrument, b.config.environment.gravity_mps2, self.unknowns)
                 factors.append(block.custom_factor())
-                if sighting is not None and sighting.number not in self._places:
-                    self._places.add(sighting.number)
+                if landmark is not None and landmark.number not in self._places:
+                    self._places.add(landmark.number)
                     insert_places(values, block, one.state)
-                    factors.append(unseen_place(sighting.number))
+                    factors.append(landmark_prior(landmark.number))
         self.engine.add(factors, values)
-        if any(a.sighting for a in interval.attached):
-            interval = replace(interval, attached=[one.attached for one in used])
+        if any(a.landmark for a in interval.measurements):
+            interval = replace(interval, measurements=[one.measurement for one in used])
         self.intervals.append(interval)
         if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
             self.update()
@@ -130,7 +130,7 @@ class IncrementalEstimator:
         problem = make_problem(intervals, b.start, b.config, self.beliefs, b.instruments)
         return smoothed(Optimum(intervals, problem, solution_at(problem, self.engine.values())), b)
 
-    def _take(self, intervals: list[Interval]) -> list[Interval]:
+    def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
         for interval in intervals:
             self.step(interval)
         return intervals

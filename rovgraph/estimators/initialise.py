@@ -30,7 +30,7 @@ ENOUGH_SAMPLES = 100
 
 
 @dataclass(frozen=True)
-class Beginning:
+class InitialConditions:
     """The resolved start of a dive.
 
     Attributes
@@ -58,15 +58,15 @@ class Beginning:
         }
 
 
-def restored(state: Mapping[str, Any]) -> Beginning:
-    """A beginning from its `Beginning.state`."""
+def restored(state: Mapping[str, Any]) -> InitialConditions:
+    """A beginning from its `InitialConditions.state`."""
     config = Config.model_validate(state["config"])
     sensors = instruments(config, config.imu.lever_arm_m)
     start = Start(State(**state["at"]), **state["start"])
-    return Beginning(config, {s: sensors[s] for s in state["sensors"]}, start, list(state["assumptions"]))
+    return InitialConditions(config, {s: sensors[s] for s in state["sensors"]}, start, list(state["assumptions"]))
 
 
-def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Beginning:
+def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> InitialConditions:
     """Resolve everything that the configuration leaves to the log.
 
     Parameters
@@ -118,7 +118,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Begi
     at_imu = p_n + R_nb @ np.asarray(config.imu.lever_arm_m)
     state = State(R_nb[None], at_imu[None], np.zeros((1, 3)), bias[None])
     prior = Start(state, rpy_sd, p_sd, np.full(3, START_VELOCITY_SD), bias_sd)
-    return Beginning(config, sensors, prior, assumptions)
+    return InitialConditions(config, sensors, prior, assumptions)
 
 
 def _thrusters(log: Log, config: Config) -> list[str]:
@@ -164,7 +164,7 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
 
 
 def sample_density(time: Array, samples: Array) -> float:
-    """Noise density that samples show by themselves, blind to knocks [unit/rtHz].
+    """Noise density that samples show by themselves, in_outage to knocks [unit/rtHz].
 
     Parameters
     ----------
@@ -201,8 +201,10 @@ def _attitude(
 ) -> tuple[Array, Array]:
     """R_nb of the first epoch and the sd of roll, pitch, yaw."""
     start = config.start
-    stated, felt = (start.roll_deg, start.pitch_deg), level_from_force(first.force_b).tolist()
-    roll, pitch = (own if said is None else float(np.deg2rad(said)) for said, own in zip(stated, felt, strict=True))
+    stated, from_gravity = (start.roll_deg, start.pitch_deg), level_from_force(first.force_b).tolist()
+    roll, pitch = (
+        own if said is None else float(np.deg2rad(said)) for said, own in zip(stated, from_gravity, strict=True)
+    )
     tilt_sd = np.deg2rad(start.tilt_sd_deg)
     if not first.quiet and (start.roll_deg is None or start.pitch_deg is None):
         tilt_sd = max(tilt_sd, MOVING_TILT_SD)

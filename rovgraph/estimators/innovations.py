@@ -102,7 +102,7 @@ class Innovations:
         """Minimise the robust cost of the measurements and of a prior of covariance P.
 
         By reweighting: weights follow from the residuals after the update, as in the graph's cost,
-        not from the innovations, which a vague prior makes large.
+        not from the innovations, which a attitude_poorly_known prior makes large.
 
         Returns
         -------

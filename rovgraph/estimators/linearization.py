@@ -6,9 +6,9 @@ from itertools import accumulate, groupby, pairwise
 import numpy as np
 
 from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.initialise import Beginning
+from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.geometry import Array, rotate
-from rovgraph.graph.assembly import Attached
+from rovgraph.graph.assembly import KeyframeMeasurement
 from rovgraph.graph.keys import Unknowns
 from rovgraph.graph.measurements import Block, make_block, motions, whitening
 from rovgraph.graph.places import ORIGIN
@@ -30,18 +30,18 @@ class Linearization:
     size : length of the error
     """
 
-    def __init__(self, beginning: Beginning, error: ErrorVector, unknowns: Unknowns) -> None:
+    def __init__(self, beginning: InitialConditions, error: ErrorVector, unknowns: Unknowns) -> None:
         self._beginning, self._error, self._unknowns = beginning, error, unknowns
         self.size = error.size
 
-    def block(self, attached: Sequence[Attached]) -> Block:
+    def block(self, attached: Sequence[KeyframeMeasurement]) -> Block:
         """Measurements of one sensor."""
         b = self._beginning
         instrument, gravity = b.instruments[attached[0].sensor], b.config.environment.gravity_mps2
         return make_block(attached, instrument, gravity, self._unknowns)
 
     def linearize(
-        self, state: State, attached: Sequence[Sequence[Attached]]
+        self, state: State, attached: Sequence[Sequence[KeyframeMeasurement]]
     ) -> tuple[list[Array], list[Array], list[list[slice]]]:
         """Whitened innovations and Jacobians of the measurements of a keyframe of each of n filters.
 
@@ -70,7 +70,7 @@ class Linearization:
         ends = list(accumulate(len(list(group)) for _, group in groupby(those, _kind)))
         for begin, end in pairwise([0, *ends]):
             which, own = slice(begin, end), those[begin:end]
-            if own[0].track is not None or own[0].felt is not None:
+            if own[0].window is not None or own[0].scale_to_bias is not None:
                 own_r, own_H = self._of_block(state.at(filters[which]), own)
             else:
                 calibration = self._calibration(state, own[0], filters[which])
@@ -80,16 +80,16 @@ class Linearization:
                 r[k][part], H[k][part] = one_r, one_H
         return r, H, parts
 
-    def _calibration(self, state: State, a: Attached, filters: list[int]) -> dict[str, Array]:
+    def _calibration(self, state: State, a: KeyframeMeasurement, filters: list[int]) -> dict[str, Array]:
         """What a measurement's model reads, of some filters."""
-        if a.sighting is not None:
+        if a.landmark is not None:
             return {PLACE: ORIGIN}
         values = {name: state.calibration[name] for name in self._beginning.instruments[a.sensor].model.calibration}
         return {name: value if value.ndim == 1 else value[filters] for name, value in values.items()}
 
     def _rows(
-        self, attached: Sequence[Sequence[Attached]]
-    ) -> tuple[list[list[slice]], list[tuple[int, slice, Attached]]]:
+        self, attached: Sequence[Sequence[KeyframeMeasurement]]
+    ) -> tuple[list[list[slice]], list[tuple[int, slice, KeyframeMeasurement]]]:
         """Rows of each filter's measurements; and all of them with filter and rows, those of one kind together."""
         parts, flat = [], []
         for k, own in enumerate(attached):
@@ -98,14 +98,14 @@ class Linearization:
             flat += [(k, part, a) for part, a in zip(parts[-1], own, strict=True)]
         return parts, sorted(flat, key=lambda one: _kind(one[2]))
 
-    def _of_block(self, state: State, attached: Sequence[Attached]) -> tuple[Array, Array]:
+    def _of_block(self, state: State, attached: Sequence[KeyframeMeasurement]) -> tuple[Array, Array]:
         """Whitened innovations, shape (m, dim), and Jacobians, shape (m, dim, size), of m measurements of a sensor."""
-        if attached[0].sighting is not None:
+        if attached[0].landmark is not None:
             state = state.seeing(ORIGIN)
         r, jacobians = self.block(attached).linearize(state)
         return r, self._error.matrix(jacobians)
 
-    def _of_sensor(self, state: State, F: Array | None, attached: Sequence[Attached]) -> tuple[Array, Array]:
+    def _of_sensor(self, state: State, F: Array | None, attached: Sequence[KeyframeMeasurement]) -> tuple[Array, Array]:
         """The same at less cost, of measurements that are where their stamps say, with an IMU of exact scale.
 
         Parameters
@@ -126,6 +126,6 @@ class Linearization:
         return rotate(W, r), W @ H
 
 
-def _kind(a: Attached) -> tuple[str, bool, bool]:
+def _kind(a: KeyframeMeasurement) -> tuple[str, bool, bool]:
     """Of which measurements can be linearised together."""
-    return a.sensor, a.track is None, a.felt is None
+    return a.sensor, a.window is None, a.scale_to_bias is None

@@ -9,7 +9,7 @@ import fnmatch
 from collections.abc import Sequence
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.chains import RENEWED, STEPPED, Named, Stage, assembled
+from rovgraph.estimators.chains import RENEWED, STEPPED, EstimatorSpec, Stage, assembled
 from rovgraph.estimators.error_state import ErrorStateFilter
 from rovgraph.estimators.kalman import FILTERS, Filter
 from rovgraph.estimators.smoother import BatchSmoother
@@ -19,34 +19,34 @@ _LETTERS = {(True, True): "a", (False, True): "b", (True, False): "c"}  # magnet
 _WITH = {"a": "magnetometer and DVL compass", "b": "DVL compass alone", "c": "magnetometer alone"}
 
 
-def _of_the_thesis(variant: Filter) -> Named:
+def _of_the_thesis(variant: Filter) -> EstimatorSpec:
     """One of the thesis's filters, which hold calibration at its means but for what are their states."""
 
     letter = _LETTERS.get((variant.magnetometer, variant.compass), "")
     about = (variant.about, letter, variant.misalignment, False)
-    return Named(variant.name, "thesis", *about, stages=(), whitened=True, variant=variant)
+    return EstimatorSpec(variant.name, "thesis", *about, stages=(), whitened=True, variant=variant)
 
 
-def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> list[Named]:
+def _variants(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> list[EstimatorSpec]:
     """An estimator with each set of headings, and with the misalignment estimated."""
     held = [
-        Named(f"{kind}-{letter}", family, f"{about}, {words}", letter, False, smoothing, (assembled, *stages))
+        EstimatorSpec(f"{kind}-{letter}", family, f"{about}, {words}", letter, False, smoothing, (assembled, *stages))
         for letter, words in _WITH.items()
     ]
     words = f"{about}, misalignment estimated"
-    return [*held, Named(f"{kind}-misalignment", family, words, "a", True, smoothing, (assembled, *stages))]
+    return [*held, EstimatorSpec(f"{kind}-misalignment", family, words, "a", True, smoothing, (assembled, *stages))]
 
 
-def _driven(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> Named:
+def _driven(kind: str, family: str, about: str, smoothing: bool, *stages: Stage) -> EstimatorSpec:
     """An estimator that knows thrusters and drag, with both headings."""
     name, words = f"{kind}-hydrodynamics", f"{about}, {_WITH['a']}, thrusters and drag"
-    return Named(name, family, words, "a", False, smoothing, (assembled, *stages), hydrodynamics=True)
+    return EstimatorSpec(name, family, words, "a", False, smoothing, (assembled, *stages), hydrodynamics=True)
 
 
-ESTIMATORS: dict[str, Named] = {
+ESTIMATORS: dict[str, EstimatorSpec] = {
     named.name: named
     for named in (
-        Named(
+        EstimatorSpec(
             "dead-reckoning",
             "dead reckoning",
             "DVL along the best compass, gyro levelled by gravity",
@@ -73,7 +73,7 @@ ESTIMATORS: dict[str, Named] = {
 }
 
 
-def select(names: Sequence[str] | None = None) -> list[Named]:
+def select(names: Sequence[str] | None = None) -> list[EstimatorSpec]:
     """Estimators by name or pattern (``graph-*``), in the order of `ESTIMATORS`, each once.
 
     Without names all but those that need thrusters.

@@ -25,7 +25,12 @@ from rovgraph.graph.information import knowledge, noise_of_states
 # than 0.6 of the prior's weight: what they say is mostly the prior repeated, and no estimate to act upon.
 OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE = 0.3, 0.8
 OBSERVABLE, WEAK, UNOBSERVABLE = "observable", "weak", "unobservable"
-DECEIVED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale")  # by noise: multiplied by the velocity in what is measured
+SPURIOUSLY_OBSERVABLE = (
+    "dvl_roll",
+    "dvl_pitch",
+    "dvl_yaw",
+    "dvl_scale",
+)  # by noise: multiplied by the velocity in what is measured
 DOUBTFUL_ABOVE = 0.15  # an sd of these below it is not noise: half an hour straight ahead takes it to 0.43
 
 STILL = 0.95  # of the prior's sd: where the graph claims no less, noise moves little
@@ -73,7 +78,7 @@ def prior_sd(problem: Problem, beliefs: Mapping[str, Belief], segment: int) -> d
     }
 
 
-def without_noise(
+def without_spurious_information(
     problem: Problem, solution: Solution, keyframes: Sequence[int], information: Array, sd: Array
 ) -> Array:
     """Information without what noise in the estimate pretends.
@@ -112,17 +117,17 @@ def relative_sd(
     dict : name -> ndarray, shape (dim,)
     """
     ratio = {name: sd[name] / prior[name] for name in problem.unknowns.estimated}
-    at_stake = [r for name in DECEIVED if name in ratio for r in ratio[name]]
+    at_stake = [r for name in SPURIOUSLY_OBSERVABLE if name in ratio for r in ratio[name]]
     if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
     end, before = [problem.count - 1], np.concatenate([prior[name] for name in ratio])
     seen = data_information(knowledge(problem, solution.values, solution.gates, end).calibration, before)
-    own = relative_covariance(without_noise(problem, solution, end, seen, before[None]))[0]
+    own = relative_covariance(without_spurious_information(problem, solution, end, seen, before[None]))[0]
     parts = np.split(np.sqrt(np.diag(own)), np.cumsum([len(r) for r in ratio.values()])[:-1])
     return dict(zip(ratio, parts, strict=True))
 
 
-def deceptive(problem: Problem, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
+def spuriously_observable(problem: Problem, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
     """Constant variables that are unobservable, and that noise can have moved all the same.
 
     Parameters
@@ -131,5 +136,5 @@ def deceptive(problem: Problem, claimed: Mapping[str, Array], relative: Mapping[
     claimed, relative : name -> ndarray, shape (dim,), sd as a part of the prior's, as the graph has
         it and without what noise pretends
     """
-    constant = [name for name in DECEIVED if name in relative and not problem.unknowns.walks[name]]
+    constant = [name for name in SPURIOUSLY_OBSERVABLE if name in relative and not problem.unknowns.walks[name]]
     return [n for n in constant if (relative[n] > UNOBSERVABLE_ABOVE).all() and (claimed[n] < STILL).any()]

@@ -1,8 +1,8 @@
 """A second process that renews the filter of the first.
 
 It takes the same measurements, some seconds later, when their order is settled, and solves
-the dive so far as a graph at the times of `RENEW_AT_S`, which takes longer than a live
-estimate can wait. Asked for a keyframe, it gives its own filter's estimate of it, from which
+the dive so far as a graph at the times of `REINITIALISE_AT_S`, which takes longer than a live
+estimate can wait. FilterJob for a keyframe, it gives its own filter's estimate of it, from which
 the first one goes on.
 """
 
@@ -14,11 +14,11 @@ from typing import Any
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
-from rovgraph.estimators.error_state import RENEW_AT_S
-from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.passage import Gates, Gaussian
-from rovgraph.estimators.renewal import renewed
-from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.estimators.error_state import REINITIALISE_AT_S
+from rovgraph.estimators.filter_step import Gates, Gaussian
+from rovgraph.estimators.initialise import InitialConditions
+from rovgraph.estimators.reinitialisation import renewed
+from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.workers import companion
@@ -26,9 +26,9 @@ from rovgraph.workers import companion
 DUE_LATER = 0.4  # a renewal takes up to this part of its time
 
 
-def due_times(lag_s: float, renew_at: Sequence[float] = RENEW_AT_S) -> list[float]:
+def due_times(lag_s: float, reinitialise_at: Sequence[float] = REINITIALISE_AT_S) -> list[float]:
     """Times since the start at which a renewal should be ready, where measurements are settled after ``lag_s``."""
-    return [(1.0 + DUE_LATER) * t + lag_s for t in renew_at]
+    return [(1.0 + DUE_LATER) * t + lag_s for t in reinitialise_at]
 
 
 class Refiner:
@@ -36,19 +36,19 @@ class Refiner:
 
     Parameters
     ----------
-    renew_at : times since the start at which the dive so far is solved as a graph [s]
+    reinitialise_at : times since the start at which the dive so far is solved as a graph [s]
     learn_noise : of the IMU, as the first filter does
     """
 
-    def __init__(self, renew_at: tuple[float, ...] = RENEW_AT_S, learn_noise: bool = False) -> None:
+    def __init__(self, reinitialise_at: tuple[float, ...] = REINITIALISE_AT_S, learn_noise: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
         self._work: Any = context.Queue()  # with a thread that feeds it, so that no one waits here
         self._answers, theirs = context.Pipe(duplex=False)
-        self._process = companion(_refine, renew_at, learn_noise, self._work, theirs)
+        self._process = companion(_refine, reinitialise_at, learn_noise, self._work, theirs)
         theirs.close()
         self._asked: int | None = None
 
-    def begin(self, beginning: Beginning) -> None:
+    def begin(self, beginning: InitialConditions) -> None:
         """The beginning of the dive, before all else."""
         self._work.put(beginning)
 
@@ -100,12 +100,12 @@ class Refiner:
 class _Renewed:
     """What the process does: it solves the dive at each time of renewal, and filters on from there until it is done."""
 
-    def __init__(self, beginning: Beginning, renew_at: Sequence[float], learn_noise: bool) -> None:
+    def __init__(self, beginning: InitialConditions, reinitialise_at: Sequence[float], learn_noise: bool) -> None:
         b = beginning
         self._assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=learn_noise)
         self._recursion = ErrorStateRecursion(b)
-        self._renewals = list(renew_at)
-        self._intervals: list[Interval] = []
+        self._renewals = list(reinitialise_at)
+        self._intervals: list[KeyframeInterval] = []
         self._known: list[Gaussian] = []  # of the newest keyframes, since the last renewal
         self._gates: Gates = {}
         self._made = self._served = 0
@@ -135,9 +135,9 @@ class _Renewed:
         return renewed(recursion, self._intervals, dead_reckon(self._intervals, b, recursion.unknowns.fixed))
 
 
-def _refine(renew_at: tuple[float, ...], learn_noise: bool, work: Any, answers: Connection) -> None:
+def _refine(reinitialise_at: tuple[float, ...], learn_noise: bool, work: Any, answers: Connection) -> None:
     """Work off what the first process sends: measurements, the index of a keyframe, None = the answer served."""
-    dive = _Renewed(work.get(), renew_at, learn_noise)
+    dive = _Renewed(work.get(), reinitialise_at, learn_noise)
     try:
         while True:
             item = work.get()

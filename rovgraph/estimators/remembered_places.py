@@ -7,7 +7,7 @@ claims no more than it knows. Places come after all other components of the erro
 north and east. They do not move, and errors of theirs are in n, so a correction leaves their
 coordinates alone.
 
-A sighting that fits no place of its name begins another place, as in `rovgraph.graph.places`;
+A landmark that fits no place of its name begins another place, as in `rovgraph.graph.places`;
 so a false one spoils nothing. Of more than `place.remembered` places the one that was not seen
 for longest is forgotten.
 """
@@ -28,7 +28,7 @@ class Place:
 
     Attributes
     ----------
-    name, number : of `rovgraph.graph.assembly.Sighting`
+    name, number : of `rovgraph.graph.assembly.LandmarkObservation`
     position : ndarray, shape (2,), north and east [m]
     time : when it was last seen [s]
     """
@@ -91,7 +91,7 @@ def seen_at(places: Sequence[Place], index: int, time: float) -> tuple[Place, ..
 
 @dataclass(frozen=True)
 class Match:
-    """A sighting compared with a place that is remembered.
+    """A landmark compared with a place that is remembered.
 
     Attributes
     ----------
@@ -107,13 +107,13 @@ class Match:
 
 
 def nearest(P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence[Place], name: float) -> Match | None:
-    """The place of a name that a sighting fits best; None where there is none.
+    """The place of a name that a landmark fits best; None where there is none.
 
     Parameters
     ----------
     P : ndarray, shape (d, d), of the estimate and its places
     r, H : whitened innovation and Jacobian, shapes (2,) and (2, size), of a place at the origin
-    sd : ndarray, shape (2,), of the sighting [m]
+    sd : ndarray, shape (2,), of the landmark [m]
     size : of the error without places
     places, name : those that are remembered, and the one that is seen
     """
@@ -130,14 +130,14 @@ def nearest(P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence
 def with_another(
     P: Array, places: tuple[Place, ...], place: Place, J: Array, sd: Array
 ) -> tuple[Array, tuple[Place, ...]]:
-    """The covariance with a place more, which lies where the estimate and its sighting put it.
+    """The covariance with a place more, which lies where the estimate and its landmark put it.
 
     Parameters
     ----------
     P : ndarray, shape (d, d)
     places, place : the others, and the one more
     J : ndarray, shape (2, size), derivative of where it lies by the error
-    sd : ndarray, shape (2,), of the sighting [m]
+    sd : ndarray, shape (2,), of the landmark [m]
     """
     clone = np.vstack([np.eye(len(P)), padded(J, len(P))])
     P = clone @ P @ clone.T

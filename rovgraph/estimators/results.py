@@ -10,7 +10,7 @@ from rovgraph.calibration import TABLE, Belief
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
 from rovgraph.estimators.observability import verdict
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
-from rovgraph.graph.assembly import Interval
+from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.measurements import Block
 from rovgraph.sensors import innovation
 from rovgraph.state import State
@@ -20,7 +20,7 @@ _XYZ = ("_x", "_y", "_z")
 
 
 def body_trajectory(
-    intervals: Sequence[Interval],
+    intervals: Sequence[KeyframeInterval],
     states: State,
     lever_arm_b: ArrayLike,
     cov_pose: Array | None = None,

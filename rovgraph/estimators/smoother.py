@@ -9,8 +9,8 @@ from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.observability import deceptive, prior_sd, relative_sd
+from rovgraph.estimators.initialise import InitialConditions
+from rovgraph.estimators.observability import prior_sd, relative_sd, spuriously_observable
 from rovgraph.estimators.results import (
     bias_histories,
     body_trajectory,
@@ -19,17 +19,17 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import Assembler, Interval
+from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.graph.batch import make_problem
 from rovgraph.graph.considered import Marginals, considered, holding
 from rovgraph.graph.places import Optimum, optimum
-from rovgraph.graph.stamps import Stamps
+from rovgraph.graph.time_offsets import TimeOffsets
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY
 
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
 PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
-CENTRED_REACH_S = 0.1  # around the lateness that was found
+CENTRED_REACH_S = 0.1  # around the time_offset that was found
 
 
 @dataclass
@@ -39,29 +39,29 @@ class BatchSmoother:
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
-    stamps : how late they are; None = as the configuration believes
+    time_offsets : how late they are; None = as the configuration believes
     intervals : the dive, as far as it has been taken
-    measurements : the same as they came, kept where their lateness is estimated
+    measurements : the same as they came, kept where their time_offset is estimated
     """
 
-    beginning: Beginning
-    stamps: Stamps | None = None
+    beginning: InitialConditions
+    time_offsets: TimeOffsets | None = None
 
     def __post_init__(self) -> None:
         b = self.beginning
-        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], assumed=self.stamps)
-        self.intervals: list[Interval] = []
+        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], assumed=self.time_offsets)
+        self.intervals: list[KeyframeInterval] = []
         self.measurements: list[Measurement] = []
 
-    def add(self, measurement: Measurement) -> list[Interval]:
+    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
-        if self.assembler.stamps.lags:
+        if self.assembler.time_offsets.lags:
             self.measurements.append(measurement)
         done = self.assembler.add(measurement)
         self.intervals += done
         return done
 
-    def finish(self) -> list[Interval]:
+    def finish(self) -> list[KeyframeInterval]:
         """Close the last interval."""
         done = self.assembler.finish()
         self.intervals += done
@@ -79,22 +79,22 @@ class BatchSmoother:
             states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
             best = optimum(dive.intervals, b.start, b.config, priors, b.instruments, states, calibration)
             found = best.problem.states(best.solution.values).calibration
-            anew = dive.placed_anew(found)
+            anew = dive.placed_again(found)
             if anew is None:
                 break
             dive, calibration = anew, {name: value.reshape(-1, value.shape[-1])[-1] for name, value in found.items()}
         return best
 
-    def placed_anew(self, calibration: Mapping[str, Array]) -> "BatchSmoother | None":
+    def placed_again(self, calibration: Mapping[str, Array]) -> "BatchSmoother | None":
         """The same dive with its measurements where late stamps were found to belong; None = they are there already.
 
         Parameters
         ----------
         calibration : name -> ndarray, shape (dim,) or (n, dim), what was found
         """
-        if self.assembler.stamps.off(calibration) < PLACED_WITHIN_S:
+        if self.assembler.time_offsets.off(calibration) < PLACED_WITHIN_S:
             return None
-        anew = BatchSmoother(self.beginning, self.assembler.stamps.centred(calibration, CENTRED_REACH_S))
+        anew = BatchSmoother(self.beginning, self.assembler.time_offsets.centred(calibration, CENTRED_REACH_S))
         for measurement in self.measurements:
             anew.add(measurement)
         anew.finish()
@@ -109,7 +109,7 @@ class BatchSmoother:
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
 
 
-def smoothed(optimum: Optimum, b: Beginning) -> Estimate:
+def smoothed(optimum: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
     intervals, priors = optimum.intervals, beliefs(b.config)
     known, relative = _marginals(optimum, b, priors)
@@ -155,7 +155,9 @@ def smoothed(optimum: Optimum, b: Beginning) -> Estimate:
     )
 
 
-def _marginals(optimum: Optimum, b: Beginning, priors: Mapping[str, Belief]) -> tuple[Marginals, dict[str, Array]]:
+def _marginals(
+    optimum: Optimum, b: InitialConditions, priors: Mapping[str, Belief]
+) -> tuple[Marginals, dict[str, Array]]:
     """Covariances, and the sd of the calibration as a part of the prior's, without what noise pretends."""
     problem, solution = optimum.problem, optimum.solution
     known = Marginals.of(problem, solution)
@@ -163,7 +165,7 @@ def _marginals(optimum: Optimum, b: Beginning, priors: Mapping[str, Belief]) -> 
     before = prior_sd(problem, priors, int(problem.segment[-1]))
     relative = relative_sd(problem, solution, sd, before)
     claimed = {name: sd[name] / before[name] for name in sd}
-    names = deceptive(problem, claimed, relative)
+    names = spuriously_observable(problem, claimed, relative)
     if not names:
         return known, relative
     without = make_problem(optimum.intervals, b.start, b.config, holding(priors, names), b.instruments)

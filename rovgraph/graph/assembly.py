@@ -3,7 +3,7 @@
 A keyframe stands at every DVL ping, and wherever `graph.max_gap_s` passes without one.
 Any other measurement belongs to the keyframe before it and carries the IMU's motion
 from there to its own time, so nothing is rounded to a keyframe. Batch and incremental
-estimators consume the same `Interval` objects.
+estimators consume the same `KeyframeInterval` objects.
 
 Headings and depths are taken once per interval, the first one: their errors last
 longer than that, and counting each sample would make the estimate too sure of itself.
@@ -23,11 +23,11 @@ import numpy as np
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array
 from rovgraph.graph.aiding import Aiding
+from rovgraph.graph.late_stamp_window import LateStampWindow, window_around
 from rovgraph.graph.preintegration import Snapshot
 from rovgraph.graph.samples import HALF_WINDOW_S, Samples, covering
-from rovgraph.graph.scale import felt, wanted
-from rovgraph.graph.stamps import Placed, Stamps, pack_placed, unpack_placed
-from rovgraph.graph.track import Track, track_around
+from rovgraph.graph.scale import scale_to_bias, wanted
+from rovgraph.graph.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
@@ -41,13 +41,13 @@ ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
 
-class Sighting(NamedTuple):
+class LandmarkObservation(NamedTuple):
     """Which place a camera or sonar saw.
 
     Attributes
     ----------
     name : what the log calls it
-    number : of the place's variable: that of its first sighting. To begin with each sighting is of a place
+    number : of the place's variable: that of its first landmark. To begin with each landmark is of a place
         of its own; `rovgraph.graph.places` finds those that are one.
     believed : False = the vehicle cannot have been there; it is not let in unless the optimum says otherwise
     """
@@ -58,7 +58,7 @@ class Sighting(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Attached:
+class KeyframeMeasurement:
     """A measurement that belongs to a keyframe.
 
     Attributes
@@ -71,9 +71,9 @@ class Attached:
     rate_b, rate_sd : ndarray, shape (3,), float: measured rate, bias still in it [rad/s]
     motion : Snapshot from the keyframe to the measurement
     bias : ndarray, shape (6,), that the motion was integrated with
-    track : Track of one stamp, where stamps may be late
-    felt : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
-    sighting : of a place, where it is one
+    window : LateStampWindow of one stamp, where stamps may be late
+    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
+    landmark : of a place, where it is one
     """
 
     sensor: str
@@ -87,13 +87,13 @@ class Attached:
     rate_sd: float
     motion: Snapshot
     bias: Array
-    track: Track | None = None
-    felt: Array | None = None
-    sighting: Sighting | None = None
+    window: LateStampWindow | None = None
+    scale_to_bias: Array | None = None
+    landmark: LandmarkObservation | None = None
 
 
 @dataclass(frozen=True)
-class Interval:
+class KeyframeInterval:
     """From the keyframe before to keyframe ``index``; the first has no motion.
 
     Attributes
@@ -105,8 +105,8 @@ class Interval:
         in it, and its noise [rad/s]
     pim : preintegrated motion, None for the first keyframe
     gap_s : how long the IMU was silent, where that lies in the interval or reaches into it, or 0 [s]
-    attached : measurements at the keyframe itself, and between the keyframe before and it
-    felt : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
+    measurements : at the keyframe itself, and between the keyframe before and it
+    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
     """
 
     index: int
@@ -116,8 +116,8 @@ class Interval:
     rate_sd: float
     pim: gtsam.PreintegratedCombinedMeasurements | None
     gap_s: float
-    attached: list[Attached]
-    felt: Array | None = None
+    measurements: list[KeyframeMeasurement]
+    scale_to_bias: Array | None = None
 
     @property
     def bridged(self) -> bool:
@@ -127,7 +127,7 @@ class Interval:
 
 @dataclass
 class Assembler:
-    """Takes measurements one by one, gives back an `Interval` whenever one is complete.
+    """Takes measurements one by one, gives back an `KeyframeInterval` whenever one is complete.
 
     Attributes
     ----------
@@ -145,30 +145,30 @@ class Assembler:
     bias: Array
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
     learn_noise: bool = False
-    assumed: InitVar[Stamps | None] = None
+    assumed: InitVar[TimeOffsets | None] = None
 
-    def __post_init__(self, assumed: Stamps | None) -> None:
+    def __post_init__(self, assumed: TimeOffsets | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
         self._samples = Samples(self.config, self.learn_noise)
-        self._waiting: list[Placed] = []
+        self._waiting: list[StampedMeasurement] = []
         self._aiding: Aiding | None = None
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
         self._segment, self._segment_start = -1, -np.inf
-        self._between: list[Placed] = []
+        self._between: list[StampedMeasurement] = []
         self._sighted: dict[float, float] = {}  # place -> when it last counted [s]
         self._sightings = 0
-        self.stamps = assumed or Stamps.of(self.config, self.instruments)
+        self.time_offsets = assumed or TimeOffsets.of(self.config, self.instruments)
         self._scaled = wanted(beliefs(self.config))
-        self._around = HALF_WINDOW_S + self.stamps.span
+        self._around = HALF_WINDOW_S + self.time_offsets.span
 
-    def add(self, measurement: Measurement) -> list[Interval]:
+    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease.
 
         Returns
         -------
-        list of Interval : those that this measurement completes, usually none or one
+        list of KeyframeInterval : those that this measurement completes, usually none or one
 
         Raises
         ------
@@ -179,11 +179,11 @@ class Assembler:
                 if self._aiding is not None:
                     self._aiding.add(measurement)
             elif self._admissible(measurement):
-                insort(self._waiting, self.stamps.placed(measurement), key=_time)
+                insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
             return []
         if self._samples.add(measurement):  # after a gap: a keyframe here, so that nothing is carried through it
-            insort(self._waiting, self.stamps.placed(measurement), key=_time)
-        done: list[Interval] = []
+            insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
+        done: list[KeyframeInterval] = []
         if self._index < 0:
             self._before_first(measurement.time)
             done.append(self._close(measurement.time, None))
@@ -195,7 +195,7 @@ class Assembler:
         twin._samples, twin.left_out = self._samples.copy(), self.left_out.copy()
         twin._waiting, twin._between = self._waiting[:], self._between[:]
         twin._sighted = dict(self._sighted)
-        twin.stamps = self.stamps.copy()
+        twin.time_offsets = self.time_offsets.copy()
         if self._aiding is not None:
             twin._aiding = self._aiding.copy(twin.left_out)
         return twin
@@ -204,28 +204,28 @@ class Assembler:
         """Where it stands, as plain values and arrays."""
         return {
             **self._samples.state(),
-            "waiting": pack_placed(self._waiting),
-            "between": pack_placed(self._between),
-            "assumed": self.stamps.assumed,
+            "waiting": pack_stamped(self._waiting),
+            "between": pack_stamped(self._between),
+            "assumed": self.time_offsets.assumed,
             "signals": pack(self._aiding.signals if self._aiding is not None else []),
             "at": [self._index, self._start, self._segment, self._segment_start],
             "sighted": np.array([*self._sighted.items()]).reshape(-1, 2),
-            "sightings": self._sightings,
+            "landmarks": self._sightings,
             "bias": self.bias,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         self._samples.restore(state)
-        self._waiting, self._between = unpack_placed(state["waiting"]), unpack_placed(state["between"])
-        self.stamps.assumed.update(state["assumed"])
+        self._waiting, self._between = unpack_stamped(state["waiting"]), unpack_stamped(state["between"])
+        self.time_offsets.assumed.update(state["assumed"])
         if self._aiding is not None:
             self._aiding.signals = unpack(state["signals"])
         self._index, self._start, self._segment, self._segment_start = state["at"]
         self.bias = state["bias"]
-        self._sighted, self._sightings = dict(state["sighted"].tolist()), state["sightings"]
+        self._sighted, self._sightings = dict(state["sighted"].tolist()), state["landmarks"]
 
-    def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> Interval:
+    def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> KeyframeInterval:
         """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.
 
         Parameters
@@ -238,11 +238,11 @@ class Assembler:
         table = self._samples.ahead(samples, time, np.concatenate([force, np.zeros(3)]) + state.bias[0])
         pim, _, gap_s = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
         rate_b, rate_sd = self._samples.rate(table, time)
-        return Interval(self._index + 1, time, self._segment, rate_b, rate_sd, pim, gap_s, [])
+        return KeyframeInterval(self._index + 1, time, self._segment, rate_b, rate_sd, pim, gap_s, [])
 
-    def _take_until(self, time: float) -> list[Interval]:
+    def _take_until(self, time: float) -> list[KeyframeInterval]:
         """Place what has waited for the IMU up to a time."""
-        done: list[Interval] = []
+        done: list[KeyframeInterval] = []
         while self._waiting and self._waiting[0].time <= time:
             m = self._waiting.pop(0)
             done += self._silence(m.time)
@@ -254,7 +254,7 @@ class Assembler:
                 self._between.append(m)
         return done + self._silence(time)
 
-    def finish(self) -> list[Interval]:
+    def finish(self) -> list[KeyframeInterval]:
         """Place the rest, and a last keyframe at the last IMU sample."""
         end = self._samples.newest
         if end == -math.inf:
@@ -289,7 +289,7 @@ class Assembler:
         self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
         self._waiting = [m for m in self._waiting if m.time >= time]
 
-    def _silence(self, time: float) -> list[Interval]:
+    def _silence(self, time: float) -> list[KeyframeInterval]:
         """Keyframes for a time without pings."""
         done = []
         gap = self.config.graph.max_gap_s
@@ -297,12 +297,12 @@ class Assembler:
             done.append(self._close(self._start + gap, None))
         return done
 
-    def _close(self, time: float, ping: Placed | None) -> Interval:
+    def _close(self, time: float, ping: StampedMeasurement | None) -> KeyframeInterval:
         """Make a keyframe at ``time`` and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
         pim, gap_s = None, 0.0
-        attached: list[Attached] = []
+        attached: list[KeyframeMeasurement] = []
         if self._index >= 0:
             pim, gap_s, attached = self._integrate(samples, every, time)
         before = self._start
@@ -314,11 +314,11 @@ class Assembler:
             attached += self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd, every)
         scaled = self._felt(samples, before, time) if pim is not None else None
         self._samples.forget(time, self._around)
-        return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, gap_s, attached, scaled)
+        return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, pim, gap_s, attached, scaled)
 
     def _integrate(
         self, samples: Array, every: Array, time: float
-    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, float, list[Attached]]:
+    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, float, list[KeyframeMeasurement]]:
         taken, seen = [], set()
         for m in self._between:
             if m.sensor not in seen:
@@ -327,30 +327,32 @@ class Assembler:
                 seen.add(m.sensor)
         if self._aiding is not None and not self._samples.gap(samples):
             aiding = self._aiding.between(self._start, time, samples, lambda t: self._samples.rate(samples, t)[0])
-            taken = sorted(taken + [Placed(*m, m.time) for m in aiding], key=_time)
+            taken = sorted(taken + [StampedMeasurement(*m, m.time) for m in aiding], key=_time)
         stops = np.array([m.time for m in taken])
         pim, motions, gap_s = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
-        attached: list[Attached] = []
+        attached: list[KeyframeMeasurement] = []
         for m, motion in zip(taken, motions, strict=True):
             attached += self._attach(m, motion, *self._rate_for(m, samples), every)
         return pim, gap_s, attached
 
-    def _rate_for(self, m: Placed, samples: Array) -> tuple[Array, float]:
+    def _rate_for(self, m: StampedMeasurement, samples: Array) -> tuple[Array, float]:
         """The rate, for those instruments that it reaches: by a lever arm, or by the motion of a turning body."""
         reached = m.sensor == "thruster" or self.instruments[m.sensor].rate_gain.any()
         return self._samples.rate(samples, m.time) if reached else (np.zeros(3), 0.0)
 
-    def _attach(self, m: Placed, motion: Snapshot, rate_b: Array, rate_sd: float, every: Array) -> list[Attached]:
+    def _attach(
+        self, m: StampedMeasurement, motion: Snapshot, rate_b: Array, rate_sd: float, every: Array
+    ) -> list[KeyframeMeasurement]:
         """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``."""
         instrument = self.instruments[m.sensor]
-        lag = self.stamps.lag(m.sensor)
-        track, known = None, self._samples
+        lag = self.time_offsets.lag(m.sensor)
+        window, known = None, self._samples
         if lag is not None:
-            track = track_around(m.stamp, lag, every, self._start, (known.params, self.bias), known.longest_step)
-        if lag is not None and track is None:
-            self.left_out[m.sensor, f"calibration.{instrument.lateness} reaches beyond the IMU's samples"] += 1
+            window = window_around(m.stamp, lag, every, self._start, (known.params, self.bias), known.longest_step)
+        if lag is not None and window is None:
+            self.left_out[m.sensor, f"calibration.{instrument.time_offset} reaches beyond the IMU's samples"] += 1
             return []
-        dim, sighting = instrument.model.dim, None
+        dim, landmark = instrument.model.dim, None
         z, sd = m.values[:dim], instrument.sd
         if m.sensor == "dvl":
             if m.values[4] > 0.0:
@@ -362,22 +364,22 @@ class Assembler:
         if m.sensor == "fix" and m.values[2] > 0.0:  # 0 is how receivers say that they do not know
             sd = np.full(dim, min(m.values[2], LARGEST_SD))
         if m.sensor == "place":
-            sighting = self._sighting(m)
-            if sighting is None:
+            landmark = self._sighting(m)
+            if landmark is None:
                 return []
             z, sd = np.zeros(dim), np.full(dim, min(m.values[1], LARGEST_SD)) if m.values[1] > 0.0 else sd
         place = (m.sensor, self._index, self._segment, m.time, m.row)
         scaled = self._felt(every, self._start, m.time)
-        return [Attached(*place, z, sd, rate_b, rate_sd, motion, self.bias, track, scaled, sighting)]
+        return [KeyframeMeasurement(*place, z, sd, rate_b, rate_sd, motion, self.bias, window, scaled, landmark)]
 
-    def _sighting(self, m: Placed) -> Sighting | None:
+    def _sighting(self, m: StampedMeasurement) -> LandmarkObservation | None:
         """A place that is seen; None where it has been in view just now."""
         name = float(m.values[0])
         if m.time - self._sighted.get(name, -math.inf) < self.config.place.every_s:
             self.left_out["place", "still in view"] += 1
             return None
         self._sighted[name], self._sightings = m.time, self._sightings + 1
-        return Sighting(name, self._sightings)
+        return LandmarkObservation(name, self._sightings)
 
     def _felt(self, samples: Array, begin: float, end: float) -> Array | None:
         """The IMU's mean signal as scale errors feel it, where there may be any."""
@@ -385,8 +387,8 @@ class Assembler:
             return None
         time = np.linspace(begin, end, 21)
         signal = np.array([np.interp(time, samples[:, 0], column).mean() for column in samples[:, 1:].T])
-        return felt(signal - self.bias, self._R_bs)
+        return scale_to_bias(signal - self.bias, self._R_bs)
 
 
-def _time(m: Placed) -> float:
+def _time(m: StampedMeasurement) -> float:
     return m.time

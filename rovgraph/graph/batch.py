@@ -21,8 +21,8 @@ from rovgraph.calibration import Belief
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import Attached, Interval
-from rovgraph.graph.factors import Start, drift, motion, priors, unseen_place
+from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.graph.factors import Start, drift, landmark_prior, motion, priors
 from rovgraph.graph.keys import Unknowns, key_name, unknowns
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.rows import Rows
@@ -162,16 +162,16 @@ class Solution:
 
 
 def make_problem(
-    intervals: Sequence[Interval],
+    intervals: Sequence[KeyframeInterval],
     start: Start,
     config: Config,
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],
 ) -> Problem:
     """Assemble the graph of a dive."""
-    attached: dict[str, list[Attached]] = {}
+    attached: dict[str, list[KeyframeMeasurement]] = {}
     for interval in intervals:
-        for a in interval.attached:
+        for a in interval.measurements:
             attached.setdefault(a.sensor, []).append(a)
     wanted = unknowns(beliefs, attached)
     factors = priors(start, beliefs, wanted)
@@ -183,7 +183,7 @@ def make_problem(
     gravity = config.environment.gravity_mps2
     blocks = {s: make_block(rows, instruments[s], gravity, wanted) for s, rows in attached.items()}
     if "place" in blocks:
-        factors += [unseen_place(number) for number in np.unique(blocks["place"].place).tolist()]
+        factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
     native = gtsam.NonlinearFactorGraph()
     for factor in factors:
         native.add(factor)

@@ -19,30 +19,30 @@ import gtsam
 import numpy as np
 
 from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, rpy_jacobian, wrap_angle
-from rovgraph.graph.assembly import Interval
+from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.keys import key
 from rovgraph.graph.preintegration import BRIDGE_ACC, BRIDGE_GYR, INTEGRATION_SD
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
-BLIND_S = 0.75  # intervals in a gap of the IMU that is longer are coasted through
+OUTAGE_S = 0.75  # intervals in a gap of the IMU that is longer are coasted through
 TILT_SD = np.deg2rad(8.0)  # of a vehicle that rights itself
 RIGHTS_ITSELF_S = 2.0 * TILT_SD**2 / BRIDGE_GYR**2  # so that at first it tilts as any ROV turns
 _ENDS = [6, 9, 15, 21, 24]  # of pose, velocity, bias of two keyframes side by side
 
 
-def blind(interval: Interval) -> bool:
+def in_outage(interval: KeyframeInterval) -> bool:
     """Whether an interval with motion is coasted through."""
-    return interval.gap_s > BLIND_S
+    return interval.gap_s > OUTAGE_S
 
 
-def coasted(interval: Interval, before: State) -> State:
-    """The state at the end of a blind interval; ``before`` is of one epoch."""
+def coasted(interval: KeyframeInterval, before: State) -> State:
+    """The state at the end of a in_outage interval; ``before`` is of one epoch."""
     rpy, p_n, _ = _predicted(interval, before)
     return replace(before, R_nb=matrix_from_rpy(rpy)[None], p_n=p_n[None], v_n=before.v_n.copy())
 
 
-def coasting(interval: Interval, before: State, after: State) -> tuple[Array, Array, Array, Array]:
-    """How two states disagree with a blind interval.
+def coasting(interval: KeyframeInterval, before: State, after: State) -> tuple[Array, Array, Array, Array]:
+    """How two states disagree with a in_outage interval.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def coasting(interval: Interval, before: State, after: State) -> tuple[Array, Ar
     return residual, A_i, A_j, S
 
 
-def coasting_factor(interval: Interval) -> gtsam.CustomFactor:
-    """A blind interval as a factor between its keyframes."""
+def coasting_factor(interval: KeyframeInterval) -> gtsam.CustomFactor:
+    """A in_outage interval as a factor between its keyframes."""
     i, j = interval.index - 1, interval.index
     keys = [key(POSE, i), key(VELOCITY, i), key(POSE, j), key(VELOCITY, j), key(BIAS, i), key(BIAS, j)]
 
@@ -103,8 +103,8 @@ def coasting_factor(interval: Interval) -> gtsam.CustomFactor:
     return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(S), keys, error)
 
 
-def _predicted(interval: Interval, before: State) -> tuple[Array, Array, Array]:
-    """Roll, pitch, yaw and position after a blind interval, and what is kept of each angle."""
+def _predicted(interval: KeyframeInterval, before: State) -> tuple[Array, Array, Array]:
+    """Roll, pitch, yaw and position after a in_outage interval, and what is kept of each angle."""
     assert interval.pim is not None
     duration = interval.pim.deltaTij()
     left = np.exp(-duration / RIGHTS_ITSELF_S)

@@ -11,8 +11,8 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.geometry import Array, transpose
-from rovgraph.graph.assembly import Interval
-from rovgraph.graph.coasting import blind, coasted, coasting_factor
+from rovgraph.graph.assembly import KeyframeInterval
+from rovgraph.graph.coasting import coasted, coasting_factor, in_outage
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.scale import SCALES, biased, scaled_factor
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
@@ -60,26 +60,26 @@ def priors(start: Start, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> l
     ]
 
 
-def unseen_place(number: int) -> Factor:
+def landmark_prior(number: int) -> Factor:
     """The prior of a place: it says next to nothing, and determines a place that all gates have shut out."""
     return gtsam.PriorFactorVector(
         key(PLACE, number), np.zeros(PLACE_DIM), gtsam.noiseModel.Isotropic.Sigma(PLACE_DIM, ANYWHERE_M)
     )
 
 
-def motion(interval: Interval, unknowns: Unknowns) -> list[Factor]:
+def motion(interval: KeyframeInterval, unknowns: Unknowns) -> list[Factor]:
     """The factor between the keyframe before and the one that ends the interval: the IMU's, or of coasting."""
     if interval.pim is None:
         return []
-    if blind(interval):
+    if in_outage(interval):
         return [coasting_factor(interval)]
-    if interval.felt is None:
+    if interval.scale_to_bias is None:
         return [unscaled(interval)]
     keys = {name: unknowns.key(name, interval.segment) for name in SCALES if name in unknowns.walks}
-    return [scaled_factor(unscaled(interval), interval.felt, unknowns.fixed, keys)]
+    return [scaled_factor(unscaled(interval), interval.scale_to_bias, unknowns.fixed, keys)]
 
 
-def unscaled(interval: Interval) -> gtsam.CombinedImuFactor:
+def unscaled(interval: KeyframeInterval) -> gtsam.CombinedImuFactor:
     """GTSAM's own factor of an interval with motion, which knows no scales."""
     assert interval.pim is not None
     i, j = interval.index - 1, interval.index
@@ -102,7 +102,7 @@ def drift(unknowns: Unknowns, segment: int, duration: float) -> list[Factor]:
     ]
 
 
-def predict(interval: Interval, state: State) -> State:
+def predict(interval: KeyframeInterval, state: State) -> State:
     """The state at the end of an interval, from the IMU alone, or from nothing while it is silent.
 
     Parameters
@@ -110,11 +110,11 @@ def predict(interval: Interval, state: State) -> State:
     interval : with motion
     state : State of one epoch, of the keyframe before
     """
-    if blind(interval):
+    if in_outage(interval):
         return coasted(interval, state)
     assert interval.pim is not None
-    felt = state if interval.felt is None else biased(state, interval.felt[None])
-    bias = gtsam.imuBias.ConstantBias(felt.bias[0, :3], felt.bias[0, 3:])
+    scale_to_bias = state if interval.scale_to_bias is None else biased(state, interval.scale_to_bias[None])
+    bias = gtsam.imuBias.ConstantBias(scale_to_bias.bias[0, :3], scale_to_bias.bias[0, 3:])
     before = gtsam.NavState(gtsam.Rot3(state.R_nb[0]), state.p_n[0], state.v_n[0])
     after = interval.pim.predict(before, bias)
     # in rows: products of matrices in columns round otherwise, and filters side by side are to be as each alone

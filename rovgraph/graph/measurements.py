@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from rovgraph.geometry import Array, identity, rotate
-from rovgraph.graph.assembly import Attached
+from rovgraph.graph.assembly import KeyframeMeasurement
 from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.late_stamp_window import LateStampWindow
 from rovgraph.graph.scale import COLUMNS, SCALES, biased
-from rovgraph.graph.track import Track
 from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
@@ -58,9 +58,9 @@ class Block:
     motion : Delta, n, from the keyframe to the measurement
     gravity : [m/s^2]
     unknowns : the calibration variables that are estimated, of those that the instrument has
-    track : along which the motion goes on to where a stamp that may be late belongs, or None
-    felt : ndarray, shape (n, 6, 6), of `rovgraph.graph.scale`, or None where the IMU's scale is exact
-    place, believed : ndarray of int and of bool, shape (n,), of `rovgraph.graph.assembly.Sighting`; place is -1,
+    window : along which the motion goes on to where a stamp that may be late belongs, or None
+    scale_to_bias : ndarray, shape (n, 6, 6), of `rovgraph.graph.scale`, or None where the IMU's scale is exact
+    place, believed : ndarray of int and of bool, shape (n,), of `LandmarkObservation`; place is -1,
         and all are believed, where it is no place that is measured
     """
 
@@ -77,8 +77,8 @@ class Block:
     unknowns: Unknowns
     place: NDArray[np.int64]
     believed: NDArray[np.bool_]
-    track: Track | None = None
-    felt: Array | None = None
+    window: LateStampWindow | None = None
+    scale_to_bias: Array | None = None
 
     def __len__(self) -> int:
         return len(self.z)
@@ -99,13 +99,13 @@ class Block:
     @cached_property
     def at_keyframes(self) -> bool:
         """All measurements are at their keyframes: there is no motion to reckon with."""
-        return self.track is None and not self.motion.dt.any()
+        return self.window is None and not self.motion.dt.any()
 
     def predict(self, state: State) -> tuple[Array, Jacobians]:
         """Predicted measurements, shape (n, dim), and Jacobians by the keyframes' variables."""
-        if self.felt is not None:
-            predicted, H = self._predict(biased(state, self.felt))
-            by_bias = H[BIAS] @ self.felt if BIAS in H else np.zeros((*predicted.shape, 6))
+        if self.scale_to_bias is not None:
+            predicted, H = self._predict(biased(state, self.scale_to_bias))
+            by_bias = H[BIAS] @ self.scale_to_bias if BIAS in H else np.zeros((*predicted.shape, 6))
             return predicted, H | {name: by_bias[..., COLUMNS[name]] for name in SCALES}
         return self._predict(state)
 
@@ -117,9 +117,9 @@ class Block:
         motion, rate_b = self._placed(state)
         there, F = propagate_with_jacobian(state, motion, self.gravity)
         predicted, H = model.predict(there, rate_b)
-        if self.track is not None and self.instrument.lateness is not None:
-            by = self.track.by_lateness(self._late(state), state, there, H, self.gravity)
-            H = H | {self.instrument.lateness: by}
+        if self.window is not None and self.instrument.time_offset is not None:
+            by = self.window.by_time_offset(self._late(state), state, there, H, self.gravity)
+            H = H | {self.instrument.time_offset: by}
         stacked = np.zeros((len(self), predicted.shape[1], 15))
         for variable, columns in _COLUMNS.items():
             if variable in H:
@@ -129,8 +129,8 @@ class Block:
 
     def predicted(self, state: State) -> Array:
         """Predicted measurements alone, shape (n, dim)."""
-        if self.felt is not None:
-            state = biased(state, self.felt)
+        if self.scale_to_bias is not None:
+            state = biased(state, self.scale_to_bias)
         motion, rate_b = self._placed(state)
         there = state if self.at_keyframes else propagate(state, motion, self.gravity)
         return self.instrument.model.predict(there, rate_b)[0]
@@ -141,12 +141,12 @@ class Block:
 
     def _placed(self, state: State) -> tuple[Delta, Array]:
         """The motion to where each measurement was valid, and the rate there."""
-        return (self.motion, self.rate_b) if self.track is None else self.track.placed(self._late(state))
+        return (self.motion, self.rate_b) if self.window is None else self.window.placed(self._late(state))
 
     def _late(self, state: State) -> Array:
         """How late each stamp is, shape (n,) [s]."""
-        assert self.instrument.lateness is not None
-        return np.broadcast_to(state.calibration[self.instrument.lateness][..., 0], len(self))
+        assert self.instrument.time_offset is not None
+        return np.broadcast_to(state.calibration[self.instrument.time_offset][..., 0], len(self))
 
     def linearize(self, state: State) -> tuple[Array, Jacobians]:
         """Whitened innovations and Jacobians at ``state`` (that of each keyframe).
@@ -197,15 +197,18 @@ class Block:
         """Some of the measurements."""
         arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name in _PER_MEASUREMENT}
         motion = Delta(*(getattr(self.motion, f.name)[index] for f in fields(Delta)))
-        track, felt = self.track and self.track.at(index), None if self.felt is None else self.felt[index]
-        return replace(self, **arrays, motion=motion, track=track, felt=felt)
+        window, scale_to_bias = (
+            self.window and self.window.at(index),
+            None if self.scale_to_bias is None else self.scale_to_bias[index],
+        )
+        return replace(self, **arrays, motion=motion, window=window, scale_to_bias=scale_to_bias)
 
 
 _PER_MEASUREMENT = ("keyframe", "segment", "time", "row", "z", "W", "rate_b", "place", "believed")
 
 
 def make_block(
-    attached: Sequence[Attached],
+    attached: Sequence[KeyframeMeasurement],
     instrument: Instrument,
     gravity: float,
     unknowns: Unknowns,
@@ -217,17 +220,17 @@ def make_block(
 
     W = whitening(instrument, stack("sd"), stack("rate_sd"))
     arrays = (stack("keyframe"), stack("segment"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
-    tracks = [a.track for a in attached if a.track is not None]
-    track = Track.stack(tracks) if tracks else None
-    scaled = attached[0].felt is not None
+    windows = [a.window for a in attached if a.window is not None]
+    window = LateStampWindow.stack(windows) if windows else None
+    scaled = attached[0].scale_to_bias is not None
     own = unknowns.of((*instrument.calibration, *(SCALES if scaled else ())))
-    place = np.array([-1 if a.sighting is None else a.sighting.number for a in attached])
-    believed = np.array([a.sighting is None or a.sighting.believed for a in attached])
-    felt = stack("felt") if scaled else None
-    return Block(instrument, *arrays, motions(attached), gravity, own, place, believed, track, felt)
+    place = np.array([-1 if a.landmark is None else a.landmark.number for a in attached])
+    believed = np.array([a.landmark is None or a.landmark.believed for a in attached])
+    scale_to_bias = stack("scale_to_bias") if scaled else None
+    return Block(instrument, *arrays, motions(attached), gravity, own, place, believed, window, scale_to_bias)
 
 
-def motions(attached: Sequence[Attached]) -> Delta:
+def motions(attached: Sequence[KeyframeMeasurement]) -> Delta:
     """From their keyframes to measurements, of one sensor or of many."""
     dt, dR, dv, dp = (np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp"))
     return Delta(dt, dR, dv, dp, np.array([a.bias for a in attached]))

@@ -1,18 +1,18 @@
-"""Which sightings of a name are of one place.
+"""Which landmarks of a name are of one place.
 
 A camera that takes one rock for another would tie two spots together, and a robust loss does
-not help: between two sightings lie minutes of drift, known to metres only, so the track follows
+not help: between two landmarks lie minutes of drift, known to metres only, so the track follows
 a false match and leaves no residual. What tells one is that the vehicle cannot have been there,
 as long as the match is not believed yet. So the dive is solved without places first. That gives
-the joint covariance of where the vehicle was at every sighting, and in the order of time each
-sighting is compared with the places of its name: the innovation squared over its covariance
+the joint covariance of where the vehicle was at every landmark, and in the order of time each
+landmark is compared with the places of its name: the innovation squared over its covariance
 (NIS) decides, as it does in the filter. One that fits no place of its name begins another; a
-place that is seen once says nothing, so a false first sighting spoils none of those that
+place that is seen once says nothing, so a false first landmark spoils none of those that
 follow. Each that is accepted narrows the joint covariance for the next (joint compatibility,
-Neira and Tardos 2001, one sighting at a time).
+Neira and Tardos 2001, one landmark at a time).
 
-In the end the place of a name is the one that most of its sightings agree on, and those that agree
-with nothing else are kept as sightings of it that are not believed: `rovgraph.graph.batch` begins
+In the end the place of a name is the one that most of its landmarks agree on, and those that agree
+with nothing else are kept as landmarks of it that are not believed: `rovgraph.graph.batch` begins
 without them, and lets them in if its optimum finds them within their gate after all.
 """
 
@@ -26,7 +26,7 @@ import numpy as np
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import Attached, Interval, Sighting
+from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.graph.batch import Problem, Solution, make_problem, make_values, solve
 from rovgraph.graph.factors import Start
 from rovgraph.graph.information import eliminate
@@ -44,17 +44,17 @@ class Optimum:
 
     Attributes
     ----------
-    intervals : the dive, each sighting given to its place
+    intervals : the dive, each landmark given to its place
     problem, solution : its graph, and the optimum
     """
 
-    intervals: list[Interval]
+    intervals: list[KeyframeInterval]
     problem: Problem
     solution: Solution
 
 
 def optimum(
-    intervals: Sequence[Interval],
+    intervals: Sequence[KeyframeInterval],
     start: Start,
     config: Config,
     beliefs: Mapping[str, Belief],
@@ -85,13 +85,13 @@ def optimum(
 
 
 def recognised(
-    seen: Sequence[Attached], instrument: Instrument, gravity: float, problem: Problem, solution: Solution
-) -> dict[float, Attached]:
+    seen: Sequence[KeyframeMeasurement], instrument: Instrument, gravity: float, problem: Problem, solution: Solution
+) -> dict[float, KeyframeMeasurement]:
     """Sightings of what is seen more than once, by their times, each given to its place.
 
     Parameters
     ----------
-    seen : all sightings, in the order of time
+    seen : all landmarks, in the order of time
     instrument : of the places
     gravity : [m/s^2]
     problem, solution : the dive without places, and its optimum
@@ -104,20 +104,20 @@ def recognised(
     return _settled(again, matched(again, where, covariance, instrument.gate_sd))
 
 
-def settled(intervals: Sequence[Interval]) -> list[Interval]:
-    """A dive whose sightings have been given to places one by one: what fits no other of its name is not believed."""
+def settled(intervals: Sequence[KeyframeInterval]) -> list[KeyframeInterval]:
+    """A dive whose landmarks have been given to places one by one: what fits no other of its name is not believed."""
     seen = _sightings(intervals)
     return _given(intervals, _settled(seen, [_number(a) for a in seen]))
 
 
 def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
-    """Insert the places of sightings that have none yet, each where the first sighting that is believed has it.
+    """Insert the places of landmarks that have none yet, each where the first landmark that is believed has it.
 
     Parameters
     ----------
     values : gets the new ones
-    block : n sightings
-    states : State, n, of the sightings' keyframes
+    block : n landmarks
+    states : State, n, of the landmarks' keyframes
     """
     where = block.predicted(states.seeing(ORIGIN))
     for k in np.flatnonzero(block.believed).tolist():
@@ -125,20 +125,20 @@ def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
             values.insert(own, where[k])
 
 
-def matched(seen: Sequence[Attached], where: Array, covariance: Array, gate_sd: float | None) -> list[int]:
-    """Number of the place that each sighting is of.
+def matched(seen: Sequence[KeyframeMeasurement], where: Array, covariance: Array, gate_sd: float | None) -> list[int]:
+    """Number of the place that each landmark is of.
 
     Parameters
     ----------
-    seen : m sightings in the order of time
-    where : ndarray, shape (m, 2), north and east of each place if its sighting is believed alone [m]
+    seen : m landmarks in the order of time
+    where : ndarray, shape (m, 2), north and east of each place if its landmark is believed alone [m]
     covariance : ndarray, shape (2 m, 2 m), joint
-    gate_sd : beyond which two sightings are not of one place, or None
+    gate_sd : beyond which two landmarks are not of one place, or None
     """
     gate = np.inf if gate_sd is None else gate_sd
     mean, P = where.ravel().copy(), covariance.copy()
     numbers: list[int] = []
-    newest: dict[float, dict[int, int]] = {}  # name -> number of each of its places -> its newest sighting
+    newest: dict[float, dict[int, int]] = {}  # name -> number of each of its places -> its newest landmark
     for k, a in enumerate(seen):
         places, here = newest.setdefault(_name(a), {}), _rows(k)
         best, least = None, gate**2
@@ -163,12 +163,12 @@ def matched(seen: Sequence[Attached], where: Array, covariance: Array, gate_sd: 
     return numbers
 
 
-def _settled(seen: Sequence[Attached], numbers: Sequence[int]) -> dict[float, Attached]:
+def _settled(seen: Sequence[KeyframeMeasurement], numbers: Sequence[int]) -> dict[float, KeyframeMeasurement]:
     """Sightings by their times; one that agrees with no other is not believed, where others of its name agree.
 
     Parameters
     ----------
-    seen : sightings
+    seen : landmarks
     numbers : of the place that each is of
     """
     count = Counter(numbers)
@@ -179,23 +179,25 @@ def _settled(seen: Sequence[Attached], numbers: Sequence[int]) -> dict[float, At
     out = {}
     for a, number in zip(seen, numbers, strict=True):
         alone = count[number] == 1 and _name(a) in chief
-        sighting = Sighting(_name(a), chief[_name(a)] if alone else number, not alone)
-        out[a.time] = replace(a, sighting=sighting)
+        landmark = LandmarkObservation(_name(a), chief[_name(a)] if alone else number, not alone)
+        out[a.time] = replace(a, landmark=landmark)
     return out
 
 
-def _given(intervals: Sequence[Interval], found: Mapping[float, Attached]) -> list[Interval]:
-    """The dive with sightings replaced by those that were found, by their times."""
+def _given(intervals: Sequence[KeyframeInterval], found: Mapping[float, KeyframeMeasurement]) -> list[KeyframeInterval]:
+    """The dive with landmarks replaced by those that were found, by their times."""
     return [
-        replace(i, attached=[found.get(a.time, a) if a.sighting else a for a in i.attached]) if _sightings([i]) else i
+        replace(i, measurements=[found.get(a.time, a) if a.landmark else a for a in i.measurements])
+        if _sightings([i])
+        else i
         for i in intervals
     ]
 
 
 def _where(block: Block, problem: Problem, solution: Solution) -> tuple[Array, Array]:
-    """Place of each sighting if it is believed alone, shape (m, 2), and their joint covariance, shape (2 m, 2 m).
+    """Place of each landmark if it is believed alone, shape (m, 2), and their joint covariance, shape (2 m, 2 m).
 
-    The motion from a keyframe to its sighting is short, and taken as exact.
+    The motion from a keyframe to its landmark is short, and taken as exact.
     """
     states = problem.states(solution.values).at(block.keyframe)
     where, H = block.predict(states.seeing(ORIGIN))
@@ -212,14 +214,15 @@ def _where(block: Block, problem: Problem, solution: Solution) -> tuple[Array, A
     return where, covariance
 
 
-def _sightings(intervals: Sequence[Interval]) -> list[Attached]:
-    return [a for interval in intervals for a in interval.attached if a.sighting is not None]
+def _sightings(intervals: Sequence[KeyframeInterval]) -> list[KeyframeMeasurement]:
+    return [a for interval in intervals for a in interval.measurements if a.landmark is not None]
 
 
-def _apart(intervals: Sequence[Interval]) -> list[Interval]:
+def _apart(intervals: Sequence[KeyframeInterval]) -> list[KeyframeInterval]:
     """The same dive without places."""
     return [
-        replace(i, attached=[a for a in i.attached if a.sighting is None]) if _sightings([i]) else i for i in intervals
+        replace(i, measurements=[a for a in i.measurements if a.landmark is None]) if _sightings([i]) else i
+        for i in intervals
     ]
 
 
@@ -227,11 +230,11 @@ def _rows(k: int) -> slice:
     return slice(PLACE_DIM * k, PLACE_DIM * (k + 1))
 
 
-def _name(a: Attached) -> float:
-    assert a.sighting is not None
-    return a.sighting.name
+def _name(a: KeyframeMeasurement) -> float:
+    assert a.landmark is not None
+    return a.landmark.name
 
 
-def _number(a: Attached) -> int:
-    assert a.sighting is not None
-    return a.sighting.number
+def _number(a: KeyframeMeasurement) -> int:
+    assert a.landmark is not None
+    return a.landmark.number

@@ -3,7 +3,7 @@
 A sample is (1 + k) times what is so, component by component along the IMU's axes, and the bias
 on top. Over an interval of a fraction of a second its k times the mean signal may stand for
 k times each sample, so that the motion that was integrated without k serves with the bias
-b + S k, where S holds the mean signal (`felt`). The same S takes every derivative by the bias
+b + S k, where S holds the mean signal (`scale_to_bias`). The same S takes every derivative by the bias
 to one by k.
 """
 
@@ -25,8 +25,8 @@ def wanted(beliefs: Mapping[str, Belief]) -> bool:
     return any(beliefs[name].estimate or beliefs[name].mean.any() for name in SCALES)
 
 
-def felt(signal_b: Array, R_bs: Array) -> Array:
-    """Derivative of the bias that is felt by the scales.
+def scale_to_bias(signal_b: Array, R_bs: Array) -> Array:
+    """Derivative of the bias that is scale_to_bias by the scales.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def felt(signal_b: Array, R_bs: Array) -> Array:
 
 
 def biased(state: State, S: Array) -> State:
-    """The state with the bias that is felt; ``S`` has shape (n, 6, 6)."""
+    """The state with the bias that is scale_to_bias; ``S`` has shape (n, 6, 6)."""
     scales = [np.broadcast_to(state.calibration[name], (len(state), 3)) for name in SCALES]
     bias = state.bias + (S @ np.concatenate(scales, axis=-1)[..., None])[..., 0]
     return State(state.R_nb, state.p_n, state.v_n, bias, state.calibration)
@@ -58,7 +58,7 @@ def scaled_factor(
     Parameters
     ----------
     factor : of the motion that was integrated without them
-    S : ndarray, shape (6, 6), of `felt`
+    S : ndarray, shape (6, 6), of `scale_to_bias`
     fixed : name -> ndarray, shape (3,), values of the scales that are not estimated
     keys : of those that are
     """

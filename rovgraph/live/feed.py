@@ -10,9 +10,9 @@ from operator import attrgetter
 from types import TracebackType
 from typing import Self
 
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.message import Message
 from rovgraph.live.sources.source import Source
+from rovgraph.live.warnings import Warnings
 
 TICK_S = 0.1  # longest silence of the feed
 WAIT_S = 0.2  # how often a thread that waits looks whether it shall stop
@@ -30,13 +30,13 @@ class Feed:
     Parameters
     ----------
     sources : at least one
-    complaints : where a source's failure goes
+    warnings : where a source's failure goes
     size : messages that may wait
     """
 
-    def __init__(self, sources: Sequence[Source], complaints: Complaints | None = None, size: int = QUEUE) -> None:
+    def __init__(self, sources: Sequence[Source], warnings: Warnings | None = None, size: int = QUEUE) -> None:
         self._sources = tuple(sources)
-        self._complaints = complaints or Complaints()
+        self._complaints = warnings or Warnings()
         self._queue: queue.Queue[Message | None] = queue.Queue(size)  # None = a source has ended
         self._stop = threading.Event()
 

@@ -17,12 +17,12 @@ from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.fixed_lag import FixedLag
 from rovgraph.live.checkpoint import read_checkpoint
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.keeper import Keeper
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.recorder import Recorder
 from rovgraph.live.solution import Event
 from rovgraph.live.track import TrackFile
+from rovgraph.live.warnings import Warnings
 from rovgraph.log import log_from_frame, read_log
 from rovgraph.log.streams import Log
 
@@ -43,7 +43,7 @@ class Files:
     ----------
     folder : an existing one
     config : as the user gave it
-    complaints : where trouble with the disk goes
+    warnings : where trouble with the disk goes
     resume : go on with what is there
     anew : from the recording alone, not from the checkpoint
 
@@ -59,7 +59,7 @@ class Files:
 
     folder: Path
     config: Config
-    complaints: Complaints
+    warnings: Warnings
     resume: bool = False
     anew: bool = False
 
@@ -75,10 +75,10 @@ class Files:
         if self.resume and checkpoint.exists():
             self.state = read_checkpoint(checkpoint)
             until = -np.inf if self.anew else float(self.state["engine"]["keyframe"][1])
-        self.recorder = Recorder(self.folder / RECORDING, self.complaints)
+        self.recorder = Recorder(self.folder / RECORDING, self.warnings)
         self.received = self._received() if self.resume else None  # before the track is touched: it may not be readable
         self.track = TrackFile(self.folder / TRACK, until)
-        self.keeper = Keeper(checkpoint, self.complaints)
+        self.keeper = Keeper(checkpoint, self.warnings)
         recorded = self.config.model_copy(update=_as_recorded(self.config))
         try:
             (self.folder / CONFIG).write_text(recorded.to_yaml(), encoding="utf-8")
@@ -120,7 +120,7 @@ class Files:
             with path.open("a", encoding="utf-8") as file:
                 file.write(lines)
         except OSError as error:
-            self.complaints.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
+            self.warnings.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
 
     def write_smoothed(self, estimate: Estimate) -> None:
         """Put a smoothed track on disk, in place of an older one."""
@@ -129,7 +129,7 @@ class Files:
             estimate.trajectory.write_csv(partial)
             partial.replace(path)
         except OSError as error:
-            self.complaints.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
+            self.warnings.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
 
     def keep(self, navigator: Navigator, now: bool = False) -> None:
         """Put the track and a checkpoint on disk, if it is time to."""
@@ -152,7 +152,7 @@ class Files:
             self.track.add(engine.recursion.trajectory([m.interval for m in passed], [m.known for m in passed]))
         except InputError as error:
             path = str(self.track.path)
-            self.complaints.complain(path, "disk", str(error).removeprefix(f"{path}: "))
+            self.warnings.complain(path, "disk", str(error).removeprefix(f"{path}: "))
             del navigator.passed[:-UNWRITTEN]
             return False
         navigator.passed = []

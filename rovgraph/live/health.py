@@ -4,7 +4,7 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rovgraph.estimators.fixed_lag import Mark
+from rovgraph.estimators.fixed_lag import FilterSnapshot
 from rovgraph.live.faults import Watch
 from rovgraph.live.solution import Event, SensorHealth
 
@@ -27,12 +27,12 @@ class Health:
     _out: set[str] = field(default_factory=set)
     _gap_until: float = -float("inf")
 
-    def passed(self, mark: Mark) -> None:
+    def passed(self, mark: FilterSnapshot) -> None:
         """Count a keyframe's measurements."""
         for one in mark.used:
-            (self.used if one.weight > 0.0 else self.rejected)[one.attached.sensor] += 1
+            (self.used if one.weight > 0.0 else self.rejected)[one.measurement.sensor] += 1
 
-    def step(self, marks: deque[Mark]) -> None:
+    def step(self, marks: deque[FilterSnapshot]) -> None:
         """After a keyframe."""
         newest = marks[-1]
         time, gates = newest.interval.time, newest.gates

@@ -7,7 +7,7 @@ from typing import Any
 
 from rovgraph.errors import InputError
 from rovgraph.live.checkpoint import write_checkpoint
-from rovgraph.live.complaints import Complaints
+from rovgraph.live.warnings import Warnings
 
 
 class Keeper:
@@ -16,11 +16,11 @@ class Keeper:
     Parameters
     ----------
     path : of the checkpoint
-    complaints : told from that thread where it cannot be written; it goes on trying
+    warnings : told from that thread where it cannot be written; it goes on trying
     """
 
-    def __init__(self, path: Path, complaints: Complaints) -> None:
-        self._path, self._complain = path, complaints.complain
+    def __init__(self, path: Path, warnings: Warnings) -> None:
+        self._path, self._complain = path, warnings.complain
         self._state: Mapping[str, Any] | None = None
         self._given, self._stop = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name="checkpoints", daemon=True)

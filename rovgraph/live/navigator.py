@@ -15,17 +15,17 @@ import numpy as np
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.estimators.fixed_lag import FixedLag, Mark, Taken
+from rovgraph.estimators.filter_step import Gaussian
+from rovgraph.estimators.fixed_lag import FilterSnapshot, FixedLag, InsertResult
 from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import Beginning, restored
-from rovgraph.estimators.passage import Gaussian
+from rovgraph.estimators.initialise import InitialConditions, restored
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
 from rovgraph.live.health import Health
 from rovgraph.live.intake import Intake
 from rovgraph.live.message import Message, Reading
-from rovgraph.live.renewals import Renewals
+from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.startup import Startup
 from rovgraph.log import Log, Measurement
@@ -64,7 +64,7 @@ class Navigator:
     engine: FixedLag | None = None
     isam2: IncrementalEstimator | None = None
     time: float = -np.inf
-    passed: list[Mark] = field(default_factory=list)
+    passed: list[FilterSnapshot] = field(default_factory=list)
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
     updates: int = 0
     update_s: float = 0.0
@@ -73,7 +73,7 @@ class Navigator:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
-        self._renewals = Renewals(self.patient, self.config.graph.lag_s) if self.renew else None
+        self._renewals = Reinitialisations(self.patient, self.config.graph.lag_s) if self.renew else None
         self._events: list[Event] = []
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
@@ -224,7 +224,7 @@ class Navigator:
         else:
             self._feed(self.engine, m)
 
-    def _begin(self, beginning: Beginning, state: Mapping[str, Any] | None = None) -> None:
+    def _begin(self, beginning: InitialConditions, state: Mapping[str, Any] | None = None) -> None:
         """The first seconds are over, or an estimate goes on from its state."""
         config = beginning.config
         if self.smooth:
@@ -254,7 +254,7 @@ class Navigator:
             self.left_out[m.sensor, UNEXPECTED] += 1
             return
         outcome = engine.add(m)
-        if outcome != Taken.IN:
+        if outcome != InsertResult.IN:
             self.left_out[m.sensor, outcome.value] += 1
         if engine.marks and engine.marks[-1] is not before:
             waited = 0.0
@@ -264,7 +264,7 @@ class Navigator:
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
 
-    def _pass(self, mark: Mark) -> None:
+    def _pass(self, mark: FilterSnapshot) -> None:
         self.passed.append(mark)
         if self.isam2 is not None:
             try:

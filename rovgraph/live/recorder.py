@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.message import GEODETIC, Reading
+from rovgraph.live.warnings import Warnings
 from rovgraph.log.streams import COLUMNS, LAT_LON, RECEIVED, STREAMS
 
 FLUSH_S = 0.1  # from a row to the operating system
@@ -40,7 +40,7 @@ class Recorder:
     Parameters
     ----------
     path : a new file, or a recording to go on with; its last line is dropped where it was cut off
-    complaints : told, from other threads too, of what goes wrong later
+    warnings : told, from other threads too, of what goes wrong later
 
     Attributes
     ----------
@@ -51,10 +51,10 @@ class Recorder:
     InputError : the file cannot be written, or is no recording
     """
 
-    def __init__(self, path: Path | str, complaints: Complaints | None = None) -> None:
+    def __init__(self, path: Path | str, warnings: Warnings | None = None) -> None:
         self.path = Path(path)
         self.lost = 0
-        self._complain = (complaints or Complaints()).complain
+        self._complain = (warnings or Warnings()).complain
         self._rows: deque[str] = deque(maxlen=BACKLOG)
         self._pending = b""  # rows that were taken from the queue, but for what the system took
         self._unsynced = False
@@ -130,7 +130,7 @@ class Recorder:
 
     @contextlib.contextmanager
     def _complaining(self) -> Iterator[None]:
-        """Errors of the file system become complaints."""
+        """Errors of the file system become warnings."""
         try:
             yield
         except OSError as error:

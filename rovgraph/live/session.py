@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.files import Files
 from rovgraph.live.message import Message
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.solution import Solution
+from rovgraph.live.warnings import Warnings
 
 RATE_HZ = 5.0  # of solutions, about that of pings
 COLLECT = (50_000, 20, 50)  # thresholds of the collector: next to nothing here is cyclic
@@ -32,7 +32,7 @@ class Session:
     receivers : called with each solution: outputs, the status line
     rate_hz : of solutions
     files : None = nothing is kept
-    complaints : what sources, outputs and disk complain of
+    warnings : what sources, outputs and disk complain of
     solution : the newest
     solutions : count
     took : times of the filter's updates [s]
@@ -40,7 +40,7 @@ class Session:
 
     navigator: Navigator
     receivers: list[Callable[[Solution], None]]
-    complaints: Complaints
+    warnings: Warnings
     rate_hz: float = RATE_HZ
     files: Files | None = None
     solution: Solution | None = None
@@ -129,7 +129,7 @@ class Session:
         if self.navigator.updates > before:
             self.took.append(self.navigator.update_s)
         if not rows:
-            self.complaints.complain(message.source, "stamp", "a stamp seconds off from those before, left out")
+            self.warnings.complain(message.source, "stamp", "a stamp seconds off from those before, left out")
         if self.files is not None:
             for time, readings in rows:
                 self.files.recorder.write(time, message.arrival, readings)
@@ -140,7 +140,7 @@ class Session:
         if now is not None and now - self.navigator.time > QUIET_S:
             self.navigator.tick(now)
         if self.navigator.waits_for:
-            self.complaints.complain("start", "waiting", self.navigator.waits_for)
+            self.warnings.complain("start", "waiting", self.navigator.waits_for)
 
     def _send(self) -> None:
         solution = self.navigator.solution()

@@ -7,7 +7,7 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
 from rovgraph.estimators.fixed_lag import place
-from rovgraph.estimators.initialise import Beginning, initialise
+from rovgraph.estimators.initialise import InitialConditions, initialise
 from rovgraph.log import Measurement
 from rovgraph.log.streams import gathered
 
@@ -34,7 +34,7 @@ class Startup:
     doubts: list[str] = field(default_factory=list)
     _next: float | None = None
 
-    def add(self, measurement: Measurement, origin: tuple[float, float] | None) -> Beginning | None:
+    def add(self, measurement: Measurement, origin: tuple[float, float] | None) -> InitialConditions | None:
         """Take a measurement; the beginning of the dive, once it is known.
 
         Parameters
@@ -52,7 +52,7 @@ class Startup:
         self._next = measurement.time + AGAIN_S
         return self.begin(origin)
 
-    def begin(self, origin: tuple[float, float] | None) -> Beginning | None:
+    def begin(self, origin: tuple[float, float] | None) -> InitialConditions | None:
         """The beginning from what is there, or None; then `waits_for` says why."""
         self.measurements.sort(key=place)
         imu = [m.time for m in self.measurements if m.sensor == "imu"]

@@ -24,7 +24,7 @@ class Choices:
     outliers : share of DVL pings that are wrong, 0 to 1
     dropouts : intervals (from, to) [s] without bottom lock
     places : north, east [m] of places that a camera recognises
-    false_places : share of the sightings that are of another spot, 0 to less than 1
+    false_places : share of the landmarks that are of another spot, 0 to less than 1
     noise : noise, biases, and everything about vehicle and sensors that is drawn
     """
 

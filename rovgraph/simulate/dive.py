@@ -251,7 +251,7 @@ def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
 def _sightings(sample: _Sampler, path: Path) -> pd.DataFrame | None:
     """Places that are recognised, once whenever one is passed, and some that only look like it.
 
-    A sighting is where the camera comes nearest to the place as it sees it, off by the noise.
+    A landmark is where the camera comes nearest to the place as it sees it, off by the noise.
     """
     truth, sd = sample.truth, sample.instruments["place"].sd
     if not truth.places:

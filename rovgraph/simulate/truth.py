@@ -41,7 +41,7 @@ class Truth:
     dropouts : intervals (from, to) [s] without bottom lock
     places : north, east [m] of each place that a camera recognises, 1, 2, ... in the log
     place_radius : how near the camera has to come [m]
-    false_places : part of the sightings that are of another spot
+    false_places : part of the landmarks that are of another spot
     """
 
     config: Config = field(default_factory=Config)

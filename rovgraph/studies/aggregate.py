@@ -13,12 +13,12 @@ import pandas as pd
 from scipy.special import gammaincinv
 
 from rovgraph import thesis
-from rovgraph.estimators.chains import Named
+from rovgraph.estimators.chains import EstimatorSpec
 
 BAND = 0.95
 
 
-def aggregate(runs: pd.DataFrame, estimators: Sequence[Named]) -> pd.DataFrame:
+def aggregate(runs: pd.DataFrame, estimators: Sequence[EstimatorSpec]) -> pd.DataFrame:
     """One row per estimator, in the order given; numbers are over the runs that did not fail.
 
     Parameters
@@ -30,7 +30,7 @@ def aggregate(runs: pd.DataFrame, estimators: Sequence[Named]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _row(named: Named, runs: pd.DataFrame) -> dict[str, Any]:
+def _row(named: EstimatorSpec, runs: pd.DataFrame) -> dict[str, Any]:
     good = runs[runs["error"].isna()]
     return {
         "estimator": named.name,

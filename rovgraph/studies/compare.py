@@ -10,7 +10,7 @@ import pandas as pd
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError, in_one_line
-from rovgraph.estimators.chains import Named, Outcome, Task, outcomes_of_dives
+from rovgraph.estimators.chains import EstimatorSpec, Outcome, Task, outcomes_of_dives
 from rovgraph.estimators.named import select
 from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.measures import measures, misalignment_history, velocity_history
@@ -121,7 +121,7 @@ def compare(
     return Comparison(aggregate(rows, named), rows, misalignment, velocity, results[0].config)
 
 
-def _sharing(estimators: Sequence[Named]) -> list[tuple[str, ...]]:
+def _sharing(estimators: Sequence[EstimatorSpec]) -> list[tuple[str, ...]]:
     """Names grouped by what they share, so that it is made once."""
     groups: dict[Hashable, list[str]] = {}
     for n in estimators:

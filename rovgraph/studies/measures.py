@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config
-from rovgraph.estimators.chains import Named
+from rovgraph.estimators.chains import EstimatorSpec
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.evaluate import WITHIN_ELLIPSE, evaluate, normalised_error
 from rovgraph.geometry import Array, wrap_angle
@@ -24,7 +24,7 @@ NUMBERS = (
 )  # fmt: skip
 
 
-def measures(estimate: Estimate, case: Case, named: Named) -> dict[str, Any]:
+def measures(estimate: Estimate, case: Case, named: EstimatorSpec) -> dict[str, Any]:
     """Every number of one estimate on one run, by the names of runs.csv's columns.
 
     Parameters
@@ -99,7 +99,7 @@ def _mount_yaw(config: Config) -> float:
     return float(np.deg2rad(config.dvl.mount_rpy_deg[2]))
 
 
-def _fit(estimate: Estimate, named: Named) -> dict[str, float]:
+def _fit(estimate: Estimate, named: EstimatorSpec) -> dict[str, float]:
     """Per sensor the mean NIS over its dimension, or where that is not known, the mean square of the residuals.
 
     What was rejected is left out.

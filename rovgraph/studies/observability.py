@@ -20,7 +20,7 @@ from rovgraph.estimators.observability import (
     prior_sd,
     relative_covariance,
     verdict,
-    without_noise,
+    without_spurious_information,
 )
 from rovgraph.geometry import Array
 from rovgraph.graph.information import OTHERS, knowledge
@@ -188,7 +188,7 @@ def examined(
     before = np.array([np.concatenate(list(sd.values())) for sd in walked])
     seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
     progress("information", 0.7)
-    own = without_noise(problem, solution, ends, seen, before) if noisy else seen
+    own = without_spurious_information(problem, solution, ends, seen, before) if noisy else seen
     variables = tuple(TABLE[name] for name in problem.unknowns.estimated for _ in TABLE[name].labels)
     labels = tuple(label for name in problem.unknowns.estimated for label in TABLE[name].labels)
     begin = dive.intervals[0].time

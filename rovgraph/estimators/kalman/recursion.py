@@ -30,7 +30,7 @@ from rovgraph.geometry import Array, wrap_angle
 from rovgraph.thesis import SAMPLE_S
 
 Mask = NDArray[np.bool_]
-Taken = tuple[Mask, Array, Array, Array]  # a measurement: which components, innovation, whitened, sd
+InsertResult = tuple[Mask, Array, Array, Array]  # a measurement: which components, innovation, whitened, sd
 
 LONGEST_STEP_S = 1.5 * SAMPLE_S  # of forward Euler; a longer interval is divided
 
@@ -146,7 +146,7 @@ class _Batch:
             for part in range(parts[step]):
                 self._predict(dt[step] * (part < count[step]))
             self._time, self._epoch = table.time[step], table.epoch[step]
-            taken: Taken | None = None
+            taken: InsertResult | None = None
             if table.ping[step]:
                 taken = self._take_ping(table.number[step], table.active[step])
             elif self._imu is not None:
@@ -173,7 +173,7 @@ class _Batch:
         else:
             self._P += dt[:, None, None] * Q
 
-    def _take_sample(self, model: ImuModel, active: Mask) -> Taken:
+    def _take_sample(self, model: ImuModel, active: Mask) -> InsertResult:
         z = self._samples.at(self._epoch)
 
         def innovate(x: Array) -> Linearized:
@@ -182,7 +182,7 @@ class _Batch:
 
         return self._update(innovate, np.isfinite(z) & active[:, None], self._R_imu)
 
-    def _take_ping(self, number: NDArray[np.int64], active: Mask) -> Taken:
+    def _take_ping(self, number: NDArray[np.int64], active: Mask) -> InsertResult:
         z = self._pings.at(number)
         measured = np.isfinite(z) & active[:, None]
         heading = bool(measured[:, HEADING].any())
@@ -195,7 +195,7 @@ class _Batch:
 
         return self._update(innovate, measured, self._R_dvl)
 
-    def _update(self, innovate: Innovate, measured: Mask, noise: "_Noise") -> Taken:
+    def _update(self, innovate: Innovate, measured: Mask, noise: "_Noise") -> InsertResult:
         """Update with the components that were measured and bring quaternions back to unit length."""
         R, all_measured, none_measured = noise.of(measured)
 
@@ -230,7 +230,7 @@ class _Batch:
             )
         return len(diverged) > 0
 
-    def _keep_innovations(self, taken: Taken, table: Timetable, step: int) -> None:
+    def _keep_innovations(self, taken: InsertResult, table: Timetable, step: int) -> None:
         measured, *columns = taken
         for b in np.flatnonzero(table.keeps_innovation[step]).tolist():
             m = self._members[b]

@@ -20,7 +20,7 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
-class Asked:
+class FilterJob:
     """A filter on a dive.
 
     Attributes
@@ -58,13 +58,13 @@ def run_filter(which: str | Filter, log: Log, config: Config, truth: Trajectory 
     InputError : no such filter; the log lacks what it needs; it diverges
     """
     variant = _named(which) if isinstance(which, str) else which
-    (done,) = run_filters([Asked(variant, log, config, truth)])
+    (done,) = run_filters([FilterJob(variant, log, config, truth)])
     if isinstance(done, Exception):
         raise done
     return done
 
 
-def run_filters(asked: Sequence[Asked]) -> list[Estimate | Exception]:
+def run_filters(asked: Sequence[FilterJob]) -> list[Estimate | Exception]:
     """Run filters on dives, those of one kind (`Filter.kind`) side by side, at a fraction of the time.
 
     Returns
@@ -81,7 +81,7 @@ def run_filters(asked: Sequence[Asked]) -> list[Estimate | Exception]:
     return [_attempted(_done, each) if isinstance(each, Recursion) else each for each in begun]
 
 
-def _begun(asked: Asked) -> Recursion:
+def _begun(asked: FilterJob) -> Recursion:
     variant, at = asked.variant, None
     setup = prepare(variant, asked.log, asked.config)
     if variant.linearized_at == "truth":

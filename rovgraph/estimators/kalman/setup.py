@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from rovgraph.calibration import MOUNT, Belief
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
-from rovgraph.estimators.initialise import Beginning, initialise
+from rovgraph.estimators.initialise import InitialConditions, initialise
 from rovgraph.estimators.kalman.dvl import DvlModel, Ping, pings
 from rovgraph.estimators.kalman.known import KnownMotion, known_motion
 from rovgraph.estimators.kalman.mti import Accelerometer, ImuModel, Mti, reference_field
@@ -195,7 +195,9 @@ def _samples(variant: Filter, log: Log, field_length: float) -> Array:
     return np.hstack([imu.data, field])
 
 
-def _start(places: Layout, numbers: Numbers, beginning: Beginning, priors: dict[str, Belief]) -> tuple[Array, Array]:
+def _start(
+    places: Layout, numbers: Numbers, beginning: InitialConditions, priors: dict[str, Belief]
+) -> tuple[Array, Array]:
     """State and covariance at the first epoch; biases begin as (3.15)."""
     start, where = beginning.start, beginning.config.start
     R_nb, iron = start.state.R_nb[0], priors["hard_iron"]

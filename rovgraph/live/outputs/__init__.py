@@ -5,7 +5,6 @@ dropped, counted, and complained of once per kind and minute.
 """
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.mavlink import MavlinkOutput
 from rovgraph.live.outputs.nmea import NmeaOutput
 from rovgraph.live.outputs.output import Output
@@ -13,6 +12,7 @@ from rovgraph.live.outputs.standard import StandardOutput
 from rovgraph.live.outputs.tcp import TcpOutput
 from rovgraph.live.outputs.udp import UdpOutput
 from rovgraph.live.outputs.url import parsed
+from rovgraph.live.warnings import Warnings
 
 __all__ = ["FORMS", "Output", "open_output"]
 
@@ -31,13 +31,13 @@ _OUTPUTS: dict[str, type[Output]] = {
 }
 
 
-def open_output(url: str, complaints: Complaints | None = None, patient: bool = False) -> Output:
+def open_output(url: str, warnings: Warnings | None = None, patient: bool = False) -> Output:
     """Open an output.
 
     Parameters
     ----------
     url : one of `FORMS`, with options as in ``udp://host:port?rate=5``
-    complaints : told, from other threads too, of what goes wrong later
+    warnings : told, from other threads too, of what goes wrong later
     patient : standard output waits for its reader instead of dropping lines, as a replay may
 
     Raises
@@ -46,7 +46,7 @@ def open_output(url: str, complaints: Complaints | None = None, patient: bool = 
     """
     where = parsed(url)
     if where.scheme == "-":
-        return StandardOutput(where, complaints, patient)
+        return StandardOutput(where, warnings, patient)
     if where.scheme not in _OUTPUTS:
         raise InputError(f"output {url!r} is of no known form; known are {', '.join(FORMS.values())}")
-    return _OUTPUTS[where.scheme](where, complaints)
+    return _OUTPUTS[where.scheme](where, warnings)

@@ -7,12 +7,12 @@ from importlib import import_module
 from typing import Any, ClassVar
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.background import Background
 from rovgraph.live.outputs.mavlink_messages import MESSAGES
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
 from rovgraph.live.solution import Solution
+from rovgraph.live.warnings import Warnings
 
 QUEUED = 4  # solutions; an autopilot wants the newest
 HEARTBEAT_S = 1.0
@@ -30,7 +30,7 @@ class MavlinkOutput(Output):
     ----------
     url : ``mavlink:CONNECTION?message=GPS_INPUT`` or ``VISION_POSITION_ESTIMATE``; connections as
         pymavlink writes them. Further options: ``system`` (1, the autopilot's), ``component``, ``rate``
-    complaints : where complaints go
+    warnings : where warnings go
 
     Raises
     ------
@@ -39,8 +39,8 @@ class MavlinkOutput(Output):
 
     OPTIONS: ClassVar[tuple[str, ...]] = ("message", "rate", "system", "component")
 
-    def __init__(self, url: Url, complaints: Complaints | None = None) -> None:
-        super().__init__(url, complaints)
+    def __init__(self, url: Url, warnings: Warnings | None = None) -> None:
+        super().__init__(url, warnings)
         name = url.options.get("message", "GPS_INPUT")
         if name not in MESSAGES:
             raise InputError(f"output {url.text!r}: unknown message {name!r}; known are {', '.join(MESSAGES)}")

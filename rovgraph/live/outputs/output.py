@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import ClassVar
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.url import Url
 from rovgraph.live.solution import Event, Solution
+from rovgraph.live.warnings import Warnings
 
 
 class Output(ABC):
@@ -18,7 +18,7 @@ class Output(ABC):
     Parameters
     ----------
     url : parsed; the option ``rate`` is the most solutions a second [Hz]
-    complaints : where complaints go
+    warnings : where warnings go
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Output(ABC):
 
     OPTIONS: ClassVar[tuple[str, ...]] = ("rate",)
 
-    def __init__(self, url: Url, complaints: Complaints | None = None) -> None:
+    def __init__(self, url: Url, warnings: Warnings | None = None) -> None:
         unknown = [name for name in url.options if name not in self.OPTIONS]
         if unknown:
             known = ", ".join(self.OPTIONS)
@@ -41,7 +41,7 @@ class Output(ABC):
         self._rate = url.number("rate", None, 1e-3, 1e4)
         self._tick: int | None = None
         self._held: tuple[Event, ...] = ()
-        self._complaints = complaints or Complaints()
+        self._complaints = warnings or Warnings()
         self._counting = threading.Lock()
 
     def send(self, solution: Solution) -> None:

@@ -4,12 +4,12 @@ import os
 import select
 import sys
 
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.background import Background
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
 from rovgraph.live.solution import Solution
+from rovgraph.live.warnings import Warnings
 
 QUEUED = 200  # lines behind a reader that does not read
 CLOSE_S = 1.0
@@ -29,9 +29,9 @@ class StandardOutput(Output):
     """
 
     def __init__(
-        self, url: Url, complaints: Complaints | None = None, patient: bool = False, descriptor: int = STANDARD_OUTPUT
+        self, url: Url, warnings: Warnings | None = None, patient: bool = False, descriptor: int = STANDARD_OUTPUT
     ) -> None:
-        super().__init__(url, complaints)
+        super().__init__(url, warnings)
         self._descriptor = descriptor
         self._begun = b""  # rest of a line of which a part is out
         if descriptor == STANDARD_OUTPUT:

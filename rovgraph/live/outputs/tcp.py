@@ -6,11 +6,11 @@ import time
 from collections import deque
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
 from rovgraph.live.solution import Solution
+from rovgraph.live.warnings import Warnings
 
 QUEUED = 100  # lines per reader, beyond what the system holds
 SYSTEM_BUFFER = 1 << 16  # small, so that a reader who comes back is not shown the past [bytes]
@@ -29,8 +29,8 @@ class TcpOutput(Output):
     InputError : the address cannot be listened at
     """
 
-    def __init__(self, url: Url, complaints: Complaints | None = None) -> None:
-        super().__init__(url, complaints)
+    def __init__(self, url: Url, warnings: Warnings | None = None) -> None:
+        super().__init__(url, warnings)
         host, port = url.host_port(default_host=LOOPBACK)
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:

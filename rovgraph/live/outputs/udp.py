@@ -4,11 +4,11 @@ import socket
 from collections.abc import Iterator
 
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.outputs.output import Output
 from rovgraph.live.outputs.url import Url
 from rovgraph.live.solution import Solution
+from rovgraph.live.warnings import Warnings
 
 
 class UdpOutput(Output):
@@ -19,8 +19,8 @@ class UdpOutput(Output):
     InputError : a host that cannot be found
     """
 
-    def __init__(self, url: Url, complaints: Complaints | None = None) -> None:
-        super().__init__(url, complaints)
+    def __init__(self, url: Url, warnings: Warnings | None = None) -> None:
+        super().__init__(url, warnings)
         host, port = url.host_port()
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]

@@ -38,7 +38,7 @@ class JsonRow:
     Parameters
     ----------
     url : of the source
-    notify : takes complaints
+    notify : takes warnings
     config : for columns and units
 
     Raises

@@ -33,7 +33,7 @@ class LineDecoder:
     ----------
     parse : from a line without its end, not empty, and its arrival to a message, or None where it
         says nothing of a sensor; raises `Refused`
-    notify : takes complaints
+    notify : takes warnings
     """
 
     def __init__(self, parse: Callable[[bytes, float], Message | None], notify: Notify) -> None:

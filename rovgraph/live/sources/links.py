@@ -42,7 +42,7 @@ class TcpLink:
     Parameters
     ----------
     host, port : of the server
-    notify : takes complaints
+    notify : takes warnings
     """
 
     def __init__(self, host: str, port: int, notify: Notify) -> None:
@@ -198,7 +198,7 @@ class SerialLink:
     Parameters
     ----------
     device, baud : which, and how fast
-    notify : takes complaints
+    notify : takes warnings
 
     Raises
     ------

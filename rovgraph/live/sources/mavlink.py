@@ -57,7 +57,7 @@ class MavlinkDecoder:
     Parameters
     ----------
     url : of the source
-    notify : takes complaints
+    notify : takes warnings
     config : for declination and gravity
     options : of the URL
 

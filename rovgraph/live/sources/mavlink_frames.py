@@ -31,7 +31,7 @@ class Frames:
     Parameters
     ----------
     mavlink : pymavlink's dialect
-    notify : takes complaints; "bad data" once per stretch of bytes that is no message
+    notify : takes warnings; "bad data" once per stretch of bytes that is no message
     """
 
     def __init__(self, mavlink: Any, notify: Notify) -> None:

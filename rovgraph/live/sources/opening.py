@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.live.complaints import Complaints
 from rovgraph.live.sources import waterlinked
 from rovgraph.live.sources.address import LOOPBACK, Address, one_of, parse_address, positive, whole
 from rovgraph.live.sources.json_lines import json_lines
@@ -17,6 +16,7 @@ from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.recordings import FileLink, TelemetryLog
 from rovgraph.live.sources.replay import log_replay
 from rovgraph.live.sources.source import Decoder, LinkSource, Notify, Source
+from rovgraph.live.warnings import Warnings
 from rovgraph.log.units import nearest
 
 MAVLINK_BAUD, NMEA_BAUD = 115200, 4800
@@ -36,7 +36,7 @@ _baud = whole(50, 4_000_000)
 
 def open_sources(
     urls: Sequence[str],
-    complaints: Complaints | None = None,
+    warnings: Warnings | None = None,
     config: Config | None = None,
     speed: str = "1",
 ) -> tuple[Source, ...]:
@@ -51,13 +51,13 @@ def open_sources(
     for url in urls:
         if urls.count(url) > 1:
             raise InputError(f"{url}: given twice; each source can be read once")
-    complaints = complaints or Complaints()
-    return tuple(open_source(url, complaints, config, speed) for url in urls)
+    warnings = warnings or Warnings()
+    return tuple(open_source(url, warnings, config, speed) for url in urls)
 
 
 def open_source(
     url: str,
-    complaints: Complaints | None = None,
+    warnings: Warnings | None = None,
     config: Config | None = None,
     speed: str = "1",
 ) -> Source:
@@ -66,7 +66,7 @@ def open_source(
     Parameters
     ----------
     url : as a person gives it
-    complaints : where those of the source go
+    warnings : where those of the source go
     config : for columns, units, declination and gravity
     speed : of files, a number or "max"; their option ``speed`` goes before it
 
@@ -80,7 +80,7 @@ def open_source(
     opener = _OPENERS.get(address.scheme)
     if opener is None:
         raise _unknown(address)
-    notify = partial((complaints or Complaints()).complain, url)
+    notify = partial((warnings or Warnings()).complain, url)
     return opener(address, notify, config or Config(), pace_of(speed))
 
 

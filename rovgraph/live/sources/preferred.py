@@ -13,7 +13,7 @@ class Preferred:
     Parameters
     ----------
     kinds : best first
-    notify : takes complaints
+    notify : takes warnings
     """
 
     def __init__(self, kinds: Sequence[str], notify: Notify) -> None:

@@ -38,7 +38,7 @@ class Source(Protocol):
 
 
 class Notify(Protocol):
-    """Takes complaints about one source; see `rovgraph.live.complaints.Complaints.complain`."""
+    """Takes warnings about one source; see `rovgraph.live.warnings.Warnings.complain`."""
 
     def __call__(self, kind: str, text: str, once: bool = False) -> None: ...
 

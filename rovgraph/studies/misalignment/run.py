@@ -11,7 +11,7 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.errors import in_one_line
-from rovgraph.estimators.chains import Named, Outcome, outcomes
+from rovgraph.estimators.chains import EstimatorSpec, Outcome, outcomes
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.estimators.named import ESTIMATORS
 from rovgraph.evaluate import evaluate
@@ -138,7 +138,7 @@ class _Run:
     def _log(self, dive: Dive) -> Any:
         return log_from_frame(dive.log_frame, f"cell {self.task.cell.id}, run {self.task.run}")
 
-    def _asked(self) -> dict[str, Named]:
+    def _asked(self) -> dict[str, EstimatorSpec]:
         """Estimators that the study wants, what shares its keyframes side by side."""
         own, held = CHAINS[self.task.cell.estimator]
         asked = {"estimated": _own_headings(own)}
@@ -180,7 +180,7 @@ class _Run:
         return [{**first, "time_s": t, "error_deg": e, "sd_deg": sd} for t, e, sd in zip(*columns, strict=True)]
 
 
-def _own_headings(name: str) -> Named:
+def _own_headings(name: str) -> EstimatorSpec:
     """An estimator with the heading sources of the configuration; the thesis's have their own."""
     named = ESTIMATORS[name]
     return named if named.family == "thesis" else replace(named, headings="")

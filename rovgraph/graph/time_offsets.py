@@ -1,7 +1,7 @@
-"""Stamps that may be late, and where on the time line a measurement is put for that.
+"""TimeOffsets that may be late, and where on the time line a measurement is put for that.
 
-A measurement stands at its stamp less the lateness that is assumed; what remains until the
-lateness that is estimated is bridged by a `Track`. So the assumption need not be right, but the
+A measurement stands at its stamp less the time_offset that is assumed; what remains until the
+time_offset that is estimated is bridged by a `LateStampWindow`. So the assumption need not be right, but the
 nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. The
 assumption may be renewed while measurements come.
 """
@@ -14,15 +14,15 @@ import numpy as np
 
 from rovgraph.config import Config, beliefs
 from rovgraph.geometry import Array
-from rovgraph.graph.track import KNOT_S
+from rovgraph.graph.late_stamp_window import KNOT_S
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 
-REACH_SD = 4.0  # of the prior, that a lateness may be off
+REACH_SD = 4.0  # of the prior, that a time_offset may be off
 
 
-class Placed(NamedTuple):
+class StampedMeasurement(NamedTuple):
     """A `rovgraph.log.Measurement` at the time where it is put; ``stamp`` is the time that it came with [s]."""
 
     time: float
@@ -32,27 +32,27 @@ class Placed(NamedTuple):
     stamp: float
 
 
-def pack_placed(placed: Sequence[Placed]) -> dict[str, Any]:
+def pack_stamped(placed: Sequence[StampedMeasurement]) -> dict[str, Any]:
     """As arrays."""
     return {"measurements": pack([Measurement(*p[:4]) for p in placed]), "stamps": [p.stamp for p in placed]}
 
 
-def unpack_placed(packed: Mapping[str, Any]) -> list[Placed]:
-    """The inverse of `pack_placed`."""
+def unpack_stamped(packed: Mapping[str, Any]) -> list[StampedMeasurement]:
+    """The inverse of `pack_stamped`."""
     both = zip(unpack(packed["measurements"]), packed["stamps"], strict=True)
-    return [Placed(*m, stamp) for m, stamp in both]
+    return [StampedMeasurement(*m, stamp) for m, stamp in both]
 
 
 @dataclass
-class Stamps:
+class TimeOffsets:
     """How late the stamps of a set of instruments are.
 
     Attributes
     ----------
     variable : sensor -> name of the calibration variable
-    lags : variable that is estimated -> ndarray, shape (K,), lateness that is reckoned with, ascending by
-        `rovgraph.graph.track.KNOT_S` [s]
-    assumed : variable -> lateness by which measurements are put earlier [s]
+    lags : variable that is estimated -> ndarray, shape (K,), time_offset that is reckoned with, ascending by
+        `rovgraph.graph.late_stamp_window.KNOT_S` [s]
+    assumed : variable -> time_offset by which measurements are put earlier [s]
     """
 
     variable: dict[str, str]
@@ -60,15 +60,15 @@ class Stamps:
     assumed: dict[str, float]
 
     @staticmethod
-    def of(config: Config, instruments: Mapping[str, Instrument]) -> "Stamps":
-        """Stamps as the configuration believes them to be."""
-        variable = {sensor: i.lateness for sensor, i in instruments.items() if i.lateness is not None}
+    def of(config: Config, instruments: Mapping[str, Instrument]) -> "TimeOffsets":
+        """TimeOffsets as the configuration believes them to be."""
+        variable = {sensor: i.time_offset for sensor, i in instruments.items() if i.time_offset is not None}
         priors = {name: belief for name, belief in beliefs(config).items() if name in variable.values()}
         assumed = {name: float(belief.mean[0]) for name, belief in priors.items()}
         lags = {name: around(assumed[name], REACH_SD * b.sd) for name, b in priors.items() if b.estimate}
-        return Stamps(variable, lags, assumed)
+        return TimeOffsets(variable, lags, assumed)
 
-    def copy(self) -> "Stamps":
+    def copy(self) -> "TimeOffsets":
         """One that goes on by itself from here."""
         return replace(self, assumed=dict(self.assumed))
 
@@ -78,10 +78,10 @@ class Stamps:
         every = np.concatenate([[0.0], *self.lags.values(), list(self.assumed.values())])
         return float(np.ptp(every))
 
-    def placed(self, m: Measurement) -> Placed:
+    def placed(self, m: Measurement) -> StampedMeasurement:
         """A measurement where it is assumed to belong."""
         late = self.assumed.get(self.variable.get(m.sensor, ""), 0.0)
-        return Placed(m.time - late, m.sensor, m.values, m.row, m.time)
+        return StampedMeasurement(m.time - late, m.sensor, m.values, m.row, m.time)
 
     def lag(self, sensor: str) -> Array | None:
         """Lateness that is reckoned with for a sensor, shape (K,) [s]; None where it is not estimated."""
@@ -96,11 +96,11 @@ class Stamps:
         """How far the assumption lies from estimates, at most [s]."""
         return max((float(np.abs(calibration[n] - self.assumed[n]).mean()) for n in self.lags), default=0.0)
 
-    def centred(self, calibration: Mapping[str, Array], reach: float) -> "Stamps":
-        """Stamps that are about as late as was estimated, shape (n, 1) or (1,) each, within ``reach`` [s]."""
+    def centred(self, calibration: Mapping[str, Array], reach: float) -> "TimeOffsets":
+        """TimeOffsets that are about as late as was estimated, shape (n, 1) or (1,) each, within ``reach`` [s]."""
         assumed = self.assumed | {name: float(np.mean(calibration[name])) for name in self.lags}
         lags = {name: around(assumed[name], reach + float(np.ptp(calibration[name]))) for name in self.lags}
-        return Stamps(self.variable, lags, assumed)
+        return TimeOffsets(self.variable, lags, assumed)
 
 
 def around(middle: float, reach: float) -> Array:

@@ -4,15 +4,15 @@ import time as host
 from dataclasses import dataclass, field
 
 from rovgraph.errors import InputError
+from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag
-from rovgraph.estimators.initialise import Beginning
-from rovgraph.estimators.passage import Gaussian
+from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.refiner import Refiner, due_times
 from rovgraph.log import Measurement
 
 
 @dataclass
-class Renewals:
+class Reinitialisations:
     """Asks the second process for better estimates, and hands them to the filter.
 
     Attributes
@@ -33,7 +33,7 @@ class Renewals:
         self._due = due_times(self.lag_s)
         self._start: float | None = None
 
-    def begin(self, beginning: Beginning) -> None:
+    def begin(self, beginning: InitialConditions) -> None:
         """The beginning of the dive, before all else."""
         if self._refiner is not None:
             self._refiner.begin(beginning)

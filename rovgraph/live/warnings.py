@@ -10,8 +10,8 @@ Complain = Callable[[str, str, str], None]  # source, kind, text
 PERIOD_S = 60.0
 
 
-class Complaints:
-    """Counts complaints by source and kind, and lets one of a kind through per period; thread-safe.
+class Warnings:
+    """Counts warnings by source and kind, and lets one of a kind through per period; thread-safe.
 
     Parameters
     ----------

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
-from rovgraph.estimators.passage import Gaussian
+from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.remembered_places import Place
-from rovgraph.graph.assembly import Interval
+from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.keys import key
 from rovgraph.graph.marginals import newest_covariance
 from rovgraph.graph.places import Optimum, optimum
 from rovgraph.state import PLACE, PLACE_DIM, State
 
 
-def renewed(recursion: ErrorStateRecursion, intervals: Sequence[Interval], states: State) -> Gaussian:
+def renewed(recursion: ErrorStateRecursion, intervals: Sequence[KeyframeInterval], states: State) -> Gaussian:
     """The newest keyframe, with every factor of the dive linearised at the optimum.
 
     Parameters
@@ -45,9 +45,9 @@ def remembered(best: Optimum, most: int) -> tuple[Place, ...]:
     """The places that were seen last, of those that anything says where they are."""
     seen: dict[int, Place] = {}
     for interval in best.intervals:
-        for a in interval.attached:
-            if a.sighting is not None and a.sighting.believed:
-                number = a.sighting.number
+        for a in interval.measurements:
+            if a.landmark is not None and a.landmark.believed:
+                number = a.landmark.number
                 position = best.solution.values.atVector(key(PLACE, number))
-                seen[number] = Place(a.sighting.name, number, position, a.time)
+                seen[number] = Place(a.landmark.name, number, position, a.time)
     return tuple(sorted(seen.values(), key=lambda place: place.time)[-most:])

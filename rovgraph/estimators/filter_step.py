@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from rovgraph.estimators.remembered_places import Place
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import Attached
+from rovgraph.graph.assembly import KeyframeMeasurement
 from rovgraph.state import State
 
 Gates = dict[str, float]  # sensor that is being kept out -> since when [s]
@@ -42,26 +42,26 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Used:
+class ProcessedMeasurement:
     """A measurement as the filter met it.
 
     Attributes
     ----------
-    attached : the measurement
+    measurement : at its keyframe
     state : of its keyframe, before it entered
     nis : normalised innovation squared
     weight : 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits none of its
         name counts as rejected, and is remembered as another
     """
 
-    attached: Attached
+    measurement: KeyframeMeasurement
     state: State
     nis: float
     weight: float
 
 
 @dataclass(frozen=True)
-class Passage:
+class FilterStep:
     """Through one interval, from one keyframe to the next.
 
     Attributes
@@ -75,4 +75,4 @@ class Passage:
     departed: Gaussian | None
     step: Step | None
     filtered: Gaussian
-    used: list[Used]
+    used: list[ProcessedMeasurement]

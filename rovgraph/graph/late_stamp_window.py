@@ -23,7 +23,7 @@ HALF_WINDOW_S = 0.1  # around a knot, over which the rate is taken; the less noi
 
 
 @dataclass(frozen=True)
-class Track:
+class LateStampWindow:
     """Motion from a keyframe to times around each of n stamps, K of them.
 
     Attributes
@@ -45,7 +45,7 @@ class Track:
     bias: Array
 
     @staticmethod
-    def of(keyframe: Snapshot, knots: Sequence[Snapshot], lag: Array, rate_b: Array, bias: Array) -> "Track":
+    def of(keyframe: Snapshot, knots: Sequence[Snapshot], lag: Array, rate_b: Array, bias: Array) -> "LateStampWindow":
         """The track of one stamp, from snapshots that begin at one time before them all."""
         i = keyframe
         dt = np.array([k.dt for k in knots]) - i.dt
@@ -53,16 +53,18 @@ class Track:
         dv = np.array([k.dv for k in knots]) - i.dv
         dp = np.array([k.dp for k in knots]) - i.dp - dt[:, None] * i.dv
         dv, dp = dv @ i.dR, dp @ i.dR  # into the keyframe's axes
-        return Track(*(a[None] for a in (lag, dt, dR, dv, dp, rate_b, bias)))
+        return LateStampWindow(*(a[None] for a in (lag, dt, dR, dv, dp, rate_b, bias)))
 
     @staticmethod
-    def stack(tracks: Sequence["Track"]) -> "Track":
-        """Many tracks as one."""
-        return Track(*(np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(Track)))
+    def stack(windows: Sequence["LateStampWindow"]) -> "LateStampWindow":
+        """Many windows as one."""
+        return LateStampWindow(
+            *(np.concatenate([getattr(t, f.name) for t in windows]) for f in fields(LateStampWindow))
+        )
 
-    def at(self, index: slice | Array) -> "Track":
-        """Some of the tracks."""
-        return Track(*(getattr(self, f.name)[index] for f in fields(self)))
+    def at(self, index: slice | Array) -> "LateStampWindow":
+        """Some of the windows."""
+        return LateStampWindow(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def placed(self, late: Array) -> tuple[Delta, Array]:
         """Motion to where measurements were valid, and the rate there.
@@ -82,7 +84,7 @@ class Track:
         dR = self.dR[n, k] @ exp_rotation(x * self._turn(n, k))
         return Delta(dt, dR, dv, dp, self.bias), self._rate(n, k, x)[0]
 
-    def by_lateness(self, late: Array, before: State, there: State, H: Jacobians, gravity: float) -> Array:
+    def by_time_offset(self, late: Array, before: State, there: State, H: Jacobians, gravity: float) -> Array:
         """Derivative of predicted measurements by how late their stamps are.
 
         Parameters
@@ -115,10 +117,10 @@ class Track:
         return np.asarray(out[..., None])
 
     def _rate(self, n: NDArray[np.int64], k: NDArray[np.int64], x: Array) -> tuple[Array, Array]:
-        """Rate and its slope by lateness, shape (n, 3) each, on cubic arcs through the knots (Catmull and Rom 1974).
+        """Rate and its slope by time_offset, shape (n, 3) each, on cubic arcs through the knots (Catmull and Rom 1974).
 
         Linear pieces would not do: noise of a knot and of the slope beside it go together, which through the
-        lever arm feigns a lateness. The slope of these arcs is as symmetric about a knot as the knot is.
+        lever arm feigns a time_offset. The slope of these arcs is as symmetric about a knot as the knot is.
         """
         a, b, c, d = (self.rate_b[n, k + i] for i in (-1, 0, 1, 2))
         first, second, third = 0.5 * (c - a), a - 2.5 * b + 2.0 * c - 0.5 * d, 1.5 * (b - c) + 0.5 * (d - a)
@@ -135,14 +137,14 @@ class Track:
         return np.arange(len(x)), k, (x - k)[:, None]
 
 
-def track_around(
+def window_around(
     time: float,
     lag: Array,
     imu: Array,
     start: float,
     integration: tuple[gtsam.PreintegrationCombinedParams, Array],
     longest_step: float,
-) -> Track | None:
+) -> LateStampWindow | None:
     """The motion around a stamp, from IMU samples.
 
     Parameters
@@ -156,7 +158,7 @@ def track_around(
 
     Returns
     -------
-    Track of one stamp, or None where samples are missing
+    LateStampWindow of one stamp, or None where samples are missing
     """
     params, bias = integration
     knots = time - lag
@@ -171,7 +173,7 @@ def track_around(
     stops, place = np.unique(around, return_inverse=True)
     _, found = preintegrate(params, bias, imu, begin, stops, end)
     snapshots = [found[k] for k in place]
-    return Track.of(snapshots[-1], snapshots[:-1], lag, _rate(imu, knots), bias)
+    return LateStampWindow.of(snapshots[-1], snapshots[:-1], lag, _rate(imu, knots), bias)
 
 
 def _rate(imu: Array, time: Array) -> Array:
