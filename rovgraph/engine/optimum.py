@@ -1,0 +1,134 @@
+"""The optimum of a dive, whichever solver found it, and how certain it is."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.calibration import Belief
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.measurements import Block
+from rovgraph.engine.unknowns import Unknowns
+from rovgraph.geometry import Array
+from rovgraph.state import State
+
+OTHERS = 9  # components of `Knowledge.covariance` before those of the calibration
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known at m keyframes, from all data up to each.
+
+    Attributes
+    ----------
+    keyframe : ndarray of int, shape (m,)
+    covariance : ndarray, shape (m, 9 + c, 9 + c), joint of the newest bias (6), of the first
+        keyframe's attitude (3), body axes, and of the calibration (c) in the order of
+        `Unknowns`, of what walks the newest value
+    """
+
+    keyframe: NDArray[np.int64]
+    covariance: Array
+
+    @property
+    def calibration(self) -> Array:
+        """Covariance of the calibration alone, shape (m, c, c)."""
+        return self.covariance[:, OTHERS:, OTHERS:]
+
+
+class Optimum(Protocol):
+    """A dive of n keyframes, solved.
+
+    Attributes
+    ----------
+    intervals : the dive, each landmark given to its place
+    beliefs, unknowns : the calibration variables
+    blocks : sensor -> its measurements
+    state : State of n epochs; calibration that walks has shape (n, dim), all other (dim,)
+    gates : sensor -> which measurements are let in
+    cost, iterations, converged : of the solver
+    places : number of a place -> ndarray, shape (2,), north and east [m]
+    """
+
+    @property
+    def intervals(self) -> list[KeyframeInterval]: ...
+    @property
+    def beliefs(self) -> Mapping[str, Belief]: ...
+    @property
+    def unknowns(self) -> Unknowns: ...
+    @property
+    def blocks(self) -> Mapping[str, Block]: ...
+    @property
+    def state(self) -> State: ...
+    @property
+    def gates(self) -> Gates: ...
+    @property
+    def cost(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def places(self) -> Mapping[int, Array]: ...
+
+    def covariances(self, variable: str) -> Array:
+        """Marginal covariances of a state or calibration variable at every keyframe, shape (n, d, d)."""
+        ...
+
+    def newest_covariance(self, places: Sequence[int] = ()) -> Array:
+        """Joint covariance of the newest keyframe, of the calibration there, and of places.
+
+        Returns
+        -------
+        ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Unknowns`, then
+            the places in the order of their numbers as given
+        """
+        ...
+
+    def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
+        """What is known from the data up to each of some keyframes, increasing, the first beyond 0."""
+        ...
+
+    def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
+        """The same, linearised where the data's noise moves the states once more, with either sign.
+
+        A draw of the error that the noise leaves in the states, calibration held, is put onto the optimum.
+        """
+        ...
+
+    def holding(self, names: Sequence[str]) -> tuple["Optimum", Mapping[str, Array]]:
+        """The optimum with some constants held at their means, and how it moves with them.
+
+        Returns
+        -------
+        optimum : without them among its unknowns
+        sensitivity : variable -> ndarray, shape (n, dim, k), its derivative at every keyframe by the k
+            components that are held
+        """
+        ...
+
+
+def residual_states(optimum: Optimum) -> dict[str, State]:
+    """Sensor -> State of each measurement's keyframe, with the place that it sees, where it sees one."""
+    return {
+        sensor: block.with_places(optimum.state.at(block.keyframe), optimum.places)
+        for sensor, block in optimum.blocks.items()
+    }
+
+
+def joint_prior_sd(optimum: Optimum, keyframe: int) -> dict[str, Array]:
+    """sd of the estimated calibration before any data, at a keyframe to which what walks has walked.
+
+    Returns
+    -------
+    dict : name -> ndarray, shape (dim,)
+    """
+    seconds = optimum.intervals[keyframe].time - optimum.intervals[0].time
+    beliefs = optimum.beliefs
+    return {
+        name: np.full(beliefs[name].variable.dim, np.hypot(beliefs[name].sd, walk * np.sqrt(seconds)))
+        for name, walk in optimum.unknowns.walks.items()
+    }
