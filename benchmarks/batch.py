@@ -57,7 +57,7 @@ def make_graph(seconds: float, config: Config) -> tuple[Problem, gtsam.Values]:
     b = smoother.beginning
     # gates are open: Levenberg-Marquardt has none
     sensors = {name: replace(instrument, gate_sd=None) for name, instrument in b.instruments.items()}
-    problem = make_problem(smoother.intervals, b.start, b.config, beliefs(b.config), sensors)
+    problem = make_problem(smoother.intervals, b.prior, b.config, beliefs(b.config), sensors)
     return problem, make_values(problem, dead_reckon(smoother.intervals, b, problem.unknowns.fixed))
 
 

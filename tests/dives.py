@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config, load_config
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import InitialConditions, initialise
+from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
 from rovgraph.log import STREAMS, Log, Stream, log_from_frame

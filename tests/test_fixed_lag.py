@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from dives import Simulated, falcon, fed, simulated
 
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.error_state import ErrorStateFilter
 from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag, InsertResult
-from rovgraph.estimators.initialise import InitialConditions, initialise
+from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.refiner import Refiner
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.log import Measurement

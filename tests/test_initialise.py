@@ -48,7 +48,7 @@ def still(rpy_deg, heading_deg=30.0, noise=0.0, seconds=10.0, gyr=(0.0, 0.0, 0.0
 def start_of(log, config=None):
     """Roll, pitch, yaw of the start [deg] and the whole beginning."""
     b = initialise(log, config or Config())
-    return np.rad2deg(rpy_from_matrix(b.start.state.R_nb[0])), b
+    return np.rad2deg(rpy_from_matrix(b.prior.state.R_nb[0])), b
 
 
 @pytest.mark.parametrize("roll", [-25.0, 0.0, 40.0])
@@ -56,7 +56,7 @@ def start_of(log, config=None):
 def test_a_tilted_start_is_levelled_by_gravity(roll, pitch):
     rpy, b = start_of(still((roll, pitch, 0.0)))
     np.testing.assert_allclose(rpy[:2], [roll, pitch], atol=0.01)
-    np.testing.assert_allclose(b.start.rpy_sd[:2], Config().start.tilt_sd_deg * DEG)
+    np.testing.assert_allclose(b.prior.rpy_sd[:2], Config().start.tilt_sd_deg * DEG)
     assert not any("in motion" in line for line in b.assumptions)
 
 
@@ -80,7 +80,7 @@ def in_motion(seed=4):
 def test_a_start_in_motion_is_less_sure_of_its_level():
     _, log = in_motion()
     b = initialise(log, falcon())
-    assert (b.start.rpy_sd[:2] > 2.0 * falcon().start.tilt_sd_deg * DEG).all()
+    assert (b.prior.rpy_sd[:2] > 2.0 * falcon().start.tilt_sd_deg * DEG).all()
     assert any("begins in motion" in line for line in b.assumptions)
     assert not any("standing still" in line for line in b.assumptions)
 
@@ -91,7 +91,7 @@ def test_a_start_in_motion_settles_in_the_graph():
     trajectory = smoother.solve().trajectory
     tilt = np.linalg.norm(attitude_errors(trajectory, case)[:, :2], axis=1)
     assert tilt.max() < 0.5 * DEG
-    started = rpy_from_matrix(smoother.beginning.start.state.R_nb[0])
+    started = rpy_from_matrix(smoother.beginning.prior.state.R_nb[0])
     true = case.dive.path.motion([trajectory.time[0]])
     assert np.abs(started - rpy_from_matrix(true.R_nb[0]))[:2].max() < 15.0 * DEG
 
@@ -101,15 +101,15 @@ def test_an_explicit_start_goes_before_the_log():
     config = Config.model_validate({"start": {**start, "down_m": 9, "position_sd_m": 0.3}})
     rpy, b = start_of(still((20.0, 10.0, 0.0)), config)
     np.testing.assert_allclose(np.mod(rpy, 360.0), [3, 356, 200], atol=1e-6)
-    np.testing.assert_allclose(b.start.state.p_n[0], [7, 8, 9])
-    np.testing.assert_allclose(b.start.p_sd, 0.3)
-    assert b.start.rpy_sd[2] == pytest.approx(1 * DEG)
+    np.testing.assert_allclose(b.prior.state.p_n[0], [7, 8, 9])
+    np.testing.assert_allclose(b.prior.p_sd, 0.3)
+    assert b.prior.rpy_sd[2] == pytest.approx(1 * DEG)
 
 
 def test_the_state_begins_at_the_imu():
     config = parse_config("imu: {lever_arm_m: [1, 2, 3]}\nstart: {heading_deg: 90, down_m: 5}")
     _, b = start_of(still((0.0, 0.0, 0.0)), config)
-    np.testing.assert_allclose(b.start.state.p_n[0], [-2, 1, 8], atol=1e-6)
+    np.testing.assert_allclose(b.prior.state.p_n[0], [-2, 1, 8], atol=1e-6)
 
 
 def test_what_was_null_is_filled_in_and_said():
@@ -135,9 +135,9 @@ def test_heading_comes_from_each_source_alone(source, stream, path):
     case = simulated(falcon(heading={"sources": [source]}), 40.0, path=route, noise=False, ahrs_rate=10.0, seed=2)
     b = initialise(case.log, case.config)
     assert {"mag", "dvl_heading", "ahrs"} & set(b.instruments) == {stream}
-    yaw = rpy_from_matrix(b.start.state.R_nb[0])[2]
+    yaw = rpy_from_matrix(b.prior.state.R_nb[0])[2]
     assert abs(wrap_angle(yaw - case.truth.rpy[0, 2])) < 0.1 * DEG
-    assert b.start.rpy_sd[2] == pytest.approx(UNKNOWN_HEADING_SD)
+    assert b.prior.rpy_sd[2] == pytest.approx(UNKNOWN_HEADING_SD)
 
 
 def turned(yaw: float) -> Path:
@@ -189,16 +189,16 @@ def test_fixes_alone_will_do():
 def test_the_gyros_bias_is_read_while_it_stands_still():
     bias = np.array([3e-3, -2e-3, 4e-3])
     _, b = start_of(still((2.0, 1.0, 0.0), noise=0.005, gyr=bias))
-    np.testing.assert_allclose(b.start.state.bias[0, 3:], bias, atol=1e-3)
-    assert (b.start.bias_sd[3:] < 0.5 * np.deg2rad(Config().imu.gyr_bias_sd_dps)).all()
+    np.testing.assert_allclose(b.prior.state.bias[0, 3:], bias, atol=1e-3)
+    assert (b.prior.bias_sd[3:] < 0.5 * np.deg2rad(Config().imu.gyr_bias_sd_dps)).all()
     assert any("gyro bias from the first 5 s" in line for line in b.assumptions)
-    np.testing.assert_array_equal(b.start.bias_sd[:3], Config().imu.acc_bias_sd_mps2)
+    np.testing.assert_array_equal(b.prior.bias_sd[:3], Config().imu.acc_bias_sd_mps2)
 
 
 def test_a_steady_turn_is_not_taken_for_a_bias():
     _, b = start_of(still((0.0, 0.0, 0.0), gyr=(0.0, 0.0, 0.1)))
-    np.testing.assert_array_equal(b.start.state.bias[0, 3:], 0.0)
-    np.testing.assert_allclose(b.start.bias_sd[3:], np.deg2rad(Config().imu.gyr_bias_sd_dps))
+    np.testing.assert_array_equal(b.prior.state.bias[0, 3:], 0.0)
+    np.testing.assert_allclose(b.prior.bias_sd[3:], np.deg2rad(Config().imu.gyr_bias_sd_dps))
 
 
 # noise
@@ -269,8 +269,8 @@ def test_the_start_is_the_first_fix_unless_it_is_given():
     first = case.log["fix"].data[0, :2]
     b = initialise(case.log, free)
     np.testing.assert_allclose([b.config.start.north_m, b.config.start.east_m], first)
-    assert (b.start.p_sd[:2] >= free.fix.sd_m).all()
-    assert b.start.p_sd[2] < 0.3  # of the depth sensor
+    assert (b.prior.p_sd[:2] >= free.fix.sd_m).all()
+    assert b.prior.p_sd[2] < 0.3  # of the depth sensor
     assert any("start position from the first fix" in line for line in b.assumptions)
     given = initialise(case.log, changed(case.config, start={"north_m": 3.0}))
     assert given.config.start.north_m == 3.0
@@ -395,9 +395,9 @@ def test_a_steady_turn_that_dvl_or_compass_show_is_not_taken_for_standing_still(
 def test_what_was_written_of_the_start_gives_the_same_start_again(lively):
     b = initialise(lively.log, free(lively))
     again = initialise(lively.log, Config.model_validate(b.config.model_dump()))
-    np.testing.assert_allclose(again.start.rpy_sd, b.start.rpy_sd)
-    np.testing.assert_allclose(again.start.p_sd, b.start.p_sd)
-    np.testing.assert_allclose(again.start.state.p_n, b.start.state.p_n)
+    np.testing.assert_allclose(again.prior.rpy_sd, b.prior.rpy_sd)
+    np.testing.assert_allclose(again.prior.p_sd, b.prior.p_sd)
+    np.testing.assert_allclose(again.prior.state.p_n, b.prior.state.p_n)
 
 
 def test_a_log_without_depth_says_that_it_begins_at_the_surface(lively):

@@ -331,7 +331,7 @@ def test_a_place_that_stays_in_view_counts_once(lost):
     data = np.column_stack([np.ones(len(time)), np.full(len(time), 0.3)])
     stream = replace(often, time=time, data=data, row=np.arange(len(time)))
     log = Log("dive.csv", {**lost.log.streams, "place": stream})
-    assembler = Assembler(beginning.config, beginning.instruments, beginning.start.state.bias[0])
+    assembler = Assembler(beginning.config, beginning.instruments, beginning.prior.state.bias[0])
     intervals = [i for m in log.measurements() for i in assembler.add(m)]
     seen = [a for i in intervals for a in i.measurements if a.sensor == "place"]
     assert [a.time for a in seen] == [50.0, 55.0] and [a.landmark.number for a in seen] == [1, 2]

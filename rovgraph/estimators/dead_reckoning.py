@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.instruments import HEADING_STREAMS
@@ -37,7 +37,7 @@ def dead_reckon(
     -------
     State of ``len(intervals)`` epochs
     """
-    start = beginning.start.state
+    start = beginning.prior.state
     R, bias = start.R_nb[0], start.bias[0].copy()
     attitudes, biases = [], []
     compass = _compass(beginning)

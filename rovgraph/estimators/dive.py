@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from functools import partial
 
 from rovgraph.config import Config
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import InitialConditions, initialise
+from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.log import Log

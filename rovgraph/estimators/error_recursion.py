@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.config import beliefs
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.alignment import aligned, attitude_poorly_known, with_attitude
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, Step
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.innovations import Innovations
 from rovgraph.estimators.linearization import Linearization
 from rovgraph.estimators.remembered_places import (
@@ -103,12 +103,11 @@ class ErrorStateRecursion:
 
     def start(self) -> Gaussian:
         """The prior: the graph's."""
-        start = self.beginning.start
-        R_nb = start.state.R_nb[0]
-        sd = [start.rpy_sd, start.p_sd, start.v_sd, start.bias_sd]
-        sd += [np.full(self.beliefs[name].variable.dim, self.beliefs[name].sd) for name in self.unknowns.estimated]
-        P = np.diag(np.concatenate(sd) ** 2)
-        P[:3, :3], P[3:6, 3:6] = (transpose(R_nb) @ P[i : i + 3, i : i + 3] @ R_nb for i in (0, 3))
+        start = self.beginning.prior
+        P = np.zeros((self.error.size, self.error.size))
+        P[:15, :15] = start.covariance()
+        sd = [np.full(self.beliefs[name].variable.dim, self.beliefs[name].sd) for name in self.unknowns.estimated]
+        P[15:, 15:] = np.diag(np.concatenate([np.zeros(0), *sd]) ** 2)
         return Gaussian(replace(start.state, calibration=self.unknowns.fixed), P)
 
     def through(self, interval: KeyframeInterval, before: Gaussian, gates: Gates) -> FilterStep:

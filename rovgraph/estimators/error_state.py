@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, Step
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.reinitialisation import renewed
 from rovgraph.estimators.remembered_places import columns, common, extended
 from rovgraph.estimators.results import (
@@ -57,7 +57,7 @@ class ErrorStateFilter:
 
     def __post_init__(self) -> None:
         b = self.beginning
-        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=self.learn_noise)
+        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise)
         self.intervals: list[KeyframeInterval] = []
         self.recursion = ErrorStateRecursion(b)
         self.error = self.recursion.error

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.filter_step import Gates, Gaussian, ProcessedMeasurement
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.remembered_places import Place
 from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.log import Measurement
@@ -246,4 +246,4 @@ class FixedLag:
 
     def _fresh(self) -> Assembler:
         b = self.beginning
-        return Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=self.learn_noise)
+        return Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise)

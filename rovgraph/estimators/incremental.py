@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.filter_step import Gaussian, ProcessedMeasurement
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.smoother import smoothed
 from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.graph.batch import make_problem, solution_at
@@ -51,7 +51,7 @@ class IncrementalEstimator:
         self.beliefs = {name: _stiff(belief) for name, belief in beliefs(b.config).items()}
         self.unknowns = unknowns(self.beliefs, b.instruments)
         self.engine = Incremental(self.unknowns)
-        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0])
+        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0])
         self.intervals: list[KeyframeInterval] = []
         self._filter: ErrorStateFilter | None = None
         self._places: set[int] = set()  # that iSAM2 knows
@@ -85,7 +85,7 @@ class IncrementalEstimator:
         used : what the filter let in, or kept out
         """
         b, segment = self.beginning, interval.segment
-        factors = motion(interval, self.unknowns) if self.intervals else priors(b.start, self.beliefs, self.unknowns)
+        factors = motion(interval, self.unknowns) if self.intervals else priors(b.prior, self.beliefs, self.unknowns)
         values = state_values(interval.index, known.state)
         if not self.intervals or segment > self.intervals[-1].segment:
             factors += drift(self.unknowns, segment, interval.time - self._begun)
@@ -127,7 +127,7 @@ class IncrementalEstimator:
         self.update()
         b = self.beginning
         intervals = settled(self.intervals)
-        problem = make_problem(intervals, b.start, b.config, self.beliefs, b.instruments)
+        problem = make_problem(intervals, b.prior, b.config, self.beliefs, b.instruments)
         return smoothed(Optimum(intervals, problem, solution_at(problem, self.engine.values())), b)
 
     def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:

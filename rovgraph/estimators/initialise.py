@@ -5,17 +5,15 @@ and heading from whatever the log has; the gyro's bias from standing still, wher
 stands still. An explicit ``start`` goes before all of it.
 """
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Collection
 
 import numpy as np
 
 from rovgraph.config import Config, beliefs
+from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
 from rovgraph.geometry import Array, level_from_force, matrix_from_rpy, rpy_from_matrix
-from rovgraph.graph.factors import Start
 from rovgraph.graph.noise_floor import NOISIER
 from rovgraph.graph.preintegration import scatter
 from rovgraph.instruments import Instrument, heading_sources, instruments
@@ -27,43 +25,6 @@ MOVING_TILT_SD = np.deg2rad(5.0)
 UNKNOWN_HEADING_SD = np.deg2rad(20.0)  # the samples themselves enter as factors
 START_VELOCITY_SD = 1.0
 ENOUGH_SAMPLES = 100
-
-
-@dataclass(frozen=True)
-class InitialConditions:
-    """The resolved start of a dive.
-
-    Attributes
-    ----------
-    config : effective configuration: what was null is filled in
-    instruments : the sensors in use, lever arms relative to the IMU
-    start : prior of the first keyframe, at the IMU
-    assumptions : what was assumed, one line each
-    """
-
-    config: Config
-    instruments: dict[str, Instrument]
-    start: Start
-    assumptions: list[str]
-
-    def state(self) -> dict[str, Any]:
-        """What `restored` makes it of again, as plain values and arrays."""
-        start = self.start
-        return {
-            "config": self.config.model_dump(mode="json"),
-            "sensors": list(self.instruments),
-            "start": {name: getattr(start, name) for name in ("rpy_sd", "p_sd", "v_sd", "bias_sd")},
-            "at": {name: getattr(start.state, name) for name in ("R_nb", "p_n", "v_n", "bias")},
-            "assumptions": self.assumptions,
-        }
-
-
-def restored(state: Mapping[str, Any]) -> InitialConditions:
-    """A beginning from its `InitialConditions.state`."""
-    config = Config.model_validate(state["config"])
-    sensors = instruments(config, config.imu.lever_arm_m)
-    start = Start(State(**state["at"]), **state["start"])
-    return InitialConditions(config, {s: sensors[s] for s in state["sensors"]}, start, list(state["assumptions"]))
 
 
 def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> InitialConditions:
@@ -117,7 +78,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     config = config.model_copy(update={"start": filled})
     at_imu = p_n + R_nb @ np.asarray(config.imu.lever_arm_m)
     state = State(R_nb[None], at_imu[None], np.zeros((1, 3)), bias[None])
-    prior = Start(state, rpy_sd, p_sd, np.full(3, START_VELOCITY_SD), bias_sd)
+    prior = StatePrior(state, rpy_sd, p_sd, np.full(3, START_VELOCITY_SD), bias_sd)
     return InitialConditions(config, sensors, prior, assumptions)
 
 

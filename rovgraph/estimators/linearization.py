@@ -5,8 +5,8 @@ from itertools import accumulate, groupby, pairwise
 
 import numpy as np
 
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import KeyframeMeasurement
 from rovgraph.graph.keys import Unknowns

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.filter_step import Gates, Gaussian
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.reinitialisation import renewed
 from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.log import Measurement
@@ -102,7 +102,7 @@ class _Renewed:
 
     def __init__(self, beginning: InitialConditions, reinitialise_at: Sequence[float], learn_noise: bool) -> None:
         b = beginning
-        self._assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], learn_noise=learn_noise)
+        self._assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=learn_noise)
         self._recursion = ErrorStateRecursion(b)
         self._renewals = list(reinitialise_at)
         self._intervals: list[KeyframeInterval] = []

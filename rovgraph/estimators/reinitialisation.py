@@ -26,7 +26,7 @@ def renewed(recursion: ErrorStateRecursion, intervals: Sequence[KeyframeInterval
     """
     b = recursion.beginning
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
-    best = optimum(intervals, b.start, b.config, recursion.beliefs, b.instruments, states, calibration)
+    best = optimum(intervals, b.prior, b.config, recursion.beliefs, b.instruments, states, calibration)
     problem, solution = best.problem, best.solution
     newest = problem.states(solution.values).at([problem.count - 1])
     calibration = {name: value.reshape(-1) for name, value in newest.calibration.items()}

@@ -7,9 +7,9 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.observability import prior_sd, relative_sd, spuriously_observable
 from rovgraph.estimators.results import (
     bias_histories,
@@ -49,7 +49,7 @@ class BatchSmoother:
 
     def __post_init__(self) -> None:
         b = self.beginning
-        self.assembler = Assembler(b.config, b.instruments, b.start.state.bias[0], assumed=self.time_offsets)
+        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], assumed=self.time_offsets)
         self.intervals: list[KeyframeInterval] = []
         self.measurements: list[Measurement] = []
 
@@ -77,7 +77,7 @@ class BatchSmoother:
         dive, calibration, priors = self, None, beliefs(b.config)
         for _ in range(MAX_PLACINGS):
             states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
-            best = optimum(dive.intervals, b.start, b.config, priors, b.instruments, states, calibration)
+            best = optimum(dive.intervals, b.prior, b.config, priors, b.instruments, states, calibration)
             found = best.problem.states(best.solution.values).calibration
             anew = dive.placed_again(found)
             if anew is None:
@@ -168,5 +168,5 @@ def _marginals(
     names = spuriously_observable(problem, claimed, relative)
     if not names:
         return known, relative
-    without = make_problem(optimum.intervals, b.start, b.config, holding(priors, names), b.instruments)
+    without = make_problem(optimum.intervals, b.prior, b.config, holding(priors, names), b.instruments)
     return considered(problem, solution, without, priors), relative

@@ -22,7 +22,8 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
-from rovgraph.graph.factors import Start, drift, landmark_prior, motion, priors
+from rovgraph.engine.initial_conditions import StatePrior
+from rovgraph.graph.factors import drift, landmark_prior, motion, priors
 from rovgraph.graph.keys import Unknowns, key_name, unknowns
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.rows import Rows
@@ -163,7 +164,7 @@ class Solution:
 
 def make_problem(
     intervals: Sequence[KeyframeInterval],
-    start: Start,
+    start: StatePrior,
     config: Config,
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],

@@ -4,13 +4,13 @@ Batch and iSAM2 consume the same lists.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.geometry import Array, transpose
+from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.coasting import coasted, coasting_factor, in_outage
 from rovgraph.graph.keys import Unknowns, key
@@ -21,32 +21,11 @@ Factor = gtsam.NonlinearFactor
 ANYWHERE_M = 1e5  # sd of the prior of a place, about the origin
 
 
-@dataclass(frozen=True)
-class Start:
-    """What is believed at the first keyframe.
-
-    Attributes
-    ----------
-    state : State of one epoch, at the IMU
-    rpy_sd, p_sd, v_sd : ndarray, shape (3,) [rad, m, m/s]; attitude about n's axes, as
-        roll and pitch are small
-    bias_sd : ndarray, shape (6,)
-    """
-
-    state: State
-    rpy_sd: Array
-    p_sd: Array
-    v_sd: Array
-    bias_sd: Array
-
-
-def priors(start: Start, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> list[Factor]:
+def priors(start: StatePrior, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> list[Factor]:
     """Priors of the first keyframe and of the calibration variables."""
     state = start.state
     R_nb, sigmas = state.R_nb[0], gtsam.noiseModel.Diagonal.Sigmas
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = transpose(R_nb) @ np.diag(start.rpy_sd**2) @ R_nb
-    covariance[3:, 3:] = transpose(R_nb) @ np.diag(start.p_sd**2) @ R_nb
+    covariance = start.covariance()[:6, :6]
     pose = gtsam.Pose3(gtsam.Rot3(R_nb), state.p_n[0])
     bias = gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
     return [

@@ -25,10 +25,10 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
+from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.graph.batch import Problem, Solution, make_problem, make_values, solve
-from rovgraph.graph.factors import Start
 from rovgraph.graph.information import eliminate
 from rovgraph.graph.keys import key
 from rovgraph.graph.measurements import Block, make_block
@@ -55,7 +55,7 @@ class Optimum:
 
 def optimum(
     intervals: Sequence[KeyframeInterval],
-    start: Start,
+    start: StatePrior,
     config: Config,
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],

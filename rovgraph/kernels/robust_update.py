@@ -153,7 +153,7 @@ def loss_weight(square: float, loss: int, bend: float) -> float:
 
 @helper
 def reweight(
-    r: Array, S: Array, first: Array, loss: Array, bend: Array, root_out: Array, inverse_out: Array, weight_out: Array
+    r: Array, S: Array, first: Lines, loss: Lines, bend: Array, root_out: Array, inverse_out: Array, weight_out: Array
 ) -> None:
     """Iterate the weights until they rest.
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
+from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
 from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.fixed_lag import FilterSnapshot, FixedLag, InsertResult
 from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.initialise import InitialConditions, restored
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
@@ -186,7 +186,7 @@ class Navigator:
         if self.engine is None or not self.engine.marks:
             return None
         return {
-            "beginning": self.engine.beginning.state(),
+            "beginning": self.engine.beginning.dump(),
             "engine": self.engine.state(),
             "clocks": self.clocks.state(),
             "origin": self.origin,

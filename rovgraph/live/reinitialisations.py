@@ -3,10 +3,10 @@
 import time as host
 from dataclasses import dataclass, field
 
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
 from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.fixed_lag import FixedLag
-from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.refiner import Refiner, due_times
 from rovgraph.log import Measurement
 

@@ -7,8 +7,9 @@ from numpy.typing import ArrayLike
 
 from rovgraph.calibration import MOUNT, Belief
 from rovgraph.config import Config, beliefs, mount_matrix
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
-from rovgraph.estimators.initialise import InitialConditions, initialise
+from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.kalman.dvl import DvlModel, Ping, pings
 from rovgraph.estimators.kalman.known import KnownMotion, known_motion
 from rovgraph.estimators.kalman.mti import Accelerometer, ImuModel, Mti, reference_field
@@ -88,7 +89,7 @@ def prepare(variant: Filter, log: Log, config: Config) -> Setup:
     config, priors = beginning.config, beliefs(beginning.config)
     known = None
     if variant.attitude_given:
-        known = known_motion(log, config, priors, beginning.start.state.bias[0, 3:])
+        known = known_motion(log, config, priors, beginning.prior.state.bias[0, 3:])
     process = _process(variant, log, config, known)
     sensors = instruments(config)
     field_length = float(np.linalg.norm(log["mag"].data, axis=1).mean()) if variant.magnetometer else 1.0
@@ -199,7 +200,7 @@ def _start(
     places: Layout, numbers: Numbers, beginning: InitialConditions, priors: dict[str, Belief]
 ) -> tuple[Array, Array]:
     """State and covariance at the first epoch; biases begin as (3.15)."""
-    start, where = beginning.start, beginning.config.start
+    start, where = beginning.prior, beginning.config.start
     R_nb, iron = start.state.R_nb[0], priors["hard_iron"]
     q = from_matrix(R_nb)
     by_angle = 0.5 * rate_matrix(q)

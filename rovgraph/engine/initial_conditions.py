@@ -1,0 +1,76 @@
+"""What is believed where a dive begins."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rovgraph.config import Config
+from rovgraph.geometry import Array
+from rovgraph.instruments import Instrument, instruments
+from rovgraph.state import State
+
+
+@dataclass(frozen=True)
+class StatePrior:
+    """What is believed at the first keyframe.
+
+    Attributes
+    ----------
+    state : State of one epoch, at the IMU
+    rpy_sd, p_sd, v_sd : ndarray, shape (3,) [rad, m, m/s]; attitude about n's axes, as
+        roll and pitch are small
+    bias_sd : ndarray, shape (6,)
+    """
+
+    state: State
+    rpy_sd: Array
+    p_sd: Array
+    v_sd: Array
+    bias_sd: Array
+
+    def covariance(self) -> Array:
+        """Of pose, velocity and bias in the tangent space of `State`, shape (15, 15)."""
+        R_nb = self.state.R_nb[0]
+        P = np.diag(np.concatenate([self.rpy_sd, self.p_sd, self.v_sd, self.bias_sd]) ** 2)
+        for part in (slice(0, 3), slice(3, 6)):
+            P[part, part] = R_nb.T @ P[part, part] @ R_nb
+        return P
+
+
+@dataclass(frozen=True)
+class InitialConditions:
+    """The resolved start of a dive.
+
+    Attributes
+    ----------
+    config : effective configuration: what was null is filled in
+    instruments : the sensors in use, lever arms relative to the IMU
+    prior : of the first keyframe, at the IMU
+    assumptions : what was assumed, one line each
+    """
+
+    config: Config
+    instruments: dict[str, Instrument]
+    prior: StatePrior
+    assumptions: list[str]
+
+    def dump(self) -> dict[str, Any]:
+        """What `restored` makes it of again, as plain values and arrays."""
+        prior = self.prior
+        return {
+            "config": self.config.model_dump(mode="json"),
+            "sensors": list(self.instruments),
+            "start": {name: getattr(prior, name) for name in ("rpy_sd", "p_sd", "v_sd", "bias_sd")},
+            "at": {name: getattr(prior.state, name) for name in ("R_nb", "p_n", "v_n", "bias")},
+            "assumptions": self.assumptions,
+        }
+
+
+def restored(state: Mapping[str, Any]) -> InitialConditions:
+    """Initial conditions from their `InitialConditions.dump`."""
+    config = Config.model_validate(state["config"])
+    sensors = instruments(config, config.imu.lever_arm_m)
+    prior = StatePrior(State(**state["at"]), **state["start"])
+    return InitialConditions(config, {s: sensors[s] for s in state["sensors"]}, prior, list(state["assumptions"]))

@@ -1,0 +1,35 @@
+"""How a measurement, and a sensor, are laid out in one row of numbers for the filter's kernel.
+
+=============  =====  ==========================================================================================
+measurement
+=============  =====  ==========================================================================================
+`TIME`             1  [s]
+`Z`, `SD`       3, 3  components, and their noise
+`RATE`             3  measured angular rate in b, its bias still in it [rad/s]
+`RATE_SD`          1  its noise [rad/s]
+`SNAPSHOT`        16  motion from the keyframe: time, dR by rows, dv, dp
+`ASSUMED`          6  bias that the motion was integrated with
+=============  =====  ==========================================================================================
+
+=============  =====  ==========================================================================================
+sensor
+=============  =====  ==========================================================================================
+`KIND`             1  of `rovgraph.kernels.measurements`, or `GIVEN`: linearised outside the kernel
+`DIM`              1  components
+`LOSS`, `BEND`  1, 1  of `rovgraph.kernels.weighting`, and where it begins
+`GATE`             1  normalised innovation beyond which a measurement is left out, or infinite
+`READMIT`          1  time of being left out after which the filter inflates what the sensor sees [s]
+`SEES`             3  1 where an error of the `SEEN_FRAME` shows in it
+`SEEN_FRAME`       1  `SEES_VELOCITY`, `SEES_HEADING` or `SEES_POSITION`
+`GAIN`             9  covariance of the measurement where that of the rate is the unit matrix, by rows
+`PARAMS`           *  the model's own
+=============  =====  ==========================================================================================
+"""
+
+TIME, Z, SD, RATE, RATE_SD, SNAPSHOT, ASSUMED = 0, 1, 4, 7, 10, 11, 27
+ROW = ASSUMED + 6
+DT, DR, DV, DP = SNAPSHOT, SNAPSHOT + 1, SNAPSHOT + 10, SNAPSHOT + 13
+
+KIND, DIM, LOSS, BEND, GATE, READMIT, SEES, SEEN_FRAME, GAIN, PARAMS = 0, 1, 2, 3, 4, 5, 6, 9, 10, 19
+GIVEN = -1.0
+SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2
