@@ -1,0 +1,121 @@
+"""What goes into an interval of the error-state filter, and what comes out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rovgraph.calibration import LAYOUT, calibration_size
+from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.places import RememberedPlace
+from rovgraph.geometry import Array
+from rovgraph.state import State
+
+Gates = dict[str, float]  # sensor that is left out -> since when [s]
+
+
+def calibration_vector(calibration: Mapping[str, Array]) -> Array:
+    """All calibration variables as one vector, shape (C,)."""
+    c = np.empty(calibration_size())
+    for name, part in LAYOUT.items():
+        c[part] = calibration[name]
+    return c
+
+
+def state_vector(state: State) -> Array:
+    """R_nb by rows, p_n, v_n and bias of a `State` of one epoch, shape (21,)."""
+    return np.concatenate([state.R_nb.ravel(), state.p_n[0], state.v_n[0], state.bias[0]])
+
+
+def states_of(x: Array, c: Array) -> State:
+    """A `State` of n epochs from state vectors, shape (n, 21), and calibration vectors, shape (n, C) or (C,)."""
+    calibration = {name: c[..., part] for name, part in LAYOUT.items()}
+    return State(x[:, :9].reshape(-1, 3, 3), x[:, 9:12], x[:, 12:15], x[:, 15:21], calibration)
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A state with the covariance of its error, in the order of `rovgraph.engine.error_layout`.
+
+    Attributes
+    ----------
+    x : ndarray, shape (21,), R_nb by rows, p_n, v_n, bias
+    c : ndarray, shape (C,), calibration vector
+    P : ndarray, shape (size + 2 m, size + 2 m), the places at the end
+    places : m places that are remembered
+    """
+
+    x: Array
+    c: Array
+    P: Array
+    places: tuple[RememberedPlace, ...] = ()
+
+    @staticmethod
+    def of(state: State, P: Array, places: tuple[RememberedPlace, ...] = ()) -> "Gaussian":
+        """From a `State` of one epoch, its calibration of shape (dim,)."""
+        return Gaussian(state_vector(state), calibration_vector(state.calibration), P, places)
+
+    @cached_property
+    def state(self) -> State:
+        """The state, of one epoch; calibration has shape (dim,)."""
+        return states_of(self.x[None], self.c)
+
+
+def stack_gaussians(known: Sequence[Gaussian]) -> State:
+    """The states of n estimates as one `State`; calibration has shape (n, dim)."""
+    return states_of(np.array([k.x for k in known]), np.array([k.c for k in known]))
+
+
+@dataclass(frozen=True)
+class Transition:
+    """The way from a keyframe to the next.
+
+    Attributes
+    ----------
+    F, Q : ndarray, shapes as that of P, transition from the keyframe before, and its noise
+    predicted : before anything that was measured at the keyframe
+    """
+
+    F: Array
+    Q: Array
+    predicted: Gaussian
+
+
+@dataclass(frozen=True)
+class ProcessedMeasurement:
+    """A measurement as the filter met it.
+
+    Attributes
+    ----------
+    measurement : at its keyframe
+    before : the keyframe's estimate before it entered
+    nis : normalised innovation squared
+    weight : 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits none of its
+        name counts as rejected, and is remembered as another
+    place : ndarray, shape (2,), where the place that is seen was believed to be, or None
+    """
+
+    measurement: KeyframeMeasurement
+    before: Gaussian
+    nis: float
+    weight: float
+    place: Array | None = None
+
+
+@dataclass(frozen=True)
+class FilterStep:
+    """Through one interval, from one keyframe to the next.
+
+    Attributes
+    ----------
+    departed : the keyframe before, with what was measured after it; None at the first keyframe
+    transition : the way from there; None at the first keyframe
+    filtered : the keyframe that ends the interval
+    processed : the measurements
+    """
+
+    departed: Gaussian | None
+    transition: Transition | None
+    filtered: Gaussian
+    processed: list[ProcessedMeasurement]
