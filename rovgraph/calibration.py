@@ -4,6 +4,9 @@ The configuration's ``calibration`` section, the graph's keys and priors, the
 simulator's hidden truth and the rows of a report all come from `TABLE`.
 A variable is added by adding a row here and using its name in a measurement model.
 
+Compiled measurement equations take all of the calibration as one vector, the variables of `TABLE` one after
+the other: `LAYOUT` says where each stands.
+
 The offset and the deviation of every compass are estimated by default, of a magnetometer its
 hard iron instead of the deviation: no compass in a vehicle is free of them, and holding them
 at zero pushes them into the DVL's misalignment and makes the track look far more certain than
@@ -273,6 +276,37 @@ TABLE: dict[str, Variable] = {
         ),
     )
 }
+
+
+LAYOUT: dict[str, slice] = {}  # of the calibration vector, a slice for each variable of `TABLE`, in its order
+
+
+def _lay_out(variable: Variable) -> None:
+    begin = calibration_size()
+    LAYOUT[variable.name] = slice(begin, begin + variable.dim)
+
+
+def calibration_size() -> int:
+    """Length of the calibration vector, with the variables that have been registered."""
+    return next(reversed(LAYOUT.values())).stop if LAYOUT else 0
+
+
+for _variable in TABLE.values():
+    _lay_out(_variable)
+SIZE = calibration_size()  # of the built-in variables
+
+
+def register(variable: Variable) -> None:
+    """Append a variable to `TABLE`; in the calibration vector it follows all others.
+
+    Raises
+    ------
+    ValueError : its name or letter is taken
+    """
+    if variable.name in TABLE or any(variable.letter == other.letter for other in TABLE.values()):
+        raise ValueError(f"calibration variable {variable.name!r}: its name or its letter {variable.letter!r} is taken")
+    TABLE[variable.name] = variable
+    _lay_out(variable)
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,13 @@ between 10 and 90 percent.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
+from rovgraph.kernels.measurements import WATER_VELOCITY
+from rovgraph.sensors import evaluate
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.vehicle import Hydrodynamics
 
@@ -135,13 +138,12 @@ class WaterVelocity:
     angular = False
     state = (POSE,)
     calibration = ("current",)
+    kind = WATER_VELOCITY
+
+    @cached_property
+    def packed(self) -> Array:
+        """None."""
+        return np.zeros((1, 0))
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        n = len(state)
-        water_n = np.zeros((n, 3))
-        water_n[:, :2] = state.calibration["current"]
-        R_bn = transpose(state.R_nb)
-        water_b = rotate(R_bn, water_n)
-        pose = np.zeros((n, 2, 6))
-        pose[..., :3] = skew(water_b)[:, :2]
-        return water_b[:, :2], {POSE: pose, "current": R_bn[:, :2, :2]}
+        return evaluate(self, self.state, state, rate_b)

@@ -1,37 +1,26 @@
-"""Measurement models, each written once.
+"""Measurement models: what simulator, graph, filters and observability know of a sensor.
 
 Every model is a frozen object with ``predict(state, rate_b) -> (z, Jacobians)`` that
 broadcasts over epochs. The simulator samples it, the graph linearises it, filters update
 with it and observability analysis stacks it. Calibration variables are read from
 ``state.calibration``; derivatives are given for all that a model depends on.
 
-===========  =========================================================  ==================
-sensor       equation                                                   source
-===========  =========================================================  ==================
-dvl          z = (1 + k) R_sb (R_bn v_n + (w - b_g) x (l + dl))         (3.16), (3.17)
-dvl_water    the same with v_n - c_n, c the current
-dvl_heading  z = h + A + B sin h + C cos h, h = heading - declination   (3.17); deviation
-ahrs         the same with the IMU's x axis                             curve: Bowditch
-mag          z = |H| ((1 + s) S R_sb R_bn u(declination - A - ..., dip + d) + iron)
-                                                                        (3.11), (3.14),
-                                                                        S: (3.2)
-depth        z = p_d + (R_nb l)_d + offset
-fix          z = (p + R_nb l)_north,east
-place        z = (p + R_nb l)_north,east - m, m where the place is;
-             0 is what seeing it again says
-===========  =========================================================  ==================
-
-Signs follow the corrected equations: declination is atan2(H_e, H_n), and the heading is
-clockwise from north.
+The equations and their sources stand in `rovgraph.kernels.measurements`. A model names its equation
+(``kind``) and packs its own numbers for it (``packed``, which says in what order). A model may also be
+written in NumPy, as `rovgraph.model_aiding` is.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache, cached_property
 from typing import Protocol
 
 import numpy as np
 
-from rovgraph.calibration import MOUNT
-from rovgraph.geometry import Array, cross, identities, identity, matrix_from_rpy, rotate, skew, transpose, wrap_angle
+from rovgraph.calibration import LAYOUT, MOUNT, calibration_size
+from rovgraph.geometry import Array, matrix_from_rpy, wrap_angle
+from rovgraph.kernels import measurements as kernels
+from rovgraph.kernels.layout import MOTION
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, Jacobians, State
 
 
@@ -80,27 +69,76 @@ def innovation(model: SensorModel, z: Array, predicted: Array) -> Array:
     return wrap_angle(z - predicted) if model.angular else z - predicted
 
 
-def _scalar(state: State, name: str) -> Array:
-    """A scalar calibration variable for each epoch, shape (n,)."""
-    return np.zeros(len(state)) + state.calibration[name][..., 0]
+class CompiledModel(SensorModel, Protocol):
+    """A model whose equation is one of `rovgraph.kernels.measurements`.
 
-
-def dvl_mount(state: State) -> tuple[Array, Array]:
-    """R_bs of the DVL for each epoch, and the axes (in b) its angles turn about.
-
-    Returns
-    -------
-    R_bs : ndarray, shape (n, 3, 3)
-    axes : ndarray, shape (n, 3, 3), a column each for roll, pitch, yaw
+    Attributes
+    ----------
+    kind : the equation
+    packed : ndarray, shape (1, k) or (n, k), the model's own numbers, for all epochs or for each
     """
-    rpy, axes = np.empty((len(state), 3)), np.zeros((len(state), 3, 3))
+
+    @property
+    def kind(self) -> int: ...
+    @property
+    def packed(self) -> Array: ...
+
+
+def evaluate(model: CompiledModel, by_state: tuple[str, ...], state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+    """Prediction and Jacobians of a compiled model, as `SensorModel.predict` gives them.
+
+    Parameters
+    ----------
+    model : CompiledModel
+    by_state : state variables that the Jacobians are given for; `PLACE` last
+
+    Raises
+    ------
+    ValueError : arguments of different numbers of epochs
+    """
+    n, names = len(state), model.calibration
+    if PLACE in by_state:
+        names = (*names, PLACE)
+    columns = _columns(names, calibration_size())
+    c = _vector(state.calibration, columns)
+    given = (state.R_nb, state.p_n, state.v_n, state.bias, c, rate_b, model.packed)
+    if any(len(values) != n and len(values) != 1 for values in given):
+        raise ValueError(f"{model.sensor}: cannot predict {n} epochs from arrays of {[len(v) for v in given]}")
+    z, H = np.empty((n, model.dim)), np.zeros((n, model.dim, MOTION + c.shape[1]))
+    kernels.predict_many(model.kind, *given, z, H)
+    jacobians = {name: H[..., _STATE[name]] for name in by_state if name != PLACE}
+    for name, _, own in columns:
+        jacobians[name] = H[..., own]
+    return z, jacobians
+
+
+_STATE = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
+
+
+@cache
+def _columns(names: tuple[str, ...], size: int) -> tuple[tuple[str, slice, slice], ...]:
+    """Variables with their columns in a calibration vector of some size, and in Jacobians; a place follows it."""
+    of = {name: LAYOUT[name] if name != PLACE else slice(size, size + PLACE_DIM) for name in names}
+    return tuple((name, own, slice(MOTION + own.start, MOTION + own.stop)) for name, own in of.items())
+
+
+def _vector(calibration: Mapping[str, Array], columns: tuple[tuple[str, slice, slice], ...]) -> Array:
+    """Calibration vectors of all epochs or of each, shape (1 or n, size); zero but for some variables."""
+    values = [calibration[name] for name, _, _ in columns]
+    rows = max((len(value) for value in values if value.ndim == 2), default=1)
+    size = max(calibration_size(), columns[-1][1].stop if columns else 0)
+    c = np.zeros((rows, size))
+    for (_, own, _), value in zip(columns, values, strict=True):
+        c[:, own] = value
+    return c
+
+
+def dvl_mounting(state: State) -> Array:
+    """R_bs of the DVL for each epoch, shape (n, 3, 3)."""
+    rpy = np.empty((len(state), 3))
     for k, name in enumerate(MOUNT):
         rpy[:, k] = state.calibration[name][..., 0]
-    R_bs, yaw = matrix_from_rpy(rpy), rpy[:, 2]
-    axes[:, :, 0] = R_bs[:, :, 0]
-    axes[:, 0, 1], axes[:, 1, 1] = -np.sin(yaw), np.cos(yaw)
-    axes[:, 2, 2] = 1.0
-    return R_bs, axes
+    return matrix_from_rpy(rpy)
 
 
 @dataclass(frozen=True)
@@ -121,61 +159,23 @@ class DvlVelocity:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        own = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm")
-        return (*own, "current") if self.sensor == "dvl_water" else own
+        return _DVL_WATER if self.sensor == "dvl_water" else _DVL
+
+    @property
+    def kind(self) -> int:
+        return kernels.DVL_WATER if self.sensor == "dvl_water" else kernels.DVL
+
+    @cached_property
+    def packed(self) -> Array:
+        """The lever arm."""
+        return np.array(self.lever_arm_b, dtype=float, ndmin=2)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        R_bs, axes = dvl_mount(state)
-        R_bn, v_n = transpose(state.R_nb), state.v_n
-        if self.sensor == "dvl_water":
-            v_n = v_n.copy()
-            v_n[:, :2] -= state.calibration["current"]
-        body, w = rotate(R_bn, v_n), rate_b - state.bias[:, 3:]
-        arm = skew(self.lever_arm_b + state.calibration["dvl_lever_arm"])
-        v_b = body - rotate(arm, w)
-        gain = (1.0 + _scalar(state, "dvl_scale"))[:, None]
-        R_sb = transpose(R_bs) * gain[..., None]
-
-        pose, bias = np.zeros((len(state), 3, 6)), np.zeros((len(state), 3, 6))
-        pose[..., :3] = R_sb @ skew(body)
-        bias[..., 3:] = R_sb @ arm
-        z, by_angle = rotate(R_sb, v_b), R_sb @ skew(v_b) @ axes
-        H = {POSE: pose, VELOCITY: R_sb @ R_bn, BIAS: bias, "dvl_lever_arm": R_sb @ skew(w)}
-        H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(MOUNT)}
-        H["dvl_scale"] = (z / gain)[..., None]
-        if self.sensor == "dvl_water":
-            H["current"] = -H[VELOCITY][..., :2]
-        return z, H
+        return evaluate(self, self.state, state, rate_b)
 
 
-def _heading(R_nb: Array, axis_b: Array) -> tuple[Array, Array]:
-    """Heading of a body axis, and its derivative with respect to a rotation of the axis.
-
-    Parameters
-    ----------
-    R_nb : ndarray, shape (n, 3, 3)
-    axis_b : ndarray, shape (n, 3) or (3,)
-
-    Returns
-    -------
-    heading : ndarray, shape (n,) [rad], clockwise from north
-    gradient_b : ndarray, shape (n, 3): heading changes by ``gradient_b @ dtheta_b``
-    """
-    u = rotate(R_nb, axis_b)
-    north, east = u[:, :1], u[:, 1:2]
-    # du = R_nb (dtheta x axis), dh = (north de - east dn) / (north^2 + east^2)
-    across_b = (north * R_nb[:, 1] - east * R_nb[:, 0]) / (north**2 + east**2)
-    return np.arctan2(u[:, 1], u[:, 0]), cross(axis_b, across_b)
-
-
-def _deviation(state: State, offset: str, curve: str, heading: Array) -> tuple[Array, Array, Array]:
-    """Compass deviation A + B sin h + C cos h, its slope over h, and (sin h, cos h)."""
-    A = _scalar(state, offset)
-    B, C = state.calibration[curve][..., 0], state.calibration[curve][..., 1]
-    sine, cosine = np.sin(heading), np.cos(heading)
-    both = np.empty((len(heading), 2))
-    both[:, 0], both[:, 1] = sine, cosine
-    return A + B * sine + C * cosine, B * cosine - C * sine, both
+_DVL = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm")
+_DVL_WATER = (*_DVL, "current")
 
 
 @dataclass(frozen=True)
@@ -205,48 +205,25 @@ class CompassHeading:
         mount = MOUNT if self.sensor == "dvl_heading" else ()
         return (self.offset, self.curve, *mount)
 
-    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        n = len(state)
-        R_bs, axes = dvl_mount(state) if self.sensor == "dvl_heading" else (self.R_bs, None)
-        heading, gradient = _heading(state.R_nb, R_bs[..., 0])
-        heading = heading - self.declination
-        deviation, slope, sine_cosine = _deviation(state, self.offset, self.curve, heading)
-        gradient = gradient * (1.0 + slope)[:, None]
+    @property
+    def kind(self) -> int:
+        return kernels.DVL_COMPASS if self.sensor == "dvl_heading" else kernels.COMPASS
 
-        pose = np.zeros((n, 1, 6))
-        pose[:, 0, :3] = gradient
-        H = {POSE: pose, self.offset: np.ones((n, 1, 1)), self.curve: sine_cosine[:, None, :]}
-        if axes is not None:
-            by_angle = pose[..., :3] @ axes
-            H |= {name: by_angle[..., k : k + 1] for k, name in enumerate(MOUNT)}
-        return wrap_angle(heading + deviation)[:, None], H
+    @cached_property
+    def packed(self) -> Array:
+        """Declination, places of offset and curve in the calibration vector, the instrument's x axis in b."""
+        declination = np.atleast_1d(self.declination)
+        own = LAYOUT[self.offset].start, LAYOUT[self.curve].start, *self.R_bs[:, 0]
+        return np.column_stack([declination, np.tile(own, (len(declination), 1))])
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        return evaluate(self, (POSE,), state, rate_b)
 
 
 def field_direction(declination: Array | float, dip: Array | float) -> Array:
     """Unit vector of the magnetic field in n, shape (..., 3)."""
     d, i = np.broadcast_arrays(np.asarray(declination, float), np.asarray(dip, float))
     return np.stack([np.cos(i) * np.cos(d), np.cos(i) * np.sin(d), np.sin(i)], axis=-1)
-
-
-def _field_turns(declination: Array, dip: Array) -> Array:
-    """`field_direction`, its derivative by the dip and that by the declination as columns, shape (n, 3, 3)."""
-    cos_d, sin_d, cos_i, sin_i = np.cos(declination), np.sin(declination), np.cos(dip), np.sin(dip)
-    out = np.zeros((len(dip), 3, 3))
-    out[:, 0, 0], out[:, 1, 0], out[:, 2, 0] = cos_i * cos_d, cos_i * sin_d, sin_i
-    out[:, 0, 1], out[:, 1, 1], out[:, 2, 1] = -sin_i * cos_d, -sin_i * sin_d, cos_i
-    out[:, 0, 2], out[:, 1, 2] = -out[:, 1, 0], out[:, 0, 0]
-    return out
-
-
-_ROW, _COLUMN = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # of a symmetric matrix's six components
-_SYMMETRIC = np.zeros((6, 3, 3))  # the matrix of each
-_SYMMETRIC[range(6), _ROW, _COLUMN] = _SYMMETRIC[range(6), _COLUMN, _ROW] = 1.0
-_TIMES_VECTOR = _SYMMETRIC.transpose(2, 1, 0).reshape(3, 18)
-
-
-def _symmetric(components: Array) -> Array:
-    """Symmetric matrices of components xx, yy, zz, xy, xz, yz; shape (..., 6) to (..., 3, 3)."""
-    return np.asarray((components @ _SYMMETRIC.reshape(6, 9)).reshape(*components.shape[:-1], 3, 3))
 
 
 @dataclass(frozen=True)
@@ -269,38 +246,15 @@ class MagneticField:
     angular = False
     state = (POSE, BIAS)
     calibration = ("mag_offset", "mag_deviation", "hard_iron", "soft_iron", "field_dip", "field_scale")
+    kind = kernels.MAGNETOMETER
+
+    @cached_property
+    def packed(self) -> Array:
+        """Declination, dip, magnitude, the mounting row by row."""
+        return np.array([[self.declination, self.dip, self.magnitude, *self.R_bs.ravel()]])
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        heading, gradient = _heading(state.R_nb, self.R_bs[:, 0])
-        heading = heading - self.declination
-        deviation, slope, sine_cosine = _deviation(state, "mag_offset", "mag_deviation", heading)
-        turns_n = _field_turns(self.declination - deviation, self.dip + _scalar(state, "field_dip"))
-        gain = (1.0 + _scalar(state, "field_scale"))[:, None]
-        unsoftened = self.magnitude * gain[..., None] * self.R_bs.T
-        R_sb = (identity(3) + _symmetric(state.calibration["soft_iron"])) @ unsoftened
-        turns_b = transpose(state.R_nb) @ turns_n
-        u_b, seen = turns_b[..., 0], R_sb @ turns_b
-        field, by_dip, by_deviation = seen[..., 0], seen[..., 1:2], -seen[..., 2:]
-
-        pose, iron = np.zeros((len(state), 3, 6)), np.zeros((len(state), 3, 3))
-        pose[..., :3] = R_sb @ skew(u_b) + by_deviation * (slope[:, None] * gradient)[:, None, :]
-        iron[...] = self.magnitude * identity(3)
-        H = {
-            POSE: pose,
-            "mag_offset": by_deviation,
-            "mag_deviation": by_deviation * sine_cosine[:, None, :],
-            "hard_iron": iron,
-            "soft_iron": (rotate(unsoftened, u_b) @ _TIMES_VECTOR).reshape(-1, 3, 6),
-            "field_dip": by_dip,
-            "field_scale": (field / gain)[..., None],
-        }
-        return field + self.magnitude * state.calibration["hard_iron"], H
-
-
-def _point(state: State, lever_arm_b: Array) -> tuple[Array, Array]:
-    """Position of a point on the vehicle, shape (n, 3), and its derivative by the pose, shape (n, 3, 6)."""
-    by_pose = np.concatenate([-state.R_nb @ skew(lever_arm_b), state.R_nb], axis=-1)
-    return state.p_n + rotate(state.R_nb, lever_arm_b), by_pose
+        return evaluate(self, (POSE,), state, rate_b)
 
 
 @dataclass(frozen=True)
@@ -321,6 +275,7 @@ class Position:
     offset: str | None = None
     angular = False
     state = (POSE, VELOCITY, BIAS)
+    kind = kernels.POSITION
 
     @property
     def dim(self) -> int:
@@ -330,19 +285,19 @@ class Position:
     def calibration(self) -> tuple[str, ...]:
         return () if self.offset is None else (self.offset,)
 
+    @cached_property
+    def packed(self) -> Array:
+        """The lever arm, the offset's place in the calibration vector or -1, the components measured."""
+        offset = -1 if self.offset is None else LAYOUT[self.offset].start
+        return np.array([[*self.lever_arm_b, offset, *self.axes]], dtype=float)
+
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        rows = list(self.axes)
-        point, pose = _point(state, self.lever_arm_b)
-        z, H = point[:, rows], {POSE: pose[:, rows, :]}
-        if self.offset is not None:
-            z = z + state.calibration[self.offset]
-            H[self.offset] = identities(len(state), self.dim)
-        return z, H
+        return evaluate(self, (POSE,), state, rate_b)
 
 
 @dataclass(frozen=True)
 class PlaceOffset:
-    """How far a camera or sonar is from a place that it recognises, north and east.
+    """How far a camera or sonar is from a place that it recognises, north and east; 0 is what seeing it again says.
 
     Horizontally only: a pressure sensor knows the altitude better, and looking down from higher
     up shows the same place.
@@ -358,8 +313,12 @@ class PlaceOffset:
     angular = False
     state = (POSE, VELOCITY, BIAS, PLACE)
     calibration = ()
+    kind = kernels.PLACE_OFFSET
+
+    @cached_property
+    def packed(self) -> Array:
+        """The lever arm."""
+        return np.array([self.lever_arm_b], dtype=float)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
-        point, pose = _point(state, self.lever_arm_b)
-        by_place = -identities(len(state), PLACE_DIM)
-        return point[:, :PLACE_DIM] - state.calibration[PLACE], {POSE: pose[:, :PLACE_DIM], PLACE: by_place}
+        return evaluate(self, (POSE, PLACE), state, rate_b)

@@ -6,14 +6,8 @@ derivatives in its tangent space: ``pose`` (6: rotation, translation), ``velocit
 ``bias`` (6) and each calibration variable by name.
 
 A measurement between two keyframes is predicted from the earlier keyframe through a
-`Delta`, the IMU's preintegrated motion from the keyframe to the measurement's own time:
-
-    R(t) = R_i dR Exp(-dt b_g')
-    v(t) = v_i + g dt + R_i (dv - dt b_a')
-    p(t) = p_i + v_i dt + g dt^2 / 2 + R_i (dp - dt^2 / 2 b_a')
-
-with b' the bias beyond the one the preintegration assumed (Forster et al. 2017, IMU
-preintegration on manifold, first order in the bias over a fraction of a second).
+`Delta`, the IMU's preintegrated motion from the keyframe to the measurement's own time, by the equations
+of `rovgraph.kernels.propagation`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +15,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rovgraph.geometry import Array, exp_and_right_jacobian, exp_rotation, rotate, skew, transpose
+from rovgraph.geometry import Array, exp_rotation, rotate
+from rovgraph.kernels.propagation import propagate_many
 
 POSE, VELOCITY, BIAS = "pose", "velocity", "bias"
 DIMENSION = {POSE: 6, VELOCITY: 3, BIAS: 6}
@@ -122,8 +117,8 @@ class Delta:
 
 
 def propagate(state: State, delta: Delta, gravity: float) -> State:
-    """The state at the measurements' times (equations in the module's docstring)."""
-    return _propagate(state, delta, gravity)[0]
+    """The state at the measurements' times (equations in `rovgraph.kernels.propagation`)."""
+    return _propagate(state, delta, gravity, np.empty((0, 15, 15)))
 
 
 def propagate_with_jacobian(state: State, delta: Delta, gravity: float) -> tuple[State, Array]:
@@ -140,34 +135,15 @@ def propagate_with_jacobian(state: State, delta: Delta, gravity: float) -> tuple
     state : State, n epochs
     F : ndarray, shape (n, 15, 15), pose, velocity, bias by pose, velocity, bias
     """
-    there, dv, dp, turned, Jr = _propagate(state, delta, gravity)
-    n, dt = len(delta.dt), delta.dt[:, None, None]
-    to_there = transpose(turned)
-    F = np.zeros((n, 15, 15))
-    F[:, _DIAGONAL, _DIAGONAL] = 1.0
-    F[:, 0:3, 0:3] = F[:, 3:6, 3:6] = to_there
-    F[:, 0:3, 12:15] = -dt * Jr
-    F[:, 3:6, 0:3] = -to_there @ skew(dp)
-    F[:, 3:6, 6:9] = dt * (to_there @ transpose(state.R_nb))
-    F[:, 3:6, 9:12] = -0.5 * dt**2 * to_there
-    F[:, 6:9, 0:3] = -state.R_nb @ skew(dv)
-    F[:, 6:9, 9:12] = -dt * state.R_nb
-    return there, F
+    F = np.zeros((len(state), 15, 15))
+    return _propagate(state, delta, gravity, F), F
 
 
-_DIAGONAL = np.arange(15)
-
-
-def _propagate(state: State, delta: Delta, gravity: float) -> tuple[State, Array, Array, Array, Array]:
-    """The state, and the motion corrected for the bias: velocity, position, rotation, and Jr of its correction."""
-    dt = delta.dt[:, None]
-    excess = state.bias - delta.bias
-    dv = delta.dv - dt * excess[:, :3]
-    dp = delta.dp - 0.5 * dt**2 * excess[:, :3]
-    correction, Jr = exp_and_right_jacobian(-dt * excess[:, 3:])
-    turned = delta.dR @ correction
-    v_n = state.v_n + rotate(state.R_nb, dv)
-    p_n = state.p_n + state.v_n * dt + rotate(state.R_nb, dp)
-    v_n[:, 2] += gravity * delta.dt
-    p_n[:, 2] += 0.5 * gravity * delta.dt**2
-    return State(state.R_nb @ turned, p_n, v_n, state.bias, state.calibration), dv, dp, turned, Jr
+def _propagate(state: State, delta: Delta, gravity: float, F: Array) -> State:
+    n = len(state)
+    given = (state.R_nb, state.p_n, state.v_n, state.bias, delta.dt, delta.dR, delta.dv, delta.dp, delta.bias)
+    if any(len(values) != n for values in given):
+        raise ValueError(f"cannot propagate {n} epochs with arrays of {[len(v) for v in given]}")
+    R_nb, p_n, v_n = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+    propagate_many(*given, gravity, R_nb, p_n, v_n, F)
+    return State(R_nb, p_n, v_n, state.bias, state.calibration)

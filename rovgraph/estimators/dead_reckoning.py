@@ -14,7 +14,7 @@ from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.instruments import HEADING_STREAMS
-from rovgraph.sensors import dvl_mount
+from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
 
 LEVEL_S = 10.0  # time constant of levelling by gravity
@@ -105,7 +105,7 @@ def _velocities(
     z = np.array([a.z for _, a in pings]) / (1.0 + calibration["dvl_scale"])
     rate_b = np.array([a.rate_b for _, a in pings]) - biases[index, 3:]
     arm = beginning.instruments["dvl"].model.lever_arm_b + calibration["dvl_lever_arm"]  # type: ignore[attr-defined]
-    v_b = np.einsum("nij,nj->ni", dvl_mount(here)[0], z) - cross(rate_b, arm)
+    v_b = np.einsum("nij,nj->ni", dvl_mounting(here), z) - cross(rate_b, arm)
     v_n = np.einsum("nij,nj->ni", R_nb[index], v_b)
     time = np.array([i.time for i in intervals])
     return np.column_stack([np.interp(time, time[index], column) for column in v_n.T])

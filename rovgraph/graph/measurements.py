@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from rovgraph.geometry import Array, identity, rotate
+from rovgraph.geometry import Array, rotate
 from rovgraph.graph.assembly import KeyframeMeasurement
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.late_stamp_window import LateStampWindow
 from rovgraph.graph.scale import COLUMNS, SCALES, biased
 from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
+from rovgraph.kernels.weighting import LOSSES, weight_many, whiten_many
 from rovgraph.sensors import innovation
 from rovgraph.state import (
     BIAS,
@@ -249,11 +250,9 @@ def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
     -------
     ndarray, shape (n, dim, dim), lower triangular
     """
-    gain = instrument.rate_gain
-    if not gain.any():
-        return identity(sd.shape[1]) / sd[:, :, None]
-    covariance = identity(sd.shape[1]) * sd[:, :, None] ** 2 + (gain @ gain.T) * rate_sd[:, None, None] ** 2
-    return np.linalg.inv(np.linalg.cholesky(covariance))
+    W = np.empty((*sd.shape, sd.shape[1]))
+    whiten_many(sd, instrument.rate_gain @ instrument.rate_gain.T, rate_sd, W)
+    return W
 
 
 @cache
@@ -274,24 +273,18 @@ def loss_and_weight(r: Array, loss: str) -> tuple[Array, Array]:
     -------
     rho, weight : ndarray, shape (n,); for "none" rho = d^2 / 2
     """
-    d2 = np.sum(r**2, axis=1)
-    k, weight = loss_threshold(loss, r.shape[1]), loss_weight(d2, loss, r.shape[1])
-    if loss == "none":
-        return 0.5 * d2, weight
-    if loss == "cauchy":
-        return 0.5 * k**2 * np.log1p(d2 / k**2), weight
-    d = np.sqrt(d2)
-    return np.where(d > k, k * (d - 0.5 * k), 0.5 * d2), weight
+    return _cost_and_weight(np.sum(r**2, axis=1), loss, r.shape[1])
 
 
 def loss_weight(d2: Array, loss: str, dim: int) -> Array:
     """Weight rho'(d)/d of innovations of ``dim`` components and squared length ``d2``, of any shape."""
-    k = loss_threshold(loss, dim)
-    if loss == "none":
-        return np.ones_like(d2)
-    if loss == "cauchy":
-        return np.asarray(1.0 / (1.0 + d2 / k**2))
-    return np.asarray(k / np.maximum(np.sqrt(d2), k))
+    return _cost_and_weight(d2.ravel(), loss, dim)[1].reshape(d2.shape)
+
+
+def _cost_and_weight(d2: Array, loss: str, dim: int) -> tuple[Array, Array]:
+    rho, weight = np.empty(len(d2)), np.empty(len(d2))
+    weight_many(d2, LOSSES.index(loss), loss_threshold(loss, dim), rho, weight)
+    return rho, weight
 
 
 def robust_noise(instrument: Instrument) -> gtsam.noiseModel.Base:

@@ -35,6 +35,11 @@ def helper(function: F) -> F:
     return cast(F, njit(error_model="numpy")(function))
 
 
+def given(ndim: int) -> str:
+    """Type, for a signature, of an input array with any strides, which may be read-only."""
+    return f"Array(f8, {ndim}, 'A', True)"
+
+
 def kernel(signature: str) -> Callable[[F], F]:
     """An entry point, compiled for one signature when its module is imported, or loaded from the cache.
 

@@ -1,0 +1,27 @@
+"""Where everything stands in the vectors that kernels share: compile-time constants.
+
+The error of a state, and so the columns of every Jacobian, is in this order:
+
+    0   rotation          R_nb <- R_nb Exp(d)
+    3   translation       p_n <- p_n + R_nb d, axes of b
+    6   velocity          in n
+    9   accelerometer     bias, in b
+    12  gyro              bias, in b
+    15  calibration       the calibration vector, in the order below
+
+The calibration vector has the rows of `rovgraph.calibration.TABLE` in their order, built-in ones first; those that
+are registered later follow. Its places are written down here, because kernels need them when they are compiled;
+`rovgraph.calibration.LAYOUT` gives them by name, and a test holds both equal.
+"""
+
+ROTATION, TRANSLATION, VELOCITY, ACC_BIAS, GYR_BIAS = 0, 3, 6, 9, 12
+MOTION = 15  # components of the error before the calibration
+
+DVL_ROLL, DVL_PITCH, DVL_YAW, DVL_SCALE, DVL_LEVER_ARM, DVL_TIME_OFFSET = 0, 1, 2, 3, 4, 7
+DVL_COMPASS_OFFSET, DVL_COMPASS_DEVIATION = 8, 9
+AHRS_OFFSET, AHRS_DEVIATION = 11, 12
+MAG_OFFSET, MAG_DEVIATION, HARD_IRON, SOFT_IRON, FIELD_DIP, FIELD_SCALE = 14, 15, 17, 20, 26, 27
+ACC_SCALE, GYR_SCALE = 28, 31
+DEPTH_OFFSET = 34
+DRAG_LINEAR, DRAG_QUADRATIC, CURRENT = 35, 38, 41
+SIZE = 43  # components of the built-in calibration

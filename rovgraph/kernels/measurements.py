@@ -1,0 +1,209 @@
+"""Measurement equations with their derivatives, for one epoch and for many.
+
+Each equation is written once, here and in `rovgraph.kernels.compass`; simulator, graph, filters and observability
+call it through the models of `rovgraph.sensors`, the filter's kernel calls `predict`.
+
+==============  =========================================================  ==================
+kind            equation                                                   source
+==============  =========================================================  ==================
+DVL             z = (1 + k) R_sb (R_bn v_n + (w - b_g) x (l + dl))         (3.16), (3.17)
+DVL_WATER       the same with v_n - c_n, c the current
+DVL_COMPASS     z = h + A + B sin h + C cos h, h the DVL's heading less    (3.17); deviation
+                the declination                                            curve: Bowditch
+COMPASS         the same, with an x axis that is known
+MAGNETOMETER    z = |H| ((1 + s) S R_sb R_bn u(declination - A - ...,      (3.11), (3.14),
+                dip + d) + iron)                                           S: (3.2)
+POSITION        some of north, east, down of p + R_nb l, plus an offset
+PLACE_OFFSET    z = (p + R_nb l)_north,east - m, m where the place is
+WATER_VELOCITY  z = (R_bn c_n)_forward,starboard
+==============  =========================================================  ==================
+
+Arguments of `predict`, in the order of `rovgraph.kernels.layout`:
+
+    R, p, v    shapes (3, 3), (3,), (3,): R_nb, position and velocity over ground in n [m, m/s]
+    b          shape (6,), biases of accelerometer and gyro, in b [m/s^2, rad/s]
+    c          calibration vector; of PLACE_OFFSET, north and east of the place follow it and are its last two
+    rate       shape (3,), measured angular rate in b, its bias still in it [rad/s]
+    params     the model's own numbers, as ``packed`` of each model in `rovgraph.sensors` says
+    z_out      shape (dim,)
+    H_out      shape (dim, 15 + len(c)), derivative by the error of the state and by c
+
+Of ``H_out`` a kind writes the columns that it depends on, and always the same ones, so that a buffer which was zero
+at first can be used again and again:
+
+    DVL, DVL_WATER   rotation, velocity, gyro, dvl_roll to dvl_lever_arm; DVL_WATER: current
+    DVL_COMPASS      rotation, its offset and its curve, dvl_roll to dvl_yaw
+    COMPASS          rotation, its offset and its curve
+    MAGNETOMETER     rotation, mag_offset to field_scale
+    POSITION         rotation, translation, its offset
+    PLACE_OFFSET     rotation, translation, the last two
+    WATER_VELOCITY   rotation, current
+"""
+
+import numpy as np
+
+from rovgraph.geometry import Array
+from rovgraph.kernels.compass import compass, dvl_mount, magnetometer
+from rovgraph.kernels.compile import given, helper, kernel
+from rovgraph.kernels.layout import CURRENT, DVL_LEVER_ARM, DVL_ROLL, DVL_SCALE, GYR_BIAS, MOTION, TRANSLATION, VELOCITY
+from rovgraph.kernels.rotations import cross, dot, rotate, rotate_back
+
+DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY = range(8)
+WORK = 6  # matrices (3, 3) that `predict` needs to calculate with
+
+
+@helper
+def is_angular(kind: int) -> bool:
+    """Whether the components are angles, so that differences wrap."""
+    return kind in (DVL_COMPASS, COMPASS)
+
+
+@helper
+def dvl_velocity(
+    R: Array,
+    v: Array,
+    b: Array,
+    c: Array,
+    rate: Array,
+    params: Array,
+    water: bool,
+    z_out: Array,
+    H_out: Array,
+    work: Array,
+) -> None:
+    """Velocity of the DVL in its own axes, over ground or relative to the water."""
+    R_bs, axes = work[0], work[1]
+    body, w, arm, v_b, row, turn = work[2, 0], work[2, 1], work[2, 2], work[3, 0], work[3, 1], work[3, 2]
+    dvl_mount(c[DVL_ROLL], c[DVL_ROLL + 1], c[DVL_ROLL + 2], R_bs, axes)
+    for i in range(3):
+        w[i] = rate[i] - b[3 + i]
+        arm[i] = params[i] + c[DVL_LEVER_ARM + i]
+        row[i] = v[i]
+    if water:
+        row[0] -= c[CURRENT]
+        row[1] -= c[CURRENT + 1]
+    rotate_back(R, row, body)
+    cross(w, arm, v_b)
+    for i in range(3):
+        v_b[i] += body[i]
+    gain = 1.0 + c[DVL_SCALE]
+    for i in range(3):
+        for k in range(3):
+            row[k] = gain * R_bs[k, i]  # of (1 + k) R_sb; a row times S(u) is the row x u
+        z_out[i] = dot(row, v_b)
+        cross(row, body, H_out[i, 0:3])
+        rotate(R, row, H_out[i, VELOCITY : VELOCITY + 3])
+        cross(row, arm, H_out[i, GYR_BIAS : GYR_BIAS + 3])
+        cross(row, w, H_out[i, MOTION + DVL_LEVER_ARM : MOTION + DVL_LEVER_ARM + 3])
+        cross(row, v_b, turn)
+        rotate_back(axes, turn, H_out[i, MOTION + DVL_ROLL : MOTION + DVL_ROLL + 3])
+        H_out[i, MOTION + DVL_SCALE] = z_out[i] / gain
+        if water:
+            H_out[i, MOTION + CURRENT] = -H_out[i, VELOCITY]
+            H_out[i, MOTION + CURRENT + 1] = -H_out[i, VELOCITY + 1]
+
+
+@helper
+def _point(R: Array, p: Array, lever_arm_b: Array, axis: int, H_out: Array) -> float:
+    """One component in n of a point on the vehicle; ``H_out`` is its row."""
+    row = R[axis]
+    cross(lever_arm_b, row, H_out[0:3])
+    for k in range(3):
+        H_out[TRANSLATION + k] = row[k]
+    return p[axis] + dot(row, lever_arm_b)  # type: ignore[no-any-return]
+
+
+@helper
+def position(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array) -> None:
+    """Some of north, east, down of a point on the vehicle."""
+    offset = int(params[3])
+    for i in range(len(z_out)):
+        z_out[i] = _point(R, p, params[0:3], int(params[4 + i]), H_out[i])
+        if offset >= 0:
+            z_out[i] += c[offset + i]
+            H_out[i, MOTION + offset + i] = 1.0
+
+
+@helper
+def place_offset(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array) -> None:
+    """North and east from a place to a point on the vehicle."""
+    place = len(c) - 2
+    for i in range(2):
+        z_out[i] = _point(R, p, params[0:3], i, H_out[i]) - c[place + i]
+        H_out[i, MOTION + place + i] = -1.0
+
+
+@helper
+def water_velocity(R: Array, c: Array, z_out: Array, H_out: Array) -> None:
+    """Forward and starboard components of the water's velocity."""
+    north, east = c[CURRENT], c[CURRENT + 1]
+    for i in range(2):
+        z_out[i] = R[0, i] * north + R[1, i] * east
+        H_out[i, MOTION + CURRENT], H_out[i, MOTION + CURRENT + 1] = R[0, i], R[1, i]
+    down = R[0, 2] * north + R[1, 2] * east
+    H_out[0, 0], H_out[0, 1], H_out[0, 2] = 0.0, -down, z_out[1]
+    H_out[1, 0], H_out[1, 1], H_out[1, 2] = down, 0.0, -z_out[0]
+
+
+@helper
+def predict(
+    kind: int,
+    R: Array,
+    p: Array,
+    v: Array,
+    b: Array,
+    c: Array,
+    rate: Array,
+    params: Array,
+    z_out: Array,
+    H_out: Array,
+    work: Array,
+) -> None:
+    """The measurement that a state predicts, and its derivatives; ``work`` has shape (WORK, 3, 3)."""
+    if kind in (DVL, DVL_WATER):
+        dvl_velocity(R, v, b, c, rate, params, kind == DVL_WATER, z_out, H_out, work)
+    elif kind in (DVL_COMPASS, COMPASS):
+        compass(R, c, params, kind == DVL_COMPASS, z_out, H_out, work)
+    elif kind == MAGNETOMETER:
+        magnetometer(R, c, params, z_out, H_out, work)
+    elif kind == POSITION:
+        position(R, p, c, params, z_out, H_out)
+    elif kind == PLACE_OFFSET:
+        place_offset(R, p, c, params, z_out, H_out)
+    elif kind == WATER_VELOCITY:
+        water_velocity(R, c, z_out, H_out)
+
+
+@kernel(
+    f"void(i8, {given(3)}, {given(2)}, {given(2)}, {given(2)}, f8[:, ::1], {given(2)}, f8[:, ::1], f8[:, ::1], "
+    "f8[:, :, ::1])"
+)
+def predict_many(
+    kind: int,
+    R: Array,
+    p: Array,
+    v: Array,
+    b: Array,
+    c: Array,
+    rate: Array,
+    params: Array,
+    z_out: Array,
+    H_out: Array,
+) -> None:
+    """`predict` of n epochs: every argument with the epochs in front, or with one row for all of them.
+
+    ``H_out`` must be zero.
+    """
+    work, one_R, one = np.empty((WORK, 3, 3)), np.empty((3, 3)), np.empty((4, 6))
+    # a row that stands for all epochs stays
+    of_R, of_p, of_v, of_b = len(R) > 1, len(p) > 1, len(v) > 1, len(b) > 1
+    of_c, of_rate, of_params = len(c) > 1, len(rate) > 1, len(params) > 1
+    for k in range(len(z_out)):
+        for i in range(3):
+            one[0, i], one[1, i], one[2, i] = p[k * of_p, i], v[k * of_v, i], rate[k * of_rate, i]
+            for j in range(3):
+                one_R[i, j] = R[k * of_R, i, j]
+        for i in range(6):
+            one[3, i] = b[k * of_b, i]
+        of_calibration, own = c[k * of_c], params[k * of_params]
+        predict(kind, one_R, one[0], one[1], one[3], of_calibration, one[2], own, z_out[k], H_out[k], work)
