@@ -1,0 +1,246 @@
+"""The error-state Kalman filter: `FilterEngine.step` takes one interval, and is the only loop body there is.
+
+The error has 15 components (attitude, position, velocity, biases) and those of the calibration that is estimated.
+Motion, measurement equations, noise, losses, gates and prior are the smoother's own. What differs: every measurement
+is linearised once, where it comes.
+
+Per interval, the measurements between two keyframes correct the earlier one, as they do in the smoother; the state
+goes on to the next keyframe with the IMU; what was measured there corrects it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rovgraph.config import beliefs
+from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
+from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.error_layout import ErrorLayout
+from rovgraph.engine.filter_step import (
+    FilterStep,
+    Gates,
+    Gaussian,
+    ProcessedMeasurement,
+    Transition,
+    calibration_vector,
+    state_vector,
+)
+from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.measurements import Block, make_block
+from rovgraph.engine.remembered_places import (
+    RememberedPlace,
+    moved,
+    nearest,
+    padded,
+    seen_at,
+    with_another,
+    without_oldest,
+)
+from rovgraph.engine.sensor_rows import compiled, measurement_row, sensor_table
+from rovgraph.engine.unknowns import unknowns
+from rovgraph.geometry import Array
+from rovgraph.kernels import measurement_row as at
+from rovgraph.kernels.correction import correct, linearize
+from rovgraph.kernels.error_coordinates import local, retract, seen_variables
+from rovgraph.kernels.prediction import predict_filter
+from rovgraph.state import PLACE, PLACE_DIM
+
+ORIGIN = np.zeros(PLACE_DIM)  # where a place is put to begin with
+_EXACT = np.zeros((0, 6, 6))  # of an IMU without scale errors
+
+
+class FilterEngine:
+    """Extended Kalman filter that keeps nothing: the estimate goes in and comes out.
+
+    Parameters
+    ----------
+    initial : sensors, configuration and prior
+
+    Attributes
+    ----------
+    beliefs, unknowns : priors of the calibration, and what of it is estimated
+    layout : of the error
+    """
+
+    def __init__(self, initial: InitialConditions) -> None:
+        self.initial = initial
+        self.beliefs = beliefs(initial.config)
+        self.unknowns = unknowns(self.beliefs, initial.instruments)
+        self.layout = ErrorLayout(self.unknowns.estimated)
+        self._gravity = initial.config.environment.gravity_mps2
+        self._walk = np.zeros(self.layout.size)  # variance that walking adds in a second
+        for name, walk in self.unknowns.walks.items():
+            self._walk[self.layout.columns[name]] = walk**2
+        instruments = initial.instruments
+        self._given = {  # linearised outside the kernels
+            s for s, i in instruments.items() if not compiled(i, i.time_offset in self.unknowns.walks) or s == PLACE
+        }
+        self._sensors = sensor_table(instruments, sorted(self._given))
+        self._index = {sensor: k for k, sensor in enumerate(instruments)}
+        self._seen = seen_variables(instruments, self.unknowns.estimated)
+
+    def start(self) -> Gaussian:
+        """The prior: the smoother's."""
+        prior, size = self.initial.prior, self.layout.size
+        P = np.zeros((size, size))
+        P[:15, :15] = prior.covariance()
+        for name in self.unknowns.estimated:
+            own = self.layout.columns[name]
+            P[own, own] = np.eye(own.stop - own.start) * self.beliefs[name].sd ** 2
+        return Gaussian(state_vector(prior.state), calibration_vector(self.unknowns.fixed), P)
+
+    def step(self, interval: KeyframeInterval, before: Gaussian, gates: Gates) -> FilterStep:
+        """Take one interval.
+
+        Parameters
+        ----------
+        interval : the next one
+        before : the keyframe before, or at the first `start`
+        gates : renewed in place
+        """
+        processed: list[ProcessedMeasurement] = []
+        departed = transition = None
+        predicted = before
+        if interval.motion is not None:
+            departed = self._align(before, interval)
+            departed = self.correct(departed, interval.between, gates, processed)
+            transition = self.predict(interval, departed)
+            predicted = transition.predicted
+        filtered = self.correct(predicted, interval.here, gates, processed)
+        return FilterStep(departed, transition, filtered, processed)
+
+    def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:
+        """The next keyframe, from the IMU alone; calibration walks."""
+        assert interval.motion is not None
+        n = len(before.P)
+        P, x, F, Q = before.P.copy(), np.empty(21), np.empty((n, n)), np.empty((n, n))
+        scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
+        walk = self._walk if n == self.layout.size else np.append(self._walk, np.zeros(n - self.layout.size))
+        predict_filter(before.x, before.c, P, interval.motion.row, scale, self.layout.column, walk, x, F, Q)
+        return Transition(F, Q, Gaussian(x, before.c, P, before.places))
+
+    def correct(
+        self,
+        before: Gaussian,
+        measurements: Sequence[KeyframeMeasurement],
+        gates: Gates | None,
+        processed: list[ProcessedMeasurement],
+    ) -> Gaussian:
+        """The estimate corrected by measurements that belong to its keyframe, places last; without gates all count."""
+        landmarks = [m for m in measurements if m.landmark is not None]
+        others = [m for m in measurements if m.landmark is None] if landmarks else measurements
+        known = self._correct(before, others, gates, processed) if others else before
+        for m in landmarks:
+            known = self._see(known, m, processed)
+        return known
+
+    def linearize(self, known: Gaussian, measurements: Sequence[KeyframeMeasurement]) -> tuple[Array, Array]:
+        """Whitened innovations, shape (m,), and Jacobians, shape (m, size), of measurements of no places."""
+        r, H = [], []
+        for m in measurements:
+            if m.sensor in self._given:
+                own_r, own_H = self._of_block(known, m)
+            else:
+                own_r, own_H = np.zeros(len(m.z)), np.zeros((len(m.z), self.layout.size))
+                scale = _EXACT if m.scale_to_bias is None else m.scale_to_bias[None]
+                which = np.array([self._index[m.sensor]])
+                rows = (measurement_row(m)[None], which, self._sensors, self.layout.column, scale, self._gravity)
+                linearize(known.x, known.c, *rows, own_r, own_H)
+            r.append(own_r)
+            H.append(own_H)
+        return np.concatenate(r), np.vstack(H)
+
+    def block(self, measurements: Sequence[KeyframeMeasurement]) -> Block:
+        """Measurements of one sensor."""
+        return make_block(
+            measurements, self.initial.instruments[measurements[0].sensor], self._gravity, self.unknowns
+        )
+
+    def retract(self, known: Gaussian, delta: Array, P: Array) -> Gaussian:
+        """The estimate that lies ``delta``, shape (d,), away; ``P``, shape (d, d), is its covariance at the old one."""
+        x, c, P = known.x.copy(), known.c.copy(), P.copy()
+        retract(x, c, P, delta, self.layout.column, self._seen, self._sensors)
+        return Gaussian(x, c, P, moved(known.places, delta[self.layout.size :]))
+
+    def local(self, some: Gaussian, other: Gaussian) -> tuple[Array, Array]:
+        """The error, shape (size,), that leads from one estimate to another, and the basis, shape (size, size).
+
+        The basis takes an error about ``other`` over to ``some``.
+        """
+        size = self.layout.size
+        delta, basis = np.empty(size), np.empty((size, size))
+        local(some.x, some.c, other.x, other.c, self.layout.column, self._seen, self._sensors, delta, basis)
+        return delta, basis
+
+    def _align(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
+        """The keyframe before an interval; where its attitude is poorly known, with the one it is corrected to."""
+        if not poorly_known(known):
+            return known
+        near = aligned(known, interval, self.linearize, self._gravity)
+        after = self.correct(near, interval.between, None, [])
+        return with_attitude(known, after.state.R_nb[0])
+
+    def _correct(
+        self,
+        before: Gaussian,
+        measurements: Sequence[KeyframeMeasurement],
+        gates: Gates | None,
+        processed: list[ProcessedMeasurement],
+    ) -> Gaussian:
+        """The estimate corrected by measurements of no places."""
+        given = [self._of_block(before, m) for m in measurements if m.sensor in self._given]
+        r = np.concatenate([own for own, _ in given]) if given else np.empty(0)
+        H = np.vstack([own for _, own in given]) if given else np.empty((0, self.layout.size))
+        scaled = measurements[0].scale_to_bias is not None
+        scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
+        rows = np.array([m.row_vector for m in measurements])
+        which = np.array([self._index[m.sensor] for m in measurements])
+        x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
+        since = np.array([(gates or {}).get(sensor, np.nan) for sensor in self._index])
+        nis, weight = np.empty(len(rows)), np.empty(len(rows))
+        places = np.zeros(len(P) - self.layout.size)
+        tables = (self._sensors, self.layout.column, scale, r, H, self._seen)
+        correct(x, c, P, rows, which, *tables, since, gates is not None, self._gravity, nis, weight, places)
+        if gates is not None:
+            gates.clear()
+            gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
+        known = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
+        processed += [ProcessedMeasurement(m, before, *rest) for m, *rest in known]
+        return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places)
+
+    def _of_block(self, known: Gaussian, m: KeyframeMeasurement) -> tuple[Array, Array]:
+        """The same of a sensor whose equation the kernels do not know."""
+        state = known.state if m.landmark is None else known.state.seeing(ORIGIN)
+        r, jacobians = self.block([m]).linearize(state)
+        return r[0], self.layout.matrix(jacobians)[0]
+
+    def _see(self, before: Gaussian, m: KeyframeMeasurement, processed: list[ProcessedMeasurement]) -> Gaussian:
+        """The estimate corrected by a place that is seen again, or with one place more."""
+        assert m.landmark is not None
+        instrument, size = self.initial.instruments[m.sensor], self.layout.size
+        r, H = self._of_block(before, m)
+        match = nearest(before.P, r, H, m.sd, size, before.places, m.landmark.name)
+        gate = instrument.gate_sd or np.inf
+        if match is not None and match.nis <= gate**2:
+            found = before.places[match.index]
+            known, weight = self._correct_by(before, m, match.r, match.H)
+            seen = replace(m, landmark=m.landmark._replace(number=found.number))
+            processed.append(ProcessedMeasurement(seen, before, match.nis, weight, found.position))
+            return replace(known, places=seen_at(known.places, match.index, m.time))
+        place = RememberedPlace(m.landmark.name, m.landmark.number, -m.sd * r, m.time)
+        other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
+        processed.append(ProcessedMeasurement(m, before, nis, 1.0 if match is None else 0.0, other.position))
+        P, places = with_another(before.P, before.places, place, m.sd[:, None] * H, m.sd)
+        most = self.initial.config.place.remembered
+        return Gaussian(before.x, before.c, *without_oldest(P, places, size, most))
+
+    def _correct_by(self, before: Gaussian, m: KeyframeMeasurement, r: Array, H: Array) -> tuple[Gaussian, float]:
+        """The estimate corrected by whitened rows that are at hand, and the weight of the measurement."""
+        x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
+        nis, weight, places = np.empty(1), np.empty(1), np.zeros(len(P) - self.layout.size)
+        rows, which = np.zeros((1, at.ROW)), np.array([self._index[m.sensor]])
+        tables = (self._sensors, self.layout.column, _EXACT, r, padded(H, len(P)), self._seen)
+        since = np.full(len(self._index), np.nan)
+        correct(x, c, P, rows, which, *tables, since, False, self._gravity, nis, weight, places)
+        return Gaussian(x, c, P, moved(before.places, places)), float(weight[0])

@@ -1,0 +1,103 @@
+"""The filter's prediction over one interval.
+
+    x_j = f(x_i, b + S k),  e_j = F e_i + w,  P_j = F P_i F' + Q
+
+f, F and Q of pose, velocity and bias are the motion's (`rovgraph.kernels.motion`); k are the IMU's scale errors
+where S is given, and calibration that walks adds its variance a second times the interval to Q.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.geometry import Array
+from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.layout import ACC_SCALE, MOTION
+from rovgraph.kernels.motion import predict_with_transition
+from rovgraph.kernels.motion_row import DURATION
+
+MOVED = 9  # components that the motion mixes: rotation, position, velocity; biases and calibration stay
+
+
+@helper
+def carry(P: Array, F: Array, Q: Array) -> None:
+    """P <- F P F' + Q, where F differs from the unit matrix in its first rows only; P stays symmetric."""
+    n = len(P)
+    FP, own = np.zeros((MOVED, n)), np.empty(MOVED)
+    for i in range(MOVED):
+        for j in range(n):
+            share = F[i, j]
+            if share != 0.0:
+                for k in range(n):
+                    FP[i, k] += share * P[j, k]
+    for i in range(MOVED):
+        for k in range(MOVED, n):
+            P[i, k] = P[k, i] = FP[i, k]
+    for i in range(MOVED):
+        for k in range(i + 1):
+            total = 0.0
+            for j in range(n):
+                total += FP[i, j] * F[k, j]
+            own[k] = total
+        for k in range(i + 1):
+            P[i, k] = P[k, i] = own[k]
+    for i in range(n):
+        for j in range(n):
+            P[i, j] += Q[i, j]
+
+
+@kernel(
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])"
+)
+def predict_filter(
+    x: Array,
+    c: Array,
+    P: Array,
+    motion: Array,
+    scale: Array,
+    column: NDArray[np.int64],
+    walk: Array,
+    x_out: Array,
+    F_out: Array,
+    Q_out: Array,
+) -> None:
+    """Carry an estimate over an interval.
+
+    Parameters
+    ----------
+    x, c : state (21,) and calibration vector of the keyframe before
+    P : shape (n, n), its covariance; afterwards that of the keyframe after
+    motion : row of `rovgraph.kernels.motion_row`
+    scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
+    column : place of each component of state and calibration in the error, -1 where it is not estimated
+    walk : shape (n,), variance that walking adds in a second
+    x_out : state after it
+    F_out, Q_out : shape (n, n), transition and noise
+    """
+    n = len(P)
+    bias, F, Q = x[15:21].copy(), np.zeros((MOTION, MOTION)), np.zeros((MOTION, MOTION))
+    if len(scale):
+        for i in range(6):
+            for k in range(6):
+                bias[i] += scale[i, k] * c[ACC_SCALE + k]
+    R_out = x_out[0:9].reshape(3, 3)
+    predict_with_transition(
+        motion, x[0:9].reshape(3, 3), x[9:12], x[12:15], bias, R_out, x_out[9:12], x_out[12:15], F, Q
+    )
+    x_out[15:21] = x[15:21]
+    F_out[:] = 0.0
+    Q_out[:] = 0.0
+    for i in range(n):
+        F_out[i, i] = 1.0
+        Q_out[i, i] = walk[i] * motion[DURATION]
+    for i in range(MOTION):
+        for j in range(MOTION):
+            F_out[i, j] = F[i, j]
+            Q_out[i, j] += Q[i, j]
+    if len(scale):
+        for k in range(6):
+            own = column[MOTION + ACC_SCALE + k]
+            if own >= 0:  # a scale moves the state as the bias does that it makes, but not the bias itself
+                for i in range(MOVED):
+                    for j in range(6):
+                        F_out[i, own] += F[i, MOVED + j] * scale[j, k]
+    carry(P, F_out, Q_out)
