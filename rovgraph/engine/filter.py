@@ -206,7 +206,7 @@ class FilterEngine:
             gates.clear()
             gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
         known = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
-        processed += [ProcessedMeasurement(m, before, *rest) for m, *rest in known]
+        processed += [ProcessedMeasurement(m, before.x, before.c, *rest) for m, *rest in known]
         return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places)
 
     def _of_block(self, known: Gaussian, m: KeyframeMeasurement) -> tuple[Array, Array]:
@@ -226,11 +226,11 @@ class FilterEngine:
             found = before.places[match.index]
             known, weight = self._correct_by(before, m, match.r, match.H)
             seen = replace(m, landmark=m.landmark._replace(number=found.number))
-            processed.append(ProcessedMeasurement(seen, before, match.nis, weight, found.position))
+            processed.append(ProcessedMeasurement(seen, before.x, before.c, match.nis, weight, found.position))
             return replace(known, places=seen_at(known.places, match.index, m.time))
         place = RememberedPlace(m.landmark.name, m.landmark.number, -m.sd * r, m.time)
         other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
-        processed.append(ProcessedMeasurement(m, before, nis, 1.0 if match is None else 0.0, other.position))
+        processed.append(ProcessedMeasurement(m, before.x, before.c, nis, 1.0 if match is None else 0.0, other.position))
         P, places = with_another(before.P, before.places, place, m.sd[:, None] * H, m.sd)
         most = self.initial.config.place.remembered
         return Gaussian(before.x, before.c, *without_oldest(P, places, size, most))

@@ -8,7 +8,7 @@ import numpy as np
 
 from rovgraph.calibration import LAYOUT, calibration_size
 from rovgraph.engine.assembly import KeyframeMeasurement
-from rovgraph.engine.places import RememberedPlace
+from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.geometry import Array
 from rovgraph.state import State
 
@@ -62,7 +62,7 @@ class Gaussian:
         return states_of(self.x[None], self.c)
 
 
-def stack_gaussians(known: Sequence[Gaussian]) -> State:
+def stack_states(known: Sequence["Gaussian | ProcessedMeasurement"]) -> State:
     """The states of n estimates as one `State`; calibration has shape (n, dim)."""
     return states_of(np.array([k.x for k in known]), np.array([k.c for k in known]))
 
@@ -89,7 +89,7 @@ class ProcessedMeasurement:
     Attributes
     ----------
     measurement : at its keyframe
-    before : the keyframe's estimate before it entered
+    x, c : ndarray, shapes (21,), (C,), the keyframe before it entered, as of `Gaussian`
     nis : normalised innovation squared
     weight : 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits none of its
         name counts as rejected, and is remembered as another
@@ -97,7 +97,8 @@ class ProcessedMeasurement:
     """
 
     measurement: KeyframeMeasurement
-    before: Gaussian
+    x: Array
+    c: Array
     nis: float
     weight: float
     place: Array | None = None

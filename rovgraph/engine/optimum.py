@@ -48,7 +48,7 @@ class Optimum(Protocol):
     beliefs, unknowns : the calibration variables
     blocks : sensor -> its measurements
     state : State of n epochs; calibration that walks has shape (n, dim), all other (dim,)
-    gates : sensor -> which measurements are let in
+    gates, weights : sensor -> which measurements are let in, and their weights, shape (m,)
     cost, iterations, converged : of the solver
     places : number of a place -> ndarray, shape (2,), north and east [m]
     """
@@ -65,6 +65,8 @@ class Optimum(Protocol):
     def state(self) -> State: ...
     @property
     def gates(self) -> Gates: ...
+    @property
+    def weights(self) -> Mapping[str, Array]: ...
     @property
     def cost(self) -> float: ...
     @property

@@ -15,10 +15,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.calibration import TABLE, Belief
+from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, Solution
-from rovgraph.graph.information import knowledge, noise_of_states
 
 # sd after the dive over sd before. Below 0.3 more than nine tenths of the variance are gone and
 # the data outweigh the prior ten to one, so a wrong prior does no harm. Above 0.8 the data have less
@@ -60,81 +59,58 @@ def relative_covariance(information: Array) -> Array:
     return np.asarray(np.linalg.inv(np.eye(information.shape[-1]) + information))
 
 
-def prior_sd(problem: Problem, beliefs: Mapping[str, Belief], segment: int) -> dict[str, Array]:
-    """sd of the estimated calibration before any data; what walks has walked to a segment.
-
-    Parameters
-    ----------
-    problem, beliefs : of the dive
-    segment : of time
-
-    Returns
-    -------
-    dict : name -> ndarray, shape (dim,)
-    """
-    return {
-        name: np.full(TABLE[name].dim, np.hypot(beliefs[name].sd, walk * np.sqrt(problem.walked(segment))))
-        for name, walk in problem.unknowns.walks.items()
-    }
-
-
-def without_spurious_information(
-    problem: Problem, solution: Solution, keyframes: Sequence[int], information: Array, sd: Array
-) -> Array:
+def without_spurious_information(best: Optimum, keyframes: Sequence[int], information: Array, sd: Array) -> Array:
     """Information without what noise in the estimate pretends.
 
     Parameters
     ----------
-    problem, solution : the dive
+    best : the dive
     keyframes : at which the information was found, m
-    information : ndarray, shape (m, c, c), of the data, linearised at the solution
+    information : ndarray, shape (m, c, c), of the data, linearised at the optimum
     sd : ndarray, shape (m, c), of the prior
     """
-    noise = noise_of_states(problem, solution.values, solution.gates)
     more = np.zeros_like(information)
-    for sign in (1.0, -1.0):
-        moved = solution.values.retract(noise.scale(sign))
-        noisier = knowledge(problem, moved, solution.gates, keyframes).calibration
-        more += 0.5 * np.array([data_information(P, s) for P, s in zip(noisier, sd, strict=True)])
+    for noisier in best.noisier(keyframes):
+        more += 0.5 * np.array([data_information(P, s) for P, s in zip(noisier.calibration, sd, strict=True)])
     value, axes = np.linalg.eigh(2.0 * information - more)
     return np.asarray((axes * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
 
-def relative_sd(
-    problem: Problem, solution: Solution, sd: Mapping[str, Array], prior: Mapping[str, Array]
-) -> dict[str, Array]:
-    """sd of the calibration at the end as a part of the prior's, without what noise pretends.
+def relative_sd(best: Optimum, sd: Mapping[str, Array], prior: Mapping[str, Array]) -> dict[str, Array]:
+    """sd of the calibration at the end as a part of the prior's, without spurious information.
 
     That is looked for only where it could change a verdict.
 
     Parameters
     ----------
-    problem, solution : the dive
+    best : the dive
     sd, prior : name -> ndarray, shape (dim,), sd after and before, of the estimated variables
 
     Returns
     -------
     dict : name -> ndarray, shape (dim,)
     """
-    ratio = {name: sd[name] / prior[name] for name in problem.unknowns.estimated}
+    ratio = {name: sd[name] / prior[name] for name in best.unknowns.estimated}
     at_stake = [r for name in SPURIOUSLY_OBSERVABLE if name in ratio for r in ratio[name]]
     if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
-    end, before = [problem.count - 1], np.concatenate([prior[name] for name in ratio])
-    seen = data_information(knowledge(problem, solution.values, solution.gates, end).calibration, before)
-    own = relative_covariance(without_spurious_information(problem, solution, end, seen, before[None]))[0]
+    end, before = [len(best.intervals) - 1], np.concatenate([prior[name] for name in ratio])
+    seen = data_information(best.knowledge(end).calibration, before)
+    own = relative_covariance(without_spurious_information(best, end, seen, before[None]))[0]
     parts = np.split(np.sqrt(np.diag(own)), np.cumsum([len(r) for r in ratio.values()])[:-1])
     return dict(zip(ratio, parts, strict=True))
 
 
-def spuriously_observable(problem: Problem, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
+def spuriously_observable(
+    unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]
+) -> list[str]:
     """Constant variables that are unobservable, and that noise can have moved all the same.
 
     Parameters
     ----------
-    problem : of the dive
-    claimed, relative : name -> ndarray, shape (dim,), sd as a part of the prior's, as the graph has
-        it and without what noise pretends
+    unknowns : of the dive
+    claimed, relative : name -> ndarray, shape (dim,), sd as a part of the prior's, as the smoother has
+        it and without spurious information
     """
-    constant = [name for name in SPURIOUSLY_OBSERVABLE if name in relative and not problem.unknowns.walks[name]]
+    constant = [name for name in SPURIOUSLY_OBSERVABLE if name in relative and not unknowns.walks[name]]
     return [n for n in constant if (relative[n] > UNOBSERVABLE_ABOVE).all() and (claimed[n] < STILL).any()]

@@ -5,12 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.considered import Considered, consider
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
+from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.observability import prior_sd, relative_sd, spuriously_observable
+from rovgraph.estimators.observability import relative_sd, spuriously_observable
+from rovgraph.estimators.optimum import optimum
 from rovgraph.estimators.results import (
     bias_histories,
     body_trajectory,
@@ -19,11 +23,6 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
-from rovgraph.graph.batch import make_problem
-from rovgraph.graph.considered import Marginals, considered, holding
-from rovgraph.graph.places import Optimum, optimum
-from rovgraph.graph.time_offsets import TimeOffsets
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY
 
@@ -77,8 +76,8 @@ class BatchSmoother:
         dive, calibration, priors = self, None, beliefs(b.config)
         for _ in range(MAX_PLACINGS):
             states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
-            best = optimum(dive.intervals, b.prior, b.config, priors, b.instruments, states, calibration)
-            found = best.problem.states(best.solution.values).calibration
+            best = optimum(dive.intervals, b, states, calibration)
+            found = best.state.calibration
             anew = dive.placed_again(found)
             if anew is None:
                 break
@@ -109,64 +108,52 @@ class BatchSmoother:
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
 
 
-def smoothed(optimum: Optimum, b: InitialConditions) -> Estimate:
+def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
-    intervals, priors = optimum.intervals, beliefs(b.config)
-    known, relative = _marginals(optimum, b, priors)
-    problem, solution = known.problem, known.solution
-    n, states = problem.count, problem.states(solution.values)
+    known, relative = _considered(best)
+    best = known.optimum
+    states, intervals = best.state, best.intervals
     trajectory = body_trajectory(
-        intervals,
-        states,
-        b.config.imu.lever_arm_m,
-        known.covariances(POSE, n),
-        known.covariances(VELOCITY, n),
+        intervals, states, b.config.imu.lever_arm_m, known.covariances(POSE), known.covariances(VELOCITY)
     )
-    bias_sd = np.sqrt(np.diagonal(known.covariances(BIAS, n), axis1=1, axis2=2))
+    bias_sd = np.sqrt(np.diagonal(known.covariances(BIAS), axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd)
-    final, spread = dict(problem.unknowns.fixed), {name: np.diag(sd**2) for name, sd in known.held.items()}
-    ends, begun = np.array([0, n - 1]), np.flatnonzero(np.diff(problem.segment)) + 1
-    for name, walk in problem.unknowns.walks.items():
+    final, spread = dict(best.unknowns.fixed), {name: np.diag(sd**2) for name, sd in known.held.items()}
+    n, segment = len(intervals), np.array([i.segment for i in intervals])
+    ends, begun = np.array([0, n - 1]), np.flatnonzero(np.diff(segment)) + 1
+    for name, walk in best.unknowns.walks.items():
         rows = np.concatenate([[0], begun, [n - 1]]) if walk else ends
-        segment = problem.segment[rows] if walk else np.zeros_like(rows)
-        P = known.covariances(name, int(segment[-1]) + 1)
+        P = known.covariances(name)
         value = np.broadcast_to(states.calibration[name], (n, P.shape[1]))[rows]
-        sd = np.sqrt(np.diagonal(P, axis1=1, axis2=2))[segment]
-        history[name] = calibration_history(name, trajectory.time[rows], value, sd)
+        history[name] = calibration_history(
+            name, trajectory.time[rows], value, np.sqrt(np.diagonal(P[rows], axis1=1, axis2=2))
+        )
         final[name], spread[name] = value[-1], P[-1]
     for name, sd in known.held.items():
         both = np.tile(final[name], (2, 1)), np.tile(sd, (2, 1))
         history[name] = calibration_history(name, trajectory.time[ends], *both)
-    here = {sensor: state for sensor, _, state in problem.seen(solution.values)}
     return Estimate(
         "smoothed",
         trajectory,
-        calibration_estimates(priors, list(problem.blocks), final, spread, relative),
+        calibration_estimates(best.beliefs, list(best.blocks), final, spread, relative),
         history,
-        residual_frame(problem.blocks, here, solution.weights),
+        residual_frame(best.blocks, residual_states(best), best.weights),
         {
             "keyframes": n,
-            "cost": solution.cost,
-            "iterations": solution.iterations,
-            "converged": solution.converged,
+            "cost": best.cost,
+            "iterations": best.iterations,
+            "converged": best.converged,
             "bridged_intervals": sum(i.bridged for i in intervals),
             "held_at_prior": list(known.held),
         },
     )
 
 
-def _marginals(
-    optimum: Optimum, b: InitialConditions, priors: Mapping[str, Belief]
-) -> tuple[Marginals, dict[str, Array]]:
-    """Covariances, and the sd of the calibration as a part of the prior's, without what noise pretends."""
-    problem, solution = optimum.problem, optimum.solution
-    known = Marginals.of(problem, solution)
-    sd = {name: np.sqrt(np.diag(known.newest(name, walk))) for name, walk in problem.unknowns.walks.items()}
-    before = prior_sd(problem, priors, int(problem.segment[-1]))
-    relative = relative_sd(problem, solution, sd, before)
-    claimed = {name: sd[name] / before[name] for name in sd}
-    names = spuriously_observable(problem, claimed, relative)
-    if not names:
-        return known, relative
-    without = make_problem(optimum.intervals, b.prior, b.config, holding(priors, names), b.instruments)
-    return considered(problem, solution, without, priors), relative
+def _considered(best: Optimum) -> tuple[Considered, dict[str, Array]]:
+    """What to hold, and the sd of the calibration as a part of the prior's, without spurious information."""
+    names = best.unknowns.estimated
+    sd = {name: np.sqrt(np.diag(best.covariances(name)[-1])) for name in names}
+    before = joint_prior_sd(best, len(best.intervals) - 1)
+    relative = relative_sd(best, sd, before)
+    held = spuriously_observable(best.unknowns, {name: sd[name] / before[name] for name in sd}, relative)
+    return (consider(best, held) if held else Considered(best)), relative

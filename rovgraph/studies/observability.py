@@ -12,6 +12,7 @@ import numpy as np
 
 from rovgraph.calibration import TABLE, Variable
 from rovgraph.config import Config, beliefs
+from rovgraph.engine.optimum import OTHERS, Optimum, joint_prior_sd
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.initialise import initialise
@@ -23,8 +24,6 @@ from rovgraph.estimators.observability import (
     without_spurious_information,
 )
 from rovgraph.geometry import Array
-from rovgraph.graph.information import OTHERS, knowledge
-from rovgraph.graph.places import Optimum
 from rovgraph.log import Log
 
 Progress = Callable[[str, float], None]
@@ -122,7 +121,7 @@ def observe(
     """
     config = estimating(config, also)
     dive = solved(log, config, progress)
-    missing = set(also) - set(dive.problem.unknowns.estimated)
+    missing = set(also) - set(dive.unknowns.estimated)
     if missing:
         name = min(missing)
         needed = " or ".join(TABLE[name].sensors)
@@ -161,7 +160,7 @@ def solved(log: Log, config: Config, progress: Progress = lambda what, done: Non
             f"{FEWEST_KEYFRAMES} are the fewest; take a longer log"
         )
     dive = batch.optimum()
-    if not dive.problem.unknowns.estimated:
+    if not dive.unknowns.estimated:
         raise InputError(
             f"{log.source}: no calibration variable is estimated; give --estimate, or estimate: true in calibration"
         )
@@ -179,18 +178,15 @@ def examined(
     noisy : take off what noise in the estimate pretends
     progress : called now and then
     """
-    problem, solution = dive.problem, dive.solution
     progress("information", 0.6)
-    ends = np.unique(np.linspace(0, problem.count - 1, TIMES + 1).round().astype(int)[1:]).tolist()
-    known = knowledge(problem, solution.values, solution.gates, ends)
-    priors = beliefs(config)
-    walked = [prior_sd(problem, priors, s) for s in problem.segment[ends].tolist()]
-    before = np.array([np.concatenate(list(sd.values())) for sd in walked])
+    ends = np.unique(np.linspace(0, len(dive.intervals) - 1, TIMES + 1).round().astype(int)[1:]).tolist()
+    known = dive.knowledge(ends)
+    before = np.array([np.concatenate(list(joint_prior_sd(dive, end).values())) for end in ends])
     seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
     progress("information", 0.7)
-    own = without_spurious_information(problem, solution, ends, seen, before) if noisy else seen
-    variables = tuple(TABLE[name] for name in problem.unknowns.estimated for _ in TABLE[name].labels)
-    labels = tuple(label for name in problem.unknowns.estimated for label in TABLE[name].labels)
+    own = without_spurious_information(dive, ends, seen, before) if noisy else seen
+    variables = tuple(TABLE[name] for name in dive.unknowns.estimated for _ in TABLE[name].labels)
+    labels = tuple(label for name in dive.unknowns.estimated for label in TABLE[name].labels)
     begin = dive.intervals[0].time
     relative = np.sqrt(np.diagonal(relative_covariance(own), axis1=1, axis2=2))
     return Observability(

@@ -17,18 +17,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rovgraph.estimators.innovations import normalised_squared
-from rovgraph.geometry import Array, identities
+from rovgraph.geometry import Array
 from rovgraph.state import PLACE_DIM
 
 
 @dataclass(frozen=True)
-class Place:
+class RememberedPlace:
     """A place that is remembered.
 
     Attributes
     ----------
-    name, number : of `rovgraph.graph.assembly.LandmarkObservation`
+    name, number : of `rovgraph.engine.assembly.LandmarkObservation`
     position : ndarray, shape (2,), north and east [m]
     time : when it was last seen [s]
     """
@@ -56,21 +55,18 @@ def padded(H: Array, size: int) -> Array:
 
 
 def extended(basis: Array, size: int) -> Array:
-    """Changes of basis that leave places alone; shape (n, size, size)."""
-    n, own, _ = basis.shape
-    if own == size:
-        return basis
-    out = identities(n, size)
-    out[:, :own, :own] = basis
+    """A change of basis that leaves places alone, shape (size, size)."""
+    out = np.eye(size)
+    out[: len(basis), : len(basis)] = basis
     return out
 
 
-def moved(places: Sequence[Place], delta: Array) -> tuple[Place, ...]:
+def moved(places: Sequence[RememberedPlace], delta: Array) -> tuple[RememberedPlace, ...]:
     """Places corrected by the end of an error, shape (2 len(places),)."""
     return tuple(replace(p, position=p.position + d) for p, d in zip(places, delta.reshape(-1, PLACE_DIM), strict=True))
 
 
-def common(some: Sequence[Place], others: Sequence[Place]) -> tuple[list[int], list[int], Array]:
+def common(some: Sequence[RememberedPlace], others: Sequence[RememberedPlace]) -> tuple[list[int], list[int], Array]:
     """Places that two estimates both know.
 
     Returns
@@ -84,7 +80,7 @@ def common(some: Sequence[Place], others: Sequence[Place]) -> tuple[list[int], l
     return [i for i, _ in pairs], [j for _, j in pairs], np.concatenate([np.zeros(0), *shift])
 
 
-def seen_at(places: Sequence[Place], index: int, time: float) -> tuple[Place, ...]:
+def seen_at(places: Sequence[RememberedPlace], index: int, time: float) -> tuple[RememberedPlace, ...]:
     """Places of which one has just been seen."""
     return tuple(replace(p, time=time) if k == index else p for k, p in enumerate(places))
 
@@ -106,7 +102,7 @@ class Match:
     nis: float
 
 
-def nearest(P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence[Place], name: float) -> Match | None:
+def nearest(P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence[RememberedPlace], name: float) -> Match | None:
     """The place of a name that a landmark fits best; None where there is none.
 
     Parameters
@@ -123,13 +119,14 @@ def nearest(P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence
             own_H = padded(H, len(P))
             own_H[:, rows(size, k)] = -np.diag(1.0 / sd)
             own_r = r + place.position / sd
-            matches.append(Match(k, own_r, own_H, normalised_squared(P, own_r, own_H)))
+            S = own_H @ P @ own_H.T + np.eye(PLACE_DIM)
+            matches.append(Match(k, own_r, own_H, float(own_r @ np.linalg.solve(S, own_r))))
     return min(matches, key=lambda match: match.nis, default=None)
 
 
 def with_another(
-    P: Array, places: tuple[Place, ...], place: Place, J: Array, sd: Array
-) -> tuple[Array, tuple[Place, ...]]:
+    P: Array, places: tuple[RememberedPlace, ...], place: RememberedPlace, J: Array, sd: Array
+) -> tuple[Array, tuple[RememberedPlace, ...]]:
     """The covariance with a place more, which lies where the estimate and its landmark put it.
 
     Parameters
@@ -145,7 +142,7 @@ def with_another(
     return P, (*places, place)
 
 
-def without_oldest(P: Array, places: tuple[Place, ...], size: int, most: int) -> tuple[Array, tuple[Place, ...]]:
+def without_oldest(P: Array, places: tuple[RememberedPlace, ...], size: int, most: int) -> tuple[Array, tuple[RememberedPlace, ...]]:
     """Without the place that was not seen for longest, where there are more than ``most``."""
     if len(places) <= most:
         return P, places

@@ -8,7 +8,7 @@ long as nothing is later than the lag; and nothing older than that is kept.
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import pairwise
@@ -16,15 +16,17 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.filter import FilterEngine
+from rovgraph.engine.filter_step import Gates, Gaussian, ProcessedMeasurement, stack_states
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.error_recursion import ErrorStateRecursion
-from rovgraph.estimators.filter_step import Gates, Gaussian, ProcessedMeasurement
-from rovgraph.estimators.remembered_places import Place
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.remembered_places import RememberedPlace
+from rovgraph.estimators.results import body_trajectory
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.log.streams import precedence
-from rovgraph.state import State
+from rovgraph.state import POSE, VELOCITY
+from rovgraph.trajectory import Trajectory
 
 
 class InsertResult(StrEnum):
@@ -49,7 +51,7 @@ class FilterSnapshot:
     interval : the keyframe's
     known : its estimate, with what was measured up to it
     gates : sensors that are being kept out
-    used : measurements that entered, or did not, since the mark before
+    processed : measurements that entered, or did not, since the mark before
     assembler : what had been assembled
     taken : count of measurements that had been taken
     """
@@ -57,7 +59,7 @@ class FilterSnapshot:
     interval: KeyframeInterval
     known: Gaussian
     gates: Gates
-    used: list[ProcessedMeasurement]
+    processed: list[ProcessedMeasurement]
     assembler: Assembler
     taken: int
 
@@ -85,7 +87,7 @@ class FixedLag:
     marks: deque[FilterSnapshot] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
-        self.recursion = ErrorStateRecursion(self.beginning)
+        self.filter = FilterEngine(self.beginning)
         self._assembler = self._fresh()
         self._gates: Gates = {}
         self._record: list[Measurement] = []  # in order; the first `_taken` have been taken
@@ -134,8 +136,8 @@ class FixedLag:
         self.marks[-1] = replace(self.marks[-1], known=known)
         self._gates = dict(self.marks[-1].gates)
         for mark in reversed(later):
-            filter_step = self.recursion.through(mark.interval, self.marks[-1].known, self._gates)
-            after = replace(mark, known=filter_step.filtered, gates=dict(self._gates), used=filter_step.used)
+            filter_step = self.filter.step(mark.interval, self.marks[-1].known, self._gates)
+            after = replace(mark, known=filter_step.filtered, gates=dict(self._gates), processed=filter_step.processed)
             self.marks.append(after)
         self._assembler.time_offsets.assume(self.marks[-1].known.state.calibration)
         return True
@@ -160,11 +162,8 @@ class FixedLag:
         return {
             "keyframe": [interval.index, interval.time, interval.segment, interval.rate_sd],
             "rate_b": interval.rate_b,
-            "R_nb": known.state.R_nb,
-            "p_n": known.state.p_n,
-            "v_n": known.state.v_n,
-            "bias": known.state.bias,
-            "calibration": {name: np.asarray(value) for name, value in known.state.calibration.items()},
+            "x": known.x,
+            "c": known.c,
             "P": known.P,
             "places": np.array([[p.name, p.number, *p.position, p.time] for p in known.places]).reshape(-1, 5),
             "gates": mark.gates,
@@ -176,12 +175,11 @@ class FixedLag:
         """Go on from where another stood."""
         index, time, segment, rate_sd = state["keyframe"]
         interval = KeyframeInterval(index, time, segment, state["rate_b"], rate_sd, None, 0.0, [])
-        here = State(*(state[name] for name in ("R_nb", "p_n", "v_n", "bias", "calibration")))
-        places = tuple(Place(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
+        places = tuple(RememberedPlace(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         assembler = self._fresh()
         assembler.restore(state["assembler"])
         self.marks = deque(
-            [FilterSnapshot(interval, Gaussian(here, state["P"], places), state["gates"], [], assembler, 0)]
+            [FilterSnapshot(interval, Gaussian(state["x"], state["c"], state["P"], places), state["gates"], [], assembler, 0)]
         )
         self._record, self._forgotten, self._taken = [], 0, 0
         self._back_to(0)
@@ -207,7 +205,18 @@ class FixedLag:
             return mark.interval, mark.known
         later = [m for m in self._record[self._taken :] if m.sensor == "imu" and m.time <= time]
         interval = self._assembler.ahead(later, time, mark.known.state)
-        return interval, self.recursion.predict(interval, mark.known).predicted
+        return interval, self.filter.predict(interval, mark.known).predicted
+
+    def trajectory(self, intervals: Sequence[KeyframeInterval], known: Sequence[Gaussian]) -> Trajectory:
+        """The body's origin at keyframes, at least one, in n, with its covariance.
+
+        Parameters
+        ----------
+        intervals, known : the keyframes and what is known of them, n each
+        """
+        columns, arm = self.filter.layout.columns, self.beginning.config.imu.lever_arm_m
+        pose, velocity = (np.array([k.P[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
+        return body_trajectory(intervals, stack_states(known), arm, pose, velocity)
 
     def _go_on(self, until: float) -> None:
         """Take measurements up to a time."""
@@ -219,12 +228,12 @@ class FixedLag:
         """Take intervals that are complete, and forget what the lag has passed."""
         if not intervals:
             return
-        known = self.marks[-1].known if self.marks else self.recursion.start()
+        known = self.marks[-1].known if self.marks else self.filter.start()
         taken, passed = self._forgotten + self._taken, []
         for interval in intervals:
-            filter_step = self.recursion.through(interval, known, self._gates)
+            filter_step = self.filter.step(interval, known, self._gates)
             known = filter_step.filtered
-            passed.append((interval, known, dict(self._gates), filter_step.used))
+            passed.append((interval, known, dict(self._gates), filter_step.processed))
         self._assembler.time_offsets.assume(known.state.calibration)
         assembler = self._assembler.copy()
         self.marks += [FilterSnapshot(*one, assembler, taken) for one in passed]

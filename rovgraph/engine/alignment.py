@@ -7,13 +7,13 @@ That is no measurement: the covariance stays, and they enter afterwards as they 
 iterated Kalman filter does (Bell and Cathey 1993), for the attitude alone, and begun where it can converge.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.estimators.filter_step import Gaussian
-from rovgraph.estimators.linearization import Linearization
+from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.filter_step import Gaussian
 from rovgraph.geometry import (
     Array,
     exp_rotation,
@@ -24,15 +24,16 @@ from rovgraph.geometry import (
     skew,
     transpose,
 )
-from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.instruments import HEADING_STREAMS
 
 POORLY_KNOWN_TILT, POORLY_KNOWN_HEADING = np.deg2rad(4.0), np.deg2rad(10.0)  # sd from which a tangent does harm
 STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
 AT_REST = 0.2  # share of gravity by which a mean specific force may differ from it and still show where down is
 
+Linearize = Callable[[Gaussian, Sequence[KeyframeMeasurement]], tuple[Array, Array]]
 
-def attitude_poorly_known(known: Gaussian) -> bool:
+
+def poorly_known(known: Gaussian) -> bool:
     """Whether tilt or heading is hardly known."""
     if known.P[0, 0] + known.P[1, 1] + known.P[2, 2] < POORLY_KNOWN_TILT**2:
         return False
@@ -40,29 +41,22 @@ def attitude_poorly_known(known: Gaussian) -> bool:
     return bool(tilt > POORLY_KNOWN_TILT**2 or heading > POORLY_KNOWN_HEADING**2)
 
 
-def aligned(
-    known: Gaussian,
-    interval: KeyframeInterval,
-    between: Sequence[KeyframeMeasurement],
-    measurements: Linearization,
-    gravity: float,
-) -> Gaussian:
-    """The keyframe before an interval, levelled and turned to its compasses where it is `attitude_poorly_known`.
+def aligned(known: Gaussian, interval: KeyframeInterval, linearize: Linearize, gravity: float) -> Gaussian:
+    """The keyframe before an interval, levelled and turned to its compasses where it is `poorly_known`.
 
     Parameters
     ----------
     known : its estimate
     interval : with motion
-    between : measurements that belong to the keyframe
-    measurements : of the filter
+    linearize : from an estimate and measurements to whitened innovations and Jacobians
     gravity : [m/s^2]
     """
     tilt, heading = _variances(known)
     if tilt > POORLY_KNOWN_TILT**2:
         known = with_attitude(known, _levelled(known, interval, gravity))
-    compasses = [a for a in between if a.sensor in HEADING_STREAMS]
+    compasses = [m for m in interval.between if m.sensor in HEADING_STREAMS]
     if compasses and heading > POORLY_KNOWN_HEADING**2:
-        known = with_attitude(known, _towards(known, compasses, measurements))
+        known = with_attitude(known, _towards(known, compasses, linearize))
     return known
 
 
@@ -71,14 +65,15 @@ def with_attitude(known: Gaussian, R_nb: Array) -> Gaussian:
 
     A velocity that is better known along these axes turns with them.
     """
-    state, columns = known.state, [0, 1, 2, 6, 7, 8]
-    before, v_n, basis = state.R_nb[0], state.v_n, np.eye(len(known.P))
+    x, columns = known.x.copy(), [0, 1, 2, 6, 7, 8]
+    before, v_n, basis = known.state.R_nb[0], known.state.v_n[0], np.eye(len(known.P))
     basis[3:6, 3:6] = R_nb.T @ before  # position stays along n's
-    along_body = np.concatenate([skew(v_n[0]) @ before, np.eye(3)], axis=1)
+    along_body = np.concatenate([skew(v_n) @ before, np.eye(3)], axis=1)
     if np.trace(along_body @ known.P[np.ix_(columns, columns)] @ along_body.T) < np.trace(known.P[6:9, 6:9]):
         basis[6:9, 6:9] = turn = R_nb @ before.T
-        v_n = v_n @ turn.T
-    return replace(known, state=replace(state, R_nb=R_nb[None], v_n=v_n), P=basis @ known.P @ basis.T)
+        x[12:15] = turn @ v_n
+    x[:9] = R_nb.ravel()
+    return replace(known, x=x, P=basis @ known.P @ basis.T)
 
 
 def _variances(known: Gaussian) -> tuple[float, float]:
@@ -100,21 +95,22 @@ def _levelled(known: Gaussian, interval: KeyframeInterval, gravity: float) -> Ar
     return matrix_from_rpy([*level_from_force(force_b), rpy_from_matrix(R_nb)[2]])
 
 
-def _towards(known: Gaussian, compasses: Sequence[KeyframeMeasurement], measurements: Linearization) -> Array:
+def _towards(known: Gaussian, compasses: Sequence[KeyframeMeasurement], linearize: Linearize) -> Array:
     """The attitude with the heading that compasses make likeliest.
 
     Headings all around the believed one are tried, calibration and tilt being as sure as they are.
     """
-    state, P = known.state, known.P[: measurements.size, : measurements.size]
-    by_heading = P[:, :3] @ state.R_nb[0, 2]
-    variance = float(state.R_nb[0, 2] @ by_heading[:3])
+    R_nb = known.state.R_nb[0]
+    size = linearize(known, compasses)[1].shape[1]
+    P = known.P[:size, :size]
+    by_heading = P[:, :3] @ R_nb[2]
+    variance = float(R_nb[2] @ by_heading[:3])
     reach = min(REACH_SD * np.sqrt(variance), np.pi)
     angles = np.linspace(-reach, reach, 2 * int(np.ceil(reach / STEP)) + 1)
-    R_nb = exp_rotation(np.column_stack([0.0 * angles, 0.0 * angles, angles])) @ state.R_nb
-    turned = replace(state.at([0] * len(angles)), R_nb=R_nb)
-    r, H, _ = measurements.linearize(turned, [compasses] * len(angles))
-    misfit, by = np.array(r), np.array(H)
+    turned = exp_rotation(np.column_stack([0.0 * angles, 0.0 * angles, angles])) @ R_nb
+    rows = [linearize(replace(known, x=np.concatenate([R.ravel(), known.x[9:]])), compasses) for R in turned]
+    misfit, by = np.array([r for r, _ in rows]), np.array([H for _, H in rows])
     S = by @ (P - np.outer(by_heading, by_heading) / variance) @ transpose(by) + identity(misfit.shape[1])
     nis = (misfit * np.linalg.solve(S, misfit[..., None])[..., 0]).sum(axis=1)
     likeliest = (nis + np.linalg.slogdet(S)[1] + angles**2 / variance).argmin()
-    return np.asarray(R_nb[likeliest])
+    return np.asarray(turned[likeliest])

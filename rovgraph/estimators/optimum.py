@@ -1,0 +1,35 @@
+"""The optimum of a dive: a chain where no place is seen twice, and GTSAM's graph where loops are closed."""
+
+from collections.abc import Mapping, Sequence
+
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.chain_smoother import smooth_chain
+from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.optimum import Optimum
+from rovgraph.geometry import Array
+from rovgraph.state import PLACE, State
+
+
+def optimum(
+    intervals: Sequence[KeyframeInterval],
+    initial: InitialConditions,
+    states: State,
+    calibration: Mapping[str, Array] | None = None,
+) -> Optimum:
+    """Solve a dive.
+
+    Parameters
+    ----------
+    intervals, initial : the dive
+    states : State of its keyframes to begin with
+    calibration : to begin with, its prior means where it is None
+
+    Raises
+    ------
+    InputError : the data do not determine some variable, which is named
+    """
+    if any(m.sensor == PLACE for interval in intervals for m in interval.measurements):
+        from rovgraph.graph.places import smooth_graph  # GTSAM is slow to load, and not everywhere to be had
+
+        return smooth_graph(intervals, initial, states, calibration)
+    return smooth_chain(intervals, initial, states, calibration)
