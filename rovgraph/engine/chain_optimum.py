@@ -1,0 +1,156 @@
+"""The optimum of a dive that closes no loop, as `rovgraph.engine.optimum` asks of any solver."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from rovgraph.calibration import TABLE, Belief
+from rovgraph.config import beliefs as beliefs_of
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.chain import COLUMNS, MOTION, Chain, ChainStep
+from rovgraph.engine.conditionals import Conditionals
+from rovgraph.engine.gauss_newton import Gates, Solution, minimise
+from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.measurements import Block, blocks_of, weights_of
+from rovgraph.engine.optimum import Knowledge
+from rovgraph.engine.unknowns import Unknowns, unknowns
+from rovgraph.geometry import Array
+from rovgraph.state import State
+
+
+@dataclass(frozen=True)
+class ChainOptimum:
+    """A chain and where its robust cost is least."""
+
+    chain: Chain
+    solution: Solution[State]
+
+    @property
+    def intervals(self) -> list[KeyframeInterval]:
+        return self.chain.intervals
+
+    @property
+    def beliefs(self) -> Mapping[str, Belief]:
+        return self.chain.beliefs
+
+    @property
+    def unknowns(self) -> Unknowns:
+        return self.chain.unknowns
+
+    @property
+    def blocks(self) -> Mapping[str, Block]:
+        return self.chain.blocks
+
+    @property
+    def state(self) -> State:
+        return self.solution.point
+
+    @property
+    def gates(self) -> Gates:
+        return self.solution.gates
+
+    @cached_property
+    def weights(self) -> Mapping[str, Array]:
+        return weights_of(self.chain.seen(self.state), self.gates)
+
+    @property
+    def cost(self) -> float:
+        return self.solution.cost
+
+    @property
+    def iterations(self) -> int:
+        return self.solution.iterations
+
+    @property
+    def converged(self) -> bool:
+        return self.solution.converged
+
+    @property
+    def places(self) -> Mapping[int, Array]:
+        return {}
+
+    @cached_property
+    def conditionals(self) -> Conditionals:
+        """All factors linearised at the optimum and eliminated."""
+        return self.chain.eliminate(self.state, self.gates)
+
+    def covariances(self, variable: str) -> Array:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        if variable in COLUMNS:
+            return self.conditionals.covariances[:, COLUMNS[variable], COLUMNS[variable]]
+        border, part = self.chain.layout[variable]
+        if not border:
+            return self.conditionals.covariances[:, part, part]
+        P = self.conditionals.border_covariance[part, part]
+        return np.broadcast_to(P, (len(self.intervals), *P.shape))
+
+    def newest_covariance(self, places: Sequence[int] = ()) -> Array:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        chosen = np.concatenate([np.arange(MOTION), *(self.chain.target(n) for n in self.unknowns.estimated)])
+        return self.conditionals.newest_covariance()[np.ix_(chosen, chosen)]
+
+    def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        return self._knowledge_at(self.state, keyframes)
+
+    def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        held = replace(self.chain, unknowns=self.unknowns.of(()))
+        noise = held.eliminate(self.state, self.gates).draw(np.random.default_rng(seed))
+        more, less = (
+            self._knowledge_at(held.moved(self.state, ChainStep(sign * noise, np.empty(0)), 1.0), keyframes)
+            for sign in (1.0, -1.0)
+        )
+        return more, less
+
+    def holding(self, names: Sequence[str]) -> tuple["ChainOptimum", Mapping[str, Array]]:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        kept = self.unknowns.of(set(self.unknowns.estimated) - set(names))
+        without = replace(self.chain, unknowns=kept)
+        begin = replace(
+            self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}}
+        )
+        solution = minimise(without, begin)
+        full = self.chain.eliminate(solution.point, solution.gates)
+        given = np.concatenate([np.r_[self.chain.layout[n][1]] for n in names])
+        by_given = full.border_by_last(given)
+        x, parts = full.by_border @ by_given, self.chain.layout
+        out = {v: x[:, columns] for v, columns in COLUMNS.items()}
+        for name, (border, part) in parts.items():
+            out[name] = np.broadcast_to(by_given[part], (len(x), TABLE[name].dim, len(given))) if border else x[:, part]
+        return ChainOptimum(without, solution), out
+
+    def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
+        P = self.chain.eliminate(point, self.gates, keyframes).filtered_covariances()
+        attitude = self.chain.d + self.chain.c + np.arange(3)
+        calibration = [self.chain.target(name) for name in self.unknowns.estimated]
+        chosen = np.concatenate([np.arange(9, MOTION), attitude, *calibration])
+        return Knowledge(np.array(keyframes), P[:, chosen[:, None], chosen])
+
+
+def smooth_chain(
+    intervals: Sequence[KeyframeInterval],
+    initial: InitialConditions,
+    states: State,
+    calibration: Mapping[str, Array] | None = None,
+) -> ChainOptimum:
+    """Solve a dive that closes no loop.
+
+    Parameters
+    ----------
+    intervals, initial : the dive
+    states : State of its keyframes to begin with
+    calibration : to begin with, its prior means where it is None
+
+    Raises
+    ------
+    InputError : the data do not determine some variable, which is named
+    """
+    beliefs = beliefs_of(initial.config)
+    measured = {m.sensor for interval in intervals for m in interval.measurements}
+    wanted = unknowns(beliefs, measured)
+    blocks = blocks_of(intervals, initial.instruments, initial.config.environment.gravity_mps2, wanted)
+    chain = Chain(list(intervals), initial, beliefs, wanted, blocks)
+    return ChainOptimum(chain, minimise(chain, chain.start(states, calibration)))
