@@ -288,7 +288,7 @@ def _lay_out(variable: Variable) -> None:
 
 def calibration_size() -> int:
     """Length of the calibration vector, with the variables that have been registered."""
-    return next(reversed(LAYOUT.values())).stop if LAYOUT else 0
+    return LAYOUT[next(reversed(LAYOUT))].stop if LAYOUT else 0
 
 
 for _variable in TABLE.values():

@@ -96,15 +96,16 @@ def evaluate(model: CompiledModel, by_state: tuple[str, ...], state: State, rate
     ------
     ValueError : arguments of different numbers of epochs
     """
-    n, names = len(state), model.calibration
+    n, names, size = len(state), model.calibration, calibration_size()
     if PLACE in by_state:
         names = (*names, PLACE)
-    columns = _columns(names, calibration_size())
-    c = _vector(state.calibration, columns)
+        size += PLACE_DIM
+    columns = _columns(names, size)
+    c = _vector(state.calibration, columns, size)
     given = (state.R_nb, state.p_n, state.v_n, state.bias, c, rate_b, model.packed)
-    if any(len(values) != n and len(values) != 1 for values in given):
+    if not {len(values) for values in given} <= {1, n}:
         raise ValueError(f"{model.sensor}: cannot predict {n} epochs from arrays of {[len(v) for v in given]}")
-    z, H = np.empty((n, model.dim)), np.zeros((n, model.dim, MOTION + c.shape[1]))
+    z, H = np.empty((n, model.dim)), np.zeros((n, model.dim, MOTION + size))
     kernels.predict_many(model.kind, *given, z, H)
     jacobians = {name: H[..., _STATE[name]] for name in by_state if name != PLACE}
     for name, _, own in columns:
@@ -117,17 +118,15 @@ _STATE = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
 
 @cache
 def _columns(names: tuple[str, ...], size: int) -> tuple[tuple[str, slice, slice], ...]:
-    """Variables with their columns in a calibration vector of some size, and in Jacobians; a place follows it."""
-    of = {name: LAYOUT[name] if name != PLACE else slice(size, size + PLACE_DIM) for name in names}
+    """Variables with their places in a calibration vector of some size, a place being its end, and in Jacobians."""
+    of = {name: LAYOUT[name] if name != PLACE else slice(size - PLACE_DIM, size) for name in names}
     return tuple((name, own, slice(MOTION + own.start, MOTION + own.stop)) for name, own in of.items())
 
 
-def _vector(calibration: Mapping[str, Array], columns: tuple[tuple[str, slice, slice], ...]) -> Array:
+def _vector(calibration: Mapping[str, Array], columns: tuple[tuple[str, slice, slice], ...], size: int) -> Array:
     """Calibration vectors of all epochs or of each, shape (1 or n, size); zero but for some variables."""
     values = [calibration[name] for name, _, _ in columns]
-    rows = max((len(value) for value in values if value.ndim == 2), default=1)
-    size = max(calibration_size(), columns[-1][1].stop if columns else 0)
-    c = np.zeros((rows, size))
+    c = np.zeros((max([len(value) for value in values if value.ndim == 2], default=1), size))
     for (_, own, _), value in zip(columns, values, strict=True):
         c[:, own] = value
     return c

@@ -15,12 +15,14 @@ coordinates and give the change of basis of the tangent space.
 """
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.geometry import Array, exp_rotation, identities, log_rotation, rotate, transpose
 from rovgraph.instruments import Instrument
+from rovgraph.kernels.error_coordinates import ErrorLayout
 from rovgraph.model_aiding import WaterVelocity
 from rovgraph.sensors import SensorModel, innovation
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State
@@ -63,6 +65,22 @@ class ErrorVector:
         self.size: int = ends[-1]
         shown = {v: instruments[s] for s, v in SEEN.items() if s in instruments and v in self.columns}
         self._seen = [(seen_model(i.model), variable, self.columns[variable]) for variable, i in shown.items()]
+
+    def layout(self) -> ErrorLayout:
+        """What `rovgraph.kernels.error_coordinates` needs to know."""
+        columns = [np.arange(LAYOUT[name].start, LAYOUT[name].stop) for name in self._estimated]
+        models: list[Any] = [model for model, _, _ in self._seen]  # all of them are compiled ones
+        seen = [(model.kind, model.dim, own.start) for model, (_, _, own) in zip(models, self._seen, strict=True)]
+        params = np.zeros((len(models), max((model.packed.shape[1] for model in models), default=0)))
+        for row, model in zip(params, models, strict=True):
+            row[: model.packed.shape[1]] = model.packed[0]
+        rows = [np.arange(6), *(np.arange(own.start, own.stop) for _, _, own in self._seen)]
+        return ErrorLayout(
+            np.concatenate([np.zeros(0, np.int64), *columns]),
+            np.array(seen, np.int64).reshape(-1, 3),
+            params,
+            np.concatenate(rows),
+        )
 
     def matrix(self, H: Jacobians) -> Array:
         """Jacobians by variable as one, shape (n, dim, size); what is not estimated is left out."""

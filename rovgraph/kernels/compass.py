@@ -13,7 +13,7 @@ Signs follow the corrected equations: declination is atan2(H_e, H_n), the headin
 import math
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper
+from rovgraph.kernels.compile import view_helper
 from rovgraph.kernels.layout import (
     DVL_ROLL,
     FIELD_DIP,
@@ -27,14 +27,14 @@ from rovgraph.kernels.layout import (
 from rovgraph.kernels.rotations import cross, dot, multiply, multiply_transposed, rotate
 
 
-@helper
+@view_helper
 def wrap(angle: float) -> float:
     """Angle wrapped to [-pi, pi) [rad]."""
     wrapped: float = (angle + math.pi) % (2.0 * math.pi) - math.pi
     return wrapped
 
 
-@helper
+@view_helper
 def dvl_mount(roll: float, pitch: float, yaw: float, R_bs_out: Array, axes_out: Array) -> None:
     """R_bs = Rz(yaw) Ry(pitch) Rx(roll), and the axes in b that the three angles turn about, a column each."""
     cr, cp, cy = math.cos(roll), math.cos(pitch), math.cos(yaw)
@@ -47,7 +47,7 @@ def dvl_mount(roll: float, pitch: float, yaw: float, R_bs_out: Array, axes_out: 
     axes_out[2, 0], axes_out[2, 1], axes_out[2, 2] = R_bs_out[2, 0], 0.0, 1.0
 
 
-@helper
+@view_helper
 def heading_of(R: Array, axis_b: Array, gradient_out: Array) -> float:
     """Heading of an axis of the body, true; a rotation d of the body changes it by ``gradient . d``."""
     north, east = dot(R[0], axis_b), dot(R[1], axis_b)
@@ -62,7 +62,7 @@ def heading_of(R: Array, axis_b: Array, gradient_out: Array) -> float:
     return math.atan2(east, north)
 
 
-@helper
+@view_helper
 def compass(R: Array, c: Array, params: Array, in_dvl: bool, z_out: Array, H_out: Array, work: Array) -> None:
     """Magnetic heading of an instrument's x axis, of the DVL's with the mounting that the calibration has."""
     R_bs, axes, axis, gradient = work[0], work[1], work[2, 0], work[2, 1]
@@ -87,7 +87,7 @@ def compass(R: Array, c: Array, params: Array, in_dvl: bool, z_out: Array, H_out
             H_out[0, MOTION + DVL_ROLL + k] = by_angle
 
 
-@helper
+@view_helper
 def _field_turns(declination: float, dip: float, out: Array) -> None:
     """Unit vector of the field in n, its derivative by the dip and that by the declination, as columns."""
     cos_d, sin_d, cos_i, sin_i = math.cos(declination), math.sin(declination), math.cos(dip), math.sin(dip)
@@ -96,7 +96,7 @@ def _field_turns(declination: float, dip: float, out: Array) -> None:
     out[2, 0], out[2, 1], out[2, 2] = sin_i, cos_i, 0.0
 
 
-@helper
+@view_helper
 def _soft_iron(soft: Array, S_out: Array) -> None:
     """I + the symmetric matrix of components xx, yy, zz, xy, xz, yz."""
     for i in range(3):
@@ -106,7 +106,7 @@ def _soft_iron(soft: Array, S_out: Array) -> None:
     S_out[1, 2] = S_out[2, 1] = soft[5]
 
 
-@helper
+@view_helper
 def _by_soft_iron(w: Array, H_out: Array) -> None:
     """Derivative of S w by the components of S."""
     first = MOTION + SOFT_IRON
@@ -117,7 +117,7 @@ def _by_soft_iron(w: Array, H_out: Array) -> None:
     H_out[1, first + 5], H_out[2, first + 5] = w[2], w[1]
 
 
-@helper
+@view_helper
 def magnetometer(R: Array, c: Array, params: Array, z_out: Array, H_out: Array, work: Array) -> None:
     """Magnetic field in IMU axes, with deviation, soft iron and hard iron."""
     turns_n, turns_b, S, A, M, seen = work[0], work[1], work[2], work[3], work[4], work[0]

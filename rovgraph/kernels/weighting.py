@@ -12,13 +12,13 @@ import math
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import given, helper, kernel
+from rovgraph.kernels.compile import given, kernel, view_helper
 
 LOSSES = ("none", "huber", "cauchy")  # in the order of the numbers below
 NONE, HUBER, CAUCHY = range(3)
 
 
-@helper
+@view_helper
 def whiten(sd: Array, rate_covariance: Array, rate_sd: float, W_out: Array) -> None:
     """Inverse of the Cholesky factor of diag(sd^2) + rate_covariance rate_sd^2, all of shape (dim, dim).
 
@@ -51,7 +51,7 @@ def whiten_many(sd: Array, rate_covariance: Array, rate_sd: Array, W_out: Array)
         whiten(one, rate_covariance, rate_sd[k], W_out[k])
 
 
-@helper
+@view_helper
 def loss_weight(d2: float, loss: int, threshold: float) -> float:
     """Weight of a measurement of squared normalised length ``d2``; the loss bends at ``threshold``."""
     if loss == HUBER:
@@ -62,7 +62,7 @@ def loss_weight(d2: float, loss: int, threshold: float) -> float:
     return 1.0
 
 
-@helper
+@view_helper
 def robust_cost(d2: float, loss: int, threshold: float) -> float:
     """Cost rho of a measurement of squared normalised length ``d2``."""
     if loss == HUBER and d2 > threshold * threshold:

@@ -1,0 +1,281 @@
+"""The error of a state in coordinates in which measurements are linear, and how it moves from state to state.
+
+The error vector is that of `rovgraph.kernels.layout`, of the calibration only what is estimated. From a state x to
+another x', attitude and position in n stay as they are, and of each instrument s one variable y_s moves so that
+what the instrument sees, z_s = h_s(x), moves as its Jacobian H_s at x says:
+
+    x' = x + d, R' = R Exp(d_R), p' = p + R d_p, then for each s:  y_s' += Y'^-1 (h_s(x) + H_s d - h_s(x'))
+
+with Y the columns of H_s for y_s. The change of basis B takes an error about x over to x'. Of its rows only those
+of the pose and of each y_s differ from the unit matrix:
+
+    B_R = B_p = R'^T R,    H_s' B = H_s,  so  B_s = Y'^-1 (H_s - (H_s' without Y') B)
+
+An instrument sees one variable y_s and depends on no other that is seen (Huang, Mourikis and Roumeliotis 2010;
+Barrau and Bonnabel 2017; `rovgraph.estimators.error_vector` says why).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.geometry import Array
+from rovgraph.kernels.compass import wrap
+from rovgraph.kernels.compile import helper, view_helper
+from rovgraph.kernels.layout import ACC_BIAS, MOTION, TRANSLATION, VELOCITY
+from rovgraph.kernels.measurements import WORK, is_angular, predict
+from rovgraph.kernels.rotations import (
+    exp_rotation,
+    log_rotation,
+    multiply,
+    multiply_transposed,
+    rotate,
+    rotate_back,
+)
+
+Indices = NDArray[np.int64]
+
+
+class ErrorLayout(NamedTuple):
+    """What of the calibration is estimated, and what the instruments see.
+
+    Attributes
+    ----------
+    columns : ndarray of int, shape (size - 15,), place of each component in the calibration vector
+    seen : ndarray of int, shape (m, 3), of each instrument the kind of its equation, its dimension, and the
+        component of the error vector with which the variable that it sees begins
+    params : ndarray, shape (m, k), the numbers of each equation, the shorter ones with zeros behind
+    rows : ndarray of int, shape (r,), rows of a change of basis that differ from the unit matrix
+    """
+
+    columns: Indices
+    seen: Indices
+    params: Array
+    rows: Indices
+
+
+class Scratch(NamedTuple):
+    """Arrays to calculate with, for one `ErrorLayout`.
+
+    Attributes
+    ----------
+    z, H : predictions of two states and their Jacobians, shapes (2, m, 3) and (2, m, 3, 15 + len(c))
+    work : of the predictions
+    turn : shape (3, 3, 3)
+    rate : shape (3,), zero
+    product, filled : of `rovgraph.kernels.change_of_basis`
+    """
+
+    z: Array
+    H: Array
+    work: Array
+    turn: Array
+    rate: Array
+    product: Array
+    filled: Indices
+
+
+@helper
+def make_scratch(layout: ErrorLayout, calibration_size: int, width: int) -> Scratch:
+    """Arrays for `retract`, `local` and `change_basis`, the last of covariances up to ``width`` wide; made once."""
+    m, r = len(layout.seen), len(layout.rows)
+    return Scratch(
+        np.zeros((2, m, 3)),
+        np.zeros((2, m, 3, MOTION + calibration_size)),
+        np.empty((WORK, 3, 3)),
+        np.empty((3, 3, 3)),
+        np.zeros(3),
+        np.empty((r, width)),
+        np.empty((r, MOTION + len(layout.columns) + 1), np.int64),
+    )
+
+
+@view_helper
+def _see(
+    s: int, which: int, R: Array, p: Array, v: Array, b: Array, c: Array, layout: ErrorLayout, scratch: Scratch
+) -> None:
+    """What instrument ``s`` sees of a state."""
+    z, H = scratch.z[which, s], scratch.H[which, s]
+    predict(layout.seen[s, 0], R, p, v, b, c, scratch.rate, layout.params[s], z, H, scratch.work)
+
+
+@view_helper
+def _column(error: int, columns: Indices) -> int:
+    """Column of a Jacobian of `predict` for a component of the error vector."""
+    return error if error < MOTION else MOTION + columns[error - MOTION]
+
+
+@view_helper
+def _inverse_of_seen(H: Array, first: int, dim: int, columns: Indices, inverse_out: Array) -> None:
+    """Inverse of the part of a Jacobian for the seen variable, of dimension 1, 2 or 3, by cofactors."""
+    j0 = _column(first, columns)
+    if dim == 1:
+        inverse_out[0, 0] = 1.0 / H[0, j0]
+        return
+    j1 = _column(first + 1, columns)
+    if dim == 2:
+        det = H[0, j0] * H[1, j1] - H[0, j1] * H[1, j0]
+        inverse_out[0, 0], inverse_out[0, 1] = H[1, j1] / det, -H[0, j1] / det
+        inverse_out[1, 0], inverse_out[1, 1] = -H[1, j0] / det, H[0, j0] / det
+        return
+    j2 = _column(first + 2, columns)
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        inverse_out[0, i] = H[a, j1] * H[b, j2] - H[a, j2] * H[b, j1]
+        inverse_out[1, i] = H[a, j2] * H[b, j0] - H[a, j0] * H[b, j2]
+        inverse_out[2, i] = H[a, j0] * H[b, j1] - H[a, j1] * H[b, j0]
+    det = H[0, j0] * inverse_out[0, 0] + H[0, j1] * inverse_out[1, 0] + H[0, j2] * inverse_out[2, 0]
+    for i in range(3):
+        for k in range(3):
+            inverse_out[i, k] /= det
+
+
+@view_helper
+def _rows_of_pose(turn: Array, basis_out: Array) -> None:
+    """B_R and B_p."""
+    for i in range(3):
+        for k in range(3):
+            basis_out[i, k] = basis_out[TRANSLATION + i, TRANSLATION + k] = turn[i, k]
+
+
+@view_helper
+def _rows_of_seen(
+    before: Array, after: Array, inverse: Array, turn: Array, first: int, dim: int, columns: Indices, basis_out: Array
+) -> None:
+    """B_s = Y'^-1 (H - (H' without Y') B), H before and H' after."""
+    for j in range(len(basis_out)):
+        column = _column(j, columns)
+        for i in range(dim):
+            basis_out[first + i, j] = 0.0
+        for k in range(dim):
+            difference = before[k, column]
+            if j < VELOCITY:  # the others' rows of B are those of the unit matrix
+                begin = 0 if j < TRANSLATION else TRANSLATION
+                for i in range(3):
+                    difference -= after[k, begin + i] * turn[i, j - begin]
+            elif not first <= j < first + dim:
+                difference -= after[k, column]
+            for i in range(dim):
+                basis_out[first + i, j] += inverse[i, k] * difference
+
+
+@view_helper
+def retract(
+    R: Array,
+    p: Array,
+    v: Array,
+    b: Array,
+    c: Array,
+    delta: Array,
+    layout: ErrorLayout,
+    scratch: Scratch,
+    basis_out: Array,
+) -> None:
+    """Move a state by ``delta``, in place.
+
+    ``basis_out``, shape (size, size), takes an error about the old state over to the new one, to first order in
+    ``delta``. It must be the unit matrix at first, or what this function or `local` has written.
+    """
+    seen, columns, turn = layout.seen, layout.columns, scratch.turn
+    for s in range(len(seen)):
+        _see(s, 0, R, p, v, b, c, layout, scratch)
+    _move(R, p, v, b, c, delta, columns, turn)
+    back, inverse = turn[0], turn[1]
+    _rows_of_pose(back, basis_out)
+    for s in range(len(seen)):
+        kind, dim, first = seen[s, 0], seen[s, 1], seen[s, 2]
+        _see(s, 1, R, p, v, b, c, layout, scratch)
+        before, after = scratch.H[0, s], scratch.H[1, s]
+        _inverse_of_seen(after, first, dim, columns, inverse)
+        for k in range(dim):
+            missing = scratch.z[0, s, k] + _product(before[k], delta, columns) - scratch.z[1, s, k]
+            missing = wrap(missing) if is_angular(kind) else missing
+            for i in range(dim):
+                _add(first + i, inverse[i, k] * missing, v, c, columns)
+        _rows_of_seen(before, after, inverse, back, first, dim, columns, basis_out)
+
+
+@view_helper
+def _move(R: Array, p: Array, v: Array, b: Array, c: Array, delta: Array, columns: Indices, turn: Array) -> None:
+    """All variables moved by themselves, in place; the first of ``turn`` becomes R'^T R."""
+    back, step, moved, shift = turn[0], turn[1], turn[2], turn[0, 0]
+    rotate(R, delta[TRANSLATION:VELOCITY], shift)
+    for i in range(3):
+        p[i] += shift[i]
+        v[i] += delta[VELOCITY + i]
+        b[i] += delta[ACC_BIAS + i]
+        b[3 + i] += delta[ACC_BIAS + 3 + i]
+    for i in range(len(columns)):
+        c[columns[i]] += delta[MOTION + i]
+    exp_rotation(delta[0:3], step)
+    multiply(R, step, moved)
+    for i in range(3):
+        for k in range(3):
+            R[i, k] = moved[i, k]
+            back[i, k] = step[k, i]
+
+
+@view_helper
+def _add(error: int, change: float, v: Array, c: Array, columns: Indices) -> None:
+    """Change a component of what can be seen: velocity or calibration."""
+    if error < MOTION:
+        v[error - VELOCITY] += change
+    else:
+        c[columns[error - MOTION]] += change
+
+
+@view_helper
+def _product(row: Array, delta: Array, columns: Indices) -> float:
+    """A row of a Jacobian of `predict` times an error."""
+    total = 0.0
+    for j in range(len(delta)):
+        total += row[_column(j, columns)] * delta[j]
+    return total
+
+
+@view_helper
+def local(
+    R: Array,
+    p: Array,
+    v: Array,
+    b: Array,
+    c: Array,
+    other: tuple[Array, Array, Array, Array, Array],
+    layout: ErrorLayout,
+    scratch: Scratch,
+    delta_out: Array,
+    basis_out: Array,
+) -> None:
+    """The error that leads from a state to another one, of (R, p, v, b, c): the inverse of `retract`.
+
+    ``basis_out``, as of `retract`, takes an error about the other state over to the first.
+    """
+    seen, columns, turn, inverse = layout.seen, layout.columns, scratch.turn[0], scratch.turn[1]
+    other_R, other_p, other_v, other_b, other_c = other
+    multiply_transposed(R, other_R, turn)
+    log_rotation(turn, delta_out[0:3])
+    apart = scratch.turn[2, 0]
+    for i in range(3):
+        apart[i] = other_p[i] - p[i]
+        delta_out[VELOCITY + i] = other_v[i] - v[i]
+        delta_out[ACC_BIAS + i] = other_b[i] - b[i]
+        delta_out[ACC_BIAS + 3 + i] = other_b[3 + i] - b[3 + i]
+    rotate_back(R, apart, delta_out[TRANSLATION:VELOCITY])
+    for i in range(len(columns)):
+        delta_out[MOTION + i] = other_c[columns[i]] - c[columns[i]]
+    _rows_of_pose(turn, basis_out)
+    for s in range(len(seen)):
+        kind, dim, first = seen[s, 0], seen[s, 1], seen[s, 2]
+        _see(s, 0, R, p, v, b, c, layout, scratch)
+        _see(s, 1, other_R, other_p, other_v, other_b, other_c, layout, scratch)
+        here, there = scratch.H[0, s], scratch.H[1, s]
+        _inverse_of_seen(here, first, dim, columns, inverse)
+        for k in range(dim):  # all of them first: they depend on what they correct
+            missing = scratch.z[1, s, k] - scratch.z[0, s, k]
+            missing = wrap(missing) if is_angular(kind) else missing
+            apart[k] = missing - _product(here[k], delta_out, columns)
+        for k in range(dim):
+            for i in range(dim):
+                delta_out[first + i] += inverse[i, k] * apart[k]
+        _rows_of_seen(there, here, inverse, turn, first, dim, columns, basis_out)
