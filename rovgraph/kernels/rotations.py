@@ -107,6 +107,14 @@ def exp_rotation(r: Array, R_out: Array) -> None:
 
 
 @helper
+def exp_and_left_jacobian(r: Array, R_out: Array, J_out: Array) -> None:
+    """Exp(r), and Jl(r) with Exp(r + d) = Exp(Jl d) Exp(r) to first order in d."""
+    sine, cosine, cubic = rodrigues(r)
+    _series(r, sine, cosine, R_out)
+    _series(r, cosine, cubic, J_out)
+
+
+@helper
 def right_jacobian(r: Array, J_out: Array) -> None:
     """Jr(r), with Exp(r + d) = Exp(r) Exp(Jr d) to first order in d."""
     _, cosine, cubic = rodrigues(r)
@@ -123,6 +131,44 @@ def inverse_right_jacobian(r: Array, J_out: Array) -> None:
         angle = math.sqrt(square)
         second = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / square
     _series(r, 0.5, second, J_out)
+
+
+@helper
+def _curvature(square: float) -> tuple[float, float]:
+    """(1 - a / 2 cot(a / 2)) / a^2 of an angle a, and its derivative by a^2."""
+    if square < 0.5:  # the series of the cotangent, exact to rounding
+        s = square
+        value = 1.0 / 47900160.0 + s * (691.0 / 1307674368000.0 + s * (1.0 / 74724249600.0 + s * CURVATURE_8))
+        value = 1.0 / 12.0 + s * (1.0 / 720.0 + s * (1.0 / 30240.0 + s * (1.0 / 1209600.0 + s * value)))
+        slope = 5.0 * 691.0 / 1307674368000.0 + s * (6.0 / 74724249600.0 + s * 7.0 * CURVATURE_8)
+        slope = 3.0 / 1209600.0 + s * (4.0 / 47900160.0 + s * slope)
+        return value, 1.0 / 720.0 + s * (2.0 / 30240.0 + s * slope)
+    angle = math.sqrt(square)
+    sine, cosine = math.sin(0.5 * angle), math.cos(0.5 * angle)
+    value = (1.0 - 0.5 * angle * cosine / sine) / square
+    return value, (0.125 / (sine * sine) + 0.25 * cosine / (sine * angle) - 1.0 / square) / square
+
+
+CURVATURE_8 = 3617.0 / 10670622842880000.0
+
+
+@helper
+def inverse_jacobian_with_slope(r: Array, v: Array, half: float, J_out: Array, slope_out: Array) -> None:
+    """J = I + half S(r) + c S(r)^2, which is Jr(r)^-1 with half = 1/2 and Jl(r)^-1 with -1/2, and d(J v)/dr."""
+    c, by_square = _curvature(dot(r, r))
+    _series(r, half, c, J_out)
+    along, across = dot(r, v), dot(r, r)
+    for i in range(3):
+        twice = r[i] * along - v[i] * across  # r x (r x v)
+        for j in range(3):
+            slope_out[i, j] = 2.0 * by_square * twice * r[j] + c * (r[i] * v[j] - 2.0 * v[i] * r[j])
+        slope_out[i, i] += c * along
+    slope_out[0, 1] += half * v[2]
+    slope_out[1, 0] -= half * v[2]
+    slope_out[0, 2] -= half * v[1]
+    slope_out[2, 0] += half * v[1]
+    slope_out[1, 2] += half * v[0]
+    slope_out[2, 1] -= half * v[0]
 
 
 @helper

@@ -1,0 +1,17 @@
+"""How a preintegrated motion is laid out in one row of numbers, so that the motions of a dive are one array.
+
+===============  =====  ========================================================================================
+`DURATION`           1  [s]
+`GAP`                1  longest time without samples that lies in the interval or reaches into it, or 0 [s]
+`TANGENT`            9  zeta: rotation vector, change of position, change of velocity in the keyframe's axes
+`BIAS`               6  that the integration assumed: accelerometer, gyro; body axes
+`NOISE`              5  densities of accelerometer, gyro, their biases' walks, and of the integration [SI/rtHz]
+`GRAVITY`            1  [m/s^2]
+`EARTH_RATE`         3  of the Earth in n, zeros where n is taken as inertial [rad/s]
+`BY_BIAS`           54  derivative of zeta by the bias, shape (9, 6)
+`COVARIANCE`       225  of the residual: rotation, position, velocity, biases, shape (15, 15)
+===============  =====  ========================================================================================
+"""
+
+DURATION, GAP, TANGENT, BIAS, NOISE, GRAVITY, EARTH_RATE, BY_BIAS, COVARIANCE = 0, 1, 2, 11, 17, 22, 23, 26, 80
+ROW = COVARIANCE + 225

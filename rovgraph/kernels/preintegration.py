@@ -1,0 +1,284 @@
+"""IMU preintegration from one keyframe to the next, with its derivative by the bias and its covariance.
+
+The motion is a vector zeta = (theta, p, v) in the tangent space of the keyframe: rotation vector Log(dR), change
+of position, change of velocity. A step of length dt with unbiased specific force a and rate w takes it to
+
+    theta' = theta + dt Jr(theta)^-1 w
+    p' = p + dt v + dt^2 / 2 R a,  R = Exp(theta)
+    v' = v + dt R a
+
+(the tangent preintegration of GTSAM's ImuFactor.pdf). Errors of theta, p, v and of the biases obey x' = F x + w with
+
+        | I + dt d(Jr^-1 w)/dtheta  0  0     0            dt Jr^-1 |
+        | dt/2 A                    I  dt I  dt^2/2 R     0        |
+    F = | A                         0  I     dt R         0        |,  A = -dt R S(a) Jr(theta)
+        | 0                         0  0     I            0        |
+        | 0                         0  0     0            I        |
+
+so the covariance becomes F P F' + Q, and the derivative H of zeta by the bias obeys (H', -I) = F (H, -I).
+
+Between two samples both signals are taken as linear. The step above turns the specific force with the attitude at
+its beginning; rotating it by half the step's turn first makes the integration second order.
+"""
+
+import numpy as np
+
+from rovgraph.geometry import Array
+from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, NOISE, TANGENT
+from rovgraph.kernels.rotations import (
+    cross,
+    exp_and_left_jacobian,
+    exp_rotation,
+    inverse_jacobian_with_slope,
+    multiply,
+    multiply_transposed,
+    right_jacobian,
+    skew,
+)
+
+STEP = 8  # numbers of a step: time of its end, length, specific force, rate
+SNAPSHOT = 16  # numbers of a snapshot: time since the keyframe, dR by rows, dv, dp
+
+
+@helper
+def _first_after(imu: Array, time: float) -> int:
+    """Index of the first sample after a time."""
+    low, high = 0, len(imu)
+    while low < high:
+        middle = (low + high) // 2
+        if imu[middle, 0] <= time:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@helper
+def _most_steps(imu: Array, start: float, stops: Array, end: float) -> int:
+    return _first_after(imu, end) - _first_after(imu, start) + len(stops) + 1
+
+
+@helper
+def _steps(imu: Array, start: float, stops: Array, end: float, bias: Array, steps_out: Array) -> int:
+    """From one sample or stop to the next, with the signal in their middle; how many."""
+    sample = _first_after(imu, start)
+    after, stop, count, now, last = sample, 0, 0, start, len(imu) - 1
+    force, rate, turned = np.empty(3), np.empty(3), np.empty(3)
+    while now < end:
+        while sample <= last and imu[sample, 0] <= now:
+            sample += 1
+        while stop < len(stops) and stops[stop] <= now:
+            stop += 1
+        then = end
+        if sample <= last:
+            then = min(then, imu[sample, 0])
+        if stop < len(stops):
+            then = min(then, stops[stop])
+        middle, dt = 0.5 * (then + now), then - now
+        while after < last and imu[after, 0] < middle:
+            after += 1
+        before = max(after - 1, 0)
+        after = min(before + 1, last)
+        span = imu[after, 0] - imu[before, 0]
+        share = min(max((middle - imu[before, 0]) / span, 0.0), 1.0) if span > 0.0 else 0.0
+        step = steps_out[count]
+        step[0], step[1] = then, dt
+        for i in range(6):
+            step[2 + i] = imu[before, 1 + i] + share * (imu[after, 1 + i] - imu[before, 1 + i])
+        for i in range(3):
+            force[i], rate[i] = step[2 + i] - bias[i], step[5 + i] - bias[3 + i]
+        cross(rate, force, turned)
+        for i in range(3):
+            step[2 + i] += 0.5 * dt * turned[i]
+        now, count = then, count + 1
+    return count
+
+
+@helper
+def _advance(zeta: Array, step: Array, bias: Array, work: Array, F_out: Array) -> None:
+    """One step of the motion, in place, and the parts of F: I + dt d(Jr^-1 w)/dtheta, dt Jr^-1, A, dt R."""
+    turn, inverse, A, R = F_out[0], F_out[1], F_out[2], F_out[3]
+    Jl, dt = work, step[1]
+    ax, ay, az = step[2] - bias[0], step[3] - bias[1], step[4] - bias[2]
+    w = R[0]  # not in use yet
+    w[0], w[1], w[2] = step[5] - bias[3], step[6] - bias[4], step[7] - bias[5]
+    inverse_jacobian_with_slope(zeta, w, 0.5, inverse, turn)
+    wx, wy, wz = dt * w[0], dt * w[1], dt * w[2]
+    exp_and_left_jacobian(zeta, R, Jl)
+    for i in range(3):
+        zeta[i] += inverse[i, 0] * wx + inverse[i, 1] * wy + inverse[i, 2] * wz
+        for j in range(3):
+            turn[i, j] *= dt
+            inverse[i, j] *= dt
+            R[i, j] *= dt
+        turn[i, i] += 1.0
+    ux = R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az
+    uy = R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az
+    uz = R[2, 0] * ax + R[2, 1] * ay + R[2, 2] * az
+    for j in range(3):  # R S(a) Jr = S(R a) Jl
+        A[0, j] = uz * Jl[1, j] - uy * Jl[2, j]
+        A[1, j] = ux * Jl[2, j] - uz * Jl[0, j]
+        A[2, j] = uy * Jl[0, j] - ux * Jl[1, j]
+    zeta[3] += dt * (zeta[6] + 0.5 * ux)
+    zeta[4] += dt * (zeta[7] + 0.5 * uy)
+    zeta[5] += dt * (zeta[8] + 0.5 * uz)
+    zeta[6] += ux
+    zeta[7] += uy
+    zeta[8] += uz
+
+
+@helper
+def _propagate(F: Array, dt: float, noise: Array, duration: float, X: Array) -> None:
+    """F P F' + Q and F (H, -I) in place.
+
+    ``X`` has shape (21, 9): the covariance of zeta, of the biases with zeta, and H'. The biases' own is known.
+    """
+    _apply(F, dt, X)
+    for k in range(3):
+        _apply_to_bias(F, dt, k, noise[2] * noise[2] * duration, noise[3] * noise[3] * duration, X, 9)
+        _apply_to_bias(F, dt, k, -1.0, -1.0, X, 15)
+    for i in range(9):
+        for j in range(i):
+            X[i, j], X[j, i] = X[j, i], X[i, j]
+    _apply(F, dt, X)
+    acc, gyr = noise[0] * noise[0], noise[1] * noise[1] / dt
+    for i in range(3):
+        for j in range(3):
+            X[i, j] += gyr * (F[1, i, 0] * F[1, j, 0] + F[1, i, 1] * F[1, j, 1] + F[1, i, 2] * F[1, j, 2])
+        X[3 + i, 3 + i] += dt * (0.25 * dt * dt * acc + noise[4] * noise[4])
+        X[3 + i, 6 + i] += 0.5 * dt * dt * acc
+        X[6 + i, 3 + i] += 0.5 * dt * dt * acc
+        X[6 + i, 6 + i] += dt * acc
+
+
+@helper
+def _apply(F: Array, dt: float, X: Array) -> None:
+    """The first nine rows of F times each column of the covariance, the biases' being in rows 9 to 14."""
+    for j in range(9):
+        x, y, z = X[0, j], X[1, j], X[2, j]
+        a, b, c, d, e, f = X[9, j], X[10, j], X[11, j], X[12, j], X[13, j], X[14, j]
+        for i in range(3):
+            faster = F[2, i, 0] * x + F[2, i, 1] * y + F[2, i, 2] * z + F[3, i, 0] * a + F[3, i, 1] * b + F[3, i, 2] * c
+            turned = F[0, i, 0] * x + F[0, i, 1] * y + F[0, i, 2] * z + F[1, i, 0] * d + F[1, i, 1] * e + F[1, i, 2] * f
+            X[i, j] = turned
+            X[3 + i, j] += dt * (X[6 + i, j] + 0.5 * faster)
+            X[6 + i, j] += faster
+
+
+@helper
+def _apply_to_bias(F: Array, dt: float, k: int, acc: float, gyr: float, X: Array, row: int) -> None:
+    """The same for the columns, in rows from ``row`` on, of the biases ``k``; their own variances are given."""
+    g = row + 3 + k
+    x, y, z = X[g, 0], X[g, 1], X[g, 2]
+    for i in range(3):
+        faster = F[3, i, k] * acc
+        X[row + k, 3 + i] += dt * (X[row + k, 6 + i] + 0.5 * faster)
+        X[row + k, 6 + i] += faster
+        faster = F[2, i, 0] * x + F[2, i, 1] * y + F[2, i, 2] * z
+        X[g, i] = F[0, i, 0] * x + F[0, i, 1] * y + F[0, i, 2] * z + F[1, i, k] * gyr
+        X[g, 3 + i] += dt * (X[g, 6 + i] + 0.5 * faster)
+        X[g, 6 + i] += faster
+
+
+@helper
+def _residual_by_motion(zeta: Array, duration: float, row: Array, J_out: Array) -> None:
+    """Derivative of the residual by zeta, shape (9, 9), of which the zeros are not written.
+
+    Rotation, position and velocity in the axes of the keyframe at the end. On a turning Earth the velocity in n
+    depends on the position; taken for a keyframe before that stands level and faces north, as GTSAM does.
+    """
+    R, Jr, spin, there, spun = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    rate = np.empty(3)
+    exp_rotation(zeta, R)
+    right_jacobian(zeta, Jr)
+    for i in range(3):
+        rate[i] = -duration * row[EARTH_RATE + i]
+    exp_rotation(rate, spin)
+    multiply(spin, R, there)
+    for i in range(3):
+        rate[i] = row[EARTH_RATE + i]
+    skew(rate, spin)
+    multiply(spin, there, spun)
+    multiply_transposed(there, spun, spin)
+    for i in range(3):
+        for j in range(3):
+            J_out[i, j], J_out[3 + i, 3 + j], J_out[6 + i, 6 + j] = Jr[i, j], R[j, i], R[j, i]
+            J_out[6 + i, 3 + j] = -(spin[i, 0] * R[j, 0] + spin[i, 1] * R[j, 1] + spin[i, 2] * R[j, 2])
+
+
+@helper
+def _write_covariance(zeta: Array, X: Array, noise: Array, duration: float, row_out: Array) -> None:
+    """From the covariance of zeta and the biases to that of the factor's residual: bias before less bias after."""
+    J, half = np.zeros((9, 9)), np.empty((15, 9))
+    _residual_by_motion(zeta, duration, row_out, J)
+    for i in range(15):
+        for j in range(9):
+            half[i, j] = 0.0
+            for k in range(9):
+                half[i, j] += J[j, k] * X[i, k]
+    for i in range(225):
+        row_out[COVARIANCE + i] = 0.0
+    for j in range(9):
+        for i in range(j, 9):
+            total = 0.0
+            for k in range(9):
+                total += J[i, k] * half[k, j]
+            row_out[COVARIANCE + 15 * i + j] = row_out[COVARIANCE + 15 * j + i] = total
+        for i in range(9, 15):
+            row_out[COVARIANCE + 15 * i + j] = row_out[COVARIANCE + 15 * j + i] = -half[i, j]
+    for i in range(9, 15):
+        walk = noise[2] if i < 12 else noise[3]
+        row_out[COVARIANCE + 16 * i] = walk * walk * duration
+
+
+@helper
+def _write_snapshot(duration: float, zeta: Array, R: Array, snapshot_out: Array) -> None:
+    exp_rotation(zeta, R)
+    snapshot_out[0] = duration
+    for i in range(3):
+        for j in range(3):
+            snapshot_out[1 + 3 * i + j] = R[i, j]
+        snapshot_out[10 + i], snapshot_out[13 + i] = zeta[6 + i], zeta[3 + i]
+
+
+@kernel("void(f8[:, ::1], f8, f8[::1], f8, f8[::1], f8[:, ::1])")
+def preintegrate(imu: Array, start: float, stops: Array, end: float, row_out: Array, snapshots_out: Array) -> None:
+    """Integrate IMU samples from ``start`` to ``end``.
+
+    Parameters
+    ----------
+    imu : ndarray, shape (m, 7), time, specific force, rate in body axes; held beyond its ends
+    start, end : [s]
+    stops : ndarray, shape (k,), increasing, from ``start`` to ``end``, times at which a snapshot is wanted [s]
+    row_out : ndarray, shape (ROW,), with bias, noise and rate of the Earth where `rovgraph.kernels.motion_row` has
+        them; duration, motion and covariance are written
+    snapshots_out : ndarray, shape (k, SNAPSHOT)
+    """
+    bias, noise, duration, taken = row_out[BIAS : BIAS + 6], row_out[NOISE : NOISE + 5], 0.0, 0
+    steps = np.empty((_most_steps(imu, start, stops, end), STEP))
+    count = _steps(imu, start, stops, end, bias, steps)
+    zeta, X, F, work = np.zeros(9), np.zeros((21, 9)), np.empty((4, 3, 3)), np.empty((3, 3))
+    while taken < len(stops) and stops[taken] <= start:
+        _write_snapshot(0.0, zeta, work, snapshots_out[taken])
+        taken += 1
+    for k in range(count):
+        _advance(zeta, steps[k], bias, work, F)
+        _propagate(F, steps[k, 1], noise, duration, X)
+        duration += steps[k, 1]
+        while taken < len(stops) and stops[taken] <= steps[k, 0]:
+            _write_snapshot(duration, zeta, work, snapshots_out[taken])
+            taken += 1
+    row_out[DURATION] = duration
+    for i in range(9):
+        row_out[TANGENT + i] = zeta[i]
+        for j in range(6):
+            row_out[BY_BIAS + 6 * i + j] = X[15 + j, i]
+    _write_covariance(zeta, X, noise, duration, row_out)
+
+
+@kernel("f8[:, ::1](f8[:, ::1], f8, f8[::1], f8, f8[::1])")
+def integrated_steps(imu: Array, start: float, stops: Array, end: float, bias: Array) -> Array:
+    """The steps that `preintegrate` takes, shape (s, STEP), with the biases still in them."""
+    steps = np.empty((_most_steps(imu, start, stops, end), STEP))
+    return steps[: _steps(imu, start, stops, end, bias, steps)]
