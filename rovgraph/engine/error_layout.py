@@ -1,15 +1,33 @@
 """Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import LAYOUT, TABLE, calibration_size
 from rovgraph.geometry import Array
-from rovgraph.state import DIMENSION, Jacobians
+from rovgraph.instruments import Instrument
+from rovgraph.kernels.layout import MOTION
+from rovgraph.model_aiding import WaterVelocity
+from rovgraph.sensors import CompiledModel, SensorModel
+from rovgraph.state import DIMENSION, VELOCITY, Jacobians
 
-MOTION = 15  # components before the calibration
+# the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
+SEEN = {
+    "dvl": VELOCITY,
+    "mag": "hard_iron",
+    "ahrs": "ahrs_offset",
+    "dvl_heading": "dvl_compass_offset",
+    "thruster": "current",
+    "dvl_water": "current",
+}
+
+
+def seen_model(model: SensorModel) -> CompiledModel:
+    """The model that is linear in what its instrument sees: its own, but for a current, which shows in drag."""
+    return WaterVelocity() if SEEN[model.sensor] == "current" else cast(CompiledModel, model)
 
 
 class ErrorLayout:
@@ -18,6 +36,7 @@ class ErrorLayout:
     Parameters
     ----------
     estimated : names of the calibration variables that are estimated
+    instruments : the sensors in use, by stream
 
     Attributes
     ----------
@@ -25,9 +44,10 @@ class ErrorLayout:
     size : length of the error
     column : ndarray of int, shape (15 + C,), place of each component of state and calibration vector in the
         error, -1 where it is not estimated
+    coordinates : what `rovgraph.kernels.error_coordinates.ErrorLayout` holds, one by one
     """
 
-    def __init__(self, estimated: Iterable[str]) -> None:
+    def __init__(self, estimated: Iterable[str], instruments: Mapping[str, Instrument]) -> None:
         sizes = DIMENSION | {name: TABLE[name].dim for name in estimated}
         ends = np.cumsum(list(sizes.values())).tolist()
         self.columns = {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
@@ -38,6 +58,23 @@ class ErrorLayout:
             if name in self.columns:
                 own = self.columns[name]
                 self.column[MOTION + part.start : MOTION + part.stop] = np.arange(own.start, own.stop)
+
+        self.coordinates = self._coordinates(instruments)
+
+    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Any, ...]:
+        """Columns of the calibration vector, instruments and what they see, their numbers, rows of a basis."""
+        calibration: NDArray[np.int64] = np.full(self.size - MOTION, -1)
+        for place, error in enumerate(self.column[MOTION:].tolist()):
+            if error >= 0:
+                calibration[error - MOTION] = place
+        shown = {SEEN[s]: seen_model(i.model) for s, i in instruments.items() if SEEN.get(s) in self.columns}
+        models = [(model, self.columns[variable]) for variable, model in shown.items()]
+        seen = [(model.kind, model.dim, part.start) for model, part in models]
+        params = np.zeros((len(models), max((model.packed.shape[1] for model, _ in models), default=0)))
+        for row, (model, _) in zip(params, models, strict=True):
+            row[: model.packed.shape[1]] = model.packed[0]
+        rows = np.concatenate([np.arange(6), *(np.r_[part] for _, part in models)]).astype(np.int64)
+        return calibration, np.array(seen, np.int64).reshape(-1, 3), params, rows
 
     def matrix(self, H: Jacobians) -> Array:
         """Jacobians by variable as one, shape (n, dim, size); what is not estimated is left out."""

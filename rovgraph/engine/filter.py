@@ -41,8 +41,7 @@ from rovgraph.engine.sensor_rows import compiled, measurement_row, sensor_table
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import correct, linearize
-from rovgraph.kernels.error_coordinates import local, retract, seen_variables
+from rovgraph.kernels.correction import correct, difference, linearize, move_estimate
 from rovgraph.kernels.prediction import predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 
@@ -67,7 +66,7 @@ class FilterEngine:
         self.initial = initial
         self.beliefs = beliefs(initial.config)
         self.unknowns = unknowns(self.beliefs, initial.instruments)
-        self.layout = ErrorLayout(self.unknowns.estimated)
+        self.layout = ErrorLayout(self.unknowns.estimated, initial.instruments)
         self._gravity = initial.config.environment.gravity_mps2
         self._walk = np.zeros(self.layout.size)  # variance that walking adds in a second
         for name, walk in self.unknowns.walks.items():
@@ -78,7 +77,6 @@ class FilterEngine:
         }
         self._sensors = sensor_table(instruments, sorted(self._given))
         self._index = {sensor: k for k, sensor in enumerate(instruments)}
-        self._seen = seen_variables(instruments, self.unknowns.estimated)
 
     def start(self) -> Gaussian:
         """The prior: the smoother's."""
@@ -160,7 +158,7 @@ class FilterEngine:
     def retract(self, known: Gaussian, delta: Array, P: Array) -> Gaussian:
         """The estimate that lies ``delta``, shape (d,), away; ``P``, shape (d, d), is its covariance at the old one."""
         x, c, P = known.x.copy(), known.c.copy(), P.copy()
-        retract(x, c, P, delta, self.layout.column, self._seen, self._sensors)
+        move_estimate(x, c, P, delta, *self.layout.coordinates)
         return Gaussian(x, c, P, moved(known.places, delta[self.layout.size :]))
 
     def local(self, some: Gaussian, other: Gaussian) -> tuple[Array, Array]:
@@ -169,8 +167,8 @@ class FilterEngine:
         The basis takes an error about ``other`` over to ``some``.
         """
         size = self.layout.size
-        delta, basis = np.empty(size), np.empty((size, size))
-        local(some.x, some.c, other.x, other.c, self.layout.column, self._seen, self._sensors, delta, basis)
+        delta, basis = np.empty(size), np.eye(size)
+        difference(some.x, some.c, other.x, other.c, *self.layout.coordinates, delta, basis)
         return delta, basis
 
     def _align(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
@@ -200,7 +198,7 @@ class FilterEngine:
         since = np.array([(gates or {}).get(sensor, np.nan) for sensor in self._index])
         nis, weight = np.empty(len(rows)), np.empty(len(rows))
         places = np.zeros(len(P) - self.layout.size)
-        tables = (self._sensors, self.layout.column, scale, r, H, self._seen)
+        tables = (self._sensors, self.layout.column, scale, r, H, *self.layout.coordinates)
         correct(x, c, P, rows, which, *tables, since, gates is not None, self._gravity, nis, weight, places)
         if gates is not None:
             gates.clear()
@@ -240,7 +238,7 @@ class FilterEngine:
         x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
         nis, weight, places = np.empty(1), np.empty(1), np.zeros(len(P) - self.layout.size)
         rows, which = np.zeros((1, at.ROW)), np.array([self._index[m.sensor]])
-        tables = (self._sensors, self.layout.column, _EXACT, r, padded(H, len(P)), self._seen)
+        tables = (self._sensors, self.layout.column, _EXACT, r, padded(H, len(P)), *self.layout.coordinates)
         since = np.full(len(self._index), np.nan)
         correct(x, c, P, rows, which, *tables, since, False, self._gravity, nis, weight, places)
         return Gaussian(x, c, P, moved(before.places, places)), float(weight[0])

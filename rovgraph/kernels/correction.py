@@ -12,11 +12,14 @@ covariance of what it sees.
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import wrap
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.error_coordinates import retract_state
+from rovgraph.kernels.change_of_basis import change_basis
+from rovgraph.kernels.error_coordinates import ErrorLayout, local, make_scratch, retract
+from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.measurement_row import (
     ASSUMED,
     BEND,
@@ -56,9 +59,52 @@ from rovgraph.kernels.robust_update import (
 )
 from rovgraph.kernels.weighting import whiten
 
+Index = NDArray[np.int64]
+
 RETURN_SD = 3.0  # a sensor that was left out for long returns with an innovation within this many sd
-MOTION = 15
-ACC_SCALE, GYR_SCALE = 28, 31
+
+
+@helper
+def move(x: Array, c: Array, P: Array, delta: Array, layout: ErrorLayout) -> None:
+    """Move a state by ``delta`` along the error's coordinates, and its covariance's basis with it; in place."""
+    size = MOTION + len(layout.columns)
+    scratch, basis = make_scratch(layout, len(c), len(P)), np.zeros((size, size))
+    for i in range(size):
+        basis[i, i] = 1.0
+    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
+    retract(R, p, v, b, c, delta[0:size], layout, scratch, basis)
+    change_basis(P, basis, layout.rows, scratch.product, scratch.filled)
+
+
+@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1])")
+def move_estimate(
+    x: Array, c: Array, P: Array, delta: Array, columns: Index, seen: Index, seen_params: Array, basis_rows: Index
+) -> None:
+    """`move`, from Python; the last four are those of `rovgraph.kernels.error_coordinates.ErrorLayout`."""
+    move(x, c, P, delta, ErrorLayout(columns, seen, seen_params, basis_rows))
+
+
+@kernel(
+    "void(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8[:, ::1])"
+)
+def difference(
+    x: Array,
+    c: Array,
+    other_x: Array,
+    other_c: Array,
+    columns: Index,
+    seen: Index,
+    seen_params: Array,
+    basis_rows: Index,
+    delta_out: Array,
+    basis_out: Array,
+) -> None:
+    """The error that leads from a state to another; ``basis_out``, the unit matrix before, takes errors back."""
+    layout = ErrorLayout(columns, seen, seen_params, basis_rows)
+    scratch = make_scratch(layout, len(c), MOTION + len(columns))
+    other = (other_x[0:9].reshape(3, 3), other_x[9:12], other_x[12:15], other_x[15:21], other_c)
+    own = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
+    local(own[0], own[1], own[2], own[3], c, other, layout, scratch, delta_out, basis_out)
 
 
 @helper
@@ -68,7 +114,7 @@ def linearize_one(
     row: Array,
     sensor: Array,
     scale: Array,
-    column: Array,
+    column: Index,
     gravity: float,
     r_out: Array,
     H_out: Array,
@@ -164,9 +210,9 @@ def linearize(
     x: Array,
     c: Array,
     rows: Array,
-    which: Array,
+    which: Index,
     sensors: Array,
-    column: Array,
+    column: Index,
     scale: Array,
     gravity: float,
     r_out: Array,
@@ -184,20 +230,23 @@ def linearize(
 
 @kernel(
     "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
-    "i8[:, ::1], f8[::1], b1, f8, f8[::1], f8[::1], f8[::1])"
+    "i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], f8[::1], f8[::1])"
 )
 def correct(
     x: Array,
     c: Array,
     P: Array,
     rows: Array,
-    which: Array,
+    which: Index,
     sensors: Array,
-    column: Array,
+    column: Index,
     scale: Array,
     given_r: Array,
     given_H: Array,
-    seen_variables: Array,
+    columns: Index,
+    seen: Index,
+    seen_params: Array,
+    basis_rows: Index,
     since: Array,
     gated: bool,
     gravity: float,
@@ -215,7 +264,7 @@ def correct(
     column : shape (15 + C,), place of each component in the error, -1 where it is not estimated
     scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
     given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order
-    seen_variables : of `rovgraph.kernels.error_coordinates`
+    columns, seen, seen_params, basis_rows : of `rovgraph.kernels.error_coordinates.ErrorLayout`
     since : shape (s,), since when each sensor is left out, nan where it is not [s]
     gated : False lets everything in
     gravity : [m/s^2]
@@ -262,6 +311,6 @@ def correct(
     joseph(P, r, H, HP, root, inverse, delta)
     for j in range(m):
         weight_out[j] *= weight[j]
-    retract_state(x, c, P, delta, column, seen_variables, sensors, rows)
+    move(x, c, P, delta, ErrorLayout(columns, seen, seen_params, basis_rows))
     for i in range(len(places_out)):
         places_out[i] = delta[n - len(places_out) + i]

@@ -15,9 +15,13 @@ measurements begins.
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import helper
+from rovgraph.kernels.weighting import loss_weight
+
+Lines = NDArray[np.int64]
 
 MAX_REWEIGHTINGS = 20
 SETTLED = 1e-3  # change of a weight
@@ -139,16 +143,6 @@ def inflate(P: Array, r: Array, H: Array, begin: int, end: int, seen: Array) -> 
         for k in range(n):
             for j in range(s):
                 P[i, k] += square * seen[i, j] * seen[k, j]
-
-
-@helper
-def loss_weight(square: float, loss: int, bend: float) -> float:
-    """rho'(e) / e at a squared residual: 1, Huber's (loss 1) or Cauchy's (loss 2); ``bend`` is where it begins."""
-    if loss == 1:
-        return bend / max(math.sqrt(square), bend)
-    if loss == 2:
-        return 1.0 / (1.0 + square / (bend * bend))
-    return 1.0
 
 
 @helper
