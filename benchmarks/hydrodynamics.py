@@ -10,9 +10,9 @@ import argparse
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.estimators.chains import EstimatorSpec, outcomes
+from rovgraph.studies.estimator_chains import EstimatorSpec, outcomes
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.named import ESTIMATORS, select
+from rovgraph.studies.estimators import ESTIMATORS, select
 from rovgraph.evaluate import normalised_error
 from rovgraph.geometry import Array
 from rovgraph.log import Log, log_from_frame

@@ -10,7 +10,7 @@ import pandas as pd
 
 from rovgraph.config import Config, load_config
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise

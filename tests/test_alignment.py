@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from dives import attitude_errors, falcon, fed, interrupted, position_errors, simulated
 
-import rovgraph.estimators.alignment as alignment
-from rovgraph.estimators.alignment import aligned, attitude_poorly_known, with_attitude
-from rovgraph.estimators.error_state import ErrorStateFilter
+import rovgraph.engine.alignment as alignment
+from rovgraph.engine.alignment import aligned, attitude_poorly_known, with_attitude
+from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rpy_from_matrix
 

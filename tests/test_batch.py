@@ -32,7 +32,7 @@ from rovgraph.graph import batch as solver
 from rovgraph.graph.batch import Problem, make_problem, make_values, solve
 from rovgraph.graph.keys import key
 from rovgraph.graph.marginals import covariances, marginals
-from rovgraph.graph.measurements import loss_and_weight
+from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.log import Log
 from rovgraph.simulate import CALM, Style, scenario
 

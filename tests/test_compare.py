@@ -18,9 +18,9 @@ from scipy.stats import chi2
 
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
-from rovgraph.estimators.chains import EstimatorSpec, Task, outcomes, outcomes_of_dives
+from rovgraph.studies.estimator_chains import EstimatorSpec, Task, outcomes, outcomes_of_dives
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.named import ESTIMATORS, select
+from rovgraph.studies.estimators import ESTIMATORS, select
 from rovgraph.estimators.results import residual_frame
 from rovgraph.log import Log
 from rovgraph.report.figure_compare import draw_errors, draw_velocity

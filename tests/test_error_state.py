@@ -28,14 +28,14 @@ from test_consistency import OVERCONFIDENT, band, drawn, nees
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
 from rovgraph.estimators import error_vector
-from rovgraph.estimators.error_state import ErrorStateFilter, alike, replay, replay_together, smoothed_together
+from rovgraph.estimators.eskf.error_state import ErrorStateFilter, alike, replay, replay_together, smoothed_together
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.innovations import Innovations
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.factors import predict
-from rovgraph.graph.measurements import loss_and_weight
+from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.graph.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
 from rovgraph.graph.transition import transitions
 from rovgraph.instruments import instruments

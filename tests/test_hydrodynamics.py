@@ -8,11 +8,11 @@ from dives import altered, as_log, batch, beginning, changed, kept, rms, without
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.estimators.chains import outcomes
-from rovgraph.estimators.error_state import REINITIALISE_AT_S, replay
+from rovgraph.studies.estimator_chains import outcomes
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.named import ESTIMATORS, select
+from rovgraph.studies.estimators import ESTIMATORS, select
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, rotate
 from rovgraph.graph.aiding import OLDEST_SIGNAL_S, PIECE_S

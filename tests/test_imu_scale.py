@@ -8,7 +8,7 @@ from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
-from rovgraph.estimators.filter_step import Gaussian
+from rovgraph.engine.filter_step import Gaussian
 from rovgraph.geometry import log_rotation, rotate, transpose
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.factors import motion, predict

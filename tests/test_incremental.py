@@ -20,7 +20,7 @@ from dives import (
 )
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, transpose

@@ -16,7 +16,7 @@ from rovgraph.geometry import Array, exp_rotation
 from rovgraph.graph.assembly import KeyframeMeasurement, LandmarkObservation
 from rovgraph.graph.keys import Unknowns, key
 from rovgraph.graph.late_stamp_window import KNOT_S, LateStampWindow
-from rovgraph.graph.measurements import (
+from rovgraph.engine.measurements import (
     Block,
     loss_and_weight,
     loss_threshold,

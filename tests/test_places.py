@@ -26,9 +26,9 @@ from scipy.stats import chi2
 from rovgraph.check import examine
 from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
-from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.fixed_lag import FixedLag
+from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array
 from rovgraph.graph.assembly import Assembler, KeyframeMeasurement, LandmarkObservation

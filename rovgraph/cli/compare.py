@@ -39,7 +39,7 @@ def compare(
 
     from rovgraph.cli.progress import progress_bar
     from rovgraph.config import load_config
-    from rovgraph.estimators.named import select
+    from rovgraph.studies.estimators import select
     from rovgraph.report.comparison import comparison_table, write_comparison
     from rovgraph.report.figure_compare import draw_comparison
     from rovgraph.report.folder import check_writable, results_folder

@@ -67,7 +67,7 @@ class ErrorLayout:
         for place, error in enumerate(self.column[MOTION:].tolist()):
             if error >= 0:
                 calibration[error - MOTION] = place
-        shown = {SEEN[s]: seen_model(i.model) for s, i in instruments.items() if SEEN.get(s) in self.columns}
+        shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in self.columns}
         models = [(model, self.columns[variable]) for variable, model in shown.items()]
         seen = [(model.kind, model.dim, part.start) for model, part in models]
         params = np.zeros((len(models), max((model.packed.shape[1] for model, _ in models), default=0)))

@@ -6,14 +6,13 @@ from functools import partial
 
 from rovgraph.config import Config
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
+from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.log import Log
-from rovgraph.workers import starting, workers
 
 Progress = Callable[[str, float], None]
 
@@ -44,9 +43,7 @@ class Dive:
         return self.beginning.assumptions + [f"left out {n} of {sensor}: {why}" for (sensor, why), n in counts]
 
 
-def smooth(
-    log: Log, config: Config, estimate: str = "both", progress: Progress = no_progress, parallel: bool = False
-) -> Dive:
+def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress = no_progress) -> Dive:
     """Estimate a dive: what ``rovgraph smooth`` does.
 
     Parameters
@@ -54,27 +51,17 @@ def smooth(
     log, config : the dive, and what is believed of vehicle and sensors
     estimate : "smoothed", "filtered" or "both"
     progress : called now and then
-    parallel : filter in a second process while this one smooths
 
     Raises
     ------
     InputError : the log lacks what is needed, or does not determine some variable
     """
     beginning = initialise(log, config)
-    if estimate == "both" and parallel:
-        with workers(1) as pool:
-            with starting():
-                filtering = pool.submit(_filtered, log, beginning)
-            batch = assemble(log, beginning)
-            estimates = [_solve(batch, progress)]
-            progress("filtering", 0.9)
-            estimates.append(filtering.result())
-    else:
-        batch, estimates = assemble(log, beginning), []
-        if estimate != "filtered":
-            estimates.append(_solve(batch, progress))
-        if estimate != "smoothed":
-            estimates.append(_filter(batch, progress))
+    batch, estimates = assemble(log, beginning), []
+    if estimate != "filtered":
+        estimates.append(_solve(batch, progress))
+    if estimate != "smoothed":
+        estimates.append(_filter(batch, progress))
     return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
 
 
@@ -94,10 +81,6 @@ def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
         anew = batch.placed_again(solver.latest().calibration)
         return (solver if anew is None else run(anew.intervals, anew.beginning, progress)).solve()
     return batch.solve()
-
-
-def _filtered(log: Log, beginning: InitialConditions) -> Estimate:
-    return _filter(assemble(log, beginning))
 
 
 def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:

@@ -11,7 +11,7 @@ from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, 
 from rovgraph.estimators.observability import verdict
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
 from rovgraph.graph.assembly import KeyframeInterval
-from rovgraph.graph.measurements import Block
+from rovgraph.engine.measurements import Block
 from rovgraph.sensors import innovation
 from rovgraph.state import State
 from rovgraph.trajectory import Trajectory

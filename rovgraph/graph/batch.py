@@ -25,7 +25,7 @@ from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.graph.factors import drift, landmark_prior, motion, priors
 from rovgraph.graph.keys import Unknowns, key_name, unknowns
-from rovgraph.graph.measurements import Block, loss_and_weight, make_block
+from rovgraph.engine.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state, states_from
 from rovgraph.instruments import Instrument

@@ -31,7 +31,7 @@ from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement, Landm
 from rovgraph.graph.batch import Problem, Solution, make_problem, make_values, solve
 from rovgraph.graph.information import eliminate
 from rovgraph.graph.keys import key
-from rovgraph.graph.measurements import Block, make_block
+from rovgraph.engine.measurements import Block, make_block
 from rovgraph.instruments import Instrument
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, POSE, State
 

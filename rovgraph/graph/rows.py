@@ -14,7 +14,7 @@ import numpy as np
 from rovgraph.calibration import TABLE
 from rovgraph.geometry import Array
 from rovgraph.graph.keys import key
-from rovgraph.graph.measurements import Block
+from rovgraph.engine.measurements import Block
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, Jacobians
 
 _unit = cache(gtsam.noiseModel.Unit.Create)

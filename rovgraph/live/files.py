@@ -15,7 +15,7 @@ import pymap3d
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.fixed_lag import FixedLag
+from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.live.checkpoint import read_checkpoint
 from rovgraph.live.keeper import Keeper
 from rovgraph.live.navigator import Navigator
@@ -149,7 +149,7 @@ class Files:
             return True
         passed = navigator.passed
         try:
-            self.track.add(engine.recursion.trajectory([m.interval for m in passed], [m.known for m in passed]))
+            self.track.add(engine.trajectory([m.interval for m in passed], [m.known for m in passed]))
         except InputError as error:
             path = str(self.track.path)
             self.warnings.complain(path, "disk", str(error).removeprefix(f"{path}: "))

@@ -4,7 +4,7 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rovgraph.estimators.fixed_lag import FilterSnapshot
+from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
 from rovgraph.live.faults import Watch
 from rovgraph.live.solution import Event, SensorHealth
 
@@ -29,7 +29,7 @@ class Health:
 
     def passed(self, mark: FilterSnapshot) -> None:
         """Count a keyframe's measurements."""
-        for one in mark.used:
+        for one in mark.processed:
             (self.used if one.weight > 0.0 else self.rejected)[one.measurement.sensor] += 1
 
     def step(self, marks: deque[FilterSnapshot]) -> None:

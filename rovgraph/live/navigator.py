@@ -14,10 +14,10 @@ import numpy as np
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
+from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
-from rovgraph.estimators.filter_step import Gaussian
-from rovgraph.estimators.fixed_lag import FilterSnapshot, FixedLag, InsertResult
+from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
@@ -42,8 +42,8 @@ class Navigator:
     Attributes
     ----------
     config : what is believed of vehicle and sensors
-    patient : wait for what a second process computes, so that a replay can be repeated
-    renew : renew the filter in a second process
+    patient : wait for the thread that smooths, so that a replay can be repeated
+    reinitialise : the filter from the smoothed dive so far, now and then
     smooth : have iSAM2 smooth the whole dive as it goes
     clocks, faults, health : of the sources, and of the sensors
     isam2 : the smoother, where it was asked for
@@ -56,7 +56,7 @@ class Navigator:
 
     config: Config
     patient: bool = False
-    renew: bool = True
+    reinitialise: bool = True
     smooth: bool = False
     clocks: Clocks = field(default_factory=Clocks)
     faults: Faults = field(default_factory=Faults)
@@ -73,7 +73,7 @@ class Navigator:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
-        self._renewals = Reinitialisations(self.patient, self.config.graph.lag_s) if self.renew else None
+        self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise else None
         self._events: list[Event] = []
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
@@ -85,8 +85,8 @@ class Navigator:
 
     @property
     def waited(self) -> float:
-        """Time waited for the second process, as only a replay does that is faster than it [s]."""
-        return 0.0 if self._renewals is None else self._renewals.waited
+        """Time waited for the thread that smooths, as only a replay does that is faster than it [s]."""
+        return 0.0 if self._reinitialisations is None else self._reinitialisations.waited
 
     @property
     def waits_for(self) -> str:
@@ -115,15 +115,15 @@ class Navigator:
         if self.origin is None:
             self._intake.origin = log.origin
         known = self.engine.marks[0].interval.time if self.engine is not None else -np.inf
-        if self._renewals is not None:
-            self._renewals.patient = True
+        if self._reinitialisations is not None:
+            self._reinitialisations.patient = True
         for measurement in log.measurements():
             if measurement.time > known:
                 taken = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
                 if taken is not None:
                     self._consider(taken)
-        if self._renewals is not None:
-            self._renewals.patient = self.patient
+        if self._reinitialisations is not None:
+            self._reinitialisations.patient = self.patient
 
     def say(self, source: str, kind: str, text: str) -> None:
         """Have the next solution tell of an event."""
@@ -149,9 +149,9 @@ class Navigator:
         self.close()
 
     def close(self) -> None:
-        """End the second process."""
-        if self._renewals is not None:
-            self._renewals.close()
+        """Wait for the thread no more."""
+        if self._reinitialisations is not None:
+            self._reinitialisations.close()
 
     def solution(self) -> Solution | None:
         """Where the vehicle is now; None before the beginning."""
@@ -159,7 +159,7 @@ class Navigator:
         if engine is None or not engine.marks:
             return None
         interval, known = engine.ahead(self.time)
-        t = engine.recursion.trajectory([interval], [known])
+        t = engine.trajectory([interval], [known])
         latitude, longitude = self._intake.geodetic(t.p_n[0])
         return Solution(
             time=interval.time,
@@ -196,10 +196,10 @@ class Navigator:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from where another stood; the filter is not renewed any more."""
+        """Go on from where another stood; the filter is not reinitialised any more."""
         self._intake.origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1])
         self.close()
-        self._renewals = None
+        self._reinitialisations = None
         self._begin(restored(state["beginning"]), state["engine"])
         self.clocks.restore(state["clocks"])
         self.time = state["engine"]["keyframe"][1]  # what was received since is read again
@@ -229,12 +229,7 @@ class Navigator:
         config = beginning.config
         if self.smooth:
             self.isam2 = IncrementalEstimator(beginning)
-        if self._renewals is not None:
-            self._renewals.begin(beginning)
-        settled = self._renewals.take if self._renewals is not None else lambda measurements: None
-        self.engine = FixedLag(
-            beginning, config.graph.lag_s, config.online.hold_s, self._pass, settled, learn_noise=True
-        )
+        self.engine = FixedLag(beginning, config.graph.lag_s, config.online.hold_s, self._pass, learn_noise=True)
         if state is not None:
             self.engine.restore(state)
             return
@@ -258,37 +253,39 @@ class Navigator:
             self.left_out[m.sensor, outcome.value] += 1
         if engine.marks and engine.marks[-1] is not before:
             waited = 0.0
-            if self._renewals is not None:
-                waited = self._renewals.step(engine)
+            if self._reinitialisations is not None:
+                waited = self._reinitialisations.step(engine)
             self.health.step(engine.marks)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
 
     def _pass(self, mark: FilterSnapshot) -> None:
         self.passed.append(mark)
+        if self._reinitialisations is not None:
+            self._reinitialisations.take(mark)
         if self.isam2 is not None:
             try:
-                self.isam2.take(mark.interval, mark.known, mark.used)
+                self.isam2.take(mark.interval, mark.known, mark.processed)
             except InputError as error:
                 self.lose_isam2(str(error))
         self.health.passed(mark)
 
     def _take_events(self) -> tuple[Event, ...]:
         """All that happened since they were last taken."""
-        if self._renewals is not None:
-            for text in self._renewals.news:
-                self.say("renewal", "lost", text)
-            self._renewals.news = []
+        if self._reinitialisations is not None:
+            for text in self._reinitialisations.news:
+                self.say("reinitialisation", "lost", text)
+            self._reinitialisations.news = []
         events = [*self._events, *self.faults.events, *self.health.events]
         self._events, self.faults.events, self.health.events = [], [], []
         return tuple(events)
 
     def _calibration(self, engine: FixedLag, known: Gaussian) -> dict[str, tuple[float, float]]:
         """Estimated calibration by label: value and sd."""
-        sd, columns = np.sqrt(np.diag(known.P)), engine.recursion.error.columns
+        sd, columns = np.sqrt(np.diag(known.P)), engine.filter.layout.columns
         return {
             label: (float(value), float(own))
-            for name in engine.recursion.unknowns.estimated
+            for name in engine.filter.unknowns.estimated
             for label, value, own in zip(
                 TABLE[name].labels, known.state.calibration[name].reshape(-1), sd[columns[name]], strict=True
             )

@@ -1,85 +1,102 @@
-"""When the filter is renewed by the second process."""
+"""The filter goes on from the smoothed dive so far, which a thread computes while measurements come."""
 
 import time as host
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-from rovgraph.engine.initial_conditions import InitialConditions
+import numpy as np
+
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.filter import FilterEngine
+from rovgraph.engine.filter_step import Gaussian, states_of
 from rovgraph.errors import InputError
-from rovgraph.estimators.filter_step import Gaussian
-from rovgraph.estimators.fixed_lag import FixedLag
-from rovgraph.estimators.refiner import Refiner, due_times
-from rovgraph.log import Measurement
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
+from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
+from rovgraph.estimators.eskf.reinitialisation import reinitialised
+from rovgraph.geometry import Array
+
+Keyframe = tuple[KeyframeInterval, Array, Array]  # its interval, state vector and calibration vector
 
 
 @dataclass
 class Reinitialisations:
-    """Asks the second process for better estimates, and hands them to the filter.
+    """Smooths the dive so far at the times of `REINITIALISE_AT_S`, and hands the result to the filter.
 
     Attributes
     ----------
-    patient : wait for an answer, so that a replay can be repeated
-    lag_s : of the engine; the second process has nothing younger [s]
+    patient : wait for the thread, so that a replay can be repeated
     news : what went wrong, one line each, since it was last emptied
-    waited : for answers, which only a replay does that is faster than the second process [s]
+    waited : for the thread, which only a replay does that is faster than it [s]
     """
 
     patient: bool
-    lag_s: float
     news: list[str] = field(default_factory=list)
     waited: float = 0.0
 
     def __post_init__(self) -> None:
-        self._refiner: Refiner | None = Refiner(learn_noise=True)
-        self._due = due_times(self.lag_s)
-        self._start: float | None = None
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="reinitialisation")
+        self._due = list(REINITIALISE_AT_S)
+        self._passed: list[Keyframe] = []
+        self._running: tuple[int, Future[Gaussian]] | None = None
 
-    def begin(self, beginning: InitialConditions) -> None:
-        """The beginning of the dive, before all else."""
-        if self._refiner is not None:
-            self._refiner.begin(beginning)
-
-    def take(self, measurements: list[Measurement]) -> None:
-        """Hand on what is settled."""
-        if self._refiner is not None:
-            self._refiner.take(measurements)
+    def take(self, snapshot: FilterSnapshot) -> None:
+        """Remember a keyframe that the lag has passed, as long as any reinitialisation is to come."""
+        if self._due:
+            self._passed.append(_keyframe(snapshot))
 
     def step(self, engine: FixedLag) -> float:
-        """After a keyframe of the engine; the time waited for answers, as only a fast replay does [s]."""
-        before, refiner = self.waited, self._refiner
-        if refiner is None:
-            return 0.0
-        if self._start is None:
-            self._start = engine.marks[0].interval.time
-        try:
-            if not refiner.asked and engine.marks[-1].interval.time - self._start >= self._due[0]:
-                self._ask(refiner, engine)
-            if refiner.asked and (answer := self._answer(refiner)) is not None:
-                if engine.adopt(*answer):
-                    self._due.pop(0)
-                    refiner.served()
-                else:
-                    self._ask(refiner, engine)  # the lag has passed that keyframe; the next answer comes at once
-        except InputError as error:
-            self.news.append(str(error))
-            self.close()
-        if not self._due:
-            self.close()
+        """After a keyframe of the engine; the time waited for the thread, as only a fast replay does [s]."""
+        before = self.waited
+        if self._running is None and self._due:
+            self._begin(engine)
+        if self._running is not None:
+            try:
+                self._adopt(engine, *self._running)
+            except InputError as error:
+                self.news.append(f"the filter is reinitialised no more ({error}); it goes on as it is")
+                self.close()
         return self.waited - before
 
-    def _answer(self, refiner: Refiner) -> tuple[int, Gaussian] | None:
-        began = host.perf_counter()
-        answer = refiner.answer(wait=self.patient)
-        self.waited += host.perf_counter() - began
-        return answer
-
     def close(self) -> None:
-        """End the process."""
-        if self._refiner is not None:
-            self._refiner.close()
-            self._refiner = None
+        """Wait for nothing any more."""
+        self._due, self._passed, self._running = [], [], None
+        self._thread.shutdown(wait=False, cancel_futures=True)
 
-    @staticmethod
-    def _ask(refiner: Refiner, engine: FixedLag) -> None:
-        """For the oldest keyframe that the filter can go on from."""
-        engine.settle()
-        refiner.ask(engine.oldest().interval.index)
+    def _begin(self, engine: FixedLag) -> None:
+        """Have the dive up to the oldest keyframe smoothed that the filter can go on from, if it is time to."""
+        oldest = engine.oldest()
+        first = self._passed[0][0] if self._passed else engine.marks[0].interval
+        if oldest.interval.time - first.time < self._due[0]:
+            return
+        waiting = [_keyframe(mark) for mark in engine.marks if mark.interval.index <= oldest.interval.index]
+        keyframes = [*self._passed, *waiting]
+        self._running = oldest.interval.index, self._thread.submit(_smoothed, engine.filter, keyframes)
+
+    def _adopt(self, engine: FixedLag, index: int, future: "Future[Gaussian]") -> None:
+        """Go on from the thread's result, if it is there; the keyframes that the lag has passed since are filtered."""
+        if not self.patient and not future.done():
+            return
+        began = host.perf_counter()
+        known = future.result()
+        self.waited += host.perf_counter() - began
+        oldest, gates = engine.oldest().interval.index, dict[str, float]()
+        waiting = (mark.interval for mark in engine.marks if mark.interval.index <= oldest)
+        for interval in [*(i for i, _, _ in self._passed if i.index > index), *waiting]:
+            if index < interval.index <= oldest:
+                known = engine.filter.step(interval, known, gates).filtered
+        engine.adopt(max(index, oldest), known)
+        self._due.pop(0)
+        self._running = None
+        if not self._due:
+            self.close()
+
+
+def _keyframe(snapshot: FilterSnapshot) -> Keyframe:
+    return snapshot.interval, snapshot.known.x, snapshot.known.c
+
+
+def _smoothed(engine: FilterEngine, keyframes: Sequence[Keyframe]) -> Gaussian:
+    """The newest of some keyframes, from all data so far."""
+    states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
+    return reinitialised(engine, [interval for interval, _, _ in keyframes], states)

@@ -7,7 +7,7 @@ from rovgraph.config import Config
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
-from rovgraph.estimators.fixed_lag import place
+from rovgraph.estimators.eskf.fixed_lag import place
 from rovgraph.estimators.initialise import initialise
 from rovgraph.log import Measurement
 from rovgraph.log.streams import gathered

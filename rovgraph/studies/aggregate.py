@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.special import gammaincinv
 
 from rovgraph import thesis
-from rovgraph.estimators.chains import EstimatorSpec
+from rovgraph.studies.estimator_chains import EstimatorSpec
 
 BAND = 0.95
 

@@ -10,8 +10,8 @@ import pandas as pd
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError, in_one_line
-from rovgraph.estimators.chains import EstimatorSpec, Outcome, Task, outcomes_of_dives
-from rovgraph.estimators.named import select
+from rovgraph.studies.estimator_chains import EstimatorSpec, Outcome, Task, outcomes_of_dives
+from rovgraph.studies.estimators import select
 from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.measures import measures, misalignment_history, velocity_history
 from rovgraph.studies.runs import Case, Run
@@ -85,7 +85,7 @@ def compare(
     Parameters
     ----------
     runs : the dives
-    estimators : names of `rovgraph.estimators.named.ESTIMATORS`, all by default
+    estimators : names of `rovgraph.studies.estimators.ESTIMATORS`, all by default
     jobs : processes, by default one per core
     progress : called with the share that is done
 
@@ -125,7 +125,7 @@ def _sharing(estimators: Sequence[EstimatorSpec]) -> list[tuple[str, ...]]:
     """Names grouped by what they share, so that it is made once."""
     groups: dict[Hashable, list[str]] = {}
     for n in estimators:
-        groups.setdefault(n.shared, []).append(n.name)
+        groups.setdefault(n.sharing_key, []).append(n.name)
     return [tuple(names) for names in groups.values()]
 
 

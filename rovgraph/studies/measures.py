@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config
-from rovgraph.estimators.chains import EstimatorSpec
+from rovgraph.studies.estimator_chains import EstimatorSpec
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.evaluate import WITHIN_ELLIPSE, evaluate, normalised_error
 from rovgraph.geometry import Array, wrap_angle

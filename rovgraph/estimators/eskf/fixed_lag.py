@@ -75,14 +75,12 @@ class FixedLag:
     hold_s : how long measurements are held back before they are taken; later ones cost more [s]
     passed : called with each `FilterSnapshot` that the lag has passed, for good
     learn_noise : of the IMU, from its newest samples
-    settled : called with measurements, in order, that nothing can come before any more
     """
 
     beginning: InitialConditions
     lag_s: float
     hold_s: float
     passed: Callable[[FilterSnapshot], None] = lambda mark: None
-    settled: Callable[[list[Measurement]], None] = lambda measurements: None
     learn_noise: bool = False
     marks: deque[FilterSnapshot] = field(default_factory=deque)
 
@@ -150,7 +148,6 @@ class FixedLag:
     def settle(self) -> None:
         """Forget the measurements that can be changed no more."""
         old = self._settled
-        self.settled(self._record[:old])
         del self._record[:old]
         self._forgotten += old
         self._taken -= old

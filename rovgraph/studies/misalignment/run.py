@@ -11,9 +11,9 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.errors import in_one_line
-from rovgraph.estimators.chains import EstimatorSpec, Outcome, outcomes
+from rovgraph.studies.estimator_chains import EstimatorSpec, Outcome, outcomes
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
-from rovgraph.estimators.named import ESTIMATORS
+from rovgraph.studies.estimators import ESTIMATORS
 from rovgraph.evaluate import evaluate
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.log import log_from_frame

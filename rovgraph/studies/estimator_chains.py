@@ -3,29 +3,20 @@
 The first stage of a chain takes a log and a configuration, each of the others what the stage
 before made. Estimators whose chains begin alike share what those stages made (filter and
 smoother of one pass, everything that needs the same keyframes), and each is charged for the
-whole of its chain. Filters go side by side over all dives that are asked for together, and
-each is charged for its share of that, by the seconds of its log: the error-state filters
-(`Replay`), and the thesis's of one kind, which have no chain.
+whole of its chain. The thesis's filters of one kind, which have no chain, run side by side over all
+dives, and each is charged for its share of that, by the seconds of its log.
 """
 
-import contextlib
 import itertools
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import assemble
-from rovgraph.estimators.error_state import (
-    REINITIALISE_AT_S,
-    ErrorStateFilter,
-    alike,
-    replay,
-    replay_together,
-    smoothed_together,
-)
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.kalman import Filter, FilterJob, run_filters
@@ -52,7 +43,7 @@ class EstimatorSpec:
 
     Attributes
     ----------
-    name : key of `rovgraph.estimators.named.ESTIMATORS`
+    name : key of `rovgraph.studies.estimators.ESTIMATORS`
     family : "dead reckoning", "thesis", "error state", "graph"
     about : one line of what it is
     headings : "a", "b", "c", or "" for those of the configuration
@@ -77,7 +68,7 @@ class EstimatorSpec:
     variant: Filter | None = None
 
     @property
-    def shared(self) -> Hashable:
+    def sharing_key(self) -> Hashable:
         """The same for estimators that are best asked for together."""
         return self.variant.kind if self.variant else (self.headings, self.misalignment, self.stages[0])
 
@@ -122,8 +113,8 @@ class Outcome:
     named : the estimator
     estimate : or None where it failed
     error : why it failed, or None
-    seconds : processor time of its chain, shared stages included, or its share of those that
-        went side by side [s]
+    seconds : processor time of its chain, shared stages included, or its share of filters that
+        ran side by side [s]
     """
 
     named: EstimatorSpec
@@ -137,7 +128,7 @@ def outcomes(estimators: Sequence[EstimatorSpec], log: Log, config: Config) -> I
 
     Parameters
     ----------
-    estimators : those of which `EstimatorSpec.shared` is the same are best asked for together
+    estimators : those of which `EstimatorSpec.sharing_key` is the same are best asked for together
     log, config : the dive, and what is believed of vehicle and sensors
 
     Yields
@@ -148,16 +139,15 @@ def outcomes(estimators: Sequence[EstimatorSpec], log: Log, config: Config) -> I
 
 
 def outcomes_of_dives(estimators: Sequence[EstimatorSpec], dives: Sequence[Task]) -> Iterator[tuple[int, Outcome]]:
-    """Run estimators on several logs, as `outcomes` does on one; so filters take less time.
+    """Run estimators on several logs, as `outcomes` does on one; so the filters of the thesis take less time.
 
     Yields
     ------
     index of the dive, Outcome : dive by dive, in the order of ``estimators``
     """
     side_by_side: dict[Filter, dict[tuple[int, str], Outcome]] = {}
-    made: list[Made] = [{} for _ in dives]
-    _replay_side_by_side(estimators, dives, made)
     for k, dive in enumerate(dives):
+        made: Made = {}
         for named in estimators:
             if named.variant is not None:
                 kind = named.variant.kind
@@ -167,72 +157,10 @@ def outcomes_of_dives(estimators: Sequence[EstimatorSpec], dives: Sequence[Task]
                 yield k, side_by_side[kind].pop((k, named.name))
                 continue
             try:
-                result, seconds = _run_chain(named, named.stages, dive, made[k])
+                result, seconds = _run_chain(named, named.stages, dive, made)
                 yield k, Outcome(named, result, None, seconds)
             except Exception as error:  # whatever an estimator runs into is a result of the comparison
                 yield k, Outcome(named, None, error, float("nan"))
-        made[k].clear()
-
-
-def _replay_side_by_side(estimators: Sequence[EstimatorSpec], dives: Sequence[Task], made: Sequence[Made]) -> None:
-    """Make what `Replay` makes, and its smoothers, all that is alike at once; what fails is left to be run alone."""
-    asked: dict[tuple[object, ...], list[EstimatorSpec]] = {}
-    for named in estimators:
-        if any(isinstance(stage, Replay) for stage in named.stages):
-            asked.setdefault(named.configuration_key, []).append(named)
-    for configuration_key, those in asked.items():
-        stages = {stage for named in those for stage in named.stages}
-        batches: dict[int, BatchSmoother] = {}
-        for k, dive in enumerate(dives):
-            with contextlib.suppress(Exception):  # it is met again, and told, where the estimator itself is run
-                batches[k], _ = _run_chain(those[0], (assembled,), dive, made[k])
-        for group in _groups(batches):
-            with contextlib.suppress(Exception):
-                for (k, chain), result in _replayed(group, stages, dives).items():
-                    made[k][(*configuration_key, assembled, *chain)] = result
-
-
-def _groups(batches: Mapping[int, BatchSmoother]) -> list[dict[int, BatchSmoother]]:
-    """Dives whose filters can go side by side; where they cannot a dive is left out."""
-    groups: list[dict[int, BatchSmoother]] = []
-    for k, batch in batches.items():
-        own = [group for group in groups if alike(next(iter(group.values())).beginning, batch.beginning)]
-        if own:
-            own[0][k] = batch
-        elif alike(batch.beginning, batch.beginning):
-            groups.append({k: batch})
-    return groups
-
-
-def _replayed(
-    batches: Mapping[int, BatchSmoother], stages: Set[Stage], dives: Sequence[Task]
-) -> dict[tuple[int, tuple[Stage, ...]], tuple[Any, float]]:
-    """Filters of dives that are alike, and their smoothers; by dive and stages, each with its share of the time."""
-    filters: dict[tuple[int, Replay], ErrorStateFilter] = {
-        (k, stage): ErrorStateFilter(batch.beginning, stage.reinitialise_at)
-        for k, batch in batches.items()
-        for stage in (STEPPED, RENEWED)
-        if stage in stages
-    }
-    began = time.process_time()
-    replay_together(list(filters.values()), [batches[k].intervals for k, _ in filters])
-    shares = _shares(time.process_time() - began, [dives[k] for k, _ in filters])
-    out: dict[tuple[int, tuple[Stage, ...]], tuple[Any, float]] = {}
-    for (k, stage), share in zip(filters, shares, strict=True):
-        out[k, (stage,)] = filters[k, stage], share
-    if ErrorStateFilter.smoothed in stages:
-        began = time.process_time()
-        smoothed = smoothed_together([filters[k, STEPPED] for k in batches])
-        shares = _shares(time.process_time() - began, [dives[k] for k in batches])
-        for k, estimate, share in zip(batches, smoothed, shares, strict=True):
-            out[k, (STEPPED, ErrorStateFilter.smoothed)] = estimate, share
-    return out
-
-
-def _shares(spent: float, dives: Sequence[Task]) -> list[float]:
-    """Time by the seconds of logs that share it."""
-    recorded = [_recorded_s(dive.log) for dive in dives]
-    return [spent * seconds / sum(recorded) for seconds in recorded]
 
 
 def _side_by_side(estimators: Sequence[EstimatorSpec], dives: Sequence[Task]) -> dict[tuple[int, str], Outcome]:
@@ -320,21 +248,11 @@ def assembled(task: Task) -> BatchSmoother:
     return assemble(task.log, initialise(task.log, task.config))
 
 
-@dataclass(frozen=True)
-class Replay:
-    """The error-state filter over the same keyframes.
-
-    Those of several dives go side by side, and so do those with other renewals.
-
-    Attributes
-    ----------
-    reinitialise_at : of `rovgraph.estimators.error_state.ErrorStateFilter`
-    """
-
-    reinitialise_at: tuple[float, ...] = ()
-
-    def __call__(self, batch: BatchSmoother) -> ErrorStateFilter:
-        return replay(batch.intervals, batch.beginning, self.reinitialise_at)
+def stepped(batch: BatchSmoother) -> ErrorStateFilter:
+    """The error-state filter over the same keyframes."""
+    return replay(batch.intervals, batch.beginning)
 
 
-STEPPED, RENEWED = Replay(), Replay(REINITIALISE_AT_S)
+def reinitialised(batch: BatchSmoother) -> ErrorStateFilter:
+    """The same, going on from the smoothed dive so far now and then."""
+    return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S)

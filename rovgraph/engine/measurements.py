@@ -1,30 +1,24 @@
-"""The measurements of one sensor as factors.
-
-A `Block` holds n measurements as arrays. It is linearised for all of them at once
-(`Block.linearize`), and pushed as Jacobian factors into a linear graph; or one by one, as a
-`gtsam.CustomFactor` whose callback linearises the same block of one, for iSAM2.
+"""The measurements of one sensor as arrays, linearised for all of them at once.
 
 Robust losses are applied by reweighting: the weight of a measurement is
 rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero where it is
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
-from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.late_stamp_window import LateStampWindow
+from rovgraph.engine.scale import COLUMNS, SCALES, biased
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, rotate
-from rovgraph.graph.assembly import KeyframeMeasurement
-from rovgraph.graph.keys import Unknowns, key
-from rovgraph.graph.late_stamp_window import LateStampWindow
-from rovgraph.graph.scale import COLUMNS, SCALES, biased
-from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
 from rovgraph.kernels.weighting import LOSSES, weight_many, whiten_many
 from rovgraph.sensors import innovation
@@ -88,14 +82,6 @@ class Block:
     def variables(self) -> tuple[str, ...]:
         """Variables that the factors touch, in the order of their keys."""
         return (*self.instrument.model.state, *self.unknowns.estimated)
-
-    @cached_property
-    def keys(self) -> list[list[int]]:
-        """Keys of every measurement, in the order of `variables`."""
-        columns = [key(v) + (self.place if v == PLACE else self.keyframe) for v in self.instrument.model.state]
-        columns += [key(v) + (self.segment if walk else 0 * self.segment) for v, walk in self.unknowns.walks.items()]
-        rows: list[list[int]] = np.column_stack(columns).tolist()
-        return rows
 
     @cached_property
     def at_keyframes(self) -> bool:
@@ -174,25 +160,11 @@ class Block:
         root = np.sqrt(loss_and_weight(r, self.instrument.loss)[1] * gate)[:, None]
         return r * root, {v: h * root[..., None] for v, h in H.items()}
 
-    def custom_factor(self, k: int = 0) -> gtsam.CustomFactor:
-        """Measurement ``k`` as a nonlinear factor that calls back into `linearize`."""
-        one, index, segment = self.at(slice(k, k + 1)), int(self.keyframe[k]), int(self.segment[k])
-
-        def error(_: gtsam.CustomFactor, values: gtsam.Values, H: Any) -> Array:
-            state = one.with_places(state_at(values, index, segment, self.unknowns), values)
-            r, jacobians = one.linearize(state)
-            if H is not None:
-                for place, jacobian in enumerate(jacobians.values()):
-                    H[place] = jacobian[0]
-            return np.asarray(-r[0])  # GTSAM's error is predicted minus measured
-
-        return gtsam.CustomFactor(robust_noise(self.instrument), self.keys[k], error)
-
-    def with_places(self, state: State, values: gtsam.Values) -> State:
+    def with_places(self, state: State, places: Mapping[int, Array]) -> State:
         """The state of each measurement's keyframe together with the place that is seen, where one is."""
         if PLACE not in self.instrument.model.state:
             return state
-        return state.seeing(np.array([values.atVector(key(PLACE, number)) for number in self.place.tolist()]))
+        return state.seeing(np.array([places[number] for number in self.place.tolist()]))
 
     def at(self, index: slice | Array) -> "Block":
         """Some of the measurements."""
@@ -287,12 +259,40 @@ def _cost_and_weight(d2: Array, loss: str, dim: int) -> tuple[Array, Array]:
     return rho, weight
 
 
-def robust_noise(instrument: Instrument) -> gtsam.noiseModel.Base:
-    """The same losses as GTSAM's noise models, for factors that are already whitened."""
-    dim, loss = instrument.model.dim, instrument.loss
-    unit, k = gtsam.noiseModel.Unit.Create(dim), loss_threshold(loss, dim)
-    if loss == "none":
-        return unit
-    kinds = gtsam.noiseModel.mEstimator
-    robust = kinds.Huber.Create(k) if loss == "huber" else kinds.Cauchy.Create(k)
-    return gtsam.noiseModel.Robust.Create(robust, unit)
+Seen = list[tuple[str, Block, State]]  # every sensor's block, with the state of each measurement's keyframe
+
+
+def gates_of(seen: Seen) -> Gates:
+    """Which measurements lie within their gate."""
+    out = {}
+    for sensor, block, state in seen:
+        gate = block.instrument.gate_sd or np.inf
+        out[sensor] = np.linalg.norm(block.normalised(state), axis=1) <= gate
+    return out
+
+
+def weights_of(seen: Seen, gates: Gates) -> dict[str, Array]:
+    """Weight of every measurement, shape (n,) for each sensor."""
+    return {
+        sensor: loss_and_weight(block.normalised(state), block.instrument.loss)[1] * gates[sensor]
+        for sensor, block, state in seen
+    }
+
+
+def measurement_cost(seen: Seen, gates: Gates) -> float:
+    """Robust cost of the measurements that are let in."""
+    return sum(
+        float(loss_and_weight(block.normalised(state), block.instrument.loss)[0] @ gates[sensor])
+        for sensor, block, state in seen
+    )
+
+
+def blocks_of(
+    intervals: Sequence[KeyframeInterval], instruments: Mapping[str, Instrument], gravity: float, unknowns: Unknowns
+) -> dict[str, Block]:
+    """The measurements of a dive, by sensor."""
+    measured: dict[str, list[KeyframeMeasurement]] = {}
+    for interval in intervals:
+        for m in interval.measurements:
+            measured.setdefault(m.sensor, []).append(m)
+    return {sensor: make_block(own, instruments[sensor], gravity, unknowns) for sensor, own in measured.items()}

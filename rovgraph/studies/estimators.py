@@ -9,12 +9,12 @@ import fnmatch
 from collections.abc import Sequence
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.chains import RENEWED, STEPPED, EstimatorSpec, Stage, assembled
-from rovgraph.estimators.error_state import ErrorStateFilter
+from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.kalman import FILTERS, Filter
 from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.studies.estimator_chains import EstimatorSpec, Stage, assembled, reinitialised, stepped
 
-_RENEWED_WORDS = "filter renewed from the graph of the dive so far"
+_REINITIALISED = "filter reinitialised from the graph of the dive so far"
 _LETTERS = {(True, True): "a", (False, True): "b", (True, False): "c"}  # magnetometer, compass
 _WITH = {"a": "magnetometer and DVL compass", "b": "DVL compass alone", "c": "magnetometer alone"}
 
@@ -56,18 +56,18 @@ ESTIMATORS: dict[str, EstimatorSpec] = {
             (assembled, BatchSmoother.dead_reckoning),
         ),
         *(_of_the_thesis(variant) for variant in FILTERS.values()),
-        *_variants("ekf", "error state", "error-state Kalman filter", False, STEPPED, ErrorStateFilter.solve),
-        *_variants("rts", "error state", "its Rauch-Tung-Striebel smoother", True, STEPPED, ErrorStateFilter.smoothed),
+        *_variants("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
+        *_variants("rts", "error state", "its Rauch-Tung-Striebel smoother", True, stepped, ErrorStateFilter.smoothed),
         *_variants(
             "graph-filtered",
             "graph",
-            _RENEWED_WORDS,
+            _REINITIALISED,
             False,
-            RENEWED,
+            reinitialised,
             ErrorStateFilter.solve,
         ),
         *_variants("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
-        _driven("ekf", "error state", "error-state Kalman filter", False, STEPPED, ErrorStateFilter.solve),
+        _driven("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
         _driven("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
     )
 }
