@@ -13,7 +13,8 @@ from rovgraph.calibration import Belief
 from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.coasting import coasted, coasting_factor, in_outage
-from rovgraph.graph.keys import Unknowns, key
+from rovgraph.engine.unknowns import Unknowns
+from rovgraph.graph.keys import calibration_key, key
 from rovgraph.graph.scale import SCALES, biased, scaled_factor
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
 
@@ -21,17 +22,17 @@ Factor = gtsam.NonlinearFactor
 ANYWHERE_M = 1e5  # sd of the prior of a place, about the origin
 
 
-def priors(start: StatePrior, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> list[Factor]:
+def priors(prior: StatePrior, beliefs: Mapping[str, Belief], unknowns: Unknowns) -> list[Factor]:
     """Priors of the first keyframe and of the calibration variables."""
-    state = start.state
+    state = prior.state
     R_nb, sigmas = state.R_nb[0], gtsam.noiseModel.Diagonal.Sigmas
-    covariance = start.covariance()[:6, :6]
-    pose = gtsam.Pose3(gtsam.Rot3(R_nb), state.p_n[0])
+    attitude = gtsam.noiseModel.Gaussian.Covariance(prior.covariance()[:3, :3])
     bias = gtsam.imuBias.ConstantBias(state.bias[0, :3], state.bias[0, 3:])
     return [
-        gtsam.PriorFactorPose3(key(POSE, 0), pose, gtsam.noiseModel.Gaussian.Covariance(covariance)),
-        gtsam.PriorFactorVector(key(VELOCITY, 0), state.v_n[0], sigmas(start.v_sd)),
-        gtsam.PriorFactorConstantBias(key(BIAS, 0), bias, sigmas(start.bias_sd)),
+        gtsam.PoseRotationPrior3D(key(POSE, 0), gtsam.Rot3(R_nb), attitude),
+        gtsam.PoseTranslationPrior3D(key(POSE, 0), state.p_n[0], sigmas(prior.p_sd)),
+        gtsam.PriorFactorVector(key(VELOCITY, 0), state.v_n[0], sigmas(prior.v_sd)),
+        gtsam.PriorFactorConstantBias(key(BIAS, 0), bias, sigmas(prior.bias_sd)),
         *(
             gtsam.PriorFactorVector(key(name), beliefs[name].mean, sigmas(np.full(b.variable.dim, b.sd)))
             for name, b in ((name, beliefs[name]) for name in unknowns.estimated)
@@ -46,15 +47,18 @@ def landmark_prior(number: int) -> Factor:
     )
 
 
-def motion(interval: KeyframeInterval, unknowns: Unknowns) -> list[Factor]:
-    """The factor between the keyframe before and the one that ends the interval: the IMU's, or of coasting."""
+def motion(interval: KeyframeInterval, unknowns: Unknowns, index: int) -> list[Factor]:
+    """The factor between the keyframe before and the one that ends the interval: the IMU's, or of coasting.
+
+    ``index`` is that of the value which calibration that walks has there.
+    """
     if interval.pim is None:
         return []
     if in_outage(interval):
         return [coasting_factor(interval)]
     if interval.scale_to_bias is None:
         return [unscaled(interval)]
-    keys = {name: unknowns.key(name, interval.segment) for name in SCALES if name in unknowns.walks}
+    keys = {name: calibration_key(unknowns, name, index) for name in SCALES if name in unknowns.walks}
     return [scaled_factor(unscaled(interval), interval.scale_to_bias, unknowns.fixed, keys)]
 
 
@@ -66,18 +70,18 @@ def unscaled(interval: KeyframeInterval) -> gtsam.CombinedImuFactor:
     return gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)
 
 
-def drift(unknowns: Unknowns, segment: int, duration: float) -> list[Factor]:
-    """The random walk of calibration variables into a segment from the one before, which lasted ``duration`` [s]."""
-    if segment == 0:
+def drift(unknowns: Unknowns, index: int, duration: float) -> list[Factor]:
+    """The random walk of calibration variables to a value from the one before, over ``duration`` [s]."""
+    if index == 0:
         return []
     return [
         gtsam.BetweenFactorVector(
-            unknowns.key(name, segment - 1),
-            unknowns.key(name, segment),
+            calibration_key(unknowns, name, index - 1),
+            calibration_key(unknowns, name, index),
             np.zeros(len(unknowns.fixed[name])),
             gtsam.noiseModel.Isotropic.Sigma(len(unknowns.fixed[name]), unknowns.walks[name] * np.sqrt(duration)),
         )
-        for name in unknowns.begun_by(segment)
+        for name in unknowns.begun_by(index)
     ]
 
 

@@ -7,41 +7,17 @@ linearised at the same values, and the whole costs one elimination.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Gates, Problem, indeterminate
-from rovgraph.graph.keys import is_place, key, state_index
+from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.optimum import Knowledge
+from rovgraph.graph.batch import Problem, indeterminate
+from rovgraph.graph.keys import calibration_key, is_place, key, key_index
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
-
-
-@dataclass(frozen=True)
-class Knowledge:
-    """What is known at m keyframes, from all data up to each.
-
-    Attributes
-    ----------
-    keyframe : ndarray of int, shape (m,)
-    covariance : ndarray, shape (m, 9 + c, 9 + c), joint of the newest bias (6), of the first
-        keyframe's attitude (3), body axes, and of the calibration (c) in the order of
-        `Problem.unknowns`, of what walks the newest value
-    """
-
-    keyframe: NDArray[np.int64]
-    covariance: Array
-
-    @property
-    def calibration(self) -> Array:
-        """Covariance of the calibration alone, shape (m, c, c)."""
-        return self.covariance[:, OTHERS:, OTHERS:]
-
-
-OTHERS = 9  # components of a joint covariance before those of the calibration
 
 
 def knowledge(problem: Problem, values: gtsam.Values, gates: Gates, keyframes: Sequence[int]) -> Knowledge:
@@ -60,7 +36,7 @@ def knowledge(problem: Problem, values: gtsam.Values, gates: Gates, keyframes: S
     for end, piece in zip(keyframes, _pieces(problem, problem.linearize(values, gates), keyframes), strict=True):
         piece.push_back(left)
         last = [key(v, end) for v in (POSE, VELOCITY, BIAS)]
-        last += [key(POSE, 0), *_calibration(problem, int(problem.segment[end]))]
+        last += [key(POSE, 0), *_calibration(problem, end)]
         open_places = _seen_again(problem, end)
         left, root = eliminate(piece, last + open_places)
         own = len(root) - PLACE_DIM * len(open_places)
@@ -95,8 +71,7 @@ def noise_of_states(problem: Problem, values: gtsam.Values, gates: Gates, seed: 
     problem, values, gates : the dive, and where to linearise it
     seed : of the draw
     """
-    segments = range(int(problem.segment[-1]) + 1)
-    held = list(dict.fromkeys(one for s in segments for one in _calibration(problem, s)))
+    held = list(dict.fromkeys(one for k in range(problem.count) for one in _calibration(problem, k)))
     net, rng = _sequential(problem.linearize(values, gates), held), np.random.default_rng(seed)
     white, first_held = gtsam.VectorValues(), net.size() - len(held)
     for i in range(net.size()):
@@ -147,8 +122,8 @@ def _sequential(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> gtsam
         raise InputError(indeterminate(error)) from None
 
 
-def _calibration(problem: Problem, segment: int) -> list[int]:
-    return [problem.unknowns.key(name, segment) for name in problem.unknowns.estimated]
+def _calibration(problem: Problem, index: int) -> list[int]:
+    return [calibration_key(problem.unknowns, name, index) for name in problem.unknowns.estimated]
 
 
 def _seen_again(problem: Problem, end: int) -> list[int]:
@@ -164,7 +139,6 @@ def _pieces(
     problem: Problem, linear: gtsam.GaussianFactorGraph, ends: Sequence[int]
 ) -> list[gtsam.GaussianFactorGraph]:
     """Factors by the piece of the dive that they complete; ``ends`` are the last keyframes of each."""
-    begins = np.searchsorted(problem.segment, np.arange(int(problem.segment[-1]) + 1))  # first keyframe of a segment
     first_seen = {}
     if "place" in problem.blocks:
         block = problem.blocks["place"]
@@ -173,8 +147,8 @@ def _pieces(
     newest = []
     for k in range(linear.size()):
         keys = linear.at(k).keys()
-        own = [state_index(one) for one in keys if not is_place(one)]
-        newest.append(max((i if state else begins[i] for state, i in own), default=first_seen.get(keys[0], 0)))
+        own = [key_index(one) for one in keys if not is_place(one)]
+        newest.append(max((i for i in own), default=first_seen.get(keys[0], 0)))
     for k, piece in enumerate(np.searchsorted(ends, newest).tolist()):
         if piece < len(pieces):
             pieces[piece].push_back(linear.at(k))

@@ -8,18 +8,19 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, Solution, indeterminate
-from rovgraph.graph.keys import dimension, key
+from rovgraph.engine.gauss_newton import Gates
+from rovgraph.graph.batch import Problem, indeterminate
+from rovgraph.graph.keys import calibration_key, dimension, key
 from rovgraph.state import DIMENSION, PLACE
 
 
-def marginals(problem: Problem, solution: Solution) -> gtsam.GaussianBayesTree:
+def marginals(problem: Problem, values: gtsam.Values, gates: Gates) -> gtsam.GaussianBayesTree:
     """The optimum's Bayes tree, which gives marginal covariances.
 
     By QR, since small covariances come of large and nearly dependent rows; calibration
     is eliminated last, since all keyframes share it.
     """
-    linear = problem.linearize(solution.values, solution.gates)
+    linear = problem.linearize(values, gates)
     last = [key(name) for name, walk in problem.unknowns.walks.items() if not walk]
     ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last)
     try:
@@ -28,7 +29,7 @@ def marginals(problem: Problem, solution: Solution) -> gtsam.GaussianBayesTree:
         raise InputError(indeterminate(error)) from None
 
 
-def newest_covariance(problem: Problem, solution: Solution, places: Sequence[int] = ()) -> Array:
+def newest_covariance(problem: Problem, values: gtsam.Values, gates: Gates, places: Sequence[int] = ()) -> Array:
     """Joint covariance of the newest keyframe, of the calibration there, and of places.
 
     Returns
@@ -36,9 +37,9 @@ def newest_covariance(problem: Problem, solution: Solution, places: Sequence[int
     ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Problem.unknowns`,
         then the places in the order of their numbers as given
     """
-    linear = problem.linearize(solution.values, solution.gates)
+    linear = problem.linearize(values, gates)
     last = [key(v, problem.count - 1) for v in DIMENSION]
-    last += [problem.unknowns.key(name, int(problem.segment[-1])) for name in problem.unknowns.estimated]
+    last += [calibration_key(problem.unknowns, name, problem.count - 1) for name in problem.unknowns.estimated]
     last += [key(PLACE, number) for number in places]
     before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
     for one in last:

@@ -38,54 +38,38 @@ from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, POSE, State
 ORIGIN = np.zeros(PLACE_DIM)
 
 
-@dataclass(frozen=True)
-class Optimum:
-    """The graph of a dive, solved.
-
-    Attributes
-    ----------
-    intervals : the dive, each landmark given to its place
-    problem, solution : its graph, and the optimum
-    """
-
-    intervals: list[KeyframeInterval]
-    problem: Problem
-    solution: Solution
-
-
-def optimum(
+def smooth_graph(
     intervals: Sequence[KeyframeInterval],
-    start: StatePrior,
-    config: Config,
-    beliefs: Mapping[str, Belief],
-    instruments: Mapping[str, Instrument],
+    initial: InitialConditions,
     states: State,
     calibration: Mapping[str, Array] | None = None,
-) -> Optimum:
+) -> GraphOptimum:
     """Solve a dive: without the places that it sees, where it sees any, and then with them.
 
     Parameters
     ----------
-    intervals, start, config, beliefs, instruments : as `rovgraph.graph.batch.make_problem` takes them
+    intervals, initial : the dive
     states, calibration : of the keyframes to begin with, as `make_values` takes them
     """
+    config, instruments, beliefs = initial.config, initial.instruments, beliefs_of(initial.config)
+    given = initial.prior, config, beliefs, instruments
     apart = _apart(intervals)
-    problem = make_problem(apart, start, config, beliefs, instruments)
+    problem = make_problem(apart, *given)
     solution = solve(problem, make_values(problem, states, calibration))
-    seen = _sightings(intervals)
+    seen = _landmarks(intervals)
     if not seen:
-        return Optimum(apart, problem, solution)
-    gravity = config.environment.gravity_mps2
-    given = _given(intervals, recognised(seen, instruments["place"], gravity, problem, solution))
-    together = make_problem(given, start, config, beliefs, instruments)
-    values = gtsam.Values(solution.values)
+        return GraphOptimum(apart, initial, beliefs, problem, solution)
+    found = recognised(seen, instruments["place"], config.environment.gravity_mps2, problem, solution)
+    recognised_dive = _given(intervals, found)
+    together = make_problem(recognised_dive, *given)
+    values = gtsam.Values(solution.point)
     block = together.blocks["place"]
-    insert_places(values, block, problem.states(solution.values).at(block.keyframe))
-    return Optimum(given, together, solve(together, values))
+    insert_places(values, block, problem.states(solution.point).at(block.keyframe))
+    return GraphOptimum(recognised_dive, initial, beliefs, together, solve(together, values))
 
 
 def recognised(
-    seen: Sequence[KeyframeMeasurement], instrument: Instrument, gravity: float, problem: Problem, solution: Solution
+    seen: Sequence[KeyframeMeasurement], instrument: Instrument, gravity: float, problem: Problem, solution: Solution[gtsam.Values]
 ) -> dict[float, KeyframeMeasurement]:
     """Sightings of what is seen more than once, by their times, each given to its place.
 
@@ -101,13 +85,13 @@ def recognised(
     if not again:
         return {}
     where, covariance = _where(make_block(again, instrument, gravity, problem.unknowns), problem, solution)
-    return _settled(again, matched(again, where, covariance, instrument.gate_sd))
+    return _resolved(again, matched(again, where, covariance, instrument.gate_sd))
 
 
-def settled(intervals: Sequence[KeyframeInterval]) -> list[KeyframeInterval]:
+def resolved_associations(intervals: Sequence[KeyframeInterval]) -> list[KeyframeInterval]:
     """A dive whose landmarks have been given to places one by one: what fits no other of its name is not believed."""
-    seen = _sightings(intervals)
-    return _given(intervals, _settled(seen, [_number(a) for a in seen]))
+    seen = _landmarks(intervals)
+    return _given(intervals, _resolved(seen, [_number(a) for a in seen]))
 
 
 def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
@@ -163,7 +147,7 @@ def matched(seen: Sequence[KeyframeMeasurement], where: Array, covariance: Array
     return numbers
 
 
-def _settled(seen: Sequence[KeyframeMeasurement], numbers: Sequence[int]) -> dict[float, KeyframeMeasurement]:
+def _resolved(seen: Sequence[KeyframeMeasurement], numbers: Sequence[int]) -> dict[float, KeyframeMeasurement]:
     """Sightings by their times; one that agrees with no other is not believed, where others of its name agree.
 
     Parameters
@@ -188,21 +172,21 @@ def _given(intervals: Sequence[KeyframeInterval], found: Mapping[float, Keyframe
     """The dive with landmarks replaced by those that were found, by their times."""
     return [
         replace(i, measurements=[found.get(a.time, a) if a.landmark else a for a in i.measurements])
-        if _sightings([i])
+        if _landmarks([i])
         else i
         for i in intervals
     ]
 
 
-def _where(block: Block, problem: Problem, solution: Solution) -> tuple[Array, Array]:
+def _where(block: Block, problem: Problem, solution: Solution[gtsam.Values]) -> tuple[Array, Array]:
     """Place of each landmark if it is believed alone, shape (m, 2), and their joint covariance, shape (2 m, 2 m).
 
     The motion from a keyframe to its landmark is short, and taken as exact.
     """
-    states = problem.states(solution.values).at(block.keyframe)
+    states = problem.states(solution.point).at(block.keyframe)
     where, H = block.predict(states.seeing(ORIGIN))
     frames, column = np.unique(block.keyframe, return_inverse=True)
-    linear = problem.linearize(solution.values, solution.gates)
+    linear = problem.linearize(solution.point, solution.gates)
     _, root = eliminate(linear, [key(POSE, int(frame)) for frame in frames])
     by_poses = np.zeros((len(block), PLACE_DIM, len(frames), DIMENSION[POSE]))
     by_poses[np.arange(len(block)), :, column] = H[POSE]
@@ -214,14 +198,14 @@ def _where(block: Block, problem: Problem, solution: Solution) -> tuple[Array, A
     return where, covariance
 
 
-def _sightings(intervals: Sequence[KeyframeInterval]) -> list[KeyframeMeasurement]:
+def _landmarks(intervals: Sequence[KeyframeInterval]) -> list[KeyframeMeasurement]:
     return [a for interval in intervals for a in interval.measurements if a.landmark is not None]
 
 
 def _apart(intervals: Sequence[KeyframeInterval]) -> list[KeyframeInterval]:
     """The same dive without places."""
     return [
-        replace(i, measurements=[a for a in i.measurements if a.landmark is None]) if _sightings([i]) else i
+        replace(i, measurements=[a for a in i.measurements if a.landmark is None]) if _landmarks([i]) else i
         for i in intervals
     ]
 

@@ -35,7 +35,6 @@ class Rows:
         sizes = DIMENSION | {PLACE: PLACE_DIM} | {name: TABLE[name].dim for name in walks}
         self._sizes = {variable: size for variable, size in sizes.items() if variable in touched}
         keyframe = np.concatenate([block.keyframe for block in every])
-        segment = np.concatenate([block.segment for block in every])
         place = np.concatenate([block.place for block in every])
         dims = np.concatenate([np.full(len(block), block.z.shape[1]) for block in every])
         order = np.lexsort((place, keyframe))
@@ -47,7 +46,7 @@ class Rows:
         other = np.diff(keyframe[order], prepend=-1).astype(bool) | np.diff(place[order], prepend=-2).astype(bool)
         begun = order[np.flatnonzero(other)]  # the first measurement of each factor
         index = dict.fromkeys(DIMENSION, keyframe) | {PLACE: place}
-        index |= {v: segment if walk else 0 * segment for v, walk in walks.items()}
+        index |= {v: keyframe if walk else 0 * keyframe for v, walk in walks.items()}
         self._keys: list[list[int]] = np.column_stack([key(v) + index[v][begun] for v in self._sizes]).tolist()
         self._of_factor = [slice(a, b) for a, b in pairwise([*first[begun].tolist(), self._count])]
 
