@@ -18,25 +18,24 @@ without them, and lets them in if its optimum finds them within their gate after
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
-from rovgraph.calibration import Belief
-from rovgraph.config import Config
-from rovgraph.engine.initial_conditions import StatePrior
+from rovgraph.config import beliefs as beliefs_of
+from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.filter import ORIGIN
+from rovgraph.engine.gauss_newton import Solution
+from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.measurements import Block, make_block
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
-from rovgraph.graph.batch import Problem, Solution, make_problem, make_values, solve
+from rovgraph.graph.batch import Problem, make_problem, make_values, solve
 from rovgraph.graph.information import eliminate
 from rovgraph.graph.keys import key
-from rovgraph.engine.measurements import Block, make_block
+from rovgraph.graph.optimum import GraphOptimum
 from rovgraph.instruments import Instrument
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, POSE, State
-
-ORIGIN = np.zeros(PLACE_DIM)
-
 
 def smooth_graph(
     intervals: Sequence[KeyframeInterval],
