@@ -90,26 +90,23 @@ def triangularise(W: Array, columns: int, top: int, end: int, v: Array, w: Array
 
 
 @helper
-def fold_border(Y: Array, c: int, pending: int, left_out: Array, v: Array, w: Array) -> int:
-    """Fold rows below the border's triangle into it; what no value of the border explains goes to ``left_out``."""
-    triangularise(Y, c, c, c + pending, v, w)
-    for i in range(c, c + pending):
-        left_out[0] += Y[i, c] * Y[i, c]
-    return 0
+def append_rows(source: Array, begin: int, end: int, column: int, columns: int, at: int, Y_out: Array) -> int:
+    """Copy columns of a source's rows into rows ``at`` and on; returns the row after them."""
+    for i in range(begin, end):
+        for j in range(columns):
+            Y_out[at, j] = source[i, column + j]
+        at += 1
+    return at
 
 
 @helper
-def append_border(
-    Y: Array, c: int, pending: int, source: Array, begin: int, end: int, column: int, left_out: Array, v: Array, w: Array
-) -> int:
-    """Append rows of a source, from a column on, below the border's triangle; returns how many are pending there."""
-    for i in range(begin, end):
-        if pending == PENDING:
-            pending = fold_border(Y, c, pending, left_out, v, w)
-        for j in range(c + 1):
-            Y[c + pending, j] = source[i, column + j]
-        pending += 1
-    return pending
+def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
+    """Fold the rows below the border's triangle into it; returns the square that no value of the border explains."""
+    triangularise(Y, c, c, end, v, w)
+    left = 0.0
+    for i in range(c, end):
+        left += Y[i, c] * Y[i, c]
+    return left
 
 
 @helper
@@ -162,16 +159,16 @@ def load_motion(
 
 
 @helper
-def join(V: Array, Y: Array, d: int, c: int, out: Array) -> None:
+def join(V: Array, Y: Array, d: int, c: int, at: int, joint_out: Array) -> None:
     """Rows of a keyframe and of the border as one triangle with its right-hand side."""
     for i in range(d):
         for j in range(d + c + 1):
-            out[i, j] = V[i, j]
+            joint_out[at, i, j] = V[i, j]
     for i in range(c):
         for j in range(d):
-            out[d + i, j] = 0.0
+            joint_out[at, d + i, j] = 0.0
         for j in range(c + 1):
-            out[d + i, d + j] = Y[i, j]
+            joint_out[at, d + i, d + j] = Y[i, j]
 
 
 @helper
@@ -234,21 +231,24 @@ def eliminate(
     for k in range(n):
         most = max(most, first[k + 1] - first[k])
     V, W = np.zeros((d + most, padded(d + c + 1))), np.zeros((2 * d, padded(2 * d + c + 1)))
-    Y, scale = np.zeros((c + PENDING, padded(c + 1))), np.zeros(d + c)
-    v, w = np.zeros(d + most + PENDING), np.zeros(W.shape[1])
+    Y = np.zeros((c + border_rows.shape[0] + PENDING + most, padded(c + 1)))
+    scale, v, w = np.zeros(d + c), np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1])
     left_out[0], stop = 0.0, 0
     for i in range(border_rows.shape[0]):
         for j in range(c):
             scale[d + j] += border_rows[i, j] * border_rows[i, j]
-    pending = append_border(Y, c, 0, border_rows, 0, border_rows.shape[0], 0, left_out, v, w)
+    last = append_rows(border_rows, 0, border_rows.shape[0], 0, c + 1, c, Y)
     for k in range(n):
         load_measurements(V, scale, d, s, rows, targets, first[k], first[k + 1])
         end = d + first[k + 1] - first[k]
         triangularise(V, d, 0, end, v, w)
-        pending = append_border(Y, c, pending, V, d, end, d, left_out, v, w)
-        if stop < stops.shape[0] and stops[stop] == k:
-            pending = fold_border(Y, c, pending, left_out, v, w)
-            join(V, Y, d, c, filtered_out[stop])
+        last = append_rows(V, d, end, d, c + 1, last, Y)
+        stops_here = stop < stops.shape[0] and stops[stop] == k
+        if last > c + PENDING or stops_here or k == n - 1:
+            left_out[0] += fold_border(Y, c, last, v, w)
+            last = c
+        if stops_here:
+            join(V, Y, d, c, stop, filtered_out)
             stop += 1
         for i in range(d):
             for j in range(d):
@@ -259,19 +259,14 @@ def eliminate(
         if k < n - 1:
             load_motion(W, scale, k, A_i, A_j, C, C_targets, r, walk, walk_r)
             triangularise(W, d, d, 2 * d, v, w)
-            for i in range(d):
-                for j in range(d + c + 1):
-                    V[i, j] = W[d + i, d + j]
+            append_rows(W, d, 2 * d, d, d + c + 1, 0, V)
         failing = failing_pivot(W, scale, 0, d)
         if failing >= 0:
             return k * d + failing
         for i in range(d):
             for j in range(2 * d + c + 1):
                 conditionals_out[k, i, j] = W[i, j]
-    fold_border(Y, c, pending, left_out, v, w)
-    for i in range(c):
-        for j in range(c + 1):
-            border_out[i, j] = Y[i, j]
+    append_rows(Y, 0, c, 0, c + 1, 0, border_out)
     failing = failing_pivot(Y, scale, d, d + c)
     return -1 if failing < 0 else (n - 1) * d + failing
 
@@ -290,23 +285,29 @@ def back_substitute(conditionals: Array, y: Array, x_out: Array) -> None:
     x_out : shape (n, d, m), z to begin with, then x
     """
     n, d, m, c = x_out.shape[0], x_out.shape[1], x_out.shape[2], y.shape[0]
+    totals, known = np.zeros(m), np.zeros((2 * d + c, m))  # x_k, x_{k+1}, y, in the order of the conditionals' columns
+    for j in range(c):
+        for col in range(m):
+            known[2 * d + j, col] = y[j, col]
     for k in range(n - 1, -1, -1):
         for i in range(d - 1, -1, -1):
-            for j in range(c):
-                factor = conditionals[k, i, 2 * d + j]
-                for col in range(m):
-                    x_out[k, i, col] -= factor * y[j, col]
-            if k < n - 1:
-                for j in range(d):
-                    factor = conditionals[k, i, d + j]
-                    for col in range(m):
-                        x_out[k, i, col] -= factor * x_out[k + 1, j, col]
-            for j in range(i + 1, d):
+            if m == 1:  # a sum in a register, at a quarter of the time
+                total = x_out[k, i, 0]
+                for j in range(i + 1, 2 * d + c):
+                    total -= conditionals[k, i, j] * known[j, 0]
+                known[i, 0] = total / conditionals[k, i, i]
+                continue
+            for col in range(m):
+                totals[col] = x_out[k, i, col]
+            for j in range(i + 1, 2 * d + c):
                 factor = conditionals[k, i, j]
                 for col in range(m):
-                    x_out[k, i, col] -= factor * x_out[k, j, col]
+                    totals[col] -= factor * known[j, col]
             for col in range(m):
-                x_out[k, i, col] /= conditionals[k, i, i]
+                known[i, col] = totals[col] / conditionals[k, i, i]
+        for i in range(d):
+            for col in range(m):
+                x_out[k, i, col] = known[d + i, col] = known[i, col]
 
 
 @helper
