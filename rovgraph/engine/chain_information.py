@@ -1,0 +1,231 @@
+"""What whitened rows say of a chain of keyframes and a border of constants: `rovgraph.kernels.chain` for callers.
+
+Right-hand sides are minus the residuals where a Gauss-Newton step is wanted. Variables of the border whose error is
+considered, not estimated (Schmidt), come last in it: `SquareRoot.solve` and `SquareRoot.border_covariance` take how
+many they are, or what is believed of them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from rovgraph.geometry import Array, transpose
+from rovgraph.kernels import chain
+from rovgraph.kernels.chain import Index
+
+
+class UndeterminedError(Exception):
+    """The rows do not determine some component.
+
+    Attributes
+    ----------
+    keyframe : its keyframe, or None where it belongs to the border
+    component : within the keyframe or the border
+    """
+
+    def __init__(self, keyframe: int | None, component: int) -> None:
+        where = "the border" if keyframe is None else f"keyframe {keyframe}"
+        super().__init__(f"the rows do not determine component {component} of {where}")
+        self.keyframe, self.component = keyframe, component
+
+
+@dataclass(frozen=True)
+class MotionRows:
+    """Whitened rows of the motions between n keyframes, of s components that move and d - s that walk.
+
+    Attributes
+    ----------
+    A_i, A_j : ndarray, shape (n - 1, s, s), Jacobians by the keyframes before and after
+    r : ndarray, shape (n - 1, s), right-hand sides
+    C, targets : ndarray, shapes (n - 1, s, e) and (e,), Jacobians by other columns (see `rovgraph.kernels.chain`)
+    walk, walk_r : ndarray, shape (n - 1, d - s), one over the sd of a walk, and right-hand sides
+    """
+
+    A_i: Array
+    A_j: Array
+    r: Array
+    C: Array
+    targets: Index
+    walk: Array
+    walk_r: Array
+
+    @staticmethod
+    def of_states(A_i: Array, A_j: Array, r: Array) -> "MotionRows":
+        """Rows of motions in which nothing walks and that know nothing of the border."""
+        count, s = r.shape
+        none = np.zeros((count, 0))
+        return MotionRows(A_i, A_j, r, np.zeros((count, s, 0)), np.zeros(0, dtype=np.int64), none, none)
+
+
+class MeasurementRows:
+    """Whitened rows of measurements at n keyframes, of any number of sensors.
+
+    A prior of a keyframe is a measurement of it.
+
+    Parameters
+    ----------
+    n, s : number of keyframes, and of their components that rows have columns for
+    keyframes : for each sensor an ndarray of int, shape (m,)
+    dims : for each sensor the dimension of a measurement
+    others : the largest number of other columns that any sensor has
+
+    Attributes
+    ----------
+    values, targets, first : as `rovgraph.kernels.chain.eliminate` takes them
+    """
+
+    def __init__(self, n: int, s: int, keyframes: Sequence[Index], dims: Sequence[int], others: int) -> None:
+        keyframe = np.concatenate([np.zeros(0, dtype=np.int64), *keyframes])
+        dim = np.repeat(np.array(dims, dtype=np.int64), [len(k) for k in keyframes])
+        order = np.argsort(keyframe, kind="stable")
+        begins = np.empty(len(keyframe), dtype=np.int64)
+        begins[order] = np.cumsum(dim[order]) - dim[order]
+        self._begins = np.split(begins, np.cumsum([len(k) for k in keyframes])[:-1])
+        self.first = np.concatenate([[0], np.cumsum(np.bincount(keyframe, dim, n))]).astype(np.int64)
+        self.values = np.zeros((self.first[-1], s + others + 1))
+        self.targets = np.full((self.first[-1], others), -1, dtype=np.int64)
+
+    def put(self, sensor: int, r: Array, J: Array, C: Array, targets: Index, weight: Array) -> None:
+        """Rows of a sensor's measurements, in place of those it had.
+
+        Parameters
+        ----------
+        sensor : its place in ``keyframes``
+        r : ndarray, shape (m, dim), right-hand sides
+        J : ndarray, shape (m, dim, s), Jacobians by the keyframe
+        C, targets : ndarray, shapes (m, dim, e) and (e,), Jacobians by other columns
+        weight : ndarray, shape (m,), of squares: 0 takes a measurement out
+        """
+        chain.place_rows(r, J, C, targets, weight, self._begins[sensor], self.values, self.targets)
+
+
+@dataclass(frozen=True)
+class SquareRoot:
+    """Square-root information of n keyframes of d components and a border of c.
+
+    Attributes
+    ----------
+    conditionals : ndarray, shape (n, d, 2 d + c + 1), R, S, T and z of every keyframe
+    border : ndarray, shape (c, c + 1), R and z of the border
+    left : sum of squares at the minimum
+    filtered : ndarray, shape (f, d + c, d + c + 1), R and z of a keyframe and the border, of the data up to it
+    """
+
+    conditionals: Array
+    border: Array
+    left: float
+    filtered: Array = field(repr=False)
+
+    def solve(self, held: int = 0) -> tuple[Array, Array]:
+        """Where the sum of squares is least, the border's last components held at 0.
+
+        Returns
+        -------
+        ndarray, shape (n, d), of the keyframes
+        ndarray, shape (c,), of the border
+        """
+        free, y = len(self.border) - held, np.zeros((len(self.border), 1))
+        y[:free, 0] = _solve_upper(self.border[:free, :free], self.border[:free, -1])
+        x = self.conditionals[:, :, -1:].copy()
+        chain.back_substitute(self.conditionals, y, x)
+        return x[..., 0], y[:, 0]
+
+    @cached_property
+    def x_by_y(self) -> Array:
+        """Derivative of the keyframes' optimum by the border, shape (n, d, c)."""
+        n, d, c = *self.conditionals.shape[:2], len(self.border)
+        out = np.zeros((n, d, c))
+        chain.back_substitute(self.conditionals, np.eye(c), out)
+        return out
+
+    def border_covariance(self, believed: Array | None = None) -> Array:
+        """Covariance of the border, shape (c, c).
+
+        Parameters
+        ----------
+        believed : ndarray, shape (h, h), covariance of its last components, which are held and not estimated
+        """
+        held = 0 if believed is None else len(believed)
+        free = len(self.border) - held
+        R = self.border[:free, :free]
+        root = _solve_upper(R, np.eye(free))
+        P = np.zeros((len(self.border), len(self.border)))
+        P[:free, :free] = root @ root.T
+        if believed is not None:
+            gain = np.vstack([-_solve_upper(R, self.border[:free, free:-1]), np.eye(held)])
+            P += gain @ believed @ gain.T
+        return P
+
+    def covariances(self, P_y: Array) -> tuple[Array, Array]:
+        """Marginal covariances of the keyframes, shape (n, d, d), and of them with the border, shape (n, d, c).
+
+        Parameters
+        ----------
+        P_y : ndarray, shape (c, c), of the border
+        """
+        P, cross, _ = self._covariances(P_y, 0)
+        return P, cross
+
+    def consecutive_covariances(self, P_y: Array) -> tuple[Array, Array, Array]:
+        """As `covariances`, and of keyframes with those after them, shape (n - 1, d, d)."""
+        return self._covariances(P_y, len(self.conditionals) - 1)
+
+    def _covariances(self, P_y: Array, count: int) -> tuple[Array, Array, Array]:
+        n, d = self.conditionals.shape[:2]
+        cross, P, following = self.x_by_y @ P_y, np.empty((n, d, d)), np.empty((count, d, d))
+        chain.covariances(self.conditionals, self.x_by_y, cross, P, following)
+        return P, cross, following
+
+    def filtered_covariances(self) -> Array:
+        """Joint covariances of a keyframe and the border, of the data up to it, shape (f, d + c, d + c)."""
+        root = np.linalg.inv(self.filtered[:, :, :-1])
+        return root @ transpose(root)
+
+    def draw(self, white: Array) -> Array:
+        """A draw of the keyframes' error where the border is held, from white noise, shape (n, d)."""
+        out = white[:, :, None].copy()
+        chain.back_substitute(self.conditionals, np.zeros((len(self.border), 1)), out)
+        return out[..., 0]
+
+    def log_determinant(self) -> float:
+        """Of the information of keyframes and border."""
+        diagonals = np.einsum("kii->ki", self.conditionals[:, :, : self.conditionals.shape[1]])
+        return 2.0 * float(np.log(np.abs(diagonals)).sum() + np.log(np.abs(np.diagonal(self.border))).sum())
+
+
+def eliminate(
+    motions: MotionRows, measurements: MeasurementRows, border_rows: Array, stops: Sequence[int] = ()
+) -> SquareRoot:
+    """Eliminate the keyframes in the order of time, then the border.
+
+    Parameters
+    ----------
+    motions, measurements : the rows of n keyframes
+    border_rows : ndarray, shape (p, c + 1), priors of the border with their right-hand sides
+    stops : increasing, keyframes at which to keep what the rows up to there say (`SquareRoot.filtered`)
+
+    Raises
+    ------
+    UndeterminedError : the rows do not determine some component
+    """
+    m, n, c = motions, len(measurements.first) - 1, border_rows.shape[1] - 1
+    d = m.A_i.shape[1] + m.walk.shape[1]
+    conditionals, border = np.empty((n, d, 2 * d + c + 1)), np.empty((c, c + 1))
+    filtered, left = np.empty((len(stops), d + c, d + c + 1)), np.empty(1)
+    failing = chain.eliminate(
+        *(m.A_i, m.A_j, m.r, m.C, m.targets, m.walk, m.walk_r),
+        *(measurements.values, measurements.targets, measurements.first, border_rows, np.array(stops, dtype=np.int64)),
+        *(conditionals, border, filtered, left),
+    )
+    if failing >= n * d:
+        raise UndeterminedError(None, failing - n * d)
+    if failing >= 0:
+        raise UndeterminedError(*divmod(failing, d))
+    return SquareRoot(conditionals, border, float(left[0]), filtered)
+
+
+def _solve_upper(R: Array, rhs: Array) -> Array:
+    return np.asarray(solve_triangular(R, rhs)) if len(R) else np.zeros_like(rhs)

@@ -1,0 +1,417 @@
+"""A dive's linear least squares: keyframes in a chain, with a border of constants, by square-root information.
+
+The errors x_k of the keyframes (d components each) and y of the border (c components) minimise the squares of
+
+    A_i x_k + A_j x_{k+1} + C y - r     whitened rows of the motion between two keyframes
+    J x_k + C y - r                     whitened rows of a measurement, or of a prior, at a keyframe
+    C y - r                             whitened rows of priors of the border
+
+`eliminate` takes the keyframes in the order of time, by Householder reflections of these rows, to
+
+    R_k x_k + S_k x_{k+1} + T_k y = z_k + white noise,     R_k upper triangular
+                          R_y y = z_y + white noise,     R_y upper triangular
+
+(Golub and Van Loan 2013, 5.1 and 5.2; Bierman 1977, chapters IV and X), from which solution, covariances, draws
+and sensitivities follow backwards in time. The information matrix is never formed: that squares the condition
+number, and a motion's rows tell positions to 1e-3 m where the prior may tell them to 1000 m.
+
+A target is the place of a column that rows have beyond their own: below d a component of x_k, from d on a
+component of y. What a negative target stands for is ignored.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.geometry import Array
+from rovgraph.kernels.compile import helper, kernel
+
+Index = NDArray[np.int64]
+
+UNDETERMINED = 1e-10  # a pivot below this part of its column is rounding
+PENDING = 48  # rows that are folded into the border at a time
+LANES = 8  # columns are worked on in multiples of it, so that loops become vector instructions
+
+
+@helper
+def padded(columns: int) -> int:
+    """The next multiple of `LANES`."""
+    return (columns + LANES - 1) // LANES * LANES
+
+
+@helper
+def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, w: Array) -> None:
+    """Householder reflection of the rows ``pivot`` and ``first`` to ``last`` of W that clears a column of the latter.
+
+    W has a multiple of `LANES` columns, of which those before ``column`` stay as they are. v and w are work
+    space of as many elements as W has rows and columns.
+    """
+    if pivot < 0 or first < 0 or column < 0:
+        return  # it never is; the compiler must know it to use vector instructions
+    count = last - first
+    square = 0.0
+    for i in range(count):
+        v[i] = W[first + i, column]
+        W[first + i, column] = 0.0
+        square += v[i] * v[i]
+    if square == 0.0:
+        return
+    top = W[pivot, column]
+    norm = -math.copysign(math.sqrt(top * top + square), top)
+    lead = top - norm
+    gain = 1.0 / (lead * norm)  # -2 over the square of (lead, v)
+    begin = column // LANES * LANES
+    width = (W.shape[1] // LANES - column // LANES) * LANES
+    for c in range(width):
+        w[c] = lead * W[pivot, begin + c]
+    for i in range(count):
+        factor = v[i]
+        for c in range(width):
+            w[c] += factor * W[first + i, begin + c]
+    for c in range(width):
+        w[c] *= gain
+    for c in range(column - begin + 1):
+        w[c] = 0.0
+    for c in range(width):
+        W[pivot, begin + c] += lead * w[c]
+    W[pivot, column] = norm
+    for i in range(count):
+        factor = v[i]
+        for c in range(width):
+            W[first + i, begin + c] += factor * w[c]
+
+
+@helper
+def triangularise(W: Array, columns: int, top: int, end: int, v: Array, w: Array) -> None:
+    """Clear the first columns of W's rows ``top`` to ``end`` below the diagonal; rows above are triangular."""
+    for j in range(columns):
+        reflect(W, j, max(j + 1, top), end, j, v, w)
+
+
+@helper
+def append_rows(source: Array, begin: int, end: int, column: int, columns: int, at: int, Y_out: Array) -> int:
+    """Copy columns of a source's rows into rows ``at`` and on; returns the row after them."""
+    for i in range(begin, end):
+        for j in range(columns):
+            Y_out[at, j] = source[i, column + j]
+        at += 1
+    return at
+
+
+@helper
+def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
+    """Fold the rows below the border's triangle into it; returns the square that no value of the border explains."""
+    triangularise(Y, c, c, end, v, w)
+    left = 0.0
+    for i in range(c, end):
+        left += Y[i, c] * Y[i, c]
+    return left
+
+
+@helper
+def load_measurements(
+    V: Array, scale: Array, d: int, s: int, rows: Array, targets: Index, begin: int, end: int
+) -> None:
+    """Rows of a keyframe's measurements, below the d rows that are known of it; ``scale`` adds up their squares."""
+    last = rows.shape[1] - 1
+    for i in range(end - begin):
+        row = begin + i
+        for j in range(V.shape[1]):
+            V[d + i, j] = 0.0
+        for j in range(s):
+            V[d + i, j] = rows[row, j]
+        for j in range(targets.shape[1]):
+            if targets[row, j] >= 0:
+                V[d + i, targets[row, j]] += rows[row, s + j]
+        for j in range(scale.shape[0]):
+            scale[j] += V[d + i, j] * V[d + i, j]
+        V[d + i, scale.shape[0]] = rows[row, last]
+
+
+@helper
+def load_motion(
+    W: Array, scale: Array, k: int, A_i: Array, A_j: Array, C: Array, targets: Index, r: Array, walk: Array, walk_r: Array
+) -> None:
+    """Rows of the motion after keyframe k, below the d rows of it; ``scale`` becomes that of the keyframe after it."""
+    s, d = A_i.shape[1], A_i.shape[1] + walk.shape[1]
+    for i in range(d, 2 * d):
+        for j in range(W.shape[1]):
+            W[i, j] = 0.0
+    for j in range(d):
+        scale[j] = 0.0
+    for i in range(s):
+        for j in range(s):
+            W[d + i, j] = A_i[k, i, j]
+            W[d + i, d + j] = A_j[k, i, j]
+            scale[j] += A_j[k, i, j] * A_j[k, i, j]
+        for j in range(targets.shape[0]):
+            if targets[j] >= d:
+                W[d + i, d + targets[j]] += C[k, i, j]
+                scale[targets[j]] += C[k, i, j] * C[k, i, j]
+            elif targets[j] >= 0:
+                W[d + i, targets[j]] += C[k, i, j]
+        W[d + i, d + scale.shape[0]] = r[k, i]
+    for i in range(s, d):
+        factor = walk[k, i - s]
+        W[d + i, i], W[d + i, d + i], W[d + i, d + scale.shape[0]] = -factor, factor, walk_r[k, i - s]
+        scale[i] = factor * factor
+
+
+@helper
+def join(V: Array, Y: Array, d: int, c: int, at: int, joint_out: Array) -> None:
+    """Rows of a keyframe and of the border as one triangle with its right-hand side."""
+    for i in range(d):
+        for j in range(d + c + 1):
+            joint_out[at, i, j] = V[i, j]
+    for i in range(c):
+        for j in range(d):
+            joint_out[at, d + i, j] = 0.0
+        for j in range(c + 1):
+            joint_out[at, d + i, d + j] = Y[i, j]
+
+
+@helper
+def failing_pivot(W: Array, scale: Array, begin: int, end: int) -> int:
+    """The first pivot of columns ``begin`` to ``end`` that is rounding or no number, or -1; W begins at ``begin``."""
+    for j in range(begin, end):
+        pivot = W[j - begin, j - begin]
+        if not pivot * pivot > UNDETERMINED * UNDETERMINED * scale[j]:
+            return j
+    return -1
+
+
+@kernel(
+    "i8(f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1],"
+    " i8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1])"
+)
+def eliminate(
+    A_i: Array,
+    A_j: Array,
+    r: Array,
+    C: Array,
+    C_targets: Index,
+    walk: Array,
+    walk_r: Array,
+    rows: Array,
+    targets: Index,
+    first: Index,
+    border_rows: Array,
+    stops: Index,
+    conditionals_out: Array,
+    border_out: Array,
+    filtered_out: Array,
+    left_out: Array,
+) -> int:
+    """Eliminate n keyframes in the order of time, then the border.
+
+    Parameters
+    ----------
+    A_i, A_j : shape (n - 1, s, s), whitened Jacobians of a motion by the keyframes before and after it
+    r : shape (n - 1, s), its right-hand side
+    C, C_targets : shapes (n - 1, s, e) and (e,), its other columns, of the keyframe before it or of the border
+    walk, walk_r : shape (n - 1, d - s), the last components walk: ``walk (x_{k+1} - x_k) = walk_r`` is white
+    rows : shape (m, s + q + 1), of measurements in the order of keyframes: the first s components of the
+        keyframe, q others, right-hand side
+    targets : shape (m, q), of the q others
+    first : shape (n + 1,), a keyframe's first row
+    border_rows : shape (p, c + 1), of the border's priors with their right-hand sides
+    stops : shape (f,), increasing, keyframes at which to keep what the rows up to there say
+    conditionals_out : shape (n, d, 2 d + c + 1), columns R_k, S_k, T_k, z_k
+    border_out : shape (c, c + 1), columns R_y, z_y
+    filtered_out : shape (f, d + c, d + c + 1), triangular: rows of that keyframe and of the border, of data up to it
+    left_out : shape (1,), sum of squares at the minimum
+
+    Returns
+    -------
+    -1, or the first component that the rows do not determine, ``k d + j`` of a keyframe and ``n d + j`` of the border
+    """
+    n, d, s, c = conditionals_out.shape[0], conditionals_out.shape[1], A_i.shape[1], border_out.shape[0]
+    most = 0
+    for k in range(n):
+        most = max(most, first[k + 1] - first[k])
+    V, W = np.zeros((d + most, padded(d + c + 1))), np.zeros((2 * d, padded(2 * d + c + 1)))
+    Y = np.zeros((c + border_rows.shape[0] + PENDING + most, padded(c + 1)))
+    scale, v, w = np.zeros(d + c), np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1])
+    left_out[0], stop = 0.0, 0
+    for i in range(border_rows.shape[0]):
+        for j in range(c):
+            scale[d + j] += border_rows[i, j] * border_rows[i, j]
+    last = append_rows(border_rows, 0, border_rows.shape[0], 0, c + 1, c, Y)
+    for k in range(n):
+        load_measurements(V, scale, d, s, rows, targets, first[k], first[k + 1])
+        end = d + first[k + 1] - first[k]
+        triangularise(V, d, 0, end, v, w)
+        last = append_rows(V, d, end, d, c + 1, last, Y)
+        stops_here = stop < stops.shape[0] and stops[stop] == k
+        if last > c + PENDING or stops_here or k == n - 1:
+            left_out[0] += fold_border(Y, c, last, v, w)
+            last = c
+        if stops_here:
+            join(V, Y, d, c, stop, filtered_out)
+            stop += 1
+        for i in range(d):
+            for j in range(d):
+                W[i, j] = V[i, j]
+                W[i, d + j] = 0.0
+            for j in range(c + 1):
+                W[i, 2 * d + j] = V[i, d + j]
+        if k < n - 1:
+            load_motion(W, scale, k, A_i, A_j, C, C_targets, r, walk, walk_r)
+            triangularise(W, d, d, 2 * d, v, w)
+            append_rows(W, d, 2 * d, d, d + c + 1, 0, V)
+        failing = failing_pivot(W, scale, 0, d)
+        if failing >= 0:
+            return k * d + failing
+        for i in range(d):
+            for j in range(2 * d + c + 1):
+                conditionals_out[k, i, j] = W[i, j]
+    append_rows(Y, 0, c, 0, c + 1, 0, border_out)
+    failing = failing_pivot(Y, scale, d, d + c)
+    return -1 if failing < 0 else (n - 1) * d + failing
+
+
+@kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
+def back_substitute(conditionals: Array, y: Array, x_out: Array) -> None:
+    """Solve R_k x_k = z_k - S_k x_{k+1} - T_k y backwards in time, for m right-hand sides.
+
+    With z of `eliminate` and the border's solution, the solution; with zeros and a unit matrix, the derivative of
+    the solution by the border; with white noise and zeros, a draw of the error where the border is held.
+
+    Parameters
+    ----------
+    conditionals : shape (n, d, 2 d + c + 1), of `eliminate`
+    y : shape (c, m)
+    x_out : shape (n, d, m), z to begin with, then x
+    """
+    n, d, m, c = x_out.shape[0], x_out.shape[1], x_out.shape[2], y.shape[0]
+    totals, known = np.zeros(m), np.zeros((2 * d + c, m))  # x_k, x_{k+1}, y, in the order of the conditionals' columns
+    for j in range(c):
+        for col in range(m):
+            known[2 * d + j, col] = y[j, col]
+    for k in range(n - 1, -1, -1):
+        for i in range(d - 1, -1, -1):
+            if m == 1:  # a sum in a register, at a quarter of the time
+                total = x_out[k, i, 0]
+                for j in range(i + 1, 2 * d + c):
+                    total -= conditionals[k, i, j] * known[j, 0]
+                known[i, 0] = total / conditionals[k, i, i]
+                continue
+            for col in range(m):
+                totals[col] = x_out[k, i, col]
+            for j in range(i + 1, 2 * d + c):
+                factor = conditionals[k, i, j]
+                for col in range(m):
+                    totals[col] -= factor * known[j, col]
+            for col in range(m):
+                known[i, col] = totals[col] / conditionals[k, i, i]
+        for i in range(d):
+            for col in range(m):
+                x_out[k, i, col] = known[d + i, col] = known[i, col]
+
+
+@helper
+def multiply_padded(A: Array, B: Array, inner: int, upper: bool, C_out: Array) -> None:
+    """A B of ``inner`` columns of A; those left of the diagonal count as 0 where A is ``upper`` triangular."""
+    for i in range(C_out.shape[0]):
+        for c in range(C_out.shape[1]):
+            C_out[i, c] = 0.0
+        for j in range(i if upper else 0, inner):
+            factor = A[i, j]
+            for c in range(C_out.shape[1]):
+                C_out[i, c] += factor * B[j, c]
+
+
+@helper
+def invert_triangle(R: Array, inverse_out: Array) -> None:
+    """Inverse of an upper triangular matrix."""
+    d, width = inverse_out.shape
+    for i in range(d - 1, -1, -1):
+        for c in range(width):
+            inverse_out[i, c] = 0.0
+        inverse_out[i, i] = 1.0
+        for j in range(i + 1, d):
+            factor = R[i, j]
+            for c in range(width):
+                inverse_out[i, c] -= factor * inverse_out[j, c]
+        for c in range(width):
+            inverse_out[i, c] /= R[i, i]
+
+
+@kernel("void(f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1])")
+def covariances(conditionals: Array, x_by_y: Array, cross: Array, P_out: Array, next_out: Array) -> None:
+    """Marginal covariances of the keyframes, backwards in time.
+
+        H_k = R^-1 (I + S H_{k+1} S') R^-T,   P_k = H_k + X_k P_y X_k',   P_{k,k+1} = -R^-1 S H_{k+1} + X_k P_y X_{k+1}'
+
+    H is the covariance where the border is held and X = dx/dy, so covariances are sums of squares.
+
+    Parameters
+    ----------
+    conditionals : shape (n, d, 2 d + c + 1), of `eliminate`
+    x_by_y : shape (n, d, c), X, of `back_substitute`
+    cross : shape (n, d, c), X P_y, the covariance of keyframes (rows) with the border
+    P_out : shape (n, d, d)
+    next_out : shape (n - 1, d, d), of a keyframe (rows) with that after it; or (0, d, d)
+    """
+    n, d, c = x_by_y.shape
+    width, factors, transposed = padded(d), np.zeros((d, 2 * d)), np.zeros((2 * d, padded(d)))
+    inverse, S, H, gain = np.zeros((d, width)), np.zeros((d, width)), np.zeros((d, width)), np.zeros((d, width))
+    gain_H, P = np.zeros((d, width)), np.zeros((d, width))
+    # of this keyframe, and right of it of that after it
+    X_t, by_border = np.zeros((c, 2 * width)), np.zeros((d, 2 * width))
+    for k in range(n - 1, -1, -1):
+        invert_triangle(conditionals[k], inverse)
+        if k < n - 1:
+            for i in range(d):
+                for j in range(d):
+                    S[i, j] = conditionals[k, i, d + j]
+            multiply_padded(inverse, S, d, True, gain)
+            multiply_padded(gain, H, d, False, gain_H)
+        for i in range(d):
+            for j in range(d):
+                factors[i, j], factors[i, d + j] = inverse[i, j], gain_H[i, j]
+                transposed[j, i], transposed[d + j, i] = inverse[i, j], gain[i, j]
+        multiply_padded(factors, transposed, 2 * d, True, P)
+        for i in range(c):
+            for j in range(d):
+                X_t[i, width + j] = X_t[i, j]
+                X_t[i, j] = x_by_y[k, j, i]
+        multiply_padded(cross[k], X_t, c, False, by_border)
+        for i in range(d):
+            for j in range(i, d):
+                H[i, j] = H[j, i] = P[i, j]
+                P_out[k, i, j] = P_out[k, j, i] = P[i, j] + by_border[i, j]
+        if k < next_out.shape[0]:
+            for i in range(d):
+                for j in range(d):
+                    next_out[k, i, j] = by_border[i, width + j] - gain_H[i, j]
+
+
+@kernel("void(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[::1], i8[::1], f8[:, ::1], i8[:, ::1])")
+def place_rows(
+    r: Array, J: Array, C: Array, C_targets: Index, weight: Array, first: Index, rows_out: Array, targets_out: Index
+) -> None:
+    """Put the rows of m measurements of one sensor where `eliminate` reads them.
+
+    Parameters
+    ----------
+    r : shape (m, dim), whitened right-hand sides
+    J : shape (m, dim, s), whitened Jacobians by the first s components of the keyframe
+    C, C_targets : shapes (m, dim, e) and (e,), by others
+    weight : shape (m,), of their squares (robust losses, gates)
+    first : shape (m,), the first row of each
+    rows_out : shape (rows, s + q + 1), with q >= e
+    targets_out : shape (rows, q)
+    """
+    s, e, last = J.shape[2], C.shape[2], rows_out.shape[1] - 1
+    for k in range(r.shape[0]):
+        factor = math.sqrt(weight[k])
+        for i in range(r.shape[1]):
+            row = first[k] + i
+            for j in range(s):
+                rows_out[row, j] = factor * J[k, i, j]
+            for j in range(last - s):
+                rows_out[row, s + j] = factor * C[k, i, j] if j < e else 0.0
+                targets_out[row, j] = C_targets[j] if j < e else -1
+            rows_out[row, last] = factor * r[k, i]
