@@ -6,31 +6,32 @@ factors are those of the graph that `rovgraph.graph` gives to GTSAM, and a test 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import TABLE, Belief
-from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.assembly import KeyframeInterval
-from rovgraph.engine.gauss_newton import Gates, Solution, minimise
+from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.conditionals import Conditionals
+from rovgraph.engine.chain_information import MeasurementRows, MotionRows, SquareRoot, UndeterminedError, eliminate
 from rovgraph.engine.measurements import Block, gates_of, loss_and_weight, measurement_cost
 from rovgraph.engine.scale import SCALES
-from rovgraph.engine.unknowns import Unknowns, unknowns
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
-from rovgraph.kernels import chain
 from rovgraph.kernels.motion import motion_errors, motion_weights, whiten_motions
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 MOTION = 15  # components of a keyframe before what walks
 CLONED = 3  # of the first keyframe, its attitude, that a border ends with where its covariance is asked for
+PRIORS = 3  # rows at the first keyframe that are no measurements: two priors, and the tie of its clone
 STIFF = 1e8  # square-root information that ties the clone to it [1/rad]
 COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
+
+_NOTHING, _ONE = np.empty(0, np.int64), np.ones(1)
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ class Chain:
         return total + measurement_cost(self.seen(point), gates)
 
     def step(self, point: State, gates: Gates) -> ChainStep:
-        return ChainStep(*self.eliminate(point, gates).solution())
+        return ChainStep(*self.eliminate(point, gates).solve())
 
     def moved(self, point: State, step: ChainStep, share: float) -> State:
         x, y = share * step.x, share * step.y
@@ -206,7 +207,7 @@ class Chain:
         k = [np.broadcast_to(np.atleast_2d(point.calibration[s]), (len(self.intervals), 3))[1:] for s in SCALES]
         return rotate(self.scale_to_bias, np.concatenate(k, axis=1))
 
-    def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = ()) -> Conditionals:
+    def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = ()) -> SquareRoot:
         """All factors linearised at a point and eliminated; with ``stops`` the border ends with the first attitude.
 
         Raises
@@ -214,63 +215,69 @@ class Chain:
         InputError : the data do not determine some variable, which is named
         """
         r, A_i, A_j = self.motion_residuals(point)
-        C, C_targets = self._scale_columns(A_i)
+        C, targets = self._scale_columns(A_i)
         walks = [np.diff(point.calibration[name], axis=0) * self._walk_of(name) for name in self._walking]
         walk_r = np.concatenate([np.empty((len(r), 0)), *walks], axis=1)
-        clones = CLONED if len(stops) else 0
-        rows, targets, first = self._rows(point, gates, clones)
-        out = Conditionals.empty(len(self.intervals), self.d, self.c + clones, stops)
-        failing = chain.eliminate(
-            *(A_i, A_j, -r, C, C_targets, self.walk, -walk_r, rows, targets, first),
-            *(self._border_rows(point, clones), np.array(stops, np.int64)),
-            *(out.conditionals, out.border, out.filtered, out.left_out),
-        )
-        if failing >= 0:
-            raise InputError(self._indeterminate(failing))
-        return out
+        rows, clones = (self._rows_with_clone, CLONED) if len(stops) else (self._rows, 0)
+        self._put_priors(rows, point, clones)
+        for place, (sensor, block, state) in enumerate(self.seen(point), PRIORS):
+            self._put_block(rows, place, block, state, gates[sensor])
+        try:
+            motions = MotionRows(A_i, A_j, -r, C, targets, self.walk, -walk_r)
+            return eliminate(motions, rows, self._border_rows(point, clones), stops)
+        except UndeterminedError as error:
+            raise InputError(self._indeterminate(error.keyframe, error.component)) from None
 
-    def _rows(self, point: State, gates: Gates, clones: int) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of measurements and priors in the order of keyframes, their targets, each keyframe's first row."""
-        dims = np.concatenate([np.full(len(b), b.z.shape[1]) for b in self.blocks.values()] or [np.empty(0, int)])
-        keyframe = np.concatenate([b.keyframe for b in self.blocks.values()] or [np.empty(0, int)]).astype(int)
-        ahead = MOTION + self.d - MOTION + clones  # rows of priors, at keyframe 0
-        order = np.argsort(keyframe, kind="stable")
-        begin = np.empty(len(dims), np.int64)
-        begin[order] = ahead + np.cumsum(dims[order]) - dims[order]
-        count = np.bincount(keyframe, weights=dims, minlength=len(self.intervals)).astype(np.int64)
-        first = np.concatenate([[0], ahead + np.cumsum(count)]).astype(np.int64)
-        own = {s: [n for n in b.unknowns.estimated if n in self.layout] for s, b in self.blocks.items()}
-        q = max([clones, self.d - MOTION, *(sum(TABLE[n].dim for n in names) for names in own.values())])
-        rows, targets = np.zeros((int(first[-1]), MOTION + q + 1)), np.full((int(first[-1]), q), -1)
-        self._prior_rows(point, clones, rows, targets)
-        taken = 0
-        for sensor, block, state in self.seen(point):
-            r, H = block.linearize(state)
-            weight = loss_and_weight(r, block.instrument.loss)[1] * gates[sensor]
-            zeros = np.zeros((*r.shape, MOTION))
-            for variable, columns in COLUMNS.items():
-                if variable in H:
-                    zeros[..., columns] = H[variable]
-            C = np.concatenate([np.empty((*r.shape, 0)), *(H[n] for n in own[sensor])], axis=2)
-            C_targets = np.concatenate([np.empty(0, np.int64), *(self.target(n) for n in own[sensor])])
-            chain.place_rows(r, zeros, C, C_targets, weight, begin[taken : taken + len(block)], rows, targets)
-            taken += len(block)
-        return rows, targets, first
+    @cached_property
+    def _rows(self) -> MeasurementRows:
+        return self._room(0)
 
-    def _prior_rows(self, point: State, clones: int, rows: Array, targets: NDArray[np.int64]) -> None:
-        """The first rows: the prior of the first keyframe, of what walks, and the first attitude's clone."""
+    @cached_property
+    def _rows_with_clone(self) -> MeasurementRows:
+        return self._room(CLONED)
+
+    def _room(self, clones: int) -> MeasurementRows:
+        """Room for the rows of priors, of the clone's tie and of all measurements, in this order."""
+        blocks, first = self.blocks.values(), np.zeros(1, np.int64)
+        walking = self.d - MOTION
+        keyframes = [first, first, first, *(b.keyframe for b in blocks)]
+        dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
+        others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
+        return MeasurementRows(len(self.intervals), MOTION, keyframes, dims, max([walking, clones, *others]))
+
+    def _put_priors(self, rows: MeasurementRows, point: State, clones: int) -> None:
+        """The prior of the first keyframe, that of what walks, and the tie of the first attitude's clone."""
         r, _ = self.prior_residuals(point)
-        rows[:MOTION, :MOTION], rows[:MOTION, -1] = self._prior_jacobian(point), -r
-        row = MOTION
-        for name in self._walking:
-            belief = self.beliefs[name]
-            for k, column in enumerate(self.target(name).tolist()):
-                rows[row, MOTION], targets[row, 0] = 1.0 / belief.sd, column
-                rows[row, -1] = (belief.mean[k] - point.calibration[name][0, k]) / belief.sd
-                row += 1
-        for k in range(clones):
-            rows[row, k], rows[row, MOTION], targets[row, 0] = STIFF, -STIFF, self.d + self.c + k
-            row += 1
+        rows.put(0, -r[None], self._prior_jacobian(point)[None], np.empty((1, MOTION, 0)), _NOTHING, _ONE)
+        sd = [np.full(TABLE[n].dim, self.beliefs[n].sd) for n in self._walking]
+        off = [self.beliefs[n].mean - point.calibration[n][0] for n in self._walking]
+        weight = 1.0 / np.concatenate([np.empty(0), *sd])
+        own = np.concatenate([_NOTHING, *(self.target(n) for n in self._walking)])
+        values = np.concatenate([np.empty(0), *off]) * weight
+        rows.put(1, values[None], np.zeros((1, len(own), MOTION)), np.diag(weight)[None], own, _ONE)
+        tie = np.zeros((1, clones, MOTION))
+        tie[0, :, :clones] = STIFF * np.eye(clones)
+        clone = self.d + self.c + np.arange(clones)
+        rows.put(2, np.zeros((1, clones)), tie, -STIFF * np.eye(clones)[None], clone, _ONE)
+
+    def _put_block(
+        self, rows: MeasurementRows, place: int, block: Block, state: State, gate: NDArray[np.bool_]
+    ) -> None:
+        """The measurements of one sensor, weighted."""
+        r, H = block.linearize(state)
+        weight = loss_and_weight(r, block.instrument.loss)[1] * gate
+        J = np.zeros((*r.shape, MOTION))
+        for variable, columns in COLUMNS.items():
+            if variable in H:
+                J[..., columns] = H[variable]
+        names = self._columns_of(block)
+        C = np.concatenate([np.empty((*r.shape, 0)), *(H[n] for n in names)], axis=2)
+        targets = np.concatenate([_NOTHING, *(self.target(n) for n in names)])
+        rows.put(place, r, J, C, targets, weight)
+
+    def _columns_of(self, block: Block) -> list[str]:
+        """Calibration that a sensor's measurements depend on, of what is estimated."""
+        return [name for name in block.unknowns.estimated if name in self.layout]
 
     def _border_rows(self, point: State, clones: int) -> Array:
         """Priors of the border's constants, shape (c, c + clones + 1)."""
@@ -302,19 +309,16 @@ class Chain:
         C = np.concatenate([by_scale[:, :, parts[name]] for name in names], axis=2)
         return np.ascontiguousarray(C), np.concatenate([self.target(name) for name in names])
 
-    def _indeterminate(self, component: int) -> str:
+    def _indeterminate(self, keyframe: int | None, component: int) -> str:
         """One line on a system that cannot be solved."""
-        keyframe, column = divmod(component, self.d)
-        if keyframe < len(self.intervals) and column < MOTION:
-            variable = next(v for v, columns in COLUMNS.items() if columns.start <= column < columns.stop)
+        if keyframe is not None and component < MOTION:
+            variable = next(v for v, columns in COLUMNS.items() if columns.start <= component < columns.stop)
             what = f"{variable} of keyframe {keyframe}"
         else:
-            border = component - len(self.intervals) * self.d
-            place = (True, border) if border >= 0 else (False, column)
-            what = next(
-                (n for n, (b, part) in self.layout.items() if b == place[0] and part.start <= place[1] < part.stop),
-                "some variable",
-            )
+            place = (keyframe is None, component)
+            parts = self.layout.items()
+            own = (n for n, (border, p) in parts if border == place[0] and p.start <= place[1] < p.stop)
+            what = next(own, "some variable")
         return (
             f"the data do not determine {what}: check the log (rovgraph check), "
             "tighten its prior sd, or hold it fixed in the configuration"

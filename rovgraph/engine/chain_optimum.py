@@ -10,7 +10,7 @@ from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.chain import COLUMNS, MOTION, Chain, ChainStep
-from rovgraph.engine.conditionals import Conditionals
+from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.gauss_newton import Gates, Solution, minimise
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.measurements import Block, blocks_of, weights_of
@@ -72,24 +72,32 @@ class ChainOptimum:
         return {}
 
     @cached_property
-    def conditionals(self) -> Conditionals:
+    def information(self) -> SquareRoot:
         """All factors linearised at the optimum and eliminated."""
         return self.chain.eliminate(self.state, self.gates)
+
+    @cached_property
+    def _border_covariance(self) -> Array:
+        return self.information.border_covariance()
+
+    @cached_property
+    def _covariances(self) -> Array:
+        return self.information.covariances(self._border_covariance)[0]
 
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
-            return self.conditionals.covariances[:, COLUMNS[variable], COLUMNS[variable]]
+            return self._covariances[:, COLUMNS[variable], COLUMNS[variable]]
         border, part = self.chain.layout[variable]
         if not border:
-            return self.conditionals.covariances[:, part, part]
-        P = self.conditionals.border_covariance[part, part]
+            return self._covariances[:, part, part]
+        P = self._border_covariance[part, part]
         return np.broadcast_to(P, (len(self.intervals), *P.shape))
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         chosen = np.concatenate([np.arange(MOTION), *(self.chain.target(n) for n in self.unknowns.estimated)])
-        return self.conditionals.newest_covariance()[np.ix_(chosen, chosen)]
+        return self.information.newest_covariance()[np.ix_(chosen, chosen)]
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -98,7 +106,8 @@ class ChainOptimum:
     def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
         """As `rovgraph.engine.optimum.Optimum`."""
         held = replace(self.chain, unknowns=self.unknowns.of(()))
-        noise = held.eliminate(self.state, self.gates).draw(np.random.default_rng(seed))
+        white = np.random.default_rng(seed).standard_normal((len(self.intervals), MOTION))
+        noise = held.eliminate(self.state, self.gates).draw(white)
         more, less = (
             self._knowledge_at(held.moved(self.state, ChainStep(sign * noise, np.empty(0)), 1.0), keyframes)
             for sign in (1.0, -1.0)
@@ -115,8 +124,8 @@ class ChainOptimum:
         solution = minimise(without, begin)
         full = self.chain.eliminate(solution.point, solution.gates)
         given = np.concatenate([np.r_[self.chain.layout[n][1]] for n in names])
-        by_given = full.border_by_last(given)
-        x, parts = full.by_border @ by_given, self.chain.layout
+        by_given = full.border_by(given)
+        x, parts = full.x_by_y @ by_given, self.chain.layout
         out = {v: x[:, columns] for v, columns in COLUMNS.items()}
         for name, (border, part) in parts.items():
             out[name] = np.broadcast_to(by_given[part], (len(x), TABLE[name].dim, len(given))) if border else x[:, part]
