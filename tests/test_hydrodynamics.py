@@ -7,6 +7,7 @@ import pytest
 from dives import altered, as_log, batch, beginning, changed, kept, rms, without
 
 from rovgraph.config import Config
+from rovgraph.engine.aiding import OLDEST_SIGNAL_S, PIECE_S
 from rovgraph.errors import InputError
 from rovgraph.estimators.chains import outcomes
 from rovgraph.estimators.error_state import REINITIALISE_AT_S, replay
@@ -15,7 +16,6 @@ from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.named import ESTIMATORS, select
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, rotate
-from rovgraph.graph.aiding import OLDEST_SIGNAL_S, PIECE_S
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log, Stream
 from rovgraph.model_aiding import ModelAiding, WaterVelocity

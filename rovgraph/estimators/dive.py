@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from functools import partial
 
 from rovgraph.config import Config
+from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.estimators.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import InitialConditions, initialise
 from rovgraph.estimators.smoother import BatchSmoother
-from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.log import Log
 from rovgraph.workers import starting, workers
 
@@ -80,9 +80,7 @@ def smooth(
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
     """All keyframes of a log and what lies between them."""
     batch = BatchSmoother(beginning)
-    for measurement in log.measurements():
-        batch.add(measurement)
-    batch.finish()
+    batch.take(log)
     return batch
 
 
@@ -101,12 +99,13 @@ def _filtered(log: Log, beginning: InitialConditions) -> Estimate:
 
 def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:
     filtering = partial(progress, "filtering")
-    if not batch.measurements:
+    measurements = batch.measurements
+    if not measurements:
         return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering).solve()
     estimator = ErrorStateFilter(batch.beginning, REINITIALISE_AT_S)  # learns how late they are while they come
-    for k, measurement in enumerate(batch.measurements):
+    for k, measurement in enumerate(measurements):
         if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:
-            filtering(k / len(batch.measurements))
+            filtering(k / len(measurements))
     estimator.finish()
     return estimator.solve()
 

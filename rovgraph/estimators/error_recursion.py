@@ -18,6 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.config import beliefs
+from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.scale import COLUMNS, SCALES
+from rovgraph.engine.transition import transitions
+from rovgraph.engine.unknowns import unknowns
 from rovgraph.estimators.alignment import aligned, attitude_poorly_known, with_attitude
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, Step
@@ -36,11 +40,6 @@ from rovgraph.estimators.remembered_places import (
 )
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import Array, identities, transpose
-from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
-from rovgraph.graph.factors import predict
-from rovgraph.graph.keys import unknowns
-from rovgraph.graph.scale import COLUMNS, SCALES
-from rovgraph.graph.transition import transitions
 from rovgraph.sensors import Position, SensorModel
 from rovgraph.state import POSE, VELOCITY, State, stack_states
 from rovgraph.trajectory import Trajectory
@@ -133,14 +132,13 @@ class ErrorStateRecursion:
         departed: Sequence[Gaussian | None] = [None] * len(intervals)
         steps: Sequence[Step | None] = [None] * len(intervals)
         predicted = before
-        if intervals[0].pim is not None:
-            between = [[a for a in i.measurements if a.keyframe < i.index] for i in intervals]
+        if intervals[0].motion is not None:
+            between = [i.between for i in intervals]
             near = [self._aligned(*own) for own in zip(before, intervals, between, strict=True)]
             departed = left = self._update(near, between, gates, used)
             steps = made = self.predict_together(intervals, left)
             predicted = [step.predicted for step in made]
-        here = [[a for a in i.measurements if a.keyframe == i.index] for i in intervals]
-        filtered = self._update(predicted, here, gates, used)
+        filtered = self._update(predicted, [i.here for i in intervals], gates, used)
         return [FilterStep(*one) for one in zip(departed, steps, filtered, used, strict=True)]
 
     def predict(self, interval: KeyframeInterval, before: Gaussian) -> Step:
@@ -150,12 +148,11 @@ class ErrorStateRecursion:
     def predict_together(self, intervals: Sequence[KeyframeInterval], before: Sequence[Gaussian]) -> list[Step]:
         """The next keyframes of some filters; as `predict`."""
         size, P = self.error.size, np.array([known.P for known in before])
-        states = [predict(interval, known.state) for interval, known in zip(intervals, before, strict=True)]
         F, Q = identities(*P.shape[:2]), np.zeros_like(P)
-        F[:, :15, :15], own_Q = transitions(intervals, [known.state for known in before], states)
+        states, F[:, :15, :15], own_Q = transitions(intervals, [known.state for known in before])
         for k, interval in enumerate(intervals):
-            assert interval.pim is not None
-            Q[k, :size, :size] = self._walk * interval.pim.deltaTij()
+            assert interval.motion is not None
+            Q[k, :size, :size] = self._walk * interval.motion.duration
             if interval.scale_to_bias is not None:
                 for name in set(SCALES) & set(self.error.columns):  # they move as the bias does, but for itself
                     F[k, :9, self.error.columns[name]] = F[k, :9, 9:15] @ interval.scale_to_bias[:, COLUMNS[name]]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, Step
@@ -24,7 +25,6 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array, transpose
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.graph.measurements import Block
 from rovgraph.log import Measurement
 from rovgraph.state import BIAS, PLACE, State, stack_states

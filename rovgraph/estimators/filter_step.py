@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
+from rovgraph.engine.assembly import KeyframeMeasurement
 from rovgraph.estimators.remembered_places import Place
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import KeyframeMeasurement
 from rovgraph.state import State
 
 Gates = dict[str, float]  # sensor that is being kept out -> since when [s]

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.filter_step import Gates, Gaussian, ProcessedMeasurement
 from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.remembered_places import Place
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.log.streams import precedence
@@ -175,7 +175,7 @@ class FixedLag:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         index, time, segment, rate_sd = state["keyframe"]
-        interval = KeyframeInterval(index, time, segment, state["rate_b"], rate_sd, None, 0.0, [])
+        interval = KeyframeInterval(index, time, segment, state["rate_b"], rate_sd, None, [])
         here = State(*(state[name] for name in ("R_nb", "p_n", "v_n", "bias", "calibration")))
         places = tuple(Place(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         assembler = self._fresh()

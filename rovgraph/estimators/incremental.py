@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.unknowns import unknowns
 from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.filter_step import Gaussian, ProcessedMeasurement
 from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.smoother import smoothed
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.graph.batch import make_problem, solution_at
 from rovgraph.graph.factors import drift, landmark_prior, motion, priors
 from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.keys import unknowns
 from rovgraph.graph.measurements import make_block
 from rovgraph.graph.places import Optimum, insert_places, settled
 from rovgraph.graph.values import insert_calibration, state_values

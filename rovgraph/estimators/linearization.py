@@ -5,11 +5,11 @@ from itertools import accumulate, groupby, pairwise
 
 import numpy as np
 
+from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.geometry import Array, rotate
-from rovgraph.graph.assembly import KeyframeMeasurement
-from rovgraph.graph.keys import Unknowns
 from rovgraph.graph.measurements import Block, make_block, motions, whitening
 from rovgraph.graph.places import ORIGIN
 from rovgraph.sensors import innovation

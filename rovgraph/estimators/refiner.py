@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
@@ -18,7 +19,6 @@ from rovgraph.estimators.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.filter_step import Gates, Gaussian
 from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.estimators.reinitialisation import renewed
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.workers import companion

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.remembered_places import Place
-from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.keys import key
 from rovgraph.graph.marginals import newest_covariance
 from rovgraph.graph.places import Optimum, optimum

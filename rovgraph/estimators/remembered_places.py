@@ -28,7 +28,7 @@ class Place:
 
     Attributes
     ----------
-    name, number : of `rovgraph.graph.assembly.LandmarkObservation`
+    name, number : of `rovgraph.engine.assembly.LandmarkObservation`
     position : ndarray, shape (2,), north and east [m]
     time : when it was last seen [s]
     """

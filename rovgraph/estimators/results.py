@@ -7,10 +7,10 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.calibration import TABLE, Belief
+from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
 from rovgraph.estimators.observability import verdict
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
-from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.graph.measurements import Block
 from rovgraph.sensors import innovation
 from rovgraph.state import State

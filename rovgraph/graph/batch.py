@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
+from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.graph.factors import Start, drift, landmark_prior, motion, priors
-from rovgraph.graph.keys import Unknowns, key_name, unknowns
+from rovgraph.graph.keys import key_name
 from rovgraph.graph.measurements import Block, loss_and_weight, make_block
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state, states_from

@@ -4,17 +4,17 @@ Batch and iSAM2 consume the same lists.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from rovgraph.calibration import Belief
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, transpose
-from rovgraph.graph.assembly import KeyframeInterval
-from rovgraph.graph.coasting import coasted, coasting_factor, in_outage
-from rovgraph.graph.keys import Unknowns, key
-from rovgraph.graph.scale import SCALES, biased, scaled_factor
+from rovgraph.graph.keys import calibration_key, key
+from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
 
 Factor = gtsam.NonlinearFactor
@@ -68,23 +68,8 @@ def landmark_prior(number: int) -> Factor:
 
 
 def motion(interval: KeyframeInterval, unknowns: Unknowns) -> list[Factor]:
-    """The factor between the keyframe before and the one that ends the interval: the IMU's, or of coasting."""
-    if interval.pim is None:
-        return []
-    if in_outage(interval):
-        return [coasting_factor(interval)]
-    if interval.scale_to_bias is None:
-        return [unscaled(interval)]
-    keys = {name: unknowns.key(name, interval.segment) for name in SCALES if name in unknowns.walks}
-    return [scaled_factor(unscaled(interval), interval.scale_to_bias, unknowns.fixed, keys)]
-
-
-def unscaled(interval: KeyframeInterval) -> gtsam.CombinedImuFactor:
-    """GTSAM's own factor of an interval with motion, which knows no scales."""
-    assert interval.pim is not None
-    i, j = interval.index - 1, interval.index
-    before, after = (key(POSE, i), key(VELOCITY, i)), (key(POSE, j), key(VELOCITY, j))
-    return gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)
+    """The factor between the keyframe before and the one that ends the interval, where there is one."""
+    return [] if interval.motion is None else [motion_factor(interval, unknowns)]
 
 
 def drift(unknowns: Unknowns, segment: int, duration: float) -> list[Factor]:
@@ -93,30 +78,10 @@ def drift(unknowns: Unknowns, segment: int, duration: float) -> list[Factor]:
         return []
     return [
         gtsam.BetweenFactorVector(
-            unknowns.key(name, segment - 1),
-            unknowns.key(name, segment),
+            calibration_key(unknowns, name, segment - 1),
+            calibration_key(unknowns, name, segment),
             np.zeros(len(unknowns.fixed[name])),
             gtsam.noiseModel.Isotropic.Sigma(len(unknowns.fixed[name]), unknowns.walks[name] * np.sqrt(duration)),
         )
         for name in unknowns.begun_by(segment)
     ]
-
-
-def predict(interval: KeyframeInterval, state: State) -> State:
-    """The state at the end of an interval, from the IMU alone, or from nothing while it is silent.
-
-    Parameters
-    ----------
-    interval : with motion
-    state : State of one epoch, of the keyframe before
-    """
-    if in_outage(interval):
-        return coasted(interval, state)
-    assert interval.pim is not None
-    scale_to_bias = state if interval.scale_to_bias is None else biased(state, interval.scale_to_bias[None])
-    bias = gtsam.imuBias.ConstantBias(scale_to_bias.bias[0, :3], scale_to_bias.bias[0, 3:])
-    before = gtsam.NavState(gtsam.Rot3(state.R_nb[0]), state.p_n[0], state.v_n[0])
-    after = interval.pim.predict(before, bias)
-    # in rows: products of matrices in columns round otherwise, and filters side by side are to be as each alone
-    R_nb = np.ascontiguousarray(after.attitude().matrix())
-    return replace(state, R_nb=R_nb[None], p_n=after.position()[None], v_n=after.velocity()[None])

@@ -12,9 +12,10 @@ import gtsam
 import numpy as np
 
 from rovgraph.calibration import TABLE
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.graph.batch import indeterminate
-from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.keys import calibration_key, key
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 # Changes beyond which iSAM2 relinearises a variable. Positions and velocities too: the IMU's
@@ -89,7 +90,7 @@ class Incremental:
         engine, unknowns = self._engine, self._unknowns
         pose = engine.calculateEstimatePose3(key(POSE, index))
         names = unknowns.estimated
-        calibration = {name: engine.calculateEstimateVector(unknowns.key(name, segment)) for name in names}
+        calibration = {name: engine.calculateEstimateVector(calibration_key(unknowns, name, segment)) for name in names}
         return State(
             pose.rotation().matrix()[None],
             pose.translation()[None],

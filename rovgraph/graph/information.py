@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Gates, Problem, indeterminate
-from rovgraph.graph.keys import is_place, key, state_index
+from rovgraph.graph.keys import calibration_key, is_place, key, state_index
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
 
@@ -148,7 +148,7 @@ def _sequential(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> gtsam
 
 
 def _calibration(problem: Problem, segment: int) -> list[int]:
-    return [problem.unknowns.key(name, segment) for name in problem.unknowns.estimated]
+    return [calibration_key(problem.unknowns, name, segment) for name in problem.unknowns.estimated]
 
 
 def _seen_again(problem: Problem, end: int) -> list[int]:

@@ -1,12 +1,9 @@
 """Keys of the graph's variables: x pose, v velocity, b bias, n place, one letter per calibration."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-
 import gtsam
 
-from rovgraph.calibration import TABLE, Belief
-from rovgraph.geometry import Array
+from rovgraph.calibration import TABLE
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
 _LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n"} | {v.name: v.letter for v in TABLE.values()}
@@ -56,41 +53,6 @@ def key_name(key: int) -> str:
     return f"{variable} of keyframe {symbol.index()}" if variable in DIMENSION else variable
 
 
-@dataclass(frozen=True)
-class Unknowns:
-    """What of the calibration a graph estimates.
-
-    Attributes
-    ----------
-    fixed : all calibration variables at their prior means; those that are not estimated
-        keep them
-    walks : random walk of each that is estimated [unit per root second]; with 0 it has one
-        value for all of the dive, otherwise one per segment of time
-    """
-
-    fixed: Mapping[str, Array]
-    walks: Mapping[str, float]
-
-    @property
-    def estimated(self) -> tuple[str, ...]:
-        return tuple(self.walks)
-
-    def key(self, name: str, segment: int) -> int:
-        """Key of an estimated variable in a segment."""
-        return key(name, segment if self.walks[name] else 0)
-
-    def begun_by(self, segment: int) -> tuple[str, ...]:
-        """Those that have a new value in a segment."""
-        return tuple(name for name, walk in self.walks.items() if walk or segment == 0)
-
-    def of(self, names: Iterable[str]) -> "Unknowns":
-        """Only some of the estimated variables."""
-        wanted = set(names)
-        return Unknowns(self.fixed, {name: walk for name, walk in self.walks.items() if name in wanted})
-
-
-def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
-    """Calibration variables to be estimated: asked for, and a sensor that shows them is in use."""
-    present = {*sensors, "imu"}
-    wanted = {n: b.walk for n, b in beliefs.items() if b.estimate and present & set(b.variable.sensors)}
-    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted)
+def calibration_key(unknowns: Unknowns, name: str, segment: int) -> int:
+    """Key of an estimated calibration variable in a segment."""
+    return key(name, segment if unknowns.walks[name] else 0)

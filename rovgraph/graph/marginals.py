@@ -9,7 +9,7 @@ import numpy as np
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Problem, Solution, indeterminate
-from rovgraph.graph.keys import dimension, key
+from rovgraph.graph.keys import calibration_key, dimension, key
 from rovgraph.state import DIMENSION, PLACE
 
 
@@ -38,7 +38,7 @@ def newest_covariance(problem: Problem, solution: Solution, places: Sequence[int
     """
     linear = problem.linearize(solution.values, solution.gates)
     last = [key(v, problem.count - 1) for v in DIMENSION]
-    last += [problem.unknowns.key(name, int(problem.segment[-1])) for name in problem.unknowns.estimated]
+    last += [calibration_key(problem.unknowns, name, int(problem.segment[-1])) for name in problem.unknowns.estimated]
     last += [key(PLACE, number) for number in places]
     before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
     for one in last:

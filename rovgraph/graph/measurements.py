@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.late_stamp_window import LateStampWindow
+from rovgraph.engine.scale import COLUMNS, SCALES, biased
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, identity, rotate
-from rovgraph.graph.assembly import KeyframeMeasurement
-from rovgraph.graph.keys import Unknowns, key
-from rovgraph.graph.late_stamp_window import LateStampWindow
-from rovgraph.graph.scale import COLUMNS, SCALES, biased
+from rovgraph.graph.keys import key
 from rovgraph.graph.values import state_at
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
@@ -59,7 +60,7 @@ class Block:
     gravity : [m/s^2]
     unknowns : the calibration variables that are estimated, of those that the instrument has
     window : along which the motion goes on to where a stamp that may be late belongs, or None
-    scale_to_bias : ndarray, shape (n, 6, 6), of `rovgraph.graph.scale`, or None where the IMU's scale is exact
+    scale_to_bias : ndarray, shape (n, 6, 6), of `rovgraph.engine.scale`, or None where the IMU's scale is exact
     place, believed : ndarray of int and of bool, shape (n,), of `LandmarkObservation`; place is -1,
         and all are believed, where it is no place that is measured
     """

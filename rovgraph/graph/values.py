@@ -6,8 +6,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
-from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.keys import calibration_key, key
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 
@@ -37,13 +38,13 @@ def insert_calibration(
 ) -> None:
     """Insert the calibration variables that a segment begins."""
     for name in unknowns.begun_by(segment):
-        values.insert(unknowns.key(name, segment), np.array(calibration[name], dtype=float).ravel())
+        values.insert(calibration_key(unknowns, name, segment), np.array(calibration[name], dtype=float).ravel())
 
 
 def state_at(values: gtsam.Values, index: int, segment: int, unknowns: Unknowns) -> State:
     """The state at one keyframe, which lies in ``segment``, as a `State` of one epoch."""
     pose = values.atPose3(key(POSE, index))
-    estimated = {name: values.atVector(unknowns.key(name, segment)) for name in unknowns.estimated}
+    estimated = {name: values.atVector(calibration_key(unknowns, name, segment)) for name in unknowns.estimated}
     return State(
         pose.rotation().matrix()[None],
         pose.translation()[None],
