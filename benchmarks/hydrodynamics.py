@@ -10,13 +10,13 @@ import argparse
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.studies.estimator_chains import EstimatorSpec, outcomes
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.studies.estimators import ESTIMATORS, select
 from rovgraph.evaluate import normalised_error
 from rovgraph.geometry import Array
 from rovgraph.log import Log, log_from_frame
 from rovgraph.simulate import Choices, Dive, simulated
+from rovgraph.studies.estimator_chains import EstimatorSpec, outcomes
+from rovgraph.studies.estimators import ESTIMATORS, select
 
 GAP = {"vattern": (120.0, 180.0), "excited": (150.0, 210.0)}  # without bottom lock [s]
 DRAG = ("drag_linear", "drag_quadratic")

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
 
 from rovgraph.config import load_config
 from rovgraph.estimators.dive import assemble, smooth
-from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.evaluate import evaluate, read_reference

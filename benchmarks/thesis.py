@@ -25,13 +25,13 @@ from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.kalman import FILTERS, Filter, run_filter
-from rovgraph.studies.estimators import ESTIMATORS
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
 from rovgraph.log import Log, Stream, log_from_frame
 from rovgraph.sensors import field_direction
 from rovgraph.simulate import CALM, Choices, Dive, Style, Truth, Waves, lake, scenario, simulate, simulated
 from rovgraph.simulate.files import known
 from rovgraph.simulate.noise import THESIS
+from rovgraph.studies.estimators import ESTIMATORS
 from rovgraph.trajectory import Trajectory
 from rovgraph.workers import cores, in_workers
 

@@ -5,7 +5,7 @@ import pytest
 from dives import level_log
 
 from rovgraph.config import Config
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 
@@ -45,8 +45,8 @@ def test_a_keyframe_stands_at_every_ping_and_at_both_ends_of_the_imu():
     intervals, _ = assembled(log_of(2.0, [0.213, 0.4, 0.951, 1.7777]))
     assert times(intervals) == [0.0, 0.213, 0.4, 0.951, 1.7777, 2.0]
     assert [i.index for i in intervals] == list(range(6))
-    assert intervals[0].pim is None
-    assert sum(i.pim.deltaTij() for i in intervals[1:]) == pytest.approx(2.0)
+    assert intervals[0].motion is None
+    assert sum(i.motion.duration for i in intervals[1:]) == pytest.approx(2.0)
 
 
 def test_a_ping_is_attached_to_its_own_keyframe_without_motion():

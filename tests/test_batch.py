@@ -25,6 +25,7 @@ from dives import (
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
+from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.dive import smooth
@@ -32,7 +33,6 @@ from rovgraph.graph import batch as solver
 from rovgraph.graph.batch import Problem, make_problem, make_values, solve
 from rovgraph.graph.keys import key
 from rovgraph.graph.marginals import covariances, marginals
-from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.log import Log
 from rovgraph.simulate import CALM, Style, scenario
 

@@ -8,9 +8,10 @@ import pytest
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs, parse_config
+from rovgraph.engine.scale import SCALES
+from rovgraph.engine.unknowns import unknowns
 from rovgraph.errors import InputError
-from rovgraph.graph.keys import key, key_name, unknowns
-from rovgraph.graph.scale import SCALES
+from rovgraph.graph.keys import key, key_name
 from rovgraph.instruments import instruments
 from rovgraph.state import DIMENSION
 

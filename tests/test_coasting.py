@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 from dives import batch, falcon, incremental, interrupted, position_errors, renewed, simulated, started
 
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.preintegration import preintegrate, preintegration_params
+from rovgraph.engine.scale import SCALES
+from rovgraph.engine.transition import predict, residual, transitions, whitening
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
-from rovgraph.graph.assembly import KeyframeInterval
-from rovgraph.graph.coasting import RIGHTS_ITSELF_S, TILT_SD, coasted, coasting, coasting_factor, in_outage
-from rovgraph.graph.preintegration import BRIDGE_ACC, BRIDGE_GYR, preintegrate, preintegration_params
-from rovgraph.graph.transition import transitions
+from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.graph.values import state_values
+from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 SECONDS = 0.9
@@ -18,10 +21,20 @@ SECONDS = 0.9
 @pytest.fixture(scope="module")
 def interval() -> KeyframeInterval:
     """Of which nothing is known but that the vehicle turned at 0.3 rad/s before and after."""
+    return silent(SECONDS + 0.2)
+
+
+def silent(gap_s: float) -> KeyframeInterval:
     params = preintegration_params(falcon(), BRIDGE_ACC, BRIDGE_GYR)
     samples = np.array([[t, 0.3, 0.1, -9.8, 0.02, -0.05, 0.3] for t in (-0.1, SECONDS + 0.1)])
-    pim, _ = preintegrate(params, np.zeros(6), samples, 0.0, np.empty(0), SECONDS)
-    return KeyframeInterval(1, SECONDS, 0, np.zeros(3), 0.0, pim, SECONDS + 0.2, [])
+    motion, _ = preintegrate(params, np.zeros(6), samples, 0.0, np.empty(0), SECONDS, gap_s)
+    return KeyframeInterval(1, SECONDS, 0, np.zeros(3), 0.0, motion, [])
+
+
+def covariance(interval: KeyframeInterval) -> np.ndarray:
+    """Of the residual."""
+    W = whitening(interval)
+    return np.linalg.inv(W.T @ W)
 
 
 def state(rpy: list[float], p_n: list[float], v_n: list[float]) -> State:
@@ -33,23 +46,23 @@ BEFORE, AFTER = state([0.1, -0.2, 2.0], [3, -2, 5], [0.4, -0.2, 0.1]), state([0.
 
 
 def test_an_interval_is_blind_where_the_imu_was_silent_for_more_than_three_quarters_of_a_second(interval):
-    assert in_outage(interval)
-    assert not in_outage(KeyframeInterval(1, SECONDS, 0, np.zeros(3), 0.0, interval.pim, 0.7, []))
+    assert interval.motion.coasted
+    assert not silent(0.7).motion.coasted
 
 
 def test_it_goes_on_as_it_went_turns_as_it_turned_and_rights_itself(interval):
-    after = coasted(interval, BEFORE)
+    after = predict(interval, BEFORE)
     np.testing.assert_allclose(after.v_n, BEFORE.v_n)
     np.testing.assert_allclose(after.p_n, BEFORE.p_n + SECONDS * BEFORE.v_n)
-    left = np.exp(-SECONDS / RIGHTS_ITSELF_S)
+    left = np.exp(-SECONDS / RIGHTING_S)
     np.testing.assert_allclose(
         rpy_from_matrix(after.R_nb[0]), [0.1 * left, -0.2 * left, 2.0 + 0.3 * SECONDS], atol=0.01
     )
-    np.testing.assert_allclose(coasting(interval, BEFORE, after)[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(residual(interval, BEFORE, after)[0], 0.0, atol=1e-12)
 
 
 def test_its_derivatives_are_those_of_the_residual(interval):
-    _, A_i, A_j, _ = coasting(interval, BEFORE, AFTER)
+    _, A_i, A_j = residual(interval, BEFORE, AFTER)
     columns = [(POSE, k) for k in range(6)] + [(VELOCITY, k) for k in range(3)] + [(BIAS, k) for k in range(6)]
     for column, (variable, k) in enumerate(columns):
         step = np.zeros(3 if variable == VELOCITY else 6)
@@ -59,25 +72,25 @@ def test_its_derivatives_are_those_of_the_residual(interval):
             for sign in (1.0, -1.0):
                 states = [BEFORE, AFTER]
                 states[side] = states[side].retract(variable, sign * step)
-                ends.append(coasting(interval, *states)[0])
+                ends.append(residual(interval, *states)[0])
             np.testing.assert_allclose(A[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-7)
 
 
 def test_the_factor_is_the_residual_whitened(interval):
     values = state_values(0, BEFORE)
     values.insert(state_values(1, AFTER))
-    residual, A_i, A_j, S = coasting(interval, BEFORE, AFTER)
-    factor = coasting_factor(interval)
-    assert 2.0 * factor.error(values) == pytest.approx(residual @ np.linalg.solve(S, residual))
+    (r, A_i, A_j), S = residual(interval, BEFORE, AFTER), covariance(interval)
+    fixed = {name: np.zeros(3) for name in SCALES}
+    factor = motion_factor(interval, Unknowns(fixed, {}))
+    assert 2.0 * factor.error(values) == pytest.approx(r @ np.linalg.solve(S, r))
     A, _ = factor.linearize(values).jacobian()
     both = np.concatenate([A_i[:, :9], A_j[:, :9], A_i[:, 9:], A_j[:, 9:]], axis=1)
     np.testing.assert_allclose(A.T @ A, both.T @ np.linalg.solve(S, both), rtol=1e-6, atol=1e-3)
 
 
 def test_filters_have_it_from_the_same_derivatives(interval):
-    after = coasted(interval, BEFORE)
-    F, Q = transitions([interval], [BEFORE], [after])
-    _, A_i, A_j, S = coasting(interval, BEFORE, after)
+    [after], F, Q = transitions([interval], [BEFORE])
+    (_, A_i, A_j), S = residual(interval, BEFORE, after), covariance(interval)
     np.testing.assert_allclose(A_j @ F[0], -A_i, atol=1e-9)
     np.testing.assert_allclose(A_j @ Q[0] @ A_j.T, S, atol=1e-12)
 
@@ -87,7 +100,7 @@ def test_a_tilt_that_is_as_vague_as_a_vehicles_stays_so(interval):
     known = state([0.0, 0.0, 1.0], [0, 0, 5], [0, 0, 0])
     P = np.zeros((15, 15))
     for _ in range(10):
-        F, Q = transitions([interval], [known], [coasted(interval, known)])
+        _, F, Q = transitions([interval], [known])
         P = F[0] @ P @ F[0].T + Q[0]
     np.testing.assert_allclose(np.sqrt(np.diag(P)[:2]), TILT_SD, rtol=1e-3)
     assert np.sqrt(P[2, 2]) == pytest.approx(BRIDGE_GYR * np.sqrt(10 * SECONDS), rel=1e-3)

@@ -18,14 +18,14 @@ from scipy.stats import chi2
 
 from rovgraph.cli.app import main
 from rovgraph.errors import InputError
-from rovgraph.studies.estimator_chains import EstimatorSpec, Task, outcomes, outcomes_of_dives
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.studies.estimators import ESTIMATORS, select
 from rovgraph.estimators.results import residual_frame
 from rovgraph.log import Log
 from rovgraph.report.figure_compare import draw_errors, draw_velocity
 from rovgraph.studies.aggregate import aggregate, nees_band
 from rovgraph.studies.compare import REFERENCE, RUN_COLUMNS, compare
+from rovgraph.studies.estimator_chains import EstimatorSpec, Task, outcomes, outcomes_of_dives
+from rovgraph.studies.estimators import ESTIMATORS, select
 from rovgraph.studies.measures import measures
 from rovgraph.studies.runs import Case, Recorded
 from rovgraph.trajectory import Trajectory

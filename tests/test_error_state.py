@@ -22,22 +22,21 @@ from dives import (
     started,
     without,
 )
+from rovgraph.estimators.innovations import Innovations
 from scipy.optimize import minimize
 from test_consistency import OVERCONFIDENT, band, drawn, nees
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
-from rovgraph.estimators import error_vector
-from rovgraph.estimators.eskf.error_state import ErrorStateFilter, alike, replay, replay_together, smoothed_together
-from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.innovations import Innovations
-from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
-from rovgraph.graph.assembly import KeyframeInterval
-from rovgraph.graph.factors import predict
+from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.measurements import loss_and_weight
-from rovgraph.graph.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
-from rovgraph.graph.transition import transitions
+from rovgraph.engine.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
+from rovgraph.engine.transition import predict, transitions
+from rovgraph.estimators import error_vector
+from rovgraph.estimators.error_vector import ErrorVector
+from rovgraph.estimators.eskf.error_state import ErrorStateFilter, alike, replay, replay_together, smoothed_together
+from rovgraph.estimators.initialise import initialise
+from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 from rovgraph.sensors import innovation
@@ -82,8 +81,8 @@ def moving(seconds: float, rate: float = 100.0) -> tuple[State, Array]:
 def interval_of(samples: Array, seconds: float, bias: Array, config: Config) -> KeyframeInterval:
     noise = config.imu.noise
     params = preintegration_params(config, noise.acc, noise.gyr)
-    pim, _ = preintegrate(params, bias, samples, 0.0, np.empty(0), seconds)
-    return KeyframeInterval(1, seconds, 0, np.zeros(3), 0.0, pim, 0.0, [])
+    motion, _ = preintegrate(params, bias, samples, 0.0, np.empty(0), seconds)
+    return KeyframeInterval(1, seconds, 0, np.zeros(3), 0.0, motion, [])
 
 
 def difference(state: State, other: State) -> Array:
@@ -97,8 +96,7 @@ def difference(state: State, other: State) -> Array:
 def test_transition_is_the_derivative_of_the_prediction():
     state, samples = moving(0.5)
     interval = interval_of(samples, 0.5, np.zeros(6), falcon())
-    after = predict(interval, state)
-    [F], _ = transitions([interval], [state], [after])
+    [after], [F], _ = transitions([interval], [state])
     step, columns = 1e-5, []
     for variable, size in DIMENSION.items():
         for k in range(size):
@@ -115,8 +113,7 @@ def test_process_noise_is_that_of_noisy_samples():
     state, samples = moving(seconds)
     state = replace(state, bias=np.zeros((1, 6)))
     interval = interval_of(samples, seconds, np.zeros(6), config)
-    exact = predict(interval, state)
-    _, [Q] = transitions([interval], [state], [exact])
+    [exact], _, [Q] = transitions([interval], [state])
     densities = np.repeat([noise.acc, noise.gyr], 3)
     walks = np.repeat([noise.acc_walk, noise.gyr_walk], 3)
     errors = []

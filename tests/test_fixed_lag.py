@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from dives import Simulated, falcon, fed, simulated
+from rovgraph.estimators.refiner import Refiner
 
+from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
-from rovgraph.engine.filter_step import Gaussian
 from rovgraph.estimators.eskf.fixed_lag import FixedLag, InsertResult
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.refiner import Refiner
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.log import Measurement
 

@@ -7,15 +7,13 @@ import pytest
 from dives import altered, as_log, batch, beginning, changed, kept, rms, without
 
 from rovgraph.config import Config
+from rovgraph.engine.aiding import OLDEST_SIGNAL_S, PIECE_S
 from rovgraph.errors import InputError
-from rovgraph.studies.estimator_chains import outcomes
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.studies.estimators import ESTIMATORS, select
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, rotate
-from rovgraph.graph.aiding import OLDEST_SIGNAL_S, PIECE_S
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log, Stream
 from rovgraph.model_aiding import ModelAiding, WaterVelocity
@@ -27,6 +25,8 @@ from rovgraph.simulate.named import lake
 from rovgraph.simulate.sea import Sea
 from rovgraph.simulate.worlds import World
 from rovgraph.state import POSE, State
+from rovgraph.studies.estimator_chains import outcomes
+from rovgraph.studies.estimators import ESTIMATORS, select
 
 COEFFICIENTS = ("drag_linear", "drag_quadratic")
 CURRENT = np.array([0.06, -0.04])

@@ -4,15 +4,16 @@ import gtsam
 import numpy as np
 import pytest
 from dives import Simulated, batch, falcon, renewed, simulated, started, true_at
+from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
-from rovgraph.estimators.error_recursion import ErrorStateRecursion
+from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.filter_step import Gaussian
+from rovgraph.engine.transition import predict
+from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import log_rotation, rotate, transpose
-from rovgraph.graph.assembly import KeyframeInterval
-from rovgraph.graph.factors import motion, predict
-from rovgraph.graph.keys import Unknowns, unknowns
+from rovgraph.graph.factors import motion
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.simulate import Style, Waves
 from rovgraph.state import VELOCITY, State

@@ -19,13 +19,14 @@ from dives import (
     simulated,
 )
 
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, transpose
 from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.keys import Unknowns, key
+from rovgraph.graph.keys import key
 from rovgraph.log import Log
 from rovgraph.state import POSE
 

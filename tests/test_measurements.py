@@ -10,12 +10,8 @@ from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
 from rovgraph.calibration import TABLE
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
-from rovgraph.geometry import Array, exp_rotation
-from rovgraph.graph.assembly import KeyframeMeasurement, LandmarkObservation
-from rovgraph.graph.keys import Unknowns, key
-from rovgraph.graph.late_stamp_window import KNOT_S, LateStampWindow
+from rovgraph.engine.assembly import KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.late_stamp_window import KNOT_S, LateStampWindow
 from rovgraph.engine.measurements import (
     Block,
     loss_and_weight,
@@ -24,18 +20,21 @@ from rovgraph.engine.measurements import (
     robust_noise,
     whitening,
 )
-from rovgraph.graph.preintegration import Snapshot
+from rovgraph.engine.motion import Snapshot
+from rovgraph.engine.scale import scale_to_bias
+from rovgraph.engine.unknowns import Unknowns
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.geometry import Array, exp_rotation
+from rovgraph.graph.keys import key
 from rovgraph.graph.rows import Rows
-from rovgraph.graph.scale import scale_to_bias
 from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
 
 N, STEP = 4, 1e-6
 SIZES = DIMENSION | {PLACE: PLACE_DIM} | {name: variable.dim for name, variable in TABLE.items()}
 WALKS = {name: 0.1 if name in {"hard_iron", "field_scale", "dvl_yaw"} else 0.0 for name in TABLE}
-
-
-_STILL = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 
 
 def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Block, State]:
@@ -47,7 +46,7 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         bias = state.bias[k] + 0.05 * rng.standard_normal(6)
         turn = exp_rotation(0.2 * rng.standard_normal(3))
         motion = Snapshot(0.1 + 0.05 * k, turn, 0.3 * rng.standard_normal(3), 0.1 * rng.standard_normal(3))
-        motion = motion if moving else _STILL
+        motion = motion if moving else Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
         rate, z = rng.standard_normal(3), rng.standard_normal(instrument.model.dim)
         sd = instrument.sd * rng.uniform(0.5, 2.0, instrument.model.dim)
         track = track_of(motion, bias, rng) if instrument.time_offset else None
@@ -62,11 +61,11 @@ def track_of(motion: Snapshot, bias: Array, rng: np.random.Generator) -> LateSta
     """A lively motion around a stamp."""
     lag = KNOT_S * np.arange(-60, 61)
     turn, dv, dp, rate = (wave(lag, rng) for _ in range(4))
-    knots = [
-        Snapshot(motion.dt - t, motion.dR @ exp_rotation(a), motion.dv + v, motion.dp + p)
-        for t, a, v, p in zip(lag, turn, dv, dp, strict=True)
-    ]
-    return LateStampWindow.of(_STILL, knots, lag, rate, bias)
+    still, knots = np.zeros(SNAPSHOT), np.empty((len(lag), SNAPSHOT))
+    still[1:10] = np.eye(3).ravel()
+    knots[:, 0], knots[:, 1:10] = motion.dt - lag, (motion.dR @ exp_rotation(turn)).reshape(-1, 9)
+    knots[:, 10:13], knots[:, 13:16] = motion.dv + dv, motion.dp + dp
+    return LateStampWindow.of(still, knots, lag, rate, bias)
 
 
 def wave(time: Array, rng: np.random.Generator) -> Array:

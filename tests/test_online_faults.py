@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from dives import Simulated, falcon, simulated, true_at
 from live import Flight, flown, message, navigator, turned
+from rovgraph.estimators.refiner import due_times
 
 from rovgraph.errors import InputError
 from rovgraph.estimators.incremental import IncrementalEstimator
-from rovgraph.estimators.refiner import due_times
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.files import Files
 from rovgraph.live.intake import Intake

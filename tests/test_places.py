@@ -25,18 +25,18 @@ from scipy.stats import chi2
 
 from rovgraph.check import examine
 from rovgraph.config import Config
+from rovgraph.engine.assembly import Assembler, KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.motion import Snapshot
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
-from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
+from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array
-from rovgraph.graph.assembly import Assembler, KeyframeMeasurement, LandmarkObservation
 from rovgraph.graph.information import OTHERS, knowledge
-from rovgraph.graph.keys import key, key_name
+from rovgraph.graph.keys import calibration_key, key, key_name
 from rovgraph.graph.marginals import covariances, marginals, newest_covariance
 from rovgraph.graph.places import matched
-from rovgraph.graph.preintegration import Snapshot
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.live.message import Reading
 from rovgraph.live.recorder import Recorder
@@ -317,7 +317,7 @@ def test_information_about_the_calibration_is_the_graphs_with_places_in_it(lost)
     names, column = best.problem.unknowns.estimated, OTHERS
     known = covariances(marginals(best.problem, solution))
     for name in names:
-        P = known[best.problem.unknowns.key(name, int(best.problem.segment[-1]))]
+        P = known[calibration_key(best.problem.unknowns, name, int(best.problem.segment[-1]))]
         own = slice(column, column + len(P))
         np.testing.assert_allclose(seen.covariance[-1][own, own], P, rtol=1e-4)
         column += len(P)

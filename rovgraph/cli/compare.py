@@ -39,11 +39,11 @@ def compare(
 
     from rovgraph.cli.progress import progress_bar
     from rovgraph.config import load_config
-    from rovgraph.studies.estimators import select
     from rovgraph.report.comparison import comparison_table, write_comparison
     from rovgraph.report.figure_compare import draw_comparison
     from rovgraph.report.folder import check_writable, results_folder
     from rovgraph.studies.compare import compare as library
+    from rovgraph.studies.estimators import select
 
     names = None if estimators is None else [name.strip() for name in estimators.split(",") if name.strip()]
     select(names)

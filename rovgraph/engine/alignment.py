@@ -86,10 +86,10 @@ def _variances(known: Gaussian) -> tuple[float, float]:
 def _levelled(known: Gaussian, interval: KeyframeInterval, gravity: float) -> Array:
     """The attitude whose down is that of the interval's mean specific force, where that can be gravity's."""
     R_nb: Array = known.state.R_nb[0]
-    if interval.pim is None or interval.bridged:
+    if interval.motion is None or interval.bridged:
         return R_nb
-    excess = known.state.bias[0, :3] - interval.pim.biasHat().accelerometer()
-    force_b = interval.pim.deltaVij() / interval.pim.deltaTij() - excess
+    excess = known.state.bias[0, :3] - interval.motion.bias[:3]
+    force_b = interval.motion.dv / interval.motion.duration - excess
     if abs(float(np.linalg.norm(force_b)) / gravity - 1.0) > AT_REST:
         return R_nb
     return matrix_from_rpy([*level_from_force(force_b), rpy_from_matrix(R_nb)[2]])

@@ -118,9 +118,7 @@ class ChainOptimum:
         """As `rovgraph.engine.optimum.Optimum`."""
         kept = self.unknowns.of(set(self.unknowns.estimated) - set(names))
         without = replace(self.chain, unknowns=kept)
-        begin = replace(
-            self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}}
-        )
+        begin = replace(self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}})
         solution = minimise(without, begin)
         full = self.chain.eliminate(solution.point, solution.gates)
         given = np.concatenate([np.r_[self.chain.layout[n][1]] for n in names])

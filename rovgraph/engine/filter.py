@@ -38,7 +38,7 @@ from rovgraph.engine.remembered_places import (
     without_oldest,
 )
 from rovgraph.engine.sensor_rows import compiled, measurement_row, sensor_table
-from rovgraph.engine.unknowns import unknowns
+from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.correction import correct, difference, linearize, move_estimate
@@ -149,11 +149,10 @@ class FilterEngine:
             H.append(own_H)
         return np.concatenate(r), np.vstack(H)
 
-    def block(self, measurements: Sequence[KeyframeMeasurement]) -> Block:
-        """Measurements of one sensor."""
-        return make_block(
-            measurements, self.initial.instruments[measurements[0].sensor], self._gravity, self.unknowns
-        )
+    def block(self, measurements: Sequence[KeyframeMeasurement], unknowns: Unknowns | None = None) -> Block:
+        """Measurements of one sensor; ``unknowns`` are the filter's own unless given."""
+        instrument = self.initial.instruments[measurements[0].sensor]
+        return make_block(measurements, instrument, self._gravity, unknowns or self.unknowns)
 
     def retract(self, known: Gaussian, delta: Array, P: Array) -> Gaussian:
         """The estimate that lies ``delta``, shape (d,), away; ``P``, shape (d, d), is its covariance at the old one."""
@@ -192,7 +191,7 @@ class FilterEngine:
         H = np.vstack([own for _, own in given]) if given else np.empty((0, self.layout.size))
         scaled = measurements[0].scale_to_bias is not None
         scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
-        rows = np.array([m.row_vector for m in measurements])
+        rows = np.array([measurement_row(m) for m in measurements])
         which = np.array([self._index[m.sensor] for m in measurements])
         x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
         since = np.array([(gates or {}).get(sensor, np.nan) for sensor in self._index])
@@ -228,7 +227,9 @@ class FilterEngine:
             return replace(known, places=seen_at(known.places, match.index, m.time))
         place = RememberedPlace(m.landmark.name, m.landmark.number, -m.sd * r, m.time)
         other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
-        processed.append(ProcessedMeasurement(m, before.x, before.c, nis, 1.0 if match is None else 0.0, other.position))
+        processed.append(
+            ProcessedMeasurement(m, before.x, before.c, nis, 1.0 if match is None else 0.0, other.position)
+        )
         P, places = with_another(before.P, before.places, place, m.sd[:, None] * H, m.sd)
         most = self.initial.config.place.remembered
         return Gaussian(before.x, before.c, *without_oldest(P, places, size, most))

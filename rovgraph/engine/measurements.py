@@ -54,7 +54,7 @@ class Block:
     gravity : [m/s^2]
     unknowns : the calibration variables that are estimated, of those that the instrument has
     window : along which the motion goes on to where a stamp that may be late belongs, or None
-    scale_to_bias : ndarray, shape (n, 6, 6), of `rovgraph.graph.scale`, or None where the IMU's scale is exact
+    scale_to_bias : ndarray, shape (n, 6, 6), of `rovgraph.engine.scale`, or None where the IMU's scale is exact
     place, believed : ndarray of int and of bool, shape (n,), of `LandmarkObservation`; place is -1,
         and all are believed, where it is no place that is measured
     """

@@ -102,7 +102,9 @@ class Match:
     nis: float
 
 
-def nearest(P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence[RememberedPlace], name: float) -> Match | None:
+def nearest(
+    P: Array, r: Array, H: Array, sd: Array, size: int, places: Sequence[RememberedPlace], name: float
+) -> Match | None:
     """The place of a name that a landmark fits best; None where there is none.
 
     Parameters
@@ -142,7 +144,9 @@ def with_another(
     return P, (*places, place)
 
 
-def without_oldest(P: Array, places: tuple[RememberedPlace, ...], size: int, most: int) -> tuple[Array, tuple[RememberedPlace, ...]]:
+def without_oldest(
+    P: Array, places: tuple[RememberedPlace, ...], size: int, most: int
+) -> tuple[Array, tuple[RememberedPlace, ...]]:
     """Without the place that was not seen for longest, where there are more than ``most``."""
     if len(places) <= most:
         return P, places

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
-from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
@@ -29,7 +29,7 @@ def dead_reckon(
 
     Parameters
     ----------
-    intervals : of `rovgraph.graph.assembly.Assembler`, the first without motion
+    intervals : of `rovgraph.engine.assembly.Assembler`, the first without motion
     beginning : the resolved start
     calibration : all calibration variables, at their means
 
@@ -42,7 +42,7 @@ def dead_reckon(
     attitudes, biases = [], []
     compass = _compass(beginning)
     for interval in intervals:
-        if interval.pim is not None:
+        if interval.motion is not None:
             R, bias = _turn(R, bias, interval, beginning, compass, calibration)
         attitudes.append(R)
         biases.append(bias.copy())
@@ -69,18 +69,18 @@ def _turn(
     calibration: Mapping[str, Array],
 ) -> tuple[Array, Array]:
     """Attitude and bias at the end of an interval."""
-    pim = interval.pim
-    assert pim is not None
-    dt = pim.deltaTij()
-    excess = bias - pim.biasHatVector()
-    turn = pim.deltaRij().matrix() @ exp_rotation(-dt * excess[3:])
+    motion = interval.motion
+    assert motion is not None
+    dt = motion.duration
+    excess = bias - motion.bias
+    turn = motion.dR @ exp_rotation(-dt * excess[3:])
     correction_n = np.zeros(3)
     for a in interval.measurements:
         if a.sensor == compass and a.keyframe == interval.index - 1:
             there = State((R @ a.motion.dR)[None], np.zeros((1, 3)), np.zeros((1, 3)), bias[None], calibration)
             error = yaw_correction(beginning.instruments[compass], a.z[None], there)[0]
             correction_n += FIRST_DOWN * wrap_angle(error) * min(dt / COMPASS_S, 1.0)
-    up_measured = turn.T @ (pim.deltaVij() / dt)
+    up_measured = turn.T @ (motion.dv / dt)
     up_measured = up_measured / max(float(np.linalg.norm(up_measured)), 1e-9)
     R = R @ turn
     correction = cross(up_measured, -R[2]) * min(dt / LEVEL_S, 1.0) + R.T @ correction_n

@@ -1,6 +1,6 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -8,10 +8,8 @@ from rovgraph.config import Config
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
-from rovgraph.graph.assembly import KeyframeInterval
 from rovgraph.log import Log
 
 Progress = Callable[[str, float], None]
@@ -57,52 +55,52 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     InputError : the log lacks what is needed, or does not determine some variable
     """
     beginning = initialise(log, config)
-    batch, estimates = assemble(log, beginning), []
-    if estimate != "filtered":
-        estimates.append(_solve(batch, progress))
-    if estimate != "smoothed":
-        estimates.append(_filter(batch, progress))
+    batch = assemble(log, beginning)
+    if config.graph.solver == "isam2":
+        both = _isam2(batch, progress)
+        estimates = [one for one in both if estimate in ("both", one.kind)]
+    else:
+        estimates = []
+        if estimate != "filtered":
+            estimates.append(_solve(batch, progress))
+        if estimate != "smoothed":
+            estimates.append(_filter(batch, progress))
     return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
 
 
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
     """All keyframes of a log and what lies between them."""
     batch = BatchSmoother(beginning)
-    for measurement in log.measurements():
-        batch.add(measurement)
-    batch.finish()
+    batch.take(log)
     return batch
 
 
 def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
     progress("smoothing", 0.1)
-    if batch.beginning.config.graph.solver == "isam2":
-        solver = run(batch.intervals, batch.beginning, progress)
-        anew = batch.placed_again(solver.latest().calibration)
-        return (solver if anew is None else run(anew.intervals, anew.beginning, progress)).solve()
     return batch.solve()
 
 
-def _filter(batch: BatchSmoother, progress: Progress = no_progress) -> Estimate:
+def _filter(batch: BatchSmoother, progress: Progress) -> Estimate:
     filtering = partial(progress, "filtering")
-    if not batch.measurements:
+    measurements = batch.measurements
+    if not measurements:
         return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering).solve()
     estimator = ErrorStateFilter(batch.beginning, REINITIALISE_AT_S)  # learns how late they are while they come
-    for k, measurement in enumerate(batch.measurements):
+    for k, measurement in enumerate(measurements):
         if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:
-            filtering(k / len(batch.measurements))
+            filtering(k / len(measurements))
     estimator.finish()
     return estimator.solve()
 
 
-def run(
-    intervals: Sequence[KeyframeInterval], beginning: InitialConditions, progress: Progress = no_progress
-) -> IncrementalEstimator:
-    """Feed intervals to iSAM2."""
-    estimator = IncrementalEstimator(beginning)
-    for interval in intervals:
-        estimator.step(interval)
-        if interval.index % PROGRESS_EVERY == 0:
-            progress("incremental smoothing", interval.index / len(intervals))
-    estimator.update()
-    return estimator
+def _isam2(batch: BatchSmoother, progress: Progress) -> list[Estimate]:
+    """Smoothed and filtered, of one pass of iSAM2, or of two where late stamps were found to belong elsewhere."""
+    from rovgraph.estimators.incremental import run_isam2  # GTSAM is slow to load, and not everywhere to be had
+
+    progress("incremental smoothing", 0.0)
+    report = partial(progress, "incremental smoothing")
+    solver = run_isam2(batch.intervals, batch.beginning, report)
+    again = batch.placed_again(solver.latest().calibration)
+    if again is not None:
+        solver = run_isam2(again.intervals, again.beginning, report)
+    return [solver.solve(), solver.filtered()]

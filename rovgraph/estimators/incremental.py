@@ -1,59 +1,66 @@
-"""Incremental smoothing: iSAM2 over the whole dive, behind the error-state filter.
+"""iSAM2 over a whole dive: an incremental graph that is a filter at its newest keyframe and a smoother behind it.
 
-The filter goes ahead, keeps out what disagrees, and gives iSAM2 its initial values; iSAM2
-takes the keyframes in portions and smooths all of them. A constant that all keyframes share
-would make every update touch the whole tree, so each constant of the calibration is a row of
-nearly equal ones, one for each segment of time.
+Each interval is predicted with the IMU from the graph's own newest keyframe, and measurements are gated by their
+innovations against the graph's own joint covariance there (`FilterEngine.step`, from what iSAM2 knows); what was let
+in becomes factors, and after the update the newest keyframe is the filtered estimate. In the end all keyframes
+are smoothed. A constant that all keyframes share would make every update touch the whole tree, so each constant of
+the calibration is a row of nearly equal ones, one for each segment of time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
+from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.filter import FilterEngine
+from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
+from rovgraph.engine.unknowns import unknowns
+from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement
 from rovgraph.estimators.smoother import smoothed
-from rovgraph.graph.assembly import Assembler, KeyframeInterval
-from rovgraph.graph.batch import make_problem, solution_at
 from rovgraph.graph.factors import drift, landmark_prior, motion, priors
 from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.keys import unknowns
-from rovgraph.engine.measurements import make_block
-from rovgraph.graph.places import Optimum, insert_places, settled
+from rovgraph.graph.measurement_factors import measurement_factor
+from rovgraph.graph.optimum import GraphOptimum
+from rovgraph.graph.places import insert_places, resolved_associations, segmented_problem
 from rovgraph.graph.values import insert_calibration, state_values
 from rovgraph.log import Measurement
-from rovgraph.state import State, stack_states
+from rovgraph.state import State
 
-UPDATE_S = 1.0  # of the dive, between updates of iSAM2
+UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
 STIFF = 2e-4  # walk of a constant, as a part of its prior's sd per root second
 
 
 @dataclass
 class IncrementalEstimator:
-    """iSAM2 over the whole dive, fed measurement by measurement, or with keyframes of a filter.
+    """iSAM2 over the whole dive, fed measurement by measurement or interval by interval.
 
     Attributes
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
-    update_s : of the dive, between updates of iSAM2 [s]
+    update_s : of the dive, between updates of iSAM2; in between, the filter goes on from it [s]
     intervals : the dive, as far as it has been taken
+    known : Gaussian of the newest keyframe
+    history : the filtered estimate of every keyframe
     updated : newest keyframe that iSAM2 has, -1 = none
     """
 
     beginning: InitialConditions
-    update_s: float = UPDATE_S
+    update_s: float = 0.0
 
     def __post_init__(self) -> None:
         b = self.beginning
+        self.filter = FilterEngine(b)
+        self.known = self.filter.start()
+        self.history = FilterHistory(self.filter)
+        self.gates: Gates = {}
         self.beliefs = {name: _stiff(belief) for name, belief in beliefs(b.config).items()}
         self.unknowns = unknowns(self.beliefs, b.instruments)
         self.engine = Incremental(self.unknowns)
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0])
         self.intervals: list[KeyframeInterval] = []
-        self._filter: ErrorStateFilter | None = None
         self._places: set[int] = set()  # that iSAM2 knows
         self._begun = 0.0  # when the newest segment began [s]
         self.updated = -1
@@ -68,72 +75,98 @@ class IncrementalEstimator:
         self.update()
         return done
 
-    def step(self, interval: KeyframeInterval) -> None:
-        """Take an interval by way of a filter of its own."""
-        if self._filter is None:
-            self._filter = ErrorStateFilter(self.beginning, REINITIALISE_AT_S)
-        used = self._filter.step(interval)
-        self.take(interval, self._filter.filtered[-1], used)
+    def step(self, interval: KeyframeInterval) -> FilterStep:
+        """Take an interval: predicted and gated from what iSAM2 knows of the keyframe before, then given to it."""
+        done = self.filter.step(interval, self.known, self.gates)
+        self.known = done.filtered
+        self.take(interval, self.known, done.processed)
+        self.history.append(interval, self.known, done.processed)
+        return done
 
-    def take(self, interval: KeyframeInterval, known: Gaussian, used: Sequence[ProcessedMeasurement]) -> None:
-        """Take a keyframe of a filter.
+    def take(self, interval: KeyframeInterval, known: Gaussian, processed: Sequence[ProcessedMeasurement]) -> None:
+        """Take a keyframe with what of its measurements was let in.
 
         Parameters
         ----------
         interval : the keyframe's
-        known : the filter's estimate of it
-        used : what the filter let in, or kept out
+        known : where to linearise it at first
+        processed : its measurements
         """
         b, segment = self.beginning, interval.segment
-        factors = motion(interval, self.unknowns) if self.intervals else priors(b.prior, self.beliefs, self.unknowns)
+        first = not self.intervals
+        factors = priors(b.prior, self.beliefs, self.unknowns) if first else motion(interval, self.unknowns, segment)
         values = state_values(interval.index, known.state)
-        if not self.intervals or segment > self.intervals[-1].segment:
+        if first or segment > self.intervals[-1].segment:
             factors += drift(self.unknowns, segment, interval.time - self._begun)
             insert_calibration(values, known.state.calibration, self.unknowns, segment)
             self._begun = interval.time
-        for one in used:
+        for one in processed:
             landmark = one.measurement.landmark
             if one.weight > 0.0 or landmark is not None:  # a place that fits none of its name is one by itself
-                instrument = b.instruments[one.measurement.sensor]
-                block = make_block([one.measurement], instrument, b.config.environment.gravity_mps2, self.unknowns)
-                factors.append(block.custom_factor())
+                block = self.filter.block([one.measurement], self.unknowns)
+                factors.append(measurement_factor(block, one.measurement.segment))
                 if landmark is not None and landmark.number not in self._places:
                     self._places.add(landmark.number)
-                    insert_places(values, block, one.state)
+                    insert_places(values, block, known.state)
                     factors.append(landmark_prior(landmark.number))
         self.engine.add(factors, values)
-        if any(a.landmark for a in interval.measurements):
-            interval = replace(interval, measurements=[one.measurement for one in used])
+        if any(m.landmark for m in interval.measurements):
+            interval = replace(interval, measurements=[one.measurement for one in processed])
         self.intervals.append(interval)
         if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
             self.update()
 
     def update(self) -> None:
-        """Have iSAM2 take what has come since."""
+        """Have iSAM2 take what has come since; the filter goes on from its newest keyframe."""
+        if self.updated == len(self.intervals) - 1:
+            return
         self.engine.update()
         self.updated = len(self.intervals) - 1
+        newest = self.intervals[-1]
+        places = [place.number for place in self.known.places]
+        state, P, positions = self.engine.newest(newest.index, newest.segment, places)
+        remembered = tuple(replace(p, position=q) for p, q in zip(self.known.places, positions, strict=True))
+        self.known = Gaussian.of(state, P, remembered)
 
     def latest(self) -> State:
-        """The newest keyframe that iSAM2 has taken, at the IMU, calibration included."""
-        newest = self.intervals[self.updated]
-        return self.engine.state(newest.index, newest.segment)
+        """The newest keyframe's state, at the IMU, calibration included."""
+        return self.known.state
 
-    def states(self) -> State:
-        """All keyframes that iSAM2 has taken, from all data so far."""
-        return stack_states([self.engine.state(i.index, i.segment) for i in self.intervals[: self.updated + 1]])
+    def states(self) -> list[State]:
+        """Of each keyframe that iSAM2 has taken, from all data so far."""
+        return [self.engine.state(i.index, i.segment) for i in self.intervals[: self.updated + 1]]
+
+    def filtered(self) -> Estimate:
+        """What was known of each keyframe when it was the newest."""
+        return self.history.estimate("filtered")
 
     def solve(self) -> Estimate:
         """The smoothed trajectory with its uncertainty."""
         self.update()
-        b = self.beginning
-        intervals = settled(self.intervals)
-        problem = make_problem(intervals, b.prior, b.config, self.beliefs, b.instruments)
-        return smoothed(Optimum(intervals, problem, solution_at(problem, self.engine.values())), b)
+        intervals = resolved_associations(self.intervals)
+        problem, solution = segmented_problem(intervals, self.beginning, self.beliefs, self.engine.values())
+        return smoothed(GraphOptimum(intervals, self.beginning, self.beliefs, problem, solution), self.beginning)
 
     def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
         for interval in intervals:
             self.step(interval)
         return intervals
+
+
+def run_isam2(
+    intervals: Sequence[KeyframeInterval],
+    beginning: InitialConditions,
+    progress: Callable[[float], None] = lambda done: None,
+    update_s: float = 0.0,
+) -> IncrementalEstimator:
+    """iSAM2 that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
+    estimator = IncrementalEstimator(beginning, update_s)
+    for interval in intervals:
+        estimator.step(interval)
+        if interval.index % 50 == 0:
+            progress(interval.index / len(intervals))
+    estimator.update()
+    return estimator
 
 
 def _stiff(belief: Belief) -> Belief:

@@ -11,11 +11,11 @@ import numpy as np
 
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
+from rovgraph.engine.noise_floor import NOISIER
+from rovgraph.engine.preintegration import scatter
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
 from rovgraph.geometry import Array, level_from_force, matrix_from_rpy, rpy_from_matrix
-from rovgraph.graph.noise_floor import NOISIER
-from rovgraph.graph.preintegration import scatter
 from rovgraph.instruments import Instrument, heading_sources, instruments
 from rovgraph.log import Log
 from rovgraph.state import State

@@ -101,9 +101,7 @@ def relative_sd(best: Optimum, sd: Mapping[str, Array], prior: Mapping[str, Arra
     return dict(zip(ratio, parts, strict=True))
 
 
-def spuriously_observable(
-    unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]
-) -> list[str]:
+def spuriously_observable(unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
     """Constant variables that are unobservable, and that noise can have moved all the same.
 
     Parameters

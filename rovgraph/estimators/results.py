@@ -7,11 +7,11 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.calibration import TABLE, Belief
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
 from rovgraph.estimators.observability import verdict
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
-from rovgraph.graph.assembly import KeyframeInterval
-from rovgraph.engine.measurements import Block
 from rovgraph.sensors import innovation
 from rovgraph.state import State
 from rovgraph.trajectory import Trajectory

@@ -23,7 +23,7 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array
-from rovgraph.log import Measurement
+from rovgraph.log import Log, Measurement
 from rovgraph.state import BIAS, POSE, VELOCITY
 
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
@@ -40,7 +40,6 @@ class BatchSmoother:
     beginning : of `rovgraph.estimators.initialise.initialise`
     time_offsets : how late they are; None = as the configuration believes
     intervals : the dive, as far as it has been taken
-    measurements : the same as they came, kept where their time_offset is estimated
     """
 
     beginning: InitialConditions
@@ -50,12 +49,27 @@ class BatchSmoother:
         b = self.beginning
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], assumed=self.time_offsets)
         self.intervals: list[KeyframeInterval] = []
-        self.measurements: list[Measurement] = []
+        self._log: Log | None = None
+        self._measurements: list[Measurement] = []
+
+    def take(self, log: Log) -> list[KeyframeInterval]:
+        """Take a whole log, before anything else: what `add` of each of its measurements and `finish` give."""
+        self._log = log
+        done = self.assembler.take(log)
+        self.intervals += done
+        return done
+
+    @property
+    def measurements(self) -> list[Measurement]:
+        """The dive as it came, where the time offset of a sensor is estimated; else none."""
+        if self._log is None or not self.assembler.time_offsets.lags:
+            return self._measurements
+        return list(self._log.measurements())
 
     def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
         if self.assembler.time_offsets.lags:
-            self.measurements.append(measurement)
+            self._measurements.append(measurement)
         done = self.assembler.add(measurement)
         self.intervals += done
         return done
@@ -94,7 +108,10 @@ class BatchSmoother:
         if self.assembler.time_offsets.off(calibration) < PLACED_WITHIN_S:
             return None
         anew = BatchSmoother(self.beginning, self.assembler.time_offsets.centred(calibration, CENTRED_REACH_S))
-        for measurement in self.measurements:
+        if self._log is not None:
+            anew.take(self._log)
+            return anew
+        for measurement in self._measurements:
             anew.add(measurement)
         anew.finish()
         return anew

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -42,25 +43,26 @@ class Problem:
     ----------
     native : priors and IMU factors
     blocks : sensor -> Block
-    count : of keyframes
     unknowns : the calibration variables
+    index : ndarray of int, shape (n,), of the value that calibration which walks has at each keyframe, from 0
+        and by steps of 0 or 1
     """
 
     native: gtsam.NonlinearFactorGraph
     blocks: dict[str, Block]
-    count: int
     unknowns: Unknowns
+    index: NDArray[np.int64]
+
+    @property
+    def count(self) -> int:
+        """Number of keyframes."""
+        return len(self.index)
 
     @cached_property
     def rows(self) -> list[Rows]:
         """Of the measurements; those of places touch a variable more."""
         kinds = ({s: b for s, b in self.blocks.items() if (s == "place") == seen} for seen in (False, True))
-        return [Rows(kind) for kind in kinds if kind]
-
-    @cached_property
-    def index(self) -> NDArray[np.int64]:
-        """Index of the value that calibration which walks has at each keyframe."""
-        return np.arange(self.count)
+        return [Rows(kind, self.index) for kind in kinds if kind]
 
     def states(self, values: gtsam.Values) -> State:
         """State of every keyframe."""
@@ -124,7 +126,7 @@ class Problem:
         graph = gtsam.NonlinearFactorGraph(self.native)
         for block in self.blocks.values():
             for k in range(len(block)):
-                graph.add(measurement_factor(block.at(slice(k, k + 1)), int(block.keyframe[k])))
+                graph.add(measurement_factor(block.at(slice(k, k + 1)), int(self.index[block.keyframe[k]])))
         return graph
 
 
@@ -134,31 +136,33 @@ def make_problem(
     config: Config,
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],
+    index: NDArray[np.int64] | None = None,
 ) -> Problem:
-    """Assemble the graph of a dive."""
+    """Assemble the graph of a dive; ``index`` as `Problem` has it, a value for each keyframe unless given."""
+    index = np.arange(len(intervals)) if index is None else index
     wanted = unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
     factors = priors(prior, beliefs, wanted)
-    for k, interval in enumerate(intervals):
-        factors += motion(interval, wanted, k)
-        if k:
-            factors += drift(wanted, k, interval.time - intervals[k - 1].time)
+    for interval, own in zip(intervals, index.tolist(), strict=True):
+        factors += motion(interval, wanted, own)
+    begun = np.flatnonzero(np.diff(index, prepend=-1))
+    for before, after in pairwise(begun.tolist()):
+        factors += drift(wanted, int(index[after]), intervals[after].time - intervals[before].time)
     blocks = blocks_of(intervals, instruments, config.environment.gravity_mps2, wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
     native = gtsam.NonlinearFactorGraph()
     for factor in factors:
         native.add(factor)
-    return Problem(native, blocks, len(intervals), wanted)
+    return Problem(native, blocks, wanted, index)
 
 
 def make_values(problem: Problem, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:
     """GTSAM values of the keyframes' states, calibration at its means unless given; without places."""
     values = gtsam.Values()
-    walks = any(problem.unknowns.walks.values())
     for i in range(problem.count):
         insert_state(values, i, states.at([i]))
-        if i == 0 or walks:
-            insert_calibration(values, calibration or problem.unknowns.fixed, problem.unknowns, i)
+    for own in range(int(problem.index[-1]) + 1) if any(problem.unknowns.walks.values()) else (0,):
+        insert_calibration(values, calibration or problem.unknowns.fixed, problem.unknowns, own)
     return values
 
 

@@ -4,19 +4,17 @@ Batch and iSAM2 consume the same lists.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from rovgraph.calibration import Belief
+from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.initial_conditions import StatePrior
-from rovgraph.graph.assembly import KeyframeInterval
-from rovgraph.graph.coasting import coasted, coasting_factor, in_outage
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.graph.keys import calibration_key, key
-from rovgraph.graph.scale import SCALES, biased, scaled_factor
-from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY, State
+from rovgraph.graph.motion_factors import motion_factor
+from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY
 
 Factor = gtsam.NonlinearFactor
 ANYWHERE_M = 1e5  # sd of the prior of a place, about the origin
@@ -48,26 +46,11 @@ def landmark_prior(number: int) -> Factor:
 
 
 def motion(interval: KeyframeInterval, unknowns: Unknowns, index: int) -> list[Factor]:
-    """The factor between the keyframe before and the one that ends the interval: the IMU's, or of coasting.
+    """The factor between the keyframe before and the one that ends the interval, where there is one.
 
     ``index`` is that of the value which calibration that walks has there.
     """
-    if interval.pim is None:
-        return []
-    if in_outage(interval):
-        return [coasting_factor(interval)]
-    if interval.scale_to_bias is None:
-        return [unscaled(interval)]
-    keys = {name: calibration_key(unknowns, name, index) for name in SCALES if name in unknowns.walks}
-    return [scaled_factor(unscaled(interval), interval.scale_to_bias, unknowns.fixed, keys)]
-
-
-def unscaled(interval: KeyframeInterval) -> gtsam.CombinedImuFactor:
-    """GTSAM's own factor of an interval with motion, which knows no scales."""
-    assert interval.pim is not None
-    i, j = interval.index - 1, interval.index
-    before, after = (key(POSE, i), key(VELOCITY, i)), (key(POSE, j), key(VELOCITY, j))
-    return gtsam.CombinedImuFactor(*before, *after, key(BIAS, i), key(BIAS, j), interval.pim)
+    return [] if interval.motion is None else [motion_factor(interval, unknowns, index)]
 
 
 def drift(unknowns: Unknowns, index: int, duration: float) -> list[Factor]:
@@ -83,23 +66,3 @@ def drift(unknowns: Unknowns, index: int, duration: float) -> list[Factor]:
         )
         for name in unknowns.begun_by(index)
     ]
-
-
-def predict(interval: KeyframeInterval, state: State) -> State:
-    """The state at the end of an interval, from the IMU alone, or from nothing while it is silent.
-
-    Parameters
-    ----------
-    interval : with motion
-    state : State of one epoch, of the keyframe before
-    """
-    if in_outage(interval):
-        return coasted(interval, state)
-    assert interval.pim is not None
-    scale_to_bias = state if interval.scale_to_bias is None else biased(state, interval.scale_to_bias[None])
-    bias = gtsam.imuBias.ConstantBias(scale_to_bias.bias[0, :3], scale_to_bias.bias[0, 3:])
-    before = gtsam.NavState(gtsam.Rot3(state.R_nb[0]), state.p_n[0], state.v_n[0])
-    after = interval.pim.predict(before, bias)
-    # in rows: products of matrices in columns round otherwise, and filters side by side are to be as each alone
-    R_nb = np.ascontiguousarray(after.attitude().matrix())
-    return replace(state, R_nb=R_nb[None], p_n=after.position()[None], v_n=after.velocity()[None])

@@ -6,16 +6,18 @@ reference to the linearisation point that is kept here lets the bindings hand th
 instead of a copy, without which the cost of a callback grows with the dive.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import gtsam
 import numpy as np
 
 from rovgraph.calibration import TABLE
+from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
+from rovgraph.geometry import Array
 from rovgraph.graph.batch import indeterminate
-from rovgraph.graph.keys import Unknowns, key
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.graph.keys import calibration_key, key
+from rovgraph.state import BIAS, PLACE, POSE, VELOCITY, State
 
 # Changes beyond which iSAM2 relinearises a variable. Positions and velocities too: the IMU's
 # factor multiplies them with the attitude.
@@ -80,22 +82,42 @@ class Incremental:
         except RuntimeError as error:
             raise InputError(indeterminate(error)) from None
 
-    def copy_values(self) -> None:
-        """Let the bindings copy all values for each callback, as they do by themselves: to measure what that costs."""
-        del self._theta
-
     def state(self, index: int, segment: int) -> State:
         """Estimate of a keyframe, as a `State` of one epoch, calibration included."""
         engine, unknowns = self._engine, self._unknowns
         pose = engine.calculateEstimatePose3(key(POSE, index))
         names = unknowns.estimated
-        calibration = {name: engine.calculateEstimateVector(unknowns.key(name, segment)) for name in names}
+        calibration = {name: engine.calculateEstimateVector(calibration_key(unknowns, name, segment)) for name in names}
         return State(
             pose.rotation().matrix()[None],
             pose.translation()[None],
             engine.calculateEstimateVector(key(VELOCITY, index))[None],
             engine.calculateEstimateConstantBias(key(BIAS, index)).vector()[None],
             {**unknowns.fixed, **calibration},
+        )
+
+    def newest(self, index: int, segment: int, places: Sequence[int]) -> tuple[State, Array, list[Array]]:
+        """The newest keyframe, its joint covariance with the calibration there and with places, and where these are.
+
+        Parameters
+        ----------
+        index, segment : of the keyframe
+        places : numbers of places
+
+        Returns
+        -------
+        state : State of one epoch
+        P : ndarray, shape (d, d), pose, velocity, bias, calibration in the order of `Unknowns`, places
+        positions : ndarray, shape (2,), for each place
+        """
+        keys = [key(v, index) for v in (POSE, VELOCITY, BIAS)]
+        keys += [calibration_key(self._unknowns, name, segment) for name in self._unknowns.estimated]
+        keys += [key(PLACE, number) for number in places]
+        P = self._engine.jointMarginalCovariance(keys).fullMatrix()
+        return (
+            self.state(index, segment),
+            P,
+            [self._engine.calculateEstimateVector(k) for k in keys[len(keys) - len(places) :]],
         )
 
     def values(self) -> gtsam.Values:

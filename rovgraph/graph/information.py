@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from rovgraph.errors import InputError
-from rovgraph.geometry import Array
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.optimum import Knowledge
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
 from rovgraph.graph.batch import Problem, indeterminate
 from rovgraph.graph.keys import calibration_key, is_place, key, key_index
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
@@ -36,7 +36,7 @@ def knowledge(problem: Problem, values: gtsam.Values, gates: Gates, keyframes: S
     for end, piece in zip(keyframes, _pieces(problem, problem.linearize(values, gates), keyframes), strict=True):
         piece.push_back(left)
         last = [key(v, end) for v in (POSE, VELOCITY, BIAS)]
-        last += [key(POSE, 0), *_calibration(problem, end)]
+        last += [key(POSE, 0), *_calibration(problem, int(problem.index[end]))]
         open_places = _seen_again(problem, end)
         left, root = eliminate(piece, last + open_places)
         own = len(root) - PLACE_DIM * len(open_places)
@@ -71,7 +71,7 @@ def noise_of_states(problem: Problem, values: gtsam.Values, gates: Gates, seed: 
     problem, values, gates : the dive, and where to linearise it
     seed : of the draw
     """
-    held = list(dict.fromkeys(one for k in range(problem.count) for one in _calibration(problem, k)))
+    held = list(dict.fromkeys(one for k in range(int(problem.index[-1]) + 1) for one in _calibration(problem, k)))
     net, rng = _sequential(problem.linearize(values, gates), held), np.random.default_rng(seed)
     white, first_held = gtsam.VectorValues(), net.size() - len(held)
     for i in range(net.size()):
@@ -139,6 +139,7 @@ def _pieces(
     problem: Problem, linear: gtsam.GaussianFactorGraph, ends: Sequence[int]
 ) -> list[gtsam.GaussianFactorGraph]:
     """Factors by the piece of the dive that they complete; ``ends`` are the last keyframes of each."""
+    begun = np.searchsorted(problem.index, np.arange(int(problem.index[-1]) + 1))  # first keyframe of a value
     first_seen = {}
     if "place" in problem.blocks:
         block = problem.blocks["place"]
@@ -148,7 +149,7 @@ def _pieces(
     for k in range(linear.size()):
         keys = linear.at(k).keys()
         own = [key_index(one) for one in keys if not is_place(one)]
-        newest.append(max((i for i in own), default=first_seen.get(keys[0], 0)))
+        newest.append(max((i if state else begun[i] for state, i in own), default=first_seen.get(keys[0], 0)))
     for k, piece in enumerate(np.searchsorted(ends, newest).tolist()):
         if piece < len(pieces):
             pieces[piece].push_back(linear.at(k))

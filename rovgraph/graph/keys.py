@@ -14,6 +14,8 @@ _DIMENSION = {
     for variable, dim in (DIMENSION | {PLACE: PLACE_DIM} | {v.name: v.dim for v in TABLE.values()}).items()
 }
 
+_STATES = {_FIRST[variable] // _INDICES for variable in DIMENSION}
+
 
 def key(variable: str, index: int = 0) -> int:
     """Key of a state variable at a keyframe, or of a calibration variable.
@@ -36,9 +38,10 @@ def is_place(key: int) -> bool:
     return key // _INDICES == _FIRST[PLACE] // _INDICES
 
 
-def key_index(key: int) -> int:
-    """Index of a key's keyframe; 0 of a constant."""
-    return key % _INDICES
+def key_index(key: int) -> tuple[bool, int]:
+    """Whether a key is of a keyframe's state, and the index of its keyframe, else of its value."""
+    letter, index = divmod(key, _INDICES)
+    return letter in _STATES, index
 
 
 def key_name(key: int) -> str:

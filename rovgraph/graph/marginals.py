@@ -6,9 +6,9 @@ from itertools import accumulate
 import gtsam
 import numpy as np
 
+from rovgraph.engine.gauss_newton import Gates
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.engine.gauss_newton import Gates
 from rovgraph.graph.batch import Problem, indeterminate
 from rovgraph.graph.keys import calibration_key, dimension, key
 from rovgraph.state import DIMENSION, PLACE
@@ -39,7 +39,7 @@ def newest_covariance(problem: Problem, values: gtsam.Values, gates: Gates, plac
     """
     linear = problem.linearize(values, gates)
     last = [key(v, problem.count - 1) for v in DIMENSION]
-    last += [calibration_key(problem.unknowns, name, problem.count - 1) for name in problem.unknowns.estimated]
+    last += [calibration_key(problem.unknowns, name, int(problem.index[-1])) for name in problem.unknowns.estimated]
     last += [key(PLACE, number) for number in places]
     before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
     for one in last:

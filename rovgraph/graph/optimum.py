@@ -115,7 +115,7 @@ class GraphOptimum:
     def _keys(self, variable: str) -> list[int]:
         """Keys of a variable at every keyframe."""
         if variable in TABLE:
-            return [calibration_key(self.unknowns, variable, k) for k in range(self.problem.count)]
+            return [calibration_key(self.unknowns, variable, k) for k in self.problem.index.tolist()]
         return [key(variable, k) for k in range(self.problem.count)]
 
 

@@ -23,6 +23,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from rovgraph.calibration import Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.filter import ORIGIN
@@ -30,12 +31,13 @@ from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, make_problem, make_values, solve
+from rovgraph.graph.batch import Problem, make_problem, make_values, solution_at, solve
 from rovgraph.graph.information import eliminate
 from rovgraph.graph.keys import key
 from rovgraph.graph.optimum import GraphOptimum
 from rovgraph.instruments import Instrument
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, POSE, State
+
 
 def smooth_graph(
     intervals: Sequence[KeyframeInterval],
@@ -67,8 +69,24 @@ def smooth_graph(
     return GraphOptimum(recognised_dive, initial, beliefs, together, solve(together, values))
 
 
+def segmented_problem(
+    intervals: Sequence[KeyframeInterval],
+    initial: InitialConditions,
+    beliefs: Mapping[str, Belief],
+    values: gtsam.Values,
+) -> tuple[Problem, Solution[gtsam.Values]]:
+    """The graph whose calibration has a value for each segment of time, and the optimum that iSAM2 has found of it."""
+    segments = np.array([interval.segment for interval in intervals])
+    problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments, segments)
+    return problem, solution_at(problem, values)
+
+
 def recognised(
-    seen: Sequence[KeyframeMeasurement], instrument: Instrument, gravity: float, problem: Problem, solution: Solution[gtsam.Values]
+    seen: Sequence[KeyframeMeasurement],
+    instrument: Instrument,
+    gravity: float,
+    problem: Problem,
+    solution: Solution[gtsam.Values],
 ) -> dict[float, KeyframeMeasurement]:
     """Sightings of what is seen more than once, by their times, each given to its place.
 

@@ -10,11 +10,12 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.calibration import TABLE
+from rovgraph.engine.measurements import Block
 from rovgraph.geometry import Array
 from rovgraph.graph.keys import key
-from rovgraph.engine.measurements import Block
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, Jacobians
 
 _unit = cache(gtsam.noiseModel.Unit.Create)
@@ -26,9 +27,10 @@ class Rows:
     Parameters
     ----------
     blocks : sensor -> Block, at least one; either of places or of none
+    value : index of the value that calibration which walks has at each keyframe
     """
 
-    def __init__(self, blocks: Mapping[str, Block]) -> None:
+    def __init__(self, blocks: Mapping[str, Block], value: NDArray[np.int64]) -> None:
         every, self._sensors = list(blocks.values()), list(blocks)
         walks = {name: walk for block in every for name, walk in block.unknowns.walks.items()}
         touched = {variable for block in every for variable in block.variables}
@@ -46,7 +48,7 @@ class Rows:
         other = np.diff(keyframe[order], prepend=-1).astype(bool) | np.diff(place[order], prepend=-2).astype(bool)
         begun = order[np.flatnonzero(other)]  # the first measurement of each factor
         index = dict.fromkeys(DIMENSION, keyframe) | {PLACE: place}
-        index |= {v: keyframe if walk else 0 * keyframe for v, walk in walks.items()}
+        index |= {v: value[keyframe] if walk else 0 * keyframe for v, walk in walks.items()}
         self._keys: list[list[int]] = np.column_stack([key(v) + index[v][begun] for v in self._sizes]).tolist()
         self._of_factor = [slice(a, b) for a, b in pairwise([*first[begun].tolist(), self._count])]
 

@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.geometry import Array
 from rovgraph.engine.unknowns import Unknowns
+from rovgraph.geometry import Array
 from rovgraph.graph.keys import calibration_key, key
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 

@@ -131,7 +131,16 @@ def load_measurements(
 
 @helper
 def load_motion(
-    W: Array, scale: Array, k: int, A_i: Array, A_j: Array, C: Array, targets: Index, r: Array, walk: Array, walk_r: Array
+    W: Array,
+    scale: Array,
+    k: int,
+    A_i: Array,
+    A_j: Array,
+    C: Array,
+    targets: Index,
+    r: Array,
+    walk: Array,
+    walk_r: Array,
 ) -> None:
     """Rows of the motion after keyframe k, below the d rows of it; ``scale`` becomes that of the keyframe after it."""
     s, d = A_i.shape[1], A_i.shape[1] + walk.shape[1]

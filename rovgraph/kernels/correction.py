@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.kernels.change_of_basis import change_basis
 from rovgraph.kernels.compass import wrap
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.change_of_basis import change_basis
 from rovgraph.kernels.error_coordinates import ErrorLayout, local, make_scratch, retract
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.measurement_row import (
@@ -84,9 +84,7 @@ def move_estimate(
     move(x, c, P, delta, ErrorLayout(columns, seen, seen_params, basis_rows))
 
 
-@kernel(
-    "void(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8[:, ::1])"
-)
+@kernel("void(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8[:, ::1])")
 def difference(
     x: Array,
     c: Array,

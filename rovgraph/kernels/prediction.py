@@ -45,9 +45,7 @@ def carry(P: Array, F: Array, Q: Array) -> None:
             P[i, j] += Q[i, j]
 
 
-@kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])"
-)
+@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])")
 def predict_filter(
     x: Array,
     c: Array,

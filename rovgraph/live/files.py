@@ -14,8 +14,8 @@ import pymap3d
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
+from rovgraph.estimators.estimate import Estimate
 from rovgraph.live.checkpoint import read_checkpoint
 from rovgraph.live.keeper import Keeper
 from rovgraph.live.navigator import Navigator

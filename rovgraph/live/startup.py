@@ -6,8 +6,8 @@ from rovgraph.check.values import angles, gravity, turn_rates
 from rovgraph.config import Config
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
-from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
 from rovgraph.estimators.eskf.fixed_lag import place
+from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
 from rovgraph.estimators.initialise import initialise
 from rovgraph.log import Measurement
 from rovgraph.log.streams import gathered

@@ -3,7 +3,7 @@
 import math
 import re
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -130,18 +130,33 @@ class Log:
 
         So a ping makes its keyframe before what was measured together with it is attached.
         """
-        streams = sorted(self.streams.values(), key=lambda s: precedence(s.sensor))
+        streams = in_precedence(self.streams.values())
         if not streams:
             return
-        time = np.concatenate([s.time for s in streams])
-        which = np.repeat(np.arange(len(streams)), [len(s) for s in streams])
-        index = np.concatenate([np.arange(len(s)) for s in streams])
-        row = np.concatenate([s.row for s in streams])
-        order = np.argsort(time, kind="stable")
-        names, data = [s.sensor for s in streams], [s.data for s in streams]
-        columns = (a[order].tolist() for a in (time, which, index, row))
-        for t, k, i, line in zip(*columns, strict=True):
-            yield Measurement(t, names[k], data[k][i], line)
+        which, index, time = arrivals(streams)
+        names, data, rows = [s.sensor for s in streams], [s.data for s in streams], [s.row.tolist() for s in streams]
+        for t, k, i in zip(time.tolist(), which.tolist(), index.tolist(), strict=True):
+            yield Measurement(t, names[k], data[k][i], rows[k][i])
+
+
+def in_precedence(streams: Iterable[Stream]) -> list[Stream]:
+    """Streams in the order of their measurements of one time."""
+    return sorted(streams, key=lambda s: precedence(s.sensor))
+
+
+def arrivals(streams: Sequence[Stream]) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """The measurements of some streams, at least one, in the order of time; of equal times in that of streams.
+
+    Returns
+    -------
+    which, index : ndarray of int, shape (n,), the stream of each, and its place in it
+    time : ndarray, shape (n,) [s]
+    """
+    time = np.concatenate([s.time for s in streams])
+    which = np.repeat(np.arange(len(streams)), [len(s) for s in streams])
+    index = np.concatenate([np.arange(len(s)) for s in streams])
+    order = np.argsort(time, kind="stable")
+    return which[order], index[order], time[order]
 
 
 def gathered(measurements: Iterable[Measurement], source: str, origin: tuple[float, float] | None = None) -> Log:

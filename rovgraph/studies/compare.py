@@ -10,9 +10,9 @@ import pandas as pd
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError, in_one_line
+from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.estimator_chains import EstimatorSpec, Outcome, Task, outcomes_of_dives
 from rovgraph.studies.estimators import select
-from rovgraph.studies.aggregate import aggregate
 from rovgraph.studies.measures import measures, misalignment_history, velocity_history
 from rovgraph.studies.runs import Case, Run
 from rovgraph.workers import cores, in_workers

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config
-from rovgraph.studies.estimator_chains import EstimatorSpec
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.evaluate import WITHIN_ELLIPSE, evaluate, normalised_error
 from rovgraph.geometry import Array, wrap_angle
+from rovgraph.studies.estimator_chains import EstimatorSpec
 from rovgraph.studies.runs import Case
 from rovgraph.trajectory import Trajectory
 

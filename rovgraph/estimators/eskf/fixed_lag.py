@@ -171,12 +171,16 @@ class FixedLag:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         index, time, segment, rate_sd = state["keyframe"]
-        interval = KeyframeInterval(index, time, segment, state["rate_b"], rate_sd, None, 0.0, [])
+        interval = KeyframeInterval(index, time, segment, state["rate_b"], rate_sd, None, [])
         places = tuple(RememberedPlace(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         assembler = self._fresh()
         assembler.restore(state["assembler"])
         self.marks = deque(
-            [FilterSnapshot(interval, Gaussian(state["x"], state["c"], state["P"], places), state["gates"], [], assembler, 0)]
+            [
+                FilterSnapshot(
+                    interval, Gaussian(state["x"], state["c"], state["P"], places), state["gates"], [], assembler, 0
+                )
+            ]
         )
         self._record, self._forgotten, self._taken = [], 0, 0
         self._back_to(0)

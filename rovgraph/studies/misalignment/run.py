@@ -11,14 +11,14 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.errors import in_one_line
-from rovgraph.studies.estimator_chains import EstimatorSpec, Outcome, outcomes
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
-from rovgraph.studies.estimators import ESTIMATORS
 from rovgraph.evaluate import evaluate
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.log import log_from_frame
 from rovgraph.simulate import CALM, Dive, Style, Truth, scenario, simulate
 from rovgraph.simulate.files import known
+from rovgraph.studies.estimator_chains import EstimatorSpec, Outcome, outcomes
+from rovgraph.studies.estimators import ESTIMATORS
 from rovgraph.studies.misalignment.plan import Cell, Study
 from rovgraph.studies.misalignment.vehicle import believed
 

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rovgraph.config import Config, beliefs
+from rovgraph.engine.late_stamp_window import KNOT_S
 from rovgraph.geometry import Array
-from rovgraph.graph.late_stamp_window import KNOT_S
 from rovgraph.instruments import Instrument
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
@@ -51,7 +51,7 @@ class TimeOffsets:
     ----------
     variable : sensor -> name of the calibration variable
     lags : variable that is estimated -> ndarray, shape (K,), time_offset that is reckoned with, ascending by
-        `rovgraph.graph.late_stamp_window.KNOT_S` [s]
+        `rovgraph.engine.late_stamp_window.KNOT_S` [s]
     assumed : variable -> time_offset by which measurements are put earlier [s]
     """
 
@@ -80,8 +80,11 @@ class TimeOffsets:
 
     def placed(self, m: Measurement) -> StampedMeasurement:
         """A measurement where it is assumed to belong."""
-        late = self.assumed.get(self.variable.get(m.sensor, ""), 0.0)
-        return StampedMeasurement(m.time - late, m.sensor, m.values, m.row, m.time)
+        return StampedMeasurement(m.time - self.of_sensor(m.sensor), m.sensor, m.values, m.row, m.time)
+
+    def of_sensor(self, sensor: str) -> float:
+        """By how much measurements of a sensor are put earlier [s]."""
+        return self.assumed.get(self.variable.get(sensor, ""), 0.0)
 
     def lag(self, sensor: str) -> Array | None:
         """Lateness that is reckoned with for a sensor, shape (K,) [s]; None where it is not estimated."""

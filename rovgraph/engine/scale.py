@@ -9,7 +9,6 @@ to one by k.
 
 from collections.abc import Mapping
 
-import gtsam
 import numpy as np
 
 from rovgraph.calibration import Belief
@@ -48,41 +47,3 @@ def biased(state: State, S: Array) -> State:
     scales = [np.broadcast_to(state.calibration[name], (len(state), 3)) for name in SCALES]
     bias = state.bias + (S @ np.concatenate(scales, axis=-1)[..., None])[..., 0]
     return State(state.R_nb, state.p_n, state.v_n, bias, state.calibration)
-
-
-def scaled_factor(
-    factor: gtsam.CombinedImuFactor, S: Array, fixed: Mapping[str, Array], keys: Mapping[str, int]
-) -> gtsam.CustomFactor:
-    """An interval's motion that depends on the scales, too.
-
-    Parameters
-    ----------
-    factor : of the motion that was integrated without them
-    S : ndarray, shape (6, 6), of `scale_to_bias`
-    fixed : name -> ndarray, shape (3,), values of the scales that are not estimated
-    keys : of those that are
-    """
-    own = list(factor.keys())  # pose, velocity; the same afterwards; bias before and after
-    by = {name: S[:, COLUMNS[name]] for name in keys}
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
-        scales = [values.atVector(keys[name]) if name in keys else fixed[name] for name in SCALES]
-        shift = S @ np.concatenate(scales)
-        moved = gtsam.Values()
-        for k in (own[0], own[2]):
-            moved.insert(k, values.atPose3(k))
-        for k in (own[1], own[3]):
-            moved.insert(k, values.atVector(k))
-        for k in own[4:]:
-            bias = values.atConstantBias(k).vector() + shift
-            moved.insert(k, gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
-        A, b = factor.linearize(moved).jacobian()
-        if H is not None:
-            for place, part in enumerate(np.split(A, [6, 9, 15, 18, 24], axis=1)):
-                H[place] = part
-            by_bias = A[:, 18:24] + A[:, 24:]  # of both alike, which leaves the bias's walk out of it
-            for place, name in enumerate(keys, 6):
-                H[place] = by_bias @ by[name]
-        return np.asarray(-b)
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(15), [*own, *keys.values()], error)

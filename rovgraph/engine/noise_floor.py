@@ -42,7 +42,7 @@ class NoiseFloor:
         self._seen[: len(state)], self._count = state, len(state)
 
     def take(self, odd: Array) -> None:
-        """Take an interval's scatter, shape (m, 6), of `rovgraph.graph.preintegration.scatter`."""
+        """Take an interval's scatter, shape (m, 6), of `rovgraph.engine.preintegration.scatter`."""
         middle = np.sort(np.abs(odd), axis=0)[len(odd) // 2]
         self._seen[self._count % INTERVALS] = 1.4826 * middle.reshape(2, 3).mean(axis=1)
         self._count += 1

@@ -10,12 +10,12 @@ for any tau, in the smoother and in filters alike.
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.engine.motion import Snapshot
+from rovgraph.engine.preintegration import PreintegrationParams, integrate_motion
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rotate, transpose
-from rovgraph.graph.preintegration import Snapshot, preintegrate
 from rovgraph.state import BIAS, POSE, VELOCITY, Delta, Jacobians, State
 
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
@@ -45,13 +45,11 @@ class LateStampWindow:
     bias: Array
 
     @staticmethod
-    def of(keyframe: Snapshot, knots: Sequence[Snapshot], lag: Array, rate_b: Array, bias: Array) -> "LateStampWindow":
-        """The track of one stamp, from snapshots that begin at one time before them all."""
-        i = keyframe
-        dt = np.array([k.dt for k in knots]) - i.dt
-        dR = np.array([i.dR.T @ k.dR for k in knots])
-        dv = np.array([k.dv for k in knots]) - i.dv
-        dp = np.array([k.dp for k in knots]) - i.dp - dt[:, None] * i.dv
+    def of(keyframe: Array, knots: Array, lag: Array, rate_b: Array, bias: Array) -> "LateStampWindow":
+        """The window of one stamp, from snapshots, shape (16,) and (K, 16), that begin at one time before them all."""
+        i, own = Snapshot.of(keyframe), knots - keyframe
+        dt, dR = own[:, 0], i.dR.T @ knots[:, 1:10].reshape(-1, 3, 3)
+        dv, dp = own[:, 10:13], own[:, 13:16] - dt[:, None] * i.dv
         dv, dp = dv @ i.dR, dp @ i.dR  # into the keyframe's axes
         return LateStampWindow(*(a[None] for a in (lag, dt, dR, dv, dp, rate_b, bias)))
 
@@ -142,7 +140,7 @@ def window_around(
     lag: Array,
     imu: Array,
     start: float,
-    integration: tuple[gtsam.PreintegrationCombinedParams, Array],
+    integration: tuple[PreintegrationParams, Array],
     longest_step: float,
 ) -> LateStampWindow | None:
     """The motion around a stamp, from IMU samples.
@@ -171,9 +169,8 @@ def window_around(
     if np.diff(within).max() > longest_step:
         return None
     stops, place = np.unique(around, return_inverse=True)
-    _, found = preintegrate(params, bias, imu, begin, stops, end)
-    snapshots = [found[k] for k in place]
-    return LateStampWindow.of(snapshots[-1], snapshots[:-1], lag, _rate(imu, knots), bias)
+    _, found = integrate_motion(params, bias, imu, begin, stops, end, 0.0)
+    return LateStampWindow.of(found[place[-1]], found[place[:-1]], lag, _rate(imu, knots), bias)
 
 
 def _rate(imu: Array, time: Array) -> Array:

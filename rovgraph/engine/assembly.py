@@ -11,34 +11,37 @@ longer than that, and counting each sample would make the estimate too sure of i
 
 import math
 from bisect import insort
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import InitVar, dataclass, field
+from itertools import islice
 from typing import Any, NamedTuple, cast
 
-import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.config import Config, beliefs, mount_matrix
+from rovgraph.engine.admission import refused, standard_deviation
+from rovgraph.engine.aiding import Aiding
+from rovgraph.engine.late_stamp_window import LateStampWindow, window_around
+from rovgraph.engine.motion import Motion, Snapshot
+from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
+from rovgraph.engine.scale import scale_to_bias, wanted
+from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
 from rovgraph.geometry import Array
-from rovgraph.graph.aiding import Aiding
-from rovgraph.graph.late_stamp_window import LateStampWindow, window_around
-from rovgraph.graph.preintegration import Snapshot
-from rovgraph.graph.samples import HALF_WINDOW_S, Samples, covering
-from rovgraph.graph.scale import scale_to_bias, wanted
-from rovgraph.graph.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
 from rovgraph.instruments import Instrument
-from rovgraph.log import Measurement
+from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.packing import pack, unpack
+from rovgraph.log.streams import arrivals, in_precedence
 from rovgraph.model_aiding import ModelAiding
 from rovgraph.state import State
 
-DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
 SHORTEST_S = 1e-3  # an interval
-LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
+SOME = 4096  # measurements of a log that are objects at one time
 ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
+_NO_RATE = np.zeros(3), 0.0
 
 
 class LandmarkObservation(NamedTuple):
@@ -57,7 +60,7 @@ class LandmarkObservation(NamedTuple):
     believed: bool = True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class KeyframeMeasurement:
     """A measurement that belongs to a keyframe.
 
@@ -72,7 +75,7 @@ class KeyframeMeasurement:
     motion : Snapshot from the keyframe to the measurement
     bias : ndarray, shape (6,), that the motion was integrated with
     window : LateStampWindow of one stamp, where stamps may be late
-    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
+    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.engine.scale`, where the IMU's scale may be off
     landmark : of a place, where it is one
     """
 
@@ -92,7 +95,7 @@ class KeyframeMeasurement:
     landmark: LandmarkObservation | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class KeyframeInterval:
     """From the keyframe before to keyframe ``index``; the first has no motion.
 
@@ -103,10 +106,9 @@ class KeyframeInterval:
         variables that walk have one value in each
     rate_b, rate_sd : ndarray, shape (3,), float: measured rate at the keyframe, bias still
         in it, and its noise [rad/s]
-    pim : preintegrated motion, None for the first keyframe
-    gap_s : how long the IMU was silent, where that lies in the interval or reaches into it, or 0 [s]
+    motion : from the keyframe before, None for the first
     measurements : at the keyframe itself, and between the keyframe before and it
-    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.graph.scale`, where the IMU's scale may be off
+    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.engine.scale`, where the IMU's scale may be off
     """
 
     index: int
@@ -114,15 +116,24 @@ class KeyframeInterval:
     segment: int
     rate_b: Array
     rate_sd: float
-    pim: gtsam.PreintegratedCombinedMeasurements | None
-    gap_s: float
+    motion: Motion | None
     measurements: list[KeyframeMeasurement]
     scale_to_bias: Array | None = None
 
     @property
     def bridged(self) -> bool:
         """Whether samples of the IMU are missing."""
-        return self.gap_s > 0.0
+        return self.motion is not None and self.motion.gap_s > 0.0
+
+    @property
+    def between(self) -> list[KeyframeMeasurement]:
+        """Measurements that belong to the keyframe before."""
+        return [m for m in self.measurements if m.keyframe < self.index]
+
+    @property
+    def here(self) -> list[KeyframeMeasurement]:
+        """Measurements at the keyframe that ends the interval."""
+        return [m for m in self.measurements if m.keyframe == self.index]
 
 
 @dataclass
@@ -150,8 +161,10 @@ class Assembler:
     def __post_init__(self, assumed: TimeOffsets | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
         self._samples = Samples(self.config, self.learn_noise)
-        self._waiting: list[StampedMeasurement] = []
+        self._ready: Array | None = None  # where the log is known as a whole: times up to which each sample lets see
+        self._waiting: deque[StampedMeasurement] = deque()
         self._aiding: Aiding | None = None
+        self._signals: deque[Measurement] = deque()  # of thrusters, of a log that is known as a whole
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
@@ -162,6 +175,8 @@ class Assembler:
         self.time_offsets = assumed or TimeOffsets.of(self.config, self.instruments)
         self._scaled = wanted(beliefs(self.config))
         self._around = HALF_WINDOW_S + self.time_offsets.span
+        # the rate reaches these: by a lever arm, or by the motion of a turning body
+        self._turned = {sensor for sensor, i in self.instruments.items() if i.rate_gain.any()} | {"thruster"}
 
     def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease.
@@ -185,15 +200,40 @@ class Assembler:
             insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
         done: list[KeyframeInterval] = []
         if self._index < 0:
-            self._before_first(measurement.time)
-            done.append(self._close(measurement.time, None))
+            done.append(self._begin(measurement.time))
         return done + self._take_until(measurement.time - self._around)
+
+    def take(self, log: Log) -> list[KeyframeInterval]:
+        """Take a whole log, before anything else: what `add` of each of its measurements and `finish` give.
+
+        Raises
+        ------
+        InputError : an IMU gap longer than ``imu.max_gap_s``
+        """
+        if "imu" not in log or not len(log["imu"]):
+            deque(self._stamped(log, None), maxlen=0)  # counts what is left out
+            return []
+        imu = log["imu"]
+        after_gap = imu.take(self._samples.take(imu))
+        self._ready, begin = imu.time - self._around, float(imu.time[0])
+        if self._aiding is not None and "thruster" in log:
+            stream = log["thruster"]
+            own = zip(stream.time.tolist(), stream.data, stream.row.tolist(), strict=True)
+            self._signals.extend(Measurement(time, "thruster", values, row) for time, values, row in own)
+        measurements = self._not_before(begin, self._stamped(log, after_gap))
+        self._samples.reach(1)
+        done = [self._begin(begin)]
+        while some := list(islice(measurements, SOME)):
+            self._waiting.extend(some)
+            done += self._take_until(min(some[-1].time, float(self._ready[-1])))
+        self._samples.reach(len(imu))
+        return done + self.finish()
 
     def copy(self) -> "Assembler":
         """One that goes on by itself from here."""
         twin = copy(self)
         twin._samples, twin.left_out = self._samples.copy(), self.left_out.copy()
-        twin._waiting, twin._between = self._waiting[:], self._between[:]
+        twin._waiting, twin._between = self._waiting.copy(), self._between[:]
         twin._sighted = dict(self._sighted)
         twin.time_offsets = self.time_offsets.copy()
         if self._aiding is not None:
@@ -217,7 +257,7 @@ class Assembler:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         self._samples.restore(state)
-        self._waiting, self._between = unpack_stamped(state["waiting"]), unpack_stamped(state["between"])
+        self._waiting, self._between = deque(unpack_stamped(state["waiting"])), unpack_stamped(state["between"])
         self.time_offsets.assumed.update(state["assumed"])
         if self._aiding is not None:
             self._aiding.signals = unpack(state["signals"])
@@ -236,21 +276,23 @@ class Assembler:
         """
         force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
         table = self._samples.ahead(samples, time, np.concatenate([force, np.zeros(3)]) + state.bias[0])
-        pim, _, gap_s = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
+        motion, _ = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
         rate_b, rate_sd = self._samples.rate(table, time)
-        return KeyframeInterval(self._index + 1, time, self._segment, rate_b, rate_sd, pim, gap_s, [])
+        return KeyframeInterval(self._index + 1, time, self._segment, rate_b, rate_sd, motion, [])
 
     def _take_until(self, time: float) -> list[KeyframeInterval]:
         """Place what has waited for the IMU up to a time."""
         done: list[KeyframeInterval] = []
         while self._waiting and self._waiting[0].time <= time:
-            m = self._waiting.pop(0)
+            m = self._waiting.popleft()
             done += self._silence(m.time)
-            if m.sensor == "imu":
-                done += [self._close(m.time, None)] if m.time - self._start > SHORTEST_S else []
+            if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
+                self._see(m.time)
+                done.append(self._close(m.time, None))
             elif m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
+                self._see(m.time)
                 done.append(self._close(m.time, m))
-            else:
+            elif m.sensor != "imu":
                 self._between.append(m)
         return done + self._silence(time)
 
@@ -268,43 +310,125 @@ class Assembler:
 
     def _admissible(self, m: Measurement) -> bool:
         """Whether a measurement may enter the graph; counts those that may not."""
-        reason = None
         if m.sensor not in self.instruments:
             return False
-        if m.sensor == "dvl" and m.values[3] == 0:
-            reason = "no bottom lock"
-        elif m.sensor in ("dvl", "dvl_water") and np.abs(m.values[:3]).max() > self.config.dvl.max_speed_mps:
-            reason = "faster than dvl.max_speed_mps"
-        elif m.sensor == "mag" and not m.values.any():
-            reason = "exactly zero"
-        elif m.sensor == "depth" and abs(m.values[0]) > DEEPEST_M:
-            reason = "deeper than any sea"
-        if reason:
-            self.left_out[m.sensor, reason] += 1
-        return reason is None
+        for reason, mask in refused(m.sensor, m.values[None], self.config):
+            if mask[0]:
+                self.left_out[m.sensor, reason] += 1
+                return False
+        return True
 
-    def _before_first(self, time: float) -> None:
-        """Nothing can be placed before the first IMU sample."""
+    def _stamped(self, log: Log, after_gap: Stream | None) -> Iterator[StampedMeasurement]:
+        """Measurements of a log that may enter the graph, and samples after a gap, in the order of where they are put.
+
+        Of one place in the order of arrival.
+        """
+        streams = [] if after_gap is None else [after_gap]
+        for stream in log.streams.values():
+            if stream.sensor in self.instruments and stream.sensor != "thruster":
+                streams.append(self._admitted(stream))
+        streams = in_precedence(streams)
+        if not streams:
+            return
+        names = [stream.sensor for stream in streams]
+        late = np.array([self.time_offsets.of_sensor(name) for name in names])
+        which, index, stamp = arrivals(streams)
+        time = stamp - late[which]
+        order = np.argsort(time, kind="stable")
+        order = order[self._wanted(names, which[order], time[order])]
+        for part in np.array_split(order, max(1, len(order) // SOME)):
+            columns = (a[part].tolist() for a in (time, stamp, which, index))
+            for t, s, k, i in zip(*columns, strict=True):
+                stream = streams[k]
+                yield StampedMeasurement(t, names[k], stream.data[i], int(stream.row[i]), s)
+
+    def _wanted(self, names: Sequence[str], which: NDArray[np.int64], time: Array) -> NDArray[np.bool_]:
+        """Without those of which one an interval is taken, where surely another one is: between near pings.
+
+        Parameters
+        ----------
+        names : of streams
+        which, time : ndarray, shape (n,), stream of each measurement, and where it is put [s], in this order
+        """
+        graph, wanted = self.config.graph, np.ones(len(time), bool)
+        ends = np.isin(which, [k for k, name in enumerate(names) if name in ("imu", "dvl")])
+        part = np.cumsum(ends)
+        edges = np.concatenate([[-np.inf], time[ends], [np.inf]])
+        # the keyframe before may stand up to `min_gap_s` before a ping that makes none
+        whole = np.diff(edges) > graph.max_gap_s - graph.min_gap_s - SHORTEST_S
+        begin, end = (np.inf, -np.inf) if self._ready is None else self._ready[[0, -1]] + self._around
+        whole |= (edges[:-1] < begin) | (edges[1:] > end - SHORTEST_S)  # what is left out there is counted
+        for k, name in enumerate(names):
+            if name in ONCE_PER_INTERVAL:
+                own = np.flatnonzero(which == k)
+                wanted[own] = whole[part[own]] | (np.diff(part[own], prepend=-1) > 0)
+        return wanted
+
+    def _admitted(self, stream: Stream) -> Stream:
+        """The measurements of a stream that may enter the graph; counts the others."""
+        out = np.zeros(len(stream), bool)
+        for reason, mask in refused(stream.sensor, stream.data, self.config):
+            if (mask & ~out).any():
+                self.left_out[stream.sensor, reason] += int((mask & ~out).sum())
+            out |= mask
+        return stream.take(~out) if out.any() else stream
+
+    def _not_before(self, begin: float, measurements: Iterator[StampedMeasurement]) -> Iterator[StampedMeasurement]:
+        """Without those that came and are put before the first IMU sample."""
+        for m in measurements:
+            if m.time < begin and m.stamp < begin:
+                self.left_out[m.sensor, "before the first IMU sample"] += 1
+            else:
+                yield m
+
+    def _begin(self, time: float) -> KeyframeInterval:
+        """The first keyframe, at the first IMU sample, before which nothing can be placed."""
         early = [m for m in self._waiting if m.time < time]
         self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
-        self._waiting = [m for m in self._waiting if m.time >= time]
+        self._waiting = deque(m for m in self._waiting if m.time >= time)
+        return self._close(time, None)
 
     def _silence(self, time: float) -> list[KeyframeInterval]:
         """Keyframes for a time without pings."""
         done = []
         gap = self.config.graph.max_gap_s
         while time - self._start > gap:
+            self._see_after(gap)
             done.append(self._close(self._start + gap, None))
         return done
+
+    def _see(self, time: float) -> None:
+        """Look at the samples of a log that is known as a whole up to the first that lets a time be seen."""
+        if self._ready is not None:
+            self._look(int(self._ready.searchsorted(time)))
+
+    def _see_after(self, gap: float) -> None:
+        """The same up to the first that lets more than a gap be seen since the newest keyframe."""
+        if self._ready is None:
+            return
+        k = int(self._ready.searchsorted(self._start + gap, side="right"))
+        while k > 0 and self._ready[k - 1] - self._start > gap:  # what `_silence` asks, to the last bit
+            k -= 1
+        while k < len(self._ready) and not self._ready[k] - self._start > gap:
+            k += 1
+        self._look(k)
+
+    def _look(self, sample: int) -> None:
+        assert self._ready is not None
+        count = min(sample + 1, len(self._ready))
+        self._samples.reach(count)
+        while self._signals and self._signals[0].time <= self._samples.newest:
+            assert self._aiding is not None
+            self._aiding.add(self._signals.popleft())
 
     def _close(self, time: float, ping: StampedMeasurement | None) -> KeyframeInterval:
         """Make a keyframe at ``time`` and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
-        pim, gap_s = None, 0.0
+        motion: Motion | None = None
         attached: list[KeyframeMeasurement] = []
         if self._index >= 0:
-            pim, gap_s, attached = self._integrate(samples, every, time)
+            motion, attached = self._integrate(samples, every, time)
         before = self._start
         self._index, self._start, self._between = self._index + 1, time, []
         if time - self._segment_start >= self.config.graph.segment_s:
@@ -312,13 +436,11 @@ class Assembler:
         rate_b, rate_sd = self._samples.rate(samples, time)
         if ping is not None:
             attached += self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd, every)
-        scaled = self._felt(samples, before, time) if pim is not None else None
+        scaled = self._scale_to_bias(samples, before, time) if motion is not None else None
         self._samples.forget(time, self._around)
-        return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, pim, gap_s, attached, scaled)
+        return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, motion, attached, scaled)
 
-    def _integrate(
-        self, samples: Array, every: Array, time: float
-    ) -> tuple[gtsam.PreintegratedCombinedMeasurements, float, list[KeyframeMeasurement]]:
+    def _integrate(self, samples: Array, every: Array, time: float) -> tuple[Motion, list[KeyframeMeasurement]]:
         taken, seen = [], set()
         for m in self._between:
             if m.sensor not in seen:
@@ -329,16 +451,12 @@ class Assembler:
             aiding = self._aiding.between(self._start, time, samples, lambda t: self._samples.rate(samples, t)[0])
             taken = sorted(taken + [StampedMeasurement(*m, m.time) for m in aiding], key=_time)
         stops = np.array([m.time for m in taken])
-        pim, motions, gap_s = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
+        motion, snapshots = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
         attached: list[KeyframeMeasurement] = []
-        for m, motion in zip(taken, motions, strict=True):
-            attached += self._attach(m, motion, *self._rate_for(m, samples), every)
-        return pim, gap_s, attached
-
-    def _rate_for(self, m: StampedMeasurement, samples: Array) -> tuple[Array, float]:
-        """The rate, for those instruments that it reaches: by a lever arm, or by the motion of a turning body."""
-        reached = m.sensor == "thruster" or self.instruments[m.sensor].rate_gain.any()
-        return self._samples.rate(samples, m.time) if reached else (np.zeros(3), 0.0)
+        for m, snapshot in zip(taken, snapshots, strict=True):
+            rate_b, rate_sd = self._samples.rate(samples, m.time) if m.sensor in self._turned else _NO_RATE
+            attached += self._attach(m, Snapshot.of(snapshot), rate_b, rate_sd, every)
+        return motion, attached
 
     def _attach(
         self, m: StampedMeasurement, motion: Snapshot, rate_b: Array, rate_sd: float, every: Array
@@ -346,30 +464,20 @@ class Assembler:
         """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``."""
         instrument = self.instruments[m.sensor]
         lag = self.time_offsets.lag(m.sensor)
-        window, known = None, self._samples
+        window, known, landmark = None, self._samples, None
         if lag is not None:
             window = window_around(m.stamp, lag, every, self._start, (known.params, self.bias), known.longest_step)
-        if lag is not None and window is None:
-            self.left_out[m.sensor, f"calibration.{instrument.time_offset} reaches beyond the IMU's samples"] += 1
-            return []
-        dim, landmark = instrument.model.dim, None
-        z, sd = m.values[:dim], instrument.sd
-        if m.sensor == "dvl":
-            if m.values[4] > 0.0:
-                sd = np.maximum(sd, min(m.values[4], LARGEST_SD))
-            if self.config.dvl.scale_sd:
-                sd = np.hypot(sd, self.config.dvl.scale_sd * np.linalg.norm(z))
-        if m.sensor == "thruster":  # a mean over values[3] seconds
-            sd = sd / math.sqrt(m.values[3])
-        if m.sensor == "fix" and m.values[2] > 0.0:  # 0 is how receivers say that they do not know
-            sd = np.full(dim, min(m.values[2], LARGEST_SD))
+            if window is None:
+                self.left_out[m.sensor, f"calibration.{instrument.time_offset} reaches beyond the IMU's samples"] += 1
+                return []
+        z = m.values[: instrument.model.dim]
         if m.sensor == "place":
-            landmark = self._sighting(m)
+            landmark, z = self._sighting(m), np.zeros(instrument.model.dim)
             if landmark is None:
                 return []
-            z, sd = np.zeros(dim), np.full(dim, min(m.values[1], LARGEST_SD)) if m.values[1] > 0.0 else sd
+        sd = standard_deviation(m.sensor, m.values, instrument, self.config)
         place = (m.sensor, self._index, self._segment, m.time, m.row)
-        scaled = self._felt(every, self._start, m.time)
+        scaled = self._scale_to_bias(every, self._start, m.time)
         return [KeyframeMeasurement(*place, z, sd, rate_b, rate_sd, motion, self.bias, window, scaled, landmark)]
 
     def _sighting(self, m: StampedMeasurement) -> LandmarkObservation | None:
@@ -381,13 +489,11 @@ class Assembler:
         self._sighted[name], self._sightings = m.time, self._sightings + 1
         return LandmarkObservation(name, self._sightings)
 
-    def _felt(self, samples: Array, begin: float, end: float) -> Array | None:
-        """The IMU's mean signal as scale errors feel it, where there may be any."""
+    def _scale_to_bias(self, samples: Array, begin: float, end: float) -> Array | None:
+        """The IMU's mean signal as scale errors make a bias of it, where there may be any."""
         if not self._scaled:
             return None
-        time = np.linspace(begin, end, 21)
-        signal = np.array([np.interp(time, samples[:, 0], column).mean() for column in samples[:, 1:].T])
-        return scale_to_bias(signal - self.bias, self._R_bs)
+        return scale_to_bias(self._samples.mean(samples, begin, end) - self.bias, self._R_bs)
 
 
 def _time(m: StampedMeasurement) -> float:

@@ -1,0 +1,251 @@
+"""The IMU's samples around the newest keyframe, and what is believed of their noise."""
+
+import math
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.config import Config, mount_matrix
+from rovgraph.engine.motion import Motion
+from rovgraph.engine.noise_floor import NoiseFloor
+from rovgraph.engine.preintegration import (
+    KNOCK,
+    PreintegrationParams,
+    integrate_motion,
+    preintegration_params,
+    scatter,
+)
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
+from rovgraph.kernels.imu_samples import fit_rate, mean_signal, survey
+from rovgraph.log import Measurement, Stream
+
+HALF_WINDOW_S = 0.05  # around a time, over which the rate is averaged; measurements wait that long
+ENOUGH_FOR_A_CURVE = 5  # samples in that window; a slower IMU is interpolated between two
+GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
+PERIODS = 50  # of samples, from whose median a gap is told
+ROOM = 256  # samples, in a buffer
+MEAN_OF = 21  # times of an interval, in a mean over it
+
+
+class Samples:
+    """Keeps samples in body axes and integrates them.
+
+    Parameters
+    ----------
+    config : effective configuration
+    learn_noise : raise the noise to what the newest samples show, where the log is not known as a whole
+
+    Attributes
+    ----------
+    longest_step : between two samples that are no gap [s]
+    params : of preintegration, with the noise that is believed
+    """
+
+    def __init__(self, config: Config, learn_noise: bool) -> None:
+        self._config, self._learn_noise = config, learn_noise
+        self._R_sb = mount_matrix(config.imu.mount_rpy_deg).T
+        self._noise = config.imu.noise.acc, config.imu.noise.gyr
+        self._floor = NoiseFloor(np.array(self._noise))
+        self.params = preintegration_params(config, *self._noise)
+        self._bridge = preintegration_params(config, BRIDGE_ACC, BRIDGE_GYR)
+        self._rows, self._first, self._last = np.empty((ROOM, 7)), 0, 0  # motions hold views of rows: write only once
+        self._periods: list[float] = []
+        self._longest_steps: list[float] = []  # as they were known after each of the first samples of a log
+        self.longest_step = math.inf
+
+    def add(self, m: Measurement) -> bool:
+        """Take a sample; times must not decrease.
+
+        Returns
+        -------
+        bool : samples were missing before it
+
+        Raises
+        ------
+        InputError : a gap longer than ``imu.max_gap_s``
+        """
+        missing = False
+        if self._last > self._first:
+            period = m.time - self.newest
+            missing = period > self.longest_step
+            if period > self._config.imu.max_gap_s:
+                raise self._too_long(period, m.time, m.row)
+            self._take_period(period)
+        if self._last == len(self._rows):
+            kept = self.table
+            self._rows = np.empty((len(kept) + ROOM, 7))
+            self._rows[: len(kept)], self._first, self._last = kept, 0, len(kept)
+        row = self._rows[self._last]
+        row[0], row[1:] = m.time, self._in_body(m.values[:6])
+        self._last += 1
+        return missing
+
+    def take(self, stream: Stream) -> NDArray[np.bool_]:
+        """Take all samples of a log, to be looked at as far as `reach` says; none may have been taken before.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,) : whether samples were missing before each
+
+        Raises
+        ------
+        InputError : a gap longer than ``imu.max_gap_s``
+        """
+        self._rows = np.column_stack([stream.time, self._in_body(stream.data[:, :6])])
+        periods = np.diff(stream.time)
+        too_long = np.flatnonzero(periods > self._config.imu.max_gap_s)
+        if too_long.size:
+            k = int(too_long[0])
+            raise self._too_long(float(periods[k]), float(stream.time[k + 1]), int(stream.row[k + 1]))
+        self._longest_steps = [math.inf]
+        for period in periods[:PERIODS].tolist():
+            self._take_period(period)
+            self._longest_steps.append(self.longest_step)
+        known = np.full(len(periods), self.longest_step)
+        known[:PERIODS] = self._longest_steps[:-1]
+        return np.concatenate([[False], periods > known])
+
+    def reach(self, count: int) -> None:
+        """Look at the first samples of a log only."""
+        self._last = count
+        self.longest_step = self._longest_steps[min(count, len(self._longest_steps)) - 1]
+
+    @property
+    def table(self) -> Array:
+        """All that are kept, shape (m, 7): time, specific force, rate in body axes."""
+        return self._rows[self._first : self._last]
+
+    @property
+    def newest(self) -> float:
+        """Time of the newest sample [s]; -inf where there is none."""
+        return float(self._rows[self._last - 1, 0]) if self._last > self._first else -math.inf
+
+    def forget(self, time: float, before: float) -> None:
+        """Keep those that cover a time and what is up to ``before`` it [s]."""
+        self._first += first_covering(self.table, time, before)
+
+    def ahead(self, later: Sequence[Measurement], time: float, at_rest: Array) -> Array:
+        """The table with samples that have not been taken; beyond the last one as if it stood still.
+
+        Parameters
+        ----------
+        later : of the IMU
+        time : to which it has to reach [s]
+        at_rest : ndarray, shape (6,), signal at rest
+        """
+        rows = [self.table]
+        if later:
+            values = self._in_body(np.array([m.values[:6] for m in later]))
+            rows.append(np.column_stack([[m.time for m in later], values]))
+        if time - rows[-1][-1, 0] > self.longest_step:
+            rows.append(np.concatenate([[time], at_rest])[None])
+        return np.concatenate(rows)
+
+    def gap(self, table: Array) -> float:
+        """The longest time without samples that is longer than it should be, or 0 [s]."""
+        longest = float(np.diff(table[:, 0]).max(initial=0.0))
+        return longest if longest > self.longest_step else 0.0
+
+    def integrated(
+        self, table: Array, bias: Array, start: float, stops: Array, end: float, learn: bool
+    ) -> tuple[Motion, Array]:
+        """The motion from one time to another, and that to every stop on the way, shape (k, SNAPSHOT).
+
+        Parameters
+        ----------
+        table : ndarray, shape (m, 7), samples that cover it
+        bias, start, stops, end : as `rovgraph.engine.preintegration.preintegrate` takes them
+        learn : its samples tell of the noise
+        """
+        longest, within, *shown = survey(table, start, end)
+        if within > self.longest_step:
+            return integrate_motion(self._bridge, bias, table, start, stops, end, within)
+        params = self.params
+        if learn and len(table) >= 3 and longest <= self.longest_step:
+            params = self._params_for(table, shown)
+        return integrate_motion(params, bias, table, start, stops, end, 0.0)
+
+    def rate(self, table: Array, time: float) -> tuple[Array, float]:
+        """Rate at a time, shape (3,), and the sd of its noise.
+
+        A parabola through the samples around it. The lever arm turns the noise of
+        the rate into velocity, and the derivative by the misalignment into knowledge
+        that is not there, so a single sample would not do.
+        """
+        rate = np.empty(3)
+        step, share = fit_rate(table, time, HALF_WINDOW_S, ENOUGH_FOR_A_CURVE, rate)
+        if step > self.longest_step:
+            return rate, BRIDGE_GYR
+        return rate, self._noise[1] * math.sqrt(share / step if step else share)
+
+    def mean(self, table: Array, begin: float, end: float) -> Array:
+        """Mean specific force and rate over a time, shape (6,)."""
+        mean = np.empty(6)
+        mean_signal(table, begin, end, MEAN_OF, mean)
+        return mean
+
+    def copy(self) -> "Samples":
+        """One that goes on by itself from here."""
+        twin = copy(self)
+        twin._rows, twin._first, twin._last = self.table, 0, len(self.table)  # full: the next sample goes elsewhere
+        twin._floor, twin._periods = self._floor.copy(), self._periods[:]
+        return twin
+
+    def state(self) -> dict[str, Any]:
+        """Where it stands, as plain values and arrays."""
+        return {"imu": self.table.copy(), "periods": list(self._periods), "floor": self._floor.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from where another stood."""
+        self._rows, self._first, self._last = np.ascontiguousarray(state["imu"]), 0, len(state["imu"])
+        self._periods = list(state["periods"])
+        self.longest_step = GAP_PERIODS * float(np.median(self._periods)) if self._periods else math.inf
+        self._floor.restore(state["floor"])
+        if self._learn_noise:
+            self._raise(*self._floor.densities().tolist())
+
+    def _take_period(self, period: float) -> None:
+        if len(self._periods) < PERIODS:
+            self._periods.append(period)
+            self.longest_step = GAP_PERIODS * float(np.median(self._periods))
+
+    def _too_long(self, period: float, time: float, row: int) -> InputError:
+        return InputError(
+            f"row {row}: the IMU is silent for {period:.1f} s before {time:.3f} s, longer than "
+            f"imu.max_gap_s = {self._config.imu.max_gap_s:g}; split the log there or raise that key"
+        )
+
+    def _in_body(self, values: Array) -> Array:
+        """Specific force and rate, shape (..., 6), from the IMU's axes to the body's."""
+        out: Array = np.einsum("ij,jk->ik", values.reshape(-1, 3), self._R_sb).reshape(values.shape)
+        return out
+
+    def _params_for(self, table: Array, shown: Sequence[float]) -> PreintegrationParams:
+        """The believed noise, or where a knock shakes the samples far more, what they show."""
+        if self._learn_noise:
+            self._floor.take(scatter(table[:, 0], table[:, 1:]))
+            self._raise(*self._floor.densities().tolist())
+        acc, gyr = self._noise
+        if shown[0] < KNOCK * acc and shown[1] < KNOCK * gyr:
+            return self.params
+        return preintegration_params(self._config, max(shown[0], acc), max(shown[1], gyr))
+
+    def _raise(self, acc: float, gyr: float) -> None:
+        """Take other noise densities, where they differ enough to matter."""
+        if max(abs(acc / self._noise[0] - 1.0), abs(gyr / self._noise[1] - 1.0)) > 0.05:
+            self._noise, self.params = (acc, gyr), preintegration_params(self._config, acc, gyr)
+
+
+def first_covering(table: Array, time: float, before: float = HALF_WINDOW_S) -> int:
+    """Index of the first of those samples that cover a time and what is up to ``before`` it [s]."""
+    return max(int(table[:, 0].searchsorted(time - before, side="right")) - 1, 0)
+
+
+def covering(table: Array, time: float) -> Array:
+    """The samples that cover a time, what is up to half a window before it, and all after it."""
+    return table[first_covering(table, time) :]

@@ -1,0 +1,119 @@
+"""What a filter has found on its way through a dive, and the estimate that comes of it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.filter import FilterEngine
+from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states, states_of
+from rovgraph.engine.measurements import Block
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.estimators.results import (
+    bias_histories,
+    body_trajectory,
+    calibration_estimates,
+    calibration_history,
+    residual_frame,
+)
+from rovgraph.geometry import Array
+from rovgraph.state import BIAS, POSE, VELOCITY, State
+
+Row = tuple[Array, Array, Array, Array, Array]  # state, calibration, covariances of pose and velocity, sd of the error
+
+
+class FilterHistory:
+    """Keyframes as far as results need them, and the measurements as the filter met them.
+
+    Parameters
+    ----------
+    engine : the filter's
+
+    Attributes
+    ----------
+    intervals : the dive, as far as it has been taken
+    """
+
+    def __init__(self, engine: FilterEngine) -> None:
+        self._engine = engine
+        self._rows: list[Row] = []
+        self._processed: dict[str, list[ProcessedMeasurement]] = {}
+        self.intervals: list[KeyframeInterval] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def append(self, interval: KeyframeInterval, known: Gaussian, processed: Sequence[ProcessedMeasurement]) -> None:
+        """Take the next keyframe."""
+        self.intervals.append(interval)
+        self._rows.append(self._row(known))
+        for one in processed:
+            self._processed.setdefault(one.measurement.sensor, []).append(one)
+
+    def replace_last(self, known: Gaussian) -> None:
+        """Take another estimate of the newest keyframe."""
+        self._rows[-1] = self._row(known)
+
+    @property
+    def states(self) -> State:
+        """Of n keyframes; calibration has shape (n, dim)."""
+        return states_of(np.array([row[0] for row in self._rows]), np.array([row[1] for row in self._rows]))
+
+    def estimate(self, kind: str) -> Estimate:
+        """The filtered estimate of every keyframe."""
+        return self._estimate(kind, self._rows, None)
+
+    def smoothed(self, kind: str, known: Sequence[Gaussian]) -> Estimate:
+        """The estimate of every keyframe that a smoother has found."""
+        return self._estimate(kind, [self._row(one) for one in known], stack_states(known))
+
+    def _row(self, known: Gaussian) -> Row:
+        size, columns = self._engine.layout.size, self._engine.layout.columns
+        pose, velocity = (known.P[columns[v], columns[v]].copy() for v in (POSE, VELOCITY))
+        return known.x, known.c, pose, velocity, np.sqrt(np.diagonal(known.P)[:size])
+
+    def _estimate(self, kind: str, rows: Sequence[Row], smoothed: State | None) -> Estimate:
+        """An estimate; residuals are those before the measurements entered where nothing was smoothed."""
+        x, c, pose, velocity, sd = (np.array([row[k] for row in rows]) for k in range(5))
+        engine, states = self._engine, states_of(x, c)
+        columns, estimated = engine.layout.columns, engine.unknowns.estimated
+        arm = engine.initial.config.imu.lever_arm_m
+        trajectory = body_trajectory(self.intervals, states, arm, pose, velocity)
+        history = bias_histories(trajectory.time, states.bias, sd[:, columns[BIAS]])
+        for name in estimated:
+            history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[:, columns[name]])
+        final = {name: np.diag(sd[-1, columns[name]] ** 2) for name in estimated}
+        sensors = [s for s in engine.initial.instruments if s in self._processed]
+        last = {name: value[-1] for name, value in states.calibration.items()}
+        calibration = calibration_estimates(engine.beliefs, sensors, last, final)
+        residuals = residual_frame(*self._residuals(smoothed))
+        return Estimate(kind, trajectory, calibration, history, residuals, self._summary())
+
+    def _residuals(
+        self, smoothed: State | None
+    ) -> tuple[Mapping[str, Block], Mapping[str, State], Mapping[str, Array]]:
+        """Measurements, the states they are compared with, and their weights."""
+        blocks, here, weights = {}, {}, {}
+        for sensor, rows in self._processed.items():
+            blocks[sensor] = block = self._engine.block([one.measurement for one in rows])
+            here[sensor] = stack_states(rows) if smoothed is None else smoothed.at(block.keyframe)
+            places = [one.place for one in rows if one.place is not None]
+            if places:
+                here[sensor] = here[sensor].seeing(np.array(places))
+            weights[sensor] = np.array([one.weight for one in rows])
+        return blocks, here, weights
+
+    def _summary(self) -> dict[str, Any]:
+        """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
+        nis = {}
+        for sensor, rows in self._processed.items():
+            admitted = [one.nis for one in rows if one.weight > 0.0]
+            nis[sensor] = {
+                "mean": float(np.mean(admitted)) if admitted else None,
+                "dim": self._engine.initial.instruments[sensor].model.dim,
+                "count": len(admitted),
+                "rejected": len(rows) - len(admitted),
+            }
+        bridged = sum(interval.bridged for interval in self.intervals)
+        return {"keyframes": len(self.intervals), "nis": nis, "bridged_intervals": bridged}
