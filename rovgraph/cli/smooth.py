@@ -51,7 +51,7 @@ def smooth(
     dive_log = check.without_frozen_pings(dive_log)
     seconds = {"reading": time.perf_counter() - began}
     with progress_bar() as progress:
-        dive = smooth_dive(dive_log, settings, estimate.value, progress, parallel=True)
+        dive = smooth_dive(dive_log, settings, estimate.value, progress)
     seconds["estimating"] = time.perf_counter() - began - seconds["reading"]
     assumptions = dive.assumptions
     with results_folder(out, force) as folder:

@@ -22,7 +22,7 @@ from rovgraph.engine.scale import SCALES
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
-from rovgraph.kernels.motion import motion_errors, motion_weights, whiten_motions
+from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motions
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 MOTION = 15  # components of a keyframe before what walks
