@@ -49,10 +49,12 @@ def epochs(name: str, n: int = N, seed: int = 0) -> list[np.ndarray]:
     return [R, *draws, c, rng.standard_normal((n, 3))]
 
 
-def predict(name: str, given: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    kind, dim, params = CASES[name]
-    z, H = np.empty((len(given[1]), dim)), np.zeros((len(given[1]), dim, layout.MOTION + given[4].shape[1]))
-    kernels.predict_many(kind, *given, np.array([params], float), z, H)
+def predict(name: str, given: list[np.ndarray], columns=None) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions, and some columns of the Jacobians or all of them."""
+    (kind, dim, params), n = CASES[name], len(given[1])
+    columns = np.arange(layout.MOTION + given[4].shape[1]) if columns is None else np.array(columns)
+    z, H = np.full((n, dim), np.nan), np.full((n, dim, len(columns)), np.nan)
+    kernels.predict_many(kind, *given, np.array([params], float), columns, z, H)
     return z, H
 
 
@@ -91,11 +93,18 @@ def test_one_epoch_is_predicted_as_many(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_buffer_of_jacobians_that_was_used_before_serves_again(name):
-    kind, dim, params = CASES[name]
-    z, H = np.empty((N, dim)), np.zeros((N, dim, layout.MOTION + epochs(name)[4].shape[1]))
-    for seed in (1, 0):
-        kernels.predict_many(kind, *epochs(name, seed=seed), np.array([params], float), z, H)
-    np.testing.assert_array_equal(H, predict(name, epochs(name))[1])
+    (kind, dim, params), given = CASES[name], epochs(name)
+    H = predict(name, given)[1]
+    z, buffer, work = np.empty(dim), np.zeros(H.shape[1:]), np.empty((kernels.WORK, 3, 3))
+    for k in range(N):
+        kernels.predict(kind, *(values[k] for values in given), np.array(params, float), z, buffer, work)
+        np.testing.assert_allclose(buffer, H[k], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_some_columns_are_those_of_the_whole_jacobian(name):
+    given, some = epochs(name), [20, 0, 7, 14]
+    np.testing.assert_array_equal(predict(name, given, some)[1], predict(name, given)[1][..., some])
 
 
 @pytest.mark.parametrize("name", CASES)
