@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph /
+cli / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / config, log, trajectory / sensors, model_aiding / vehicle /
 state, calibration, thesis / kernels / geometry, workers / errors.
 """

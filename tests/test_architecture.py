@@ -24,6 +24,7 @@ LAYERS = (
     {"sensors", "model_aiding"},
     {"config", "log", "trajectory"},
     {"instruments"},
+    {"engine"},
     {"graph"},
     {"estimators", "simulate", "evaluate", "check", "calibrate"},
     {"studies", "live"},

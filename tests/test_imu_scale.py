@@ -7,7 +7,7 @@ from dives import Simulated, batch, falcon, renewed, simulated, started, true_at
 from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.transition import predict
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.estimators.error_recursion import ErrorStateRecursion

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.linearization import Linearization
 from rovgraph.geometry import (

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
 from rovgraph.estimators.initialise import InitialConditions
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle

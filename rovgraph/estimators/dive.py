@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from rovgraph.config import Config
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator

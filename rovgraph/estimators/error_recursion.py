@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.config import beliefs
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.transition import transitions
 from rovgraph.engine.unknowns import unknowns

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, Step

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.estimators.remembered_places import Place
 from rovgraph.geometry import Array
 from rovgraph.state import State

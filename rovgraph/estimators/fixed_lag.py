@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.filter_step import Gates, Gaussian, ProcessedMeasurement
 from rovgraph.estimators.initialise import InitialConditions

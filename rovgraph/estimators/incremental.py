@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.estimators.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate

@@ -5,7 +5,7 @@ from itertools import accumulate, groupby, pairwise
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.estimators.error_vector import ErrorVector
 from rovgraph.estimators.initialise import InitialConditions

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.error_recursion import ErrorStateRecursion

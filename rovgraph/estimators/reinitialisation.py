@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from rovgraph.estimators.filter_step import Gaussian
 from rovgraph.estimators.remembered_places import Place

@@ -7,7 +7,8 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate

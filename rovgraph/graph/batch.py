@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array

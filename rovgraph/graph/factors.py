@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, transpose
 from rovgraph.graph.keys import calibration_key, key

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.engine.late_stamp_window import LateStampWindow
 from rovgraph.engine.scale import COLUMNS, SCALES, biased
 from rovgraph.engine.unknowns import Unknowns

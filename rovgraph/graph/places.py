@@ -25,7 +25,7 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Problem, Solution, make_problem, make_values, solve
 from rovgraph.graph.factors import Start
