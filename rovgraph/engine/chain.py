@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import TABLE, Belief
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.chain_information import MeasurementRows, MotionRows, SquareRoot, UndeterminedError, eliminate
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, gates_of, loss_and_weight, measurement_cost
 from rovgraph.engine.scale import SCALES
 from rovgraph.engine.unknowns import Unknowns

@@ -8,11 +8,11 @@ import numpy as np
 
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs as beliefs_of
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.chain import COLUMNS, MOTION, Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.gauss_newton import Gates, Solution, minimise
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, blocks_of, weights_of
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.unknowns import Unknowns, unknowns

@@ -15,7 +15,6 @@ import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.error_layout import ErrorLayout
 from rovgraph.engine.filter_step import (
     FilterStep,
@@ -27,6 +26,7 @@ from rovgraph.engine.filter_step import (
     state_vector,
 )
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.engine.remembered_places import (
     RememberedPlace,

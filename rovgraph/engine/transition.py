@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.scale import biased
 from rovgraph.geometry import Array
 from rovgraph.kernels.motion import transitions as motion_transitions
