@@ -181,7 +181,7 @@ class SquareRoot:
 
     def filtered_covariances(self) -> Array:
         """Joint covariances of a keyframe and the border, of the data up to it, shape (f, d + c, d + c)."""
-        root = np.linalg.inv(self.filtered[:, :, :-1])
+        root = np.asarray(np.linalg.inv(self.filtered[:, :, :-1]), dtype=float)
         return root @ transpose(root)
 
     def newest_covariance(self) -> Array:
