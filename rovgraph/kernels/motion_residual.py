@@ -143,9 +143,7 @@ def motion_cost(motions: Array, W: Array, R: Array, p: Array, v: Array, bias: Ar
             b_i[i], b_j[i] = bias[k, i] + own, bias[k + 1, i] + own
             r[9 + i] = b_i[i] - b_j[i]
         if is_coasted(motions[k]):
-            coasting_error(
-                motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, r, A[0], A[1]
-            )
+            coasting_error(motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, r, A[0], A[1])
         else:
             predict_motion(motions[k], R[k], p[k], v[k], b_i, R_end, p_end, v_end)
             multiply_transposed(R[k + 1], R_end, apart)
