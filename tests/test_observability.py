@@ -71,10 +71,11 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
     log = case.log
     for sensor in list(log.streams):
         log = kept(log, sensor, (log[sensor].time > 18.0) & (log[sensor].time < 24.0))
-    dive = solved(log, ONE_COMPASS)
-    problem, values, gates = dive.problem, dive.solution.values, dive.solution.gates
+    smoother = batch(log, ONE_COMPASS)
+    dive = smoother.optimum()
+    graph = smooth_graph(dive.intervals, smoother.beginning, dive.state, last(dive.state.calibration))
+    problem, values, gates = graph.problem, graph.solution.point, graph.gates
     ends = [7, 12, problem.count - 1]
-    seen = knowledge(problem, values, gates, ends)
     linear = problem.linearize(values, gates)
     for row, end in enumerate(ends):
         later = {key(v, i) for v in ("pose", "velocity", "bias") for i in range(end + 1, problem.count)}
