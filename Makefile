@@ -41,7 +41,7 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/pytest -n 2 -m 'not slow'
+	$(BIN)/pytest -n 2 --dist loadfile -m 'not slow'
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python benchmarks/batch.py

@@ -12,6 +12,7 @@ import argparse
 import resource
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,14 +44,48 @@ def messages(log: Log, order: np.ndarray | None = None) -> Iterator[Message]:
         yield Message("file", m.time, m.time, (Reading(m.sensor, m.values),))
 
 
+def processor() -> float:
+    """Processor time of this process and of its children that have ended [s]."""
+    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(s.ru_utime + s.ru_stime for s in spent)
+
+
 def resident_mb() -> float:
     """Memory of this process now [MB]."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 1e6
 
 
-def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
-    """A dive at full speed: what an update takes, and whether time and memory grow."""
+@dataclass(frozen=True)
+class Replay:
+    """A dive at full speed.
+
+    Attributes
+    ----------
+    seconds : of the dive
+    wall, processor : what it took, processor time of all processes [s]
+    update_ms : what each update took, shape (n,)
+    waited : for the second process, as only a replay does [s]
+    memory_mb : of this process, in each quarter
+    """
+
+    seconds: float
+    wall: float
+    processor: float
+    update_ms: np.ndarray
+    waited: float
+    memory_mb: dict[int, float]
+
+
+def replay(kind: str, seconds: float, seed: int, rate: float) -> Replay:
+    """Replay a simulated dive through the navigator.
+
+    Parameters
+    ----------
+    kind : "fixed-lag" or "isam2"
+    seconds : of the dive
+    rate : solutions a second of the dive
+    """
     dive, config = simulated("lawnmower", seed, falcon(), Choices(duration=seconds))
     log = log_from_frame(dive.log_frame)
     del dive
@@ -64,16 +99,24 @@ def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
             memory[int(4 * (solution.time - begin) / seconds)] = resident_mb()
 
     session.receivers.append(watch)
-    began = time.perf_counter()
+    began, spent = time.perf_counter(), processor()
     session.run(messages(log))
     wall = time.perf_counter() - began
-    ms = 1e3 * np.array(session.took)
+    navigator.close()
+    return Replay(seconds, wall, processor() - spent, 1e3 * np.array(session.took), navigator.waited, memory)
+
+
+def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
+    """A dive at full speed: what an update takes, and whether time and memory grow."""
+    done = replay(kind, seconds, seed, rate)
+    ms, memory = done.update_ms, done.memory_mb
     quarters = [float(part.mean()) for part in np.array_split(ms, 4)]
     print(f"{kind}, {rate:g} solutions a second, {len(ms)} updates")
-    print(f"{seconds:.0f} s in {wall:.1f} s, {seconds / wall:.0f} times real time")
+    print(f"{seconds:.0f} s in {done.wall:.1f} s, {seconds / done.wall:.0f} times real time")
+    print(f"processor time of all processes {done.processor:.1f} s, {seconds / done.processor:.0f} times real time")
     print(f"update: mean {ms.mean():.2f} ms, p99 {np.percentile(ms, 99):.1f} ms, max {ms.max():.0f} ms")
     print(f"mean by quarter: {np.round(quarters, 2)} ms; the last is {quarters[3] / quarters[1]:.2f} times the second")
-    print(f"waited for the second process, as only a replay does: {navigator.waited:.1f} s")
+    print(f"waited for the second process, as only a replay does: {done.waited:.1f} s")
     print(f"longest: {np.sort(ms)[-10:].round()} ms")
     print(f"memory: {memory[1]:.0f} MB at half, {memory[3]:.0f} MB at the end, {memory[3] / memory[1] - 1:+.1%}")
 

@@ -16,6 +16,7 @@ from functools import cache, cached_property
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.calibration import LAYOUT, MOUNT, calibration_size
 from rovgraph.geometry import Array, matrix_from_rpy, wrap_angle
@@ -98,37 +99,44 @@ def evaluate(model: CompiledModel, by_state: tuple[str, ...], state: State, rate
     """
     n, names, size = len(state), model.calibration, calibration_size()
     if PLACE in by_state:
-        names = (*names, PLACE)
+        by_state, names = by_state[:-1], (*names, PLACE)
         size += PLACE_DIM
-    columns = _columns(names, size)
-    c = _vector(state.calibration, columns, size)
+    columns, parts = _columns(by_state, names, size)
+    c = _vector(state.calibration, names, size)
     given = (state.R_nb, state.p_n, state.v_n, state.bias, c, rate_b, model.packed)
     if not {len(values) for values in given} <= {1, n}:
         raise ValueError(f"{model.sensor}: cannot predict {n} epochs from arrays of {[len(v) for v in given]}")
-    z, H = np.empty((n, model.dim)), np.zeros((n, model.dim, MOTION + size))
-    kernels.predict_many(model.kind, *given, z, H)
-    jacobians = {name: H[..., _STATE[name]] for name in by_state if name != PLACE}
-    for name, _, own in columns:
-        jacobians[name] = H[..., own]
-    return z, jacobians
+    z, H = np.empty((n, model.dim)), np.empty((n, model.dim, len(columns)))
+    kernels.predict_many(model.kind, *given, columns, z, H)
+    return z, {name: H[..., own] for name, own in parts}
 
 
 _STATE = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
 
 
+def _place(name: str, size: int) -> slice:
+    """Of a variable in a calibration vector of some size; what is seen of places is its end."""
+    return LAYOUT[name] if name != PLACE else slice(size - PLACE_DIM, size)
+
+
 @cache
-def _columns(names: tuple[str, ...], size: int) -> tuple[tuple[str, slice, slice], ...]:
-    """Variables with their places in a calibration vector of some size, a place being its end, and in Jacobians."""
-    of = {name: LAYOUT[name] if name != PLACE else slice(size - PLACE_DIM, size) for name in names}
-    return tuple((name, own, slice(MOTION + own.start, MOTION + own.stop)) for name, own in of.items())
+def _columns(
+    by_state: tuple[str, ...], names: tuple[str, ...], size: int
+) -> tuple[NDArray[np.int64], list[tuple[str, slice]]]:
+    """Columns of all variables in a kernel's Jacobian, and the part of them that each variable has."""
+    columns = [np.arange(_STATE[name].start, _STATE[name].stop) for name in by_state]
+    columns += [MOTION + np.arange(own.start, own.stop) for own in (_place(name, size) for name in names)]
+    ends = np.cumsum([len(own) for own in columns]).tolist()
+    parts = [slice(end - len(own), end) for own, end in zip(columns, ends, strict=True)]
+    return np.concatenate(columns), list(zip((*by_state, *names), parts, strict=True))
 
 
-def _vector(calibration: Mapping[str, Array], columns: tuple[tuple[str, slice, slice], ...], size: int) -> Array:
+def _vector(calibration: Mapping[str, Array], names: tuple[str, ...], size: int) -> Array:
     """Calibration vectors of all epochs or of each, shape (1 or n, size); zero but for some variables."""
-    values = [calibration[name] for name, _, _ in columns]
+    values = [calibration[name] for name in names]
     c = np.zeros((max([len(value) for value in values if value.ndim == 2], default=1), size))
-    for (_, own, _), value in zip(columns, values, strict=True):
-        c[:, own] = value
+    for name, value in zip(names, values, strict=True):
+        c[:, _place(name, size)] = value
     return c
 
 

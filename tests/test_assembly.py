@@ -1,11 +1,15 @@
 """Keyframes and attached measurements: what goes where, and what is left out."""
 
+from dataclasses import fields, is_dataclass
+
 import numpy as np
 import pytest
-from dives import level_log
+from dives import Simulated, falcon, interrupted, kept, level_log, simulated, started
 
 from rovgraph.config import Config
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.motion import Motion
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 
@@ -14,11 +18,33 @@ G = np.array([0.0, 0.0, -9.81])
 
 def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInterval], Assembler]:
     config = config or Config()
-    assembler = Assembler(config, instruments(config), np.zeros(6))
+    whole, assembler = (Assembler(config, instruments(config), np.zeros(6)) for _ in range(2))
     done: list[KeyframeInterval] = []
     for measurement in log.measurements():
         done += assembler.add(measurement)
-    return done + assembler.finish(), assembler
+    done += assembler.finish()
+    same(done, whole.take(log))
+    assert whole.left_out == assembler.left_out
+    return done, assembler
+
+
+def same(a: object, b: object) -> None:
+    """Two values, objects of attributes or arrays, are the same to rounding."""
+    if is_dataclass(a) and not isinstance(a, type):
+        assert type(a) is type(b)
+        for f in fields(a):
+            if not (isinstance(a, Motion) and f.name == "imu"):  # as far as samples were there
+                same(getattr(a, f.name), getattr(b, f.name))
+    elif isinstance(a, list):
+        assert isinstance(b, list) and len(a) == len(b)
+        for one, other in zip(a, b, strict=True):
+            same(one, other)
+    elif isinstance(a, np.ndarray):
+        np.testing.assert_allclose(b, a, rtol=1e-12, atol=1e-15)
+    elif isinstance(a, float):
+        assert b == pytest.approx(a, rel=1e-12)
+    else:
+        assert a == b
 
 
 def log_of(seconds: float = 4.0, pings=(), rate: float = 100.0, **sensors) -> Log:
@@ -195,3 +221,41 @@ def test_an_imu_of_one_sample_makes_one_keyframe():
     log = log_of(0.0)
     intervals, _ = assembled(log)
     assert times(intervals) == [0.0]
+
+
+@pytest.fixture(scope="module")
+def dive() -> Simulated:
+    return simulated(falcon(imu={"max_gap_s": 60.0}), 40.0, seed=5, dvl_rate=4.7)
+
+
+LATE = {"dvl_time_offset": {"estimate": True, "sd": 0.05, "mean": 0.03}}
+SCALED = {"acc_scale": {"estimate": True}, "gyr_scale": {"estimate": True}}
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {},
+        {"calibration": LATE},
+        {"calibration": SCALED},
+        {"graph": {"max_gap_s": 0.1}},
+        {"graph": {"min_gap_s": 0.3}},
+        {"graph": {"max_gap_s": 0.35, "min_gap_s": 0.25, "segment_s": 3.0}},
+        {"imu": {"mount_rpy_deg": [176.6, 1.2, 30]}},
+    ],
+    ids=["plain", "late", "scaled", "short gaps", "sparse keyframes", "segments", "mounted"],
+)
+@pytest.mark.parametrize("silence", ["none", "imu", "dvl", "everything", "beginning", "end"])
+def test_a_log_taken_as_a_whole_gives_what_its_measurements_give_one_by_one(dive, sections, silence):
+    """`assembled` compares."""
+    log = dive.log
+    if silence in ("imu", "dvl"):
+        log = interrupted(log, 34.0, 1.7, silence)
+    elif silence == "everything":
+        log = interrupted(log, 34.0, 1.7)
+    elif silence == "beginning":
+        log = kept(log, "imu", log["imu"].time > 28.234)
+    elif silence == "end":
+        log = kept(log, "imu", log["imu"].time < 38.765)
+    intervals, _ = assembled(log, started(dive, **sections))
+    assert len(intervals) > 25

@@ -1,6 +1,5 @@
 """``rovgraph smooth`` from the command line, on good and on hostile input."""
 
-import contextlib
 import errno
 import json
 import os
@@ -8,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -280,22 +278,49 @@ def test_a_read_only_place_is_refused_before_the_work(monkeypatch, capsys, tmp_p
     assert "locked" in one_line(capsys)
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes by /proc")
-def test_ctrl_c_in_the_middle_leaves_nothing_and_exits_130(tmp_path, config):
-    command = [sys.executable, "-c", "from rovgraph.cli.app import main; main()", "smooth"]
-    arguments = [str(SHIPPED / "log.csv.gz"), "-c", str(config), "-o", str(tmp_path / "out")]
-    process = subprocess.Popen([*command, *arguments], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    children, deadline = Path(f"/proc/{process.pid}/task/{process.pid}/children"), time.monotonic() + 60.0
-    while not children.read_text() and time.monotonic() < deadline:  # the filter's process, when work begins
-        time.sleep(0.05)
-    time.sleep(0.5)
-    assert process.poll() is None, "it was faster than the interrupt"
+HELD = """
+import contextlib, sys, time
+import rovgraph.cli.progress
+import rovgraph.report.results
+from rovgraph.cli.app import main
+
+def hold(*given):
+    print("there", flush=True)
+    time.sleep(120)
+
+@contextlib.contextmanager
+def progress_bar():
+    yield hold
+
+if sys.argv.pop(1) == "estimating":
+    rovgraph.cli.progress.progress_bar = progress_bar
+else:
+    rovgraph.report.results.write_results = hold
+main()
+"""
+
+
+@pytest.mark.parametrize("stage", ["estimating", "writing"])
+def test_ctrl_c_in_the_middle_leaves_nothing_and_exits_130(tmp_path, config, short, stage):
+    """At the first sign of progress, and before the first file is written."""
+    arguments = [
+        stage,
+        "smooth",
+        str(save(short, tmp_path / "log.csv")),
+        "-c",
+        str(config),
+        "-o",
+        str(tmp_path / "out"),
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-c", HELD, *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "there\n"
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=100)
     assert process.returncode == 130
     assert "Traceback" not in errors
-    with contextlib.suppress(FileNotFoundError):
-        assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the Ictineu log is not beside the checkout")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dives import batch, falcon, incremental, interrupted, position_errors, renewed, simulated, started
 
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.preintegration import preintegrate, preintegration_params
 from rovgraph.engine.scale import SCALES
 from rovgraph.engine.transition import predict, residual, transitions, whitening

@@ -410,7 +410,7 @@ def test_an_interrupt_that_another_thread_takes_waits_until_processes_have_start
 def test_an_interrupt_ends_all_workers_and_leaves_nothing(tmp_path):
     script = "from rovgraph.cli.app import main\nif __name__ == '__main__':\n    main()\n"
     (tmp_path / "run.py").write_text(script)
-    command = [sys.executable, str(tmp_path / "run.py"), "compare", "--scenario", "circle", "--seeds", "4"]
+    command = [sys.executable, str(tmp_path / "run.py"), "compare", "--scenario", "circle", "--seeds", "400"]
     process = subprocess.Popen(
         [*command, "--jobs", "2", "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True
     )

@@ -28,7 +28,7 @@ from test_consistency import OVERCONFIDENT, band, drawn, nees
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.engine.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
 from rovgraph.engine.transition import predict, transitions

@@ -8,8 +8,8 @@ from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.filter_step import Gaussian
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.transition import predict
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import log_rotation, rotate, transpose

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -192,33 +193,30 @@ def test_a_missing_library_names_the_extra(monkeypatch):
 
 
 def test_complaints_come_once_per_kind_and_period(said):
-    limited = Warnings(lambda *about: said.append(about), period=0.2).complain
+    now = [0.0]
+    limited = Warnings(lambda *about: said.append(about), period=0.2, clock=lambda: now[0]).complain
     for _ in range(2):
         for _ in range(50):
             limited("a", "slow", "text")
             limited("a", "closed", "text")
-        time.sleep(0.25)
+        now[0] += 0.25
     assert sorted(kind for _, kind, _ in said) == ["closed"] * 2 + ["slow"] * 2
 
 
 # standard output
 
 PRINTS = """
-import sys, time
+import sys
 import numpy as np
 from rovgraph.live.warnings import Warnings
 from rovgraph.live.outputs import open_output
 from rovgraph.live.solution import Solution
 v = np.zeros(3)
 out = open_output("-", Warnings(lambda *about: print(*about, file=sys.stderr)), patient=sys.argv[2] == "patient")
-slowest = 0.0
 for k in range(int(sys.argv[1])):
-    begin = time.monotonic()
     out.send(Solution(float(k), v, v, v, v, v, v, 0.0))
-    slowest = max(slowest, time.monotonic() - begin)
-begin = time.monotonic()
 out.close()
-print("slowest", slowest, "close", time.monotonic() - begin, "dropped", out.dropped, file=sys.stderr)
+print("dropped", out.dropped, file=sys.stderr)
 """
 
 
@@ -228,29 +226,27 @@ def prints(count: int, how: str) -> subprocess.Popen:
     )
 
 
-def outcome(stderr: bytes) -> dict[str, float]:
-    words = stderr.decode().splitlines()[-1].split()
-    return {name: float(value) for name, value in zip(words[::2], words[1::2], strict=True)}
+def dropped(stderr: bytes) -> int:
+    name, count = stderr.decode().splitlines()[-1].split()
+    assert name == "dropped"
+    return int(count)
 
 
 def test_standard_output_has_every_line_where_its_reader_reads():
     child = prints(100, "live")
     out, err = child.communicate(timeout=30)
     assert [strict(line)["time"] for line in out.splitlines()] == list(range(100))
-    assert outcome(err)["dropped"] == 0
+    assert dropped(err) == 0
 
 
 def test_a_reader_of_standard_output_that_does_not_read_holds_up_nothing():
-    """Neither sending nor the end of the program."""
+    """Neither sending nor the end of the program: each would wait for ever."""
     child = prints(3000, "live")
-    assert child.wait(timeout=30) == 0
+    assert child.wait(timeout=60) == 0
     err = child.stderr.read()
-    result = outcome(err)
     assert b"does not read" in err
-    assert result["slowest"] < 0.5
-    assert result["close"] < 2.0
     lines = child.stdout.read().splitlines()
-    assert len(lines) - 1 <= 3000 - result["dropped"] <= len(lines) + 1
+    assert len(lines) - 1 <= 3000 - dropped(err) <= len(lines) + 1
 
 
 def test_a_patient_output_waits_for_its_reader_and_loses_nothing():
@@ -258,7 +254,7 @@ def test_a_patient_output_waits_for_its_reader_and_loses_nothing():
     time.sleep(1.0)
     out, err = child.communicate(timeout=30)
     assert [strict(line)["time"] for line in out.splitlines()] == list(range(3000))
-    assert outcome(err)["dropped"] == 0
+    assert dropped(err) == 0
 
 
 @pytest.mark.parametrize("how", ["live", "patient"])
@@ -268,7 +264,7 @@ def test_a_closed_pipe_is_complained_of_once_and_is_no_error(how):
     assert child.wait(timeout=30) == 0
     err = child.stderr.read()
     assert err.count(b"cannot be written (Broken pipe)") == 1
-    assert outcome(err)["dropped"] == 300
+    assert dropped(err) == 300
 
 
 def test_a_line_that_was_begun_is_ended_before_the_next(said, warnings):
@@ -360,16 +356,13 @@ def test_a_reader_that_stops_reading_loses_the_oldest_lines_and_holds_up_nobody(
     quick, received = socket.create_connection(("127.0.0.1", port)), []
     reading = threading.Thread(target=lambda: received.extend(lines_of(quick, 1000)))
     reading.start()
-    took = []
     for k in range(1000):
-        begin = time.monotonic()
         out.send(at(k))
-        took.append(time.monotonic() - begin)
         time.sleep(0.0005)
+    assert not any(reader.socket.getblocking() for reader in out._readers)
     reading.join(5.0)
     assert [r["time"] for r in received] == list(range(1000))
     assert out.dropped > 500
-    assert sum(t > 0.2 for t in took) < 10, "waits for the reader: more than 500 times, where a busy machine does once"
     assert [kind for _, kind, _ in said] == ["slow reader"]
     closing = threading.Thread(target=out.close)
     closing.start()
@@ -409,15 +402,17 @@ def test_readers_come_and_go(said, warnings):
     assert said == []
 
 
-def test_closing_is_bounded_where_a_reader_does_not_read():
+def test_closing_waits_half_a_second_at_most_for_a_reader_that_does_not_read(monkeypatch):
+    slept = []
+    clock = SimpleNamespace(monotonic=lambda: sum(slept), sleep=slept.append)
+    monkeypatch.setattr("rovgraph.live.outputs.tcp.time", clock)
     port = free_port()
     out = open_output(f"tcp://:{port}")
     reader = socket.create_connection(("127.0.0.1", port))
     for k in range(3000):
         out.send(at(k))
-    begin = time.monotonic()
     out.close()
-    assert time.monotonic() - begin < 1.0
+    assert 0.4 < sum(slept) <= 0.52
     reader.close()
 
 

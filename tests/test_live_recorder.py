@@ -4,9 +4,12 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -89,52 +92,74 @@ def test_rows_that_arrived_late_are_put_in_the_order_of_time_without_complaint(t
     assert read_quietly(tmp_path / "r.csv")["imu"].time.tolist() == [1.0, 2.0, 3.0, 9.0, 10.0]
 
 
-def test_rows_reach_the_operating_system_within_a_fifth_of_a_second(tmp_path):
-    recorder = Recorder(tmp_path / "r.csv")
-    recorder.write(1.0, EPOCH, imu(1.0))
-    begin = time.monotonic()
-    while (tmp_path / "r.csv").read_bytes().count(b"\n") < 2 and time.monotonic() - begin < 5.0:
+def until(true: Callable[[], bool], within: float = 30.0) -> None:
+    end = time.monotonic() + within
+    while not true():
+        assert time.monotonic() < end, "it did not come to that"
         time.sleep(0.005)
-    took = time.monotonic() - begin
+
+
+def test_rows_reach_the_operating_system_while_the_recording_goes_on(tmp_path):
+    recorder = Recorder(tmp_path / "r.csv")
+    for t in (1.0, 2.0):
+        recorder.write(t, EPOCH, imu(t))
+        until(lambda t=t: (tmp_path / "r.csv").read_bytes().count(b"\n") == 1 + t)
     recorder.close()
-    assert took < 0.2 + 0.1  # the latter for a busy machine
+
+
+def test_rows_wait_a_fifth_of_a_second_at_most_for_the_operating_system_and_a_second_for_the_disk(
+    tmp_path, monkeypatch
+):
+    waits = set()
+
+    class Stop(threading.Event):
+        def wait(self, timeout=None):
+            waits.add(timeout)
+            return super().wait(timeout)
+
+    monkeypatch.setattr("rovgraph.live.recorder.threading", SimpleNamespace(Event=Stop, Thread=threading.Thread))
+    recorder = Recorder(tmp_path / "r.csv")
+    until(lambda: len(waits) == 2)
+    recorder.close()
+    assert min(waits) <= 0.2 and max(waits) <= 1.0
 
 
 CRASHES = """
-import sys, time
+import itertools, os, sys, time
 import numpy as np
+from rovgraph.live import recorder
 from rovgraph.live.message import Reading
-from rovgraph.live.recorder import Recorder
-recorder, k = Recorder(sys.argv[1]), 0
-while True:
-    now = time.monotonic()
-    recorder.write(now, time.time(), [Reading("imu", np.full(6, now))])
-    k += 1
-    if k % 20 == 0:
-        print(now, flush=True)
+
+def write(file, data, write=os.write):
+    count = write(file, data)
+    print(data[:count].count(b"\\n"), flush=True)  # rows that the operating system has, the first time a header
+    return count
+
+recorder.os.write = write
+recording = recorder.Recorder(sys.argv[1])
+for k in itertools.count():
+    recording.write(float(k), time.time(), [Reading("imu", np.full(6, float(k)))])
     time.sleep(0.001)
 """
 
 
-def test_a_kill_loses_a_fifth_of_a_second_at_most_and_the_recording_goes_on(tmp_path):
+def test_a_kill_loses_only_what_was_not_yet_handed_over_and_the_recording_goes_on(tmp_path):
     path = tmp_path / "r.csv"
     child = subprocess.Popen([sys.executable, "-c", CRASHES, path], stdout=subprocess.PIPE, text=True)
-    last, begin = float(child.stdout.readline()), time.monotonic()
-    while time.monotonic() - begin < 1.0:
-        last = float(child.stdout.readline())
+    told = [child.stdout.readline() for _ in range(10)]
     child.kill()
-    told = [float(line) for line in child.communicate()[0].splitlines() if line]
+    told += child.communicate()[0].splitlines(keepends=True)
     assert child.returncode == -signal.SIGKILL
-    last = max([last, *told])
     content = path.read_bytes()
     whole = content[: content.rindex(b"\n") + 1]
-    rows = [line.split(b",") for line in whole.splitlines()]
-    assert {len(row) for row in rows} == {len(HEADER)}
-    assert last - float(rows[-1][0]) < 0.2 + 0.1  # the latter for a busy machine
+    header, *rows = [line.split(b",") for line in whole.splitlines()]
+    assert {len(row) for row in (header, *rows)} == {len(HEADER)}
+    assert [float(row[0]) for row in rows] == list(range(len(rows)))
+    assert len(rows) + 1 >= sum(int(line) for line in told if line.endswith("\n")) > 10
     recorder = Recorder(path)
-    recorder.write(last + 1.0, EPOCH, imu(1.0))
+    recorder.write(len(rows), EPOCH, imu(1.0))
     recorder.close()
-    assert len(read_quietly(path)["imu"]) == len(rows)  # less the header, and one more
+    assert len(read_quietly(path)["imu"]) == len(rows) + 1
 
 
 @pytest.mark.parametrize("tail", [b"1700000000.5,0.1", b"17", b"\0" * 5000, b"1.5" + b"\0" * 200_000])
@@ -189,7 +214,9 @@ for k in range(1000):
     recorder.write(float(k), 0.0, [Reading("imu", np.full(6, float(k)))])
     if k % 100 == 0:
         time.sleep(0.05)
-time.sleep(0.3)
+end = time.monotonic() + 30.0
+while not said and time.monotonic() < end:
+    time.sleep(0.01)
 full = len(said)
 if "free" in sys.argv:
     resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
@@ -228,20 +255,6 @@ def test_a_ninth_thruster_is_complained_of(tmp_path):
         recorder.write(t, EPOCH, [Reading("thruster", np.ones(9))])
     recorder.close()
     assert [kind for _, kind, _ in said] == ["left out"]
-
-
-def test_a_row_costs_less_than_eight_microseconds(tmp_path):
-    """Best of twenty hundreds, so that a busy machine is forgiven."""
-    recorder = Recorder(tmp_path / "r.csv")
-    rows = [(EPOCH + 0.01 * k, [Reading("imu", RNG.normal(size=6))]) for k in range(100)]
-    spent = []
-    for _ in range(20):
-        begin = time.perf_counter()
-        for t, readings in rows:
-            recorder.write(t, t, readings)
-        spent.append((time.perf_counter() - begin) / len(rows))
-    recorder.close()
-    assert min(spent) < 8e-6
 
 
 # checkpoints
@@ -357,16 +370,3 @@ def test_a_kill_while_checkpoints_are_written_leaves_a_whole_one(tmp_path):
         read = read_checkpoint(tmp_path / "a")
         assert (read["a"] == read["k"]).all()
         assert read["k"] >= max(told, default=1)
-
-
-def test_a_checkpoint_of_300_kilobytes_takes_less_than_three_milliseconds(tmp_path, monkeypatch):
-    """Beside the disk's own time; best of ten, so that a busy machine is forgiven."""
-    monkeypatch.setattr("os.fsync", lambda descriptor: None)
-    state = {"blocks": [{"k": k, "cov": RNG.normal(size=(30, 25))} for k in range(50)]}
-    spent = []
-    for _ in range(10):
-        begin = time.perf_counter()
-        write_checkpoint(tmp_path / "a", state)
-        spent.append(time.perf_counter() - begin)
-    assert (tmp_path / "a").stat().st_size > 300_000
-    assert min(spent) < 3e-3

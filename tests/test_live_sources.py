@@ -4,6 +4,8 @@ import dataclasses
 import gzip
 import math
 import os
+import queue
+import select
 import signal
 import socket
 import subprocess
@@ -14,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -53,6 +56,7 @@ from rovgraph.log import read_log
 ROOT = Path(__file__).parents[1]
 DATA = Path(__file__).parents[2] / "shared" / "data"
 TLOG = DATA / "ardusub" / "ardusub_small.tlog.gz"
+HANGS_S = 30.0  # nothing takes as long on any machine
 IMU = '"acc_x": 1, "acc_y": 2, "acc_z": -9.8, "gyr_x": 0.1, "gyr_y": 0.2, "gyr_z": 0.3'
 
 
@@ -89,6 +93,13 @@ def take(source: Source, count: int, within: float = 5.0) -> list[Message]:
         timer.cancel()
         stop.set()
     return out
+
+
+def until(true: Callable[[], bool]) -> None:
+    end = time.monotonic() + HANGS_S
+    while not true():
+        assert time.monotonic() < end, "it did not come to that"
+        time.sleep(0.01)
 
 
 @contextmanager
@@ -366,9 +377,23 @@ def test_standard_input_is_read_to_its_end_and_its_last_line_may_lack_an_end(pip
     assert not heard.kinds
 
 
-def test_every_live_source_stops_within_half_a_second(pipe, heard, impatient):
-    silent = threading.Event()
-    with server(lambda connection: silent.wait(5.0) and None) as port:
+def test_every_live_source_stops_when_told_as_it_never_waits_longer_than_a_fifth_of_a_second(pipe, heard, monkeypatch):
+    """What else it waits for, an answer or the next attempt, may take as long as it likes."""
+    monkeypatch.setattr(links, "CONNECT_S", 600.0)
+    monkeypatch.setattr(links, "RETRY_S", (600.0,))
+    waits, silent = [], threading.Event()
+
+    def settimeout(connection: socket.socket, seconds: float | None, settimeout=socket.socket.settimeout) -> None:
+        waits.append(seconds)
+        settimeout(connection, seconds)
+
+    def ready(read, write, failed, seconds=None):
+        waits.append(seconds)
+        return select.select(read, write, failed, seconds)
+
+    monkeypatch.setattr(links, "select", SimpleNamespace(select=ready))
+    with server(lambda connection: silent.wait(HANGS_S) and None) as port:
+        monkeypatch.setattr(socket.socket, "settimeout", settimeout)
         sources = [
             LinkSource("-", StandardInput(pipe[0]), json_lines("-", heard, Config())),
             open_source(f"tcp://127.0.0.1:{port}"),
@@ -383,14 +408,12 @@ def test_every_live_source_stops_within_half_a_second(pipe, heard, impatient):
         for thread in threads:
             thread.start()
         time.sleep(0.3)
-        begin = time.monotonic()
         stop.set()
         for thread in threads:
-            thread.join(2.0)
-        took = time.monotonic() - begin
+            thread.join(HANGS_S)
         silent.set()
     assert not any(thread.is_alive() for thread in threads)
-    assert took < 0.5
+    assert len(waits) >= 4 and all(seconds is not None and seconds <= 0.2 for seconds in waits)
 
 
 def test_a_tcp_source_connects_again_and_drops_the_line_that_was_cut(impatient):
@@ -407,13 +430,12 @@ def test_a_host_that_is_not_there_is_complained_of_until_it_is(impatient):
     port, warnings = free_port(), Warnings()
     source = open_source(f"tcp://localhost:{port}", warnings)
     started: list[list[Message]] = []
-    reader = threading.Thread(target=lambda: started.append(take(source, 1)), daemon=True)
+    reader = threading.Thread(target=lambda: started.append(take(source, 1, within=HANGS_S)), daemon=True)
     reader.start()
-    time.sleep(0.3)
+    until(lambda: warnings.counts.get((source.url, "unreachable"), 0) >= 2)
     with server(lambda connection: connection.sendall(b'{"depth": 5}\n'), port=port):
-        reader.join(5.0)
+        reader.join(HANGS_S)
     assert [len(messages) for messages in started] == [1]
-    assert warnings.counts[source.url, "unreachable"] >= 2
 
 
 @pytest.mark.parametrize("host", ["no-such-host.invalid", "a..b", "x" * 70])
@@ -839,40 +861,49 @@ def test_fixes_in_degrees_are_replayed_in_degrees(tmp_path):
     )
 
 
-def test_a_replay_at_a_speed_takes_its_time_and_stops_when_told(tmp_path):
+class Clock(threading.Event):
+    """A host's clock, and the event by which a replay waits and is stopped: time passes while it waits."""
+
+    def __init__(self, until: float = math.inf) -> None:
+        super().__init__()
+        self.now, self.until = 0.0, until
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def time(self) -> float:
+        return 1.7e9 + self.now
+
+    def wait(self, timeout: float | None = None) -> bool:
+        assert timeout is not None
+        self.now = min(self.now + timeout, self.until)
+        if self.now == self.until:
+            self.set()
+        return self.is_set()
+
+
+def test_a_replay_at_a_speed_takes_its_time_and_stops_when_told(tmp_path, monkeypatch):
     path = csv(tmp_path / "log.csv", rows=11)  # 1 s
-    begin = time.monotonic()
-    messages = list(open_source(f"file:{path}?speed=4").messages(threading.Event()))
-    assert 0.25 <= time.monotonic() - begin < 0.9
+    clock = Clock()
+    monkeypatch.setattr("rovgraph.live.sources.source.time", clock)
+    messages = list(open_source(f"file:{path}?speed=4").messages(clock))
+    assert clock.now == pytest.approx(0.25)
     assert messages[0].arrival == 100.0
-    stop = threading.Event()
-    threading.Timer(0.2, stop.set).start()
-    begin = time.monotonic()
-    live = list(open_source(f"file:{path}?speed=1").messages(stop))
-    assert time.monotonic() - begin < 0.9
-    assert 0 < len(live) < len(messages)
+    clock.now, clock.until = 0.0, 0.25
+    live = list(open_source(f"file:{path}?speed=1").messages(clock))
+    assert clock.now == 0.25
+    assert [m.stamp for m in live] == [m.stamp for m in messages if m.stamp < 100.25]
 
 
-def test_at_the_speed_of_life_messages_arrive_by_the_hosts_clock():
+def test_at_the_speed_of_life_messages_arrive_by_the_hosts_clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("rovgraph.live.sources.source.time", clock)
     recorded = [Message("f", 100.0 + t, 100.0 + t, ()) for t in (0.0, 0.05)]
-    now = time.time()
-    first, second = paced(recorded, 1.0, threading.Event())
-    assert first.arrival == pytest.approx(now, abs=0.1)
+    first, second = paced(recorded, 1.0, clock)
+    assert clock.now == pytest.approx(0.05)
+    assert first.arrival == 1.7e9
     assert second.arrival - first.arrival == pytest.approx(0.05, abs=1e-6)
     assert (first.stamp, second.stamp) == (100.0, 100.05)
-
-
-def test_a_replay_costs_little(tmp_path):
-    """Best of three, so that a busy machine is forgiven."""
-    path = csv(tmp_path / "log.csv", rows=20_000)
-    source = open_source(f"file:{path}?speed=max")
-
-    def best() -> float:
-        begin = time.process_time()
-        count = sum(1 for _ in Feed([source]))
-        return (time.process_time() - begin) / count
-
-    assert min(best() for _ in range(3)) < 15e-6
 
 
 # Feed
@@ -910,10 +941,29 @@ def test_files_as_fast_as_they_go_are_merged_by_arrival_without_threads():
     assert [(m.source, m.arrival) for m in messages] == [("a", 1), ("b", 2), ("b", 3), ("a", 4), ("a", 5), ("b", 6)]
 
 
-def test_a_live_feed_ticks_in_silence_and_ends_with_its_last_source():
-    said = list(Feed([Scripted("a", [1, 2], wait=0.25), Scripted("b", [3])]))
+def test_a_live_feed_ticks_in_silence_and_ends_with_its_last_source(monkeypatch):
+    waits, heard = set(), threading.Event()
+
+    class Queue(queue.Queue):
+        def get(self, block=True, timeout=None):
+            waits.add(timeout)
+            return super().get(block, timeout)
+
+    class Silent(Scripted):
+        def messages(self, stop: threading.Event) -> Iterator[Message]:
+            for message in super().messages(stop):
+                heard.wait(HANGS_S)
+                yield message
+
+    monkeypatch.setattr("rovgraph.live.feed.queue.Queue", Queue)
+    said = []
+    for message in Feed([Silent("a", [1, 2]), Scripted("b", [3])]):
+        said.append(message)
+        if said.count(None) == 3:
+            heard.set()
     assert sorted(m.arrival for m in said if m is not None) == [1, 2, 3]
-    assert 2 <= said.count(None) <= 6
+    assert said.index(None) < [m and m.source for m in said].index("a")
+    assert waits - {None} == {0.1}
 
 
 def test_a_source_that_can_wait_is_kept_waiting():
@@ -927,10 +977,10 @@ def test_a_source_that_can_wait_is_kept_waiting():
 
 
 def test_a_source_that_cannot_wait_loses_messages_and_it_is_complained_of():
-    warnings = Warnings()
-    feed = iter(Feed([Scripted("a", list(range(1000)), lossy=True)], warnings, size=10))
+    warnings, source = Warnings(), Scripted("a", list(range(1000)), lossy=True)
+    feed = iter(Feed([source], warnings, size=10))
     first = next(feed)
-    time.sleep(0.2)
+    until(lambda: source.said == 1000)
     kept = [first, *(m for m in feed if m is not None)]
     lost = warnings.counts["a", "flood"]
     assert lost > 0
@@ -951,11 +1001,8 @@ def test_closing_ends_the_iteration_and_the_threads():
             if count == 20:
                 break
     assert len(list(feed)) <= 10, "what was queued, and no more"
-    end = time.monotonic() + 2.0
     names = ("source endless", "source full")
-    while any(t.name in names for t in threading.enumerate()) and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not any(t.name in names for t in threading.enumerate())
+    until(lambda: not any(t.name in names for t in threading.enumerate()))
 
 
 INTERRUPTED = """
@@ -972,7 +1019,7 @@ except KeyboardInterrupt:
 """
 
 
-def test_an_interrupt_ends_a_program_at_once():
+def test_an_interrupt_ends_a_program():
     code = INTERRUPTED.format(udp=free_port(), tcp=free_port())
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -980,9 +1027,7 @@ def test_an_interrupt_ends_a_program_at_once():
         assert program.stdout.readline() == b"ready\n"
         time.sleep(0.3)
         program.send_signal(signal.SIGINT)
-        begin = time.monotonic()
-        assert program.wait(5.0) == 7
-        assert time.monotonic() - begin < 2.0
+        assert program.wait(HANGS_S) == 7
         assert program.stderr.read() == b""
 
 
@@ -999,7 +1044,7 @@ def test_everything_together_over_the_loopback(tmp_path, impatient):
             for message in feed:
                 if message is not None:
                     found.update(r.sensor for r in message.readings)
-                if len(found) == 4 or time.monotonic() - begin > 5.0:
+                if len(found) == 4 or time.monotonic() - begin > HANGS_S:
                     break
     assert found == {"dvl": 1, "dvl_altitude": 1, "imu": 1, "ahrs": 1}
 

@@ -1,7 +1,6 @@
 """Reading logs: what is kept, what is put in order, what is refused and how that is said."""
 
 import gzip
-import time
 import warnings
 from pathlib import Path
 
@@ -321,20 +320,16 @@ def test_measurements_come_in_order_imu_first_then_the_ping():
     assert list(Log("x", {}).measurements()) == []
 
 
-def test_long_logs_are_merged_and_read_fast(tmp_path):
+def test_long_logs_are_merged_and_read_whole(tmp_path):
     n = 200_000
     log = Log(
         "x", {"imu": stream("imu", list(np.arange(n) * 0.005)), "depth": stream("depth", list(np.arange(n // 10)))}
     )
-    start = time.perf_counter()
     assert sum(1 for _ in log.measurements()) == n + n // 10
-    assert time.perf_counter() - start < 3.0  # 0.4 s on a quiet machine
     frame = pd.DataFrame(np.random.default_rng(0).normal(size=(50_000, 6)), columns=list(STREAMS["imu"]))
     frame.insert(0, "time", 0.01 * np.arange(50_000))
     frame.to_csv(tmp_path / "log.csv", index=False)
-    start = time.perf_counter()
     assert len(read_quietly(tmp_path / "log.csv")["imu"]) == 50_000
-    assert time.perf_counter() - start < 3.0  # 0.2 s on a quiet machine
 
 
 def test_the_real_dive_is_read_whole_and_without_warning():

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
 from rovgraph.calibration import TABLE
-from rovgraph.engine.assembly import KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.late_stamp_window import KNOT_S, LateStampWindow
 from rovgraph.engine.measurements import (
     Block,

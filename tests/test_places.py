@@ -25,7 +25,8 @@ from scipy.stats import chi2
 
 from rovgraph.check import examine
 from rovgraph.config import Config
-from rovgraph.engine.assembly import Assembler, KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.motion import Snapshot
 from rovgraph.engine.optimum import OTHERS
 from rovgraph.errors import DataWarning, InputError

@@ -7,7 +7,7 @@ import pytest
 from dives import LIVELY, altered, as_log, batch, changed, falcon, fed, kept, level_log, simulated
 
 from rovgraph.config import Config, parse_config
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.motion import Motion
 from rovgraph.engine.preintegration import PreintegrationParams, preintegrate, preintegration_params
 from rovgraph.engine.transition import predict

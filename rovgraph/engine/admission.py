@@ -1,6 +1,7 @@
 """Which measurements may reach an estimate, and how sure each is of itself."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,19 +15,30 @@ DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that ove
 LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
 
 
-def refused(sensor: str, values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Reasons to leave measurements out, and whether each is left out for it.
+def admitted(sensor: str, values: Array, config: Config, left_out: Counter[tuple[str, str]]) -> NDArray[np.bool_]:
+    """Whether measurements may enter the graph.
 
     Parameters
     ----------
     sensor : name of the log stream
     values : ndarray, shape (n, k), its columns
     config : effective configuration
+    left_out : (sensor, reason) -> count, of those that may not
 
-    Yields
-    ------
-    reason, mask : str, ndarray of bool, shape (n,); the first that holds of a measurement is its own
+    Returns
+    -------
+    ndarray of bool, shape (n,)
     """
+    mask = np.ones(len(values), bool)
+    for reason, bad in _refused(sensor, values, config):
+        if (bad & mask).any():
+            left_out[sensor, reason] += int((bad & mask).sum())
+            mask &= ~bad
+    return mask
+
+
+def _refused(sensor: str, values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Reasons to leave measurements out, and whether it is one for each; the first that holds counts."""
     if sensor == "dvl":
         yield "no bottom lock", values[:, 3] == 0.0
     if sensor in ("dvl", "dvl_water"):

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.filter_step import Gaussian
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.geometry import (
     Array,
     exp_rotation,

@@ -12,128 +12,34 @@ longer than that, and counting each sample would make the estimate too sure of i
 import math
 from bisect import insort
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import InitVar, dataclass, field
 from itertools import islice
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.config import Config, beliefs, mount_matrix
-from rovgraph.engine.admission import refused, standard_deviation
+from rovgraph.engine.admission import admitted, standard_deviation
 from rovgraph.engine.aiding import Aiding
-from rovgraph.engine.late_stamp_window import LateStampWindow, window_around
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.late_stamp_window import window_around
 from rovgraph.engine.motion import Motion, Snapshot
 from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
 from rovgraph.engine.scale import scale_to_bias, wanted
 from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
+from rovgraph.engine.whole_log import ONCE_PER_INTERVAL, SHORTEST_S, WholeLog
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
-from rovgraph.log import Log, Measurement, Stream
+from rovgraph.log import Log, Measurement
 from rovgraph.log.packing import pack, unpack
-from rovgraph.log.streams import arrivals, in_precedence
 from rovgraph.model_aiding import ModelAiding
 from rovgraph.state import State
 
-SHORTEST_S = 1e-3  # an interval
 SOME = 4096  # measurements of a log that are objects at one time
-ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 _AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
 _NO_RATE = np.zeros(3), 0.0
-
-
-class LandmarkObservation(NamedTuple):
-    """Which place a camera or sonar saw.
-
-    Attributes
-    ----------
-    name : what the log calls it
-    number : of the place's variable: that of its first landmark. To begin with each landmark is of a place
-        of its own; `rovgraph.graph.places` finds those that are one.
-    believed : False = the vehicle cannot have been there; it is not let in unless the optimum says otherwise
-    """
-
-    name: float
-    number: int
-    believed: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class KeyframeMeasurement:
-    """A measurement that belongs to a keyframe.
-
-    Attributes
-    ----------
-    sensor : name of the log stream
-    keyframe, segment : index of the keyframe, and the segment of time it lies in
-    time, row : of the measurement, and its line in the log
-    z : ndarray, shape (dim,)
-    sd : ndarray, shape (dim,), the instrument's, or the measurement's own
-    rate_b, rate_sd : ndarray, shape (3,), float: measured rate, bias still in it [rad/s]
-    motion : Snapshot from the keyframe to the measurement
-    bias : ndarray, shape (6,), that the motion was integrated with
-    window : LateStampWindow of one stamp, where stamps may be late
-    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.engine.scale`, where the IMU's scale may be off
-    landmark : of a place, where it is one
-    """
-
-    sensor: str
-    keyframe: int
-    segment: int
-    time: float
-    row: int
-    z: Array
-    sd: Array
-    rate_b: Array
-    rate_sd: float
-    motion: Snapshot
-    bias: Array
-    window: LateStampWindow | None = None
-    scale_to_bias: Array | None = None
-    landmark: LandmarkObservation | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class KeyframeInterval:
-    """From the keyframe before to keyframe ``index``; the first has no motion.
-
-    Attributes
-    ----------
-    index, time : of the keyframe that ends the interval
-    segment : of time that this keyframe lies in, from 0 and by steps of 0 or 1: calibration
-        variables that walk have one value in each
-    rate_b, rate_sd : ndarray, shape (3,), float: measured rate at the keyframe, bias still
-        in it, and its noise [rad/s]
-    motion : from the keyframe before, None for the first
-    measurements : at the keyframe itself, and between the keyframe before and it
-    scale_to_bias : ndarray, shape (6, 6), of `rovgraph.engine.scale`, where the IMU's scale may be off
-    """
-
-    index: int
-    time: float
-    segment: int
-    rate_b: Array
-    rate_sd: float
-    motion: Motion | None
-    measurements: list[KeyframeMeasurement]
-    scale_to_bias: Array | None = None
-
-    @property
-    def bridged(self) -> bool:
-        """Whether samples of the IMU are missing."""
-        return self.motion is not None and self.motion.gap_s > 0.0
-
-    @property
-    def between(self) -> list[KeyframeMeasurement]:
-        """Measurements that belong to the keyframe before."""
-        return [m for m in self.measurements if m.keyframe < self.index]
-
-    @property
-    def here(self) -> list[KeyframeMeasurement]:
-        """Measurements at the keyframe that ends the interval."""
-        return [m for m in self.measurements if m.keyframe == self.index]
 
 
 @dataclass
@@ -161,10 +67,9 @@ class Assembler:
     def __post_init__(self, assumed: TimeOffsets | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
         self._samples = Samples(self.config, self.learn_noise)
-        self._ready: Array | None = None  # where the log is known as a whole: times up to which each sample lets see
+        self._log: WholeLog | None = None
         self._waiting: deque[StampedMeasurement] = deque()
         self._aiding: Aiding | None = None
-        self._signals: deque[Measurement] = deque()  # of thrusters, of a log that is known as a whole
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
@@ -210,23 +115,17 @@ class Assembler:
         ------
         InputError : an IMU gap longer than ``imu.max_gap_s``
         """
-        if "imu" not in log or not len(log["imu"]):
-            deque(self._stamped(log, None), maxlen=0)  # counts what is left out
+        whole = WholeLog(log, self.instruments, self.config, self.time_offsets, self._around, self.left_out)
+        if whole.imu is None:
             return []
-        imu = log["imu"]
-        after_gap = imu.take(self._samples.take(imu))
-        self._ready, begin = imu.time - self._around, float(imu.time[0])
-        if self._aiding is not None and "thruster" in log:
-            stream = log["thruster"]
-            own = zip(stream.time.tolist(), stream.data, stream.row.tolist(), strict=True)
-            self._signals.extend(Measurement(time, "thruster", values, row) for time, values, row in own)
-        measurements = self._not_before(begin, self._stamped(log, after_gap))
+        self._log = whole
+        measurements = whole.measurements(self._samples.take(whole.imu))
         self._samples.reach(1)
-        done = [self._begin(begin)]
+        done = [self._begin(whole.begin)]
         while some := list(islice(measurements, SOME)):
             self._waiting.extend(some)
-            done += self._take_until(min(some[-1].time, float(self._ready[-1])))
-        self._samples.reach(len(imu))
+            done += self._take_until(min(some[-1].time, whole.end - self._around))
+        self._look(len(whole.imu))
         return done + self.finish()
 
     def copy(self) -> "Assembler":
@@ -287,10 +186,10 @@ class Assembler:
             m = self._waiting.popleft()
             done += self._silence(m.time)
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
-                self._see(m.time)
+                self._look_at(m.time)
                 done.append(self._close(m.time, None))
             elif m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
-                self._see(m.time)
+                self._look_at(m.time)
                 done.append(self._close(m.time, m))
             elif m.sensor != "imu":
                 self._between.append(m)
@@ -306,80 +205,12 @@ class Assembler:
         if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
             return done
+        self._look_at(math.inf)
         return [*done, self._close(end, None)]
 
     def _admissible(self, m: Measurement) -> bool:
         """Whether a measurement may enter the graph; counts those that may not."""
-        if m.sensor not in self.instruments:
-            return False
-        for reason, mask in refused(m.sensor, m.values[None], self.config):
-            if mask[0]:
-                self.left_out[m.sensor, reason] += 1
-                return False
-        return True
-
-    def _stamped(self, log: Log, after_gap: Stream | None) -> Iterator[StampedMeasurement]:
-        """Measurements of a log that may enter the graph, and samples after a gap, in the order of where they are put.
-
-        Of one place in the order of arrival.
-        """
-        streams = [] if after_gap is None else [after_gap]
-        for stream in log.streams.values():
-            if stream.sensor in self.instruments and stream.sensor != "thruster":
-                streams.append(self._admitted(stream))
-        streams = in_precedence(streams)
-        if not streams:
-            return
-        names = [stream.sensor for stream in streams]
-        late = np.array([self.time_offsets.of_sensor(name) for name in names])
-        which, index, stamp = arrivals(streams)
-        time = stamp - late[which]
-        order = np.argsort(time, kind="stable")
-        order = order[self._wanted(names, which[order], time[order])]
-        for part in np.array_split(order, max(1, len(order) // SOME)):
-            columns = (a[part].tolist() for a in (time, stamp, which, index))
-            for t, s, k, i in zip(*columns, strict=True):
-                stream = streams[k]
-                yield StampedMeasurement(t, names[k], stream.data[i], int(stream.row[i]), s)
-
-    def _wanted(self, names: Sequence[str], which: NDArray[np.int64], time: Array) -> NDArray[np.bool_]:
-        """Without those of which one an interval is taken, where surely another one is: between near pings.
-
-        Parameters
-        ----------
-        names : of streams
-        which, time : ndarray, shape (n,), stream of each measurement, and where it is put [s], in this order
-        """
-        graph, wanted = self.config.graph, np.ones(len(time), bool)
-        ends = np.isin(which, [k for k, name in enumerate(names) if name in ("imu", "dvl")])
-        part = np.cumsum(ends)
-        edges = np.concatenate([[-np.inf], time[ends], [np.inf]])
-        # the keyframe before may stand up to `min_gap_s` before a ping that makes none
-        whole = np.diff(edges) > graph.max_gap_s - graph.min_gap_s - SHORTEST_S
-        begin, end = (np.inf, -np.inf) if self._ready is None else self._ready[[0, -1]] + self._around
-        whole |= (edges[:-1] < begin) | (edges[1:] > end - SHORTEST_S)  # what is left out there is counted
-        for k, name in enumerate(names):
-            if name in ONCE_PER_INTERVAL:
-                own = np.flatnonzero(which == k)
-                wanted[own] = whole[part[own]] | (np.diff(part[own], prepend=-1) > 0)
-        return wanted
-
-    def _admitted(self, stream: Stream) -> Stream:
-        """The measurements of a stream that may enter the graph; counts the others."""
-        out = np.zeros(len(stream), bool)
-        for reason, mask in refused(stream.sensor, stream.data, self.config):
-            if (mask & ~out).any():
-                self.left_out[stream.sensor, reason] += int((mask & ~out).sum())
-            out |= mask
-        return stream.take(~out) if out.any() else stream
-
-    def _not_before(self, begin: float, measurements: Iterator[StampedMeasurement]) -> Iterator[StampedMeasurement]:
-        """Without those that came and are put before the first IMU sample."""
-        for m in measurements:
-            if m.time < begin and m.stamp < begin:
-                self.left_out[m.sensor, "before the first IMU sample"] += 1
-            else:
-                yield m
+        return m.sensor in self.instruments and bool(admitted(m.sensor, m.values[None], self.config, self.left_out)[0])
 
     def _begin(self, time: float) -> KeyframeInterval:
         """The first keyframe, at the first IMU sample, before which nothing can be placed."""
@@ -393,33 +224,22 @@ class Assembler:
         done = []
         gap = self.config.graph.max_gap_s
         while time - self._start > gap:
-            self._see_after(gap)
+            if self._log is not None:
+                self._look(self._log.count_after(self._start, gap))
             done.append(self._close(self._start + gap, None))
         return done
 
-    def _see(self, time: float) -> None:
-        """Look at the samples of a log that is known as a whole up to the first that lets a time be seen."""
-        if self._ready is not None:
-            self._look(int(self._ready.searchsorted(time)))
+    def _look_at(self, time: float) -> None:
+        """Look at the samples of a log that is known as a whole, up to the first by which a time is past."""
+        if self._log is not None:
+            self._look(self._log.count_at(time))
 
-    def _see_after(self, gap: float) -> None:
-        """The same up to the first that lets more than a gap be seen since the newest keyframe."""
-        if self._ready is None:
-            return
-        k = int(self._ready.searchsorted(self._start + gap, side="right"))
-        while k > 0 and self._ready[k - 1] - self._start > gap:  # what `_silence` asks, to the last bit
-            k -= 1
-        while k < len(self._ready) and not self._ready[k] - self._start > gap:
-            k += 1
-        self._look(k)
-
-    def _look(self, sample: int) -> None:
-        assert self._ready is not None
-        count = min(sample + 1, len(self._ready))
+    def _look(self, count: int) -> None:
+        """Look at as many samples of a log that is known as a whole."""
         self._samples.reach(count)
-        while self._signals and self._signals[0].time <= self._samples.newest:
-            assert self._aiding is not None
-            self._aiding.add(self._signals.popleft())
+        if self._aiding is not None and self._log is not None:
+            for signal in self._log.signals(self._samples.newest):
+                self._aiding.add(signal)
 
     def _close(self, time: float, ping: StampedMeasurement | None) -> KeyframeInterval:
         """Make a keyframe at ``time`` and the interval that leads to it."""

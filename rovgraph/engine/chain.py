@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import TABLE, Belief
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.chain_information import MeasurementRows, MotionRows, SquareRoot, UndeterminedError, eliminate
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, gates_of, loss_and_weight, measurement_cost
 from rovgraph.engine.scale import SCALES
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
-from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motions
+from rovgraph.kernels.motion_residual import motion_cost, motion_errors, motion_weights, whiten_motions
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 MOTION = 15  # components of a keyframe before what walks
@@ -128,8 +128,10 @@ class Chain:
         return gates_of(self.seen(point))
 
     def cost(self, point: State, gates: Gates) -> float:
-        r, _, _ = self.motion_residuals(point)
-        total = 0.5 * float(np.sum(r**2)) + 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
+        shift = np.empty((0, 6)) if self.scale_to_bias is None else self._scale_shift(point)
+        R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
+        total = motion_cost(self.motions, self.motion_weights, R, p, v, b, shift)
+        total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
         for name in self._walking:
             total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
         return total + measurement_cost(self.seen(point), gates)
@@ -240,7 +242,7 @@ class Chain:
         """Room for the rows of priors, of the clone's tie and of all measurements, in this order."""
         blocks, first = self.blocks.values(), np.zeros(1, np.int64)
         walking = self.d - MOTION
-        keyframes = [first, first, first, *(b.keyframe for b in blocks)]
+        keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]
         dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
         others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
         return MeasurementRows(len(self.intervals), MOTION, keyframes, dims, max([walking, clones, *others]))

@@ -181,7 +181,7 @@ class SquareRoot:
 
     def filtered_covariances(self) -> Array:
         """Joint covariances of a keyframe and the border, of the data up to it, shape (f, d + c, d + c)."""
-        root = np.linalg.inv(self.filtered[:, :, :-1])
+        root = np.asarray(np.linalg.inv(self.filtered[:, :, :-1]), dtype=float)
         return root @ transpose(root)
 
     def newest_covariance(self) -> Array:
@@ -196,7 +196,8 @@ class SquareRoot:
     def border_by(self, given: Index) -> Array:
         """How the optimum of the whole border moves with k of its components, shape (c, k)."""
         others = np.setdiff1d(np.arange(len(self.border)), given)
-        R, free = np.linalg.qr(self.border[:, [*others, *given]], mode="r"), len(others)
+        R: Array = np.asarray(np.linalg.qr(self.border[:, [*others, *given]], mode="r"))
+        free = len(others)
         out = np.zeros((len(self.border), len(given)))
         out[given] = np.eye(len(given))
         out[others] = -_solve_upper(R[:free, :free], R[:free, free:])

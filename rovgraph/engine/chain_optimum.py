@@ -8,11 +8,11 @@ import numpy as np
 
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs as beliefs_of
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.chain import COLUMNS, MOTION, Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.gauss_newton import Gates, Solution, minimise
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, blocks_of, weights_of
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.unknowns import Unknowns, unknowns
@@ -87,7 +87,7 @@ class ChainOptimum:
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
-            return self._covariances[:, COLUMNS[variable], COLUMNS[variable]]
+            return np.asarray(self._covariances[:, COLUMNS[variable], COLUMNS[variable]])
         border, part = self.chain.layout[variable]
         if not border:
             return self._covariances[:, part, part]
@@ -97,7 +97,7 @@ class ChainOptimum:
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         chosen = np.concatenate([np.arange(MOTION), *(self.chain.target(n) for n in self.unknowns.estimated)])
-        return self.information.newest_covariance()[np.ix_(chosen, chosen)]
+        return np.asarray(self.information.newest_covariance()[np.ix_(chosen, chosen)])
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""

@@ -1,7 +1,7 @@
 """Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from rovgraph.kernels.layout import MOTION
 from rovgraph.model_aiding import WaterVelocity
 from rovgraph.sensors import CompiledModel, SensorModel
 from rovgraph.state import DIMENSION, VELOCITY, Jacobians
+
+Index = NDArray[np.int64]
 
 # the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
 SEEN = {
@@ -61,12 +63,10 @@ class ErrorLayout:
 
         self.coordinates = self._coordinates(instruments)
 
-    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Any, ...]:
-        """Columns of the calibration vector, instruments and what they see, their numbers, rows of a basis."""
-        calibration: NDArray[np.int64] = np.full(self.size - MOTION, -1)
-        for place, error in enumerate(self.column[MOTION:].tolist()):
-            if error >= 0:
-                calibration[error - MOTION] = place
+    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Index, Index, Array, Index]:
+        """Columns of a full Jacobian, instruments and what they see, their numbers, rows of a basis."""
+        estimated = np.flatnonzero(self.column >= 0)
+        columns = estimated[np.argsort(self.column[estimated])]
         shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in self.columns}
         models = [(model, self.columns[variable]) for variable, model in shown.items()]
         seen = [(model.kind, model.dim, part.start) for model, part in models]
@@ -74,7 +74,7 @@ class ErrorLayout:
         for row, (model, _) in zip(params, models, strict=True):
             row[: model.packed.shape[1]] = model.packed[0]
         rows = np.concatenate([np.arange(6), *(np.r_[part] for _, part in models)]).astype(np.int64)
-        return calibration, np.array(seen, np.int64).reshape(-1, 3), params, rows
+        return columns, np.array(seen, np.int64).reshape(-1, 3), params, rows
 
     def matrix(self, H: Jacobians) -> Array:
         """Jacobians by variable as one, shape (n, dim, size); what is not estimated is left out."""

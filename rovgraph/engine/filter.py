@@ -15,7 +15,6 @@ import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.error_layout import ErrorLayout
 from rovgraph.engine.filter_step import (
     FilterStep,
@@ -27,6 +26,7 @@ from rovgraph.engine.filter_step import (
     state_vector,
 )
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.engine.remembered_places import (
     RememberedPlace,
@@ -202,8 +202,8 @@ class FilterEngine:
         if gates is not None:
             gates.clear()
             gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
-        known = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
-        processed += [ProcessedMeasurement(m, before.x, before.c, *rest) for m, *rest in known]
+        met = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
+        processed += [ProcessedMeasurement(m, before.x, before.c, own, w) for m, own, w in met]
         return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places)
 
     def _of_block(self, known: Gaussian, m: KeyframeMeasurement) -> tuple[Array, Array]:

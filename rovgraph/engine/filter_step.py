@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from rovgraph.calibration import LAYOUT, calibration_size
-from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.geometry import Array
 from rovgraph.state import State

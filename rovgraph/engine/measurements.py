@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.late_stamp_window import LateStampWindow
 from rovgraph.engine.scale import COLUMNS, SCALES, biased
 from rovgraph.engine.unknowns import Unknowns

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.engine.measurements import loss_threshold
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
 from rovgraph.instruments import HEADING_STREAMS

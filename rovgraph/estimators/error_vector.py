@@ -68,7 +68,7 @@ class ErrorVector:
 
     def layout(self) -> ErrorLayout:
         """What `rovgraph.kernels.error_coordinates` needs to know."""
-        columns = [np.arange(LAYOUT[name].start, LAYOUT[name].stop) for name in self._estimated]
+        columns = [np.arange(15), *(15 + np.arange(LAYOUT[n].start, LAYOUT[n].stop) for n in self._estimated)]
         models: list[Any] = [model for model, _, _ in self._seen]  # all of them are compiled ones
         seen = [(model.kind, model.dim, own.start) for model, (_, _, own) in zip(models, self._seen, strict=True)]
         params = np.zeros((len(models), max((model.packed.shape[1] for model in models), default=0)))
@@ -76,10 +76,7 @@ class ErrorVector:
             row[: model.packed.shape[1]] = model.packed[0]
         rows = [np.arange(6), *(np.arange(own.start, own.stop) for _, _, own in self._seen)]
         return ErrorLayout(
-            np.concatenate([np.zeros(0, np.int64), *columns]),
-            np.array(seen, np.int64).reshape(-1, 3),
-            params,
-            np.concatenate(rows),
+            np.concatenate(columns), np.array(seen, np.int64).reshape(-1, 3), params, np.concatenate(rows)
         )
 
     def matrix(self, H: Jacobians) -> Array:

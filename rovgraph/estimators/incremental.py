@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.estimate import Estimate

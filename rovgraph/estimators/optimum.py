@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
 from rovgraph.geometry import Array
 from rovgraph.state import PLACE, State

@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.calibration import TABLE, Belief
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
 from rovgraph.estimators.observability import verdict

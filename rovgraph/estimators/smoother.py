@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rovgraph.config import beliefs
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.considered import Considered, consider
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon

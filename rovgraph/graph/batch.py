@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.gauss_newton import Gates, Solution, minimise
 from rovgraph.engine.initial_conditions import StatePrior
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, Seen, blocks_of, gates_of, measurement_cost, weights_of
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.errors import InputError

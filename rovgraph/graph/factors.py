@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.initial_conditions import StatePrior
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.graph.keys import calibration_key, key
 from rovgraph.graph.motion_factors import motion_factor

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import gtsam
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.motion import Motion
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.transition import residual, whitening

@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 
 from rovgraph.calibration import TABLE, Belief
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.gauss_newton import Gates, Solution
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.unknowns import Unknowns

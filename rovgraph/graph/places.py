@@ -25,10 +25,10 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs as beliefs_of
-from rovgraph.engine.assembly import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Problem, make_problem, make_values, solution_at, solve

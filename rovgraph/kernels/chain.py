@@ -50,34 +50,41 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
     if pivot < 0 or first < 0 or column < 0:
         return  # it never is; the compiler must know it to use vector instructions
     count = last - first
-    square = 0.0
+    square, other = 0.0, 0.0
     for i in range(count):
         v[i] = W[first + i, column]
         W[first + i, column] = 0.0
-        square += v[i] * v[i]
+    for i in range(count // 2):  # two sums do not wait for each other
+        square += v[2 * i] * v[2 * i]
+        other += v[2 * i + 1] * v[2 * i + 1]
+    square += other
+    if count % 2:
+        square += v[count - 1] * v[count - 1]
     if square == 0.0:
         return
     top = W[pivot, column]
     norm = -math.copysign(math.sqrt(top * top + square), top)
     lead = top - norm
     gain = 1.0 / (lead * norm)  # -2 over the square of (lead, v)
+    W[pivot, column] = 0.0
     begin = column // LANES * LANES
     width = (W.shape[1] // LANES - column // LANES) * LANES
     for c in range(width):
         w[c] = lead * W[pivot, begin + c]
     for i in range(count):
         factor = v[i]
+        if factor == 0.0:
+            continue
         for c in range(width):
             w[c] += factor * W[first + i, begin + c]
+    factor = gain * lead
     for c in range(width):
-        w[c] *= gain
-    for c in range(column - begin + 1):
-        w[c] = 0.0
-    for c in range(width):
-        W[pivot, begin + c] += lead * w[c]
+        W[pivot, begin + c] += factor * w[c]
     W[pivot, column] = norm
     for i in range(count):
-        factor = v[i]
+        factor = gain * v[i]
+        if factor == 0.0:
+            continue
         for c in range(width):
             W[first + i, begin + c] += factor * w[c]
 
@@ -111,60 +118,60 @@ def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
 
 @helper
 def load_measurements(
-    V: Array, scale: Array, d: int, s: int, rows: Array, targets: Index, begin: int, end: int
+    rows: Array, targets: Index, begin: int, end: int, s: int, d: int, V_out: Array, scale_out: Array
 ) -> None:
-    """Rows of a keyframe's measurements, below the d rows that are known of it; ``scale`` adds up their squares."""
+    """Rows of a keyframe's measurements, below the d rows that are known of it; ``scale_out`` adds up their squares."""
     last = rows.shape[1] - 1
     for i in range(end - begin):
         row = begin + i
-        for j in range(V.shape[1]):
-            V[d + i, j] = 0.0
+        for j in range(V_out.shape[1]):
+            V_out[d + i, j] = 0.0
         for j in range(s):
-            V[d + i, j] = rows[row, j]
+            V_out[d + i, j] = rows[row, j]
         for j in range(targets.shape[1]):
             if targets[row, j] >= 0:
-                V[d + i, targets[row, j]] += rows[row, s + j]
-        for j in range(scale.shape[0]):
-            scale[j] += V[d + i, j] * V[d + i, j]
-        V[d + i, scale.shape[0]] = rows[row, last]
+                V_out[d + i, targets[row, j]] += rows[row, s + j]
+        for j in range(scale_out.shape[0]):
+            scale_out[j] += V_out[d + i, j] * V_out[d + i, j]
+        V_out[d + i, scale_out.shape[0]] = rows[row, last]
 
 
 @helper
 def load_motion(
-    W: Array,
-    scale: Array,
     k: int,
     A_i: Array,
     A_j: Array,
+    r: Array,
     C: Array,
     targets: Index,
-    r: Array,
     walk: Array,
     walk_r: Array,
+    W_out: Array,
+    scale_out: Array,
 ) -> None:
-    """Rows of the motion after keyframe k, below the d rows of it; ``scale`` becomes that of the keyframe after it."""
+    """Rows of the motion after keyframe k, below its own d; ``scale_out`` becomes that of the keyframe after it."""
     s, d = A_i.shape[1], A_i.shape[1] + walk.shape[1]
     for i in range(d, 2 * d):
-        for j in range(W.shape[1]):
-            W[i, j] = 0.0
+        for j in range(W_out.shape[1]):
+            W_out[i, j] = 0.0
     for j in range(d):
-        scale[j] = 0.0
+        scale_out[j] = 0.0
     for i in range(s):
         for j in range(s):
-            W[d + i, j] = A_i[k, i, j]
-            W[d + i, d + j] = A_j[k, i, j]
-            scale[j] += A_j[k, i, j] * A_j[k, i, j]
+            W_out[d + i, j] = A_i[k, i, j]
+            W_out[d + i, d + j] = A_j[k, i, j]
+            scale_out[j] += A_j[k, i, j] * A_j[k, i, j]
         for j in range(targets.shape[0]):
             if targets[j] >= d:
-                W[d + i, d + targets[j]] += C[k, i, j]
-                scale[targets[j]] += C[k, i, j] * C[k, i, j]
+                W_out[d + i, d + targets[j]] += C[k, i, j]
+                scale_out[targets[j]] += C[k, i, j] * C[k, i, j]
             elif targets[j] >= 0:
-                W[d + i, targets[j]] += C[k, i, j]
-        W[d + i, d + scale.shape[0]] = r[k, i]
+                W_out[d + i, targets[j]] += C[k, i, j]
+        W_out[d + i, d + scale_out.shape[0]] = r[k, i]
     for i in range(s, d):
         factor = walk[k, i - s]
-        W[d + i, i], W[d + i, d + i], W[d + i, d + scale.shape[0]] = -factor, factor, walk_r[k, i - s]
-        scale[i] = factor * factor
+        W_out[d + i, i], W_out[d + i, d + i], W_out[d + i, d + scale_out.shape[0]] = -factor, factor, walk_r[k, i - s]
+        scale_out[i] = factor * factor
 
 
 @helper
@@ -181,12 +188,15 @@ def join(V: Array, Y: Array, d: int, c: int, at: int, joint_out: Array) -> None:
 
 
 @helper
-def failing_pivot(W: Array, scale: Array, begin: int, end: int) -> int:
-    """The first pivot of columns ``begin`` to ``end`` that is rounding or no number, or -1; W begins at ``begin``."""
+def undetermined(triangle: Array, scale: Array, begin: int, end: int, shift: int) -> int:
+    """The first column whose pivot is rounding or no number, plus ``shift``, or -1.
+
+    The triangle is that of columns ``begin`` to ``end`` of ``scale``, the squares of the rows that went into it.
+    """
     for j in range(begin, end):
-        pivot = W[j - begin, j - begin]
+        pivot = triangle[j - begin, j - begin]
         if not pivot * pivot > UNDETERMINED * UNDETERMINED * scale[j]:
-            return j
+            return j + shift
     return -1
 
 
@@ -248,7 +258,7 @@ def eliminate(
             scale[d + j] += border_rows[i, j] * border_rows[i, j]
     last = append_rows(border_rows, 0, border_rows.shape[0], 0, c + 1, c, Y)
     for k in range(n):
-        load_measurements(V, scale, d, s, rows, targets, first[k], first[k + 1])
+        load_measurements(rows, targets, first[k], first[k + 1], s, d, V, scale)
         end = d + first[k + 1] - first[k]
         triangularise(V, d, 0, end, v, w)
         last = append_rows(V, d, end, d, c + 1, last, Y)
@@ -256,7 +266,9 @@ def eliminate(
         if last > c + PENDING or stops_here or k == n - 1:
             left_out[0] += fold_border(Y, c, last, v, w)
             last = c
+        failing = -1
         if stops_here:
+            failing = max(undetermined(V, scale, 0, d, k * d), undetermined(Y, scale, d, d + c, (n - 1) * d))
             join(V, Y, d, c, stop, filtered_out)
             stop += 1
         for i in range(d):
@@ -266,18 +278,17 @@ def eliminate(
             for j in range(c + 1):
                 W[i, 2 * d + j] = V[i, d + j]
         if k < n - 1:
-            load_motion(W, scale, k, A_i, A_j, C, C_targets, r, walk, walk_r)
+            load_motion(k, A_i, A_j, r, C, C_targets, walk, walk_r, W, scale)
             triangularise(W, d, d, 2 * d, v, w)
             append_rows(W, d, 2 * d, d, d + c + 1, 0, V)
-        failing = failing_pivot(W, scale, 0, d)
+        failing = max(failing, undetermined(W, scale, 0, d, k * d))
         if failing >= 0:
-            return k * d + failing
+            return failing
         for i in range(d):
             for j in range(2 * d + c + 1):
                 conditionals_out[k, i, j] = W[i, j]
     append_rows(Y, 0, c, 0, c + 1, 0, border_out)
-    failing = failing_pivot(Y, scale, d, d + c)
-    return -1 if failing < 0 else (n - 1) * d + failing
+    return undetermined(Y, scale, d, d + c, (n - 1) * d)
 
 
 @kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
@@ -416,11 +427,16 @@ def place_rows(
     s, e, last = J.shape[2], C.shape[2], rows_out.shape[1] - 1
     for k in range(r.shape[0]):
         factor = math.sqrt(weight[k])
-        for i in range(r.shape[1]):
-            row = first[k] + i
+        for row in range(first[k], first[k] + r.shape[1]):
+            i = row - first[k]
+            for j in range(last - s):
+                targets_out[row, j] = C_targets[j] if j < e else -1
+            for j in range(last + 1):
+                rows_out[row, j] = 0.0
+            if factor == 0.0:
+                continue  # whatever its rows are, no numbers perhaps
             for j in range(s):
                 rows_out[row, j] = factor * J[k, i, j]
-            for j in range(last - s):
-                rows_out[row, s + j] = factor * C[k, i, j] if j < e else 0.0
-                targets_out[row, j] = C_targets[j] if j < e else -1
+            for j in range(e):
+                rows_out[row, s + j] = factor * C[k, i, j]
             rows_out[row, last] = factor * r[k, i]

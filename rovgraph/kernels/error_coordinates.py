@@ -42,7 +42,8 @@ class ErrorLayout(NamedTuple):
 
     Attributes
     ----------
-    columns : ndarray of int, shape (size - 15,), place of each component in the calibration vector
+    columns : ndarray of int, shape (size,), place of each component in all of the error, which is its column in
+        a Jacobian of `predict`; of calibration it is 15 more than in the calibration vector
     seen : ndarray of int, shape (m, 3), of each instrument the kind of its equation, its dimension, and the
         component of the error vector with which the variable that it sees begins
     params : ndarray, shape (m, k), the numbers of each equation, the shorter ones with zeros behind
@@ -60,35 +61,23 @@ class Scratch(NamedTuple):
 
     Attributes
     ----------
-    z, H : predictions of two states and their Jacobians, shapes (2, m, 3) and (2, m, 3, 15 + len(c))
-    work : of the predictions
-    turn : shape (3, 3, 3)
-    rate : shape (3,), zero
-    product, filled : of `rovgraph.kernels.change_of_basis`
+    z, H : predictions of two states and their Jacobians, shapes (2, m, 3) and (2, m, 3, 15 + len(c)), zero at first
+    work : shape (WORK + 4, 3, 3), zero at first
     """
 
     z: Array
     H: Array
     work: Array
-    turn: Array
-    rate: Array
-    product: Array
-    filled: Indices
+
+
+TURN, STEP, REST, ZERO = WORK, WORK + 1, WORK + 2, WORK + 3  # matrices of ``work`` beyond those of `predict`
 
 
 @helper
-def make_scratch(layout: ErrorLayout, calibration_size: int, width: int) -> Scratch:
-    """Arrays for `retract`, `local` and `change_basis`, the last of covariances up to ``width`` wide; made once."""
-    m, r = len(layout.seen), len(layout.rows)
-    return Scratch(
-        np.zeros((2, m, 3)),
-        np.zeros((2, m, 3, MOTION + calibration_size)),
-        np.empty((WORK, 3, 3)),
-        np.empty((3, 3, 3)),
-        np.zeros(3),
-        np.empty((r, width)),
-        np.empty((r, MOTION + len(layout.columns) + 1), np.int64),
-    )
+def make_scratch(instruments: int, calibration_size: int) -> Scratch:
+    """Arrays for `retract` and `local` of so many instruments; made once."""
+    H = np.zeros((2, instruments, 3, MOTION + calibration_size))
+    return Scratch(np.zeros((2, instruments, 3)), H, np.zeros((WORK + 4, 3, 3)))
 
 
 @view_helper
@@ -96,30 +85,25 @@ def _see(
     s: int, which: int, R: Array, p: Array, v: Array, b: Array, c: Array, layout: ErrorLayout, scratch: Scratch
 ) -> None:
     """What instrument ``s`` sees of a state."""
-    z, H = scratch.z[which, s], scratch.H[which, s]
-    predict(layout.seen[s, 0], R, p, v, b, c, scratch.rate, layout.params[s], z, H, scratch.work)
-
-
-@view_helper
-def _column(error: int, columns: Indices) -> int:
-    """Column of a Jacobian of `predict` for a component of the error vector."""
-    return error if error < MOTION else MOTION + columns[error - MOTION]
+    z, H, rate = scratch.z[which, s], scratch.H[which, s], scratch.work[ZERO, 0]
+    predict(layout.seen[s, 0], R, p, v, b, c, rate, layout.params[s], z, H, scratch.work)
 
 
 @view_helper
 def _inverse_of_seen(H: Array, first: int, dim: int, columns: Indices, inverse_out: Array) -> None:
     """Inverse of the part of a Jacobian for the seen variable, of dimension 1, 2 or 3, by cofactors."""
-    j0 = _column(first, columns)
+    j0 = columns[first]
     if dim == 1:
         inverse_out[0, 0] = 1.0 / H[0, j0]
         return
-    j1 = _column(first + 1, columns)
+    j1 = columns[first + 1]
     if dim == 2:
+        inverse_out[0, 2] = inverse_out[1, 2] = 0.0
         det = H[0, j0] * H[1, j1] - H[0, j1] * H[1, j0]
         inverse_out[0, 0], inverse_out[0, 1] = H[1, j1] / det, -H[0, j1] / det
         inverse_out[1, 0], inverse_out[1, 1] = -H[1, j0] / det, H[0, j0] / det
         return
-    j2 = _column(first + 2, columns)
+    j2 = columns[first + 2]
     for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
         inverse_out[0, i] = H[a, j1] * H[b, j2] - H[a, j2] * H[b, j1]
@@ -144,20 +128,25 @@ def _rows_of_seen(
     before: Array, after: Array, inverse: Array, turn: Array, first: int, dim: int, columns: Indices, basis_out: Array
 ) -> None:
     """B_s = Y'^-1 (H - (H' without Y') B), H before and H' after."""
-    for j in range(len(basis_out)):
-        column = _column(j, columns)
+    size = len(basis_out)
+    for k in range(dim):
+        row, was, now = basis_out[first + k], before[k], after[k]
+        for i in range(3):
+            row[i] = was[i] - now[0] * turn[0, i] - now[1] * turn[1, i] - now[2] * turn[2, i]
+            row[3 + i] = was[3 + i] - now[3] * turn[0, i] - now[4] * turn[1, i] - now[5] * turn[2, i]
+        for j in range(VELOCITY, size):  # the others' rows of B are those of the unit matrix
+            row[j] = was[columns[j]] - now[columns[j]]
+        for j in range(first, first + dim):
+            row[j] = was[columns[j]]
+    if dim == 1:
+        for j in range(size):
+            basis_out[first, j] *= inverse[0, 0]
+        return
+    for j in range(size):
+        a, b = basis_out[first, j], basis_out[first + 1, j]
+        c = basis_out[first + 2, j] if dim == 3 else 0.0
         for i in range(dim):
-            basis_out[first + i, j] = 0.0
-        for k in range(dim):
-            difference = before[k, column]
-            if j < VELOCITY:  # the others' rows of B are those of the unit matrix
-                begin = 0 if j < TRANSLATION else TRANSLATION
-                for i in range(3):
-                    difference -= after[k, begin + i] * turn[i, j - begin]
-            elif not first <= j < first + dim:
-                difference -= after[k, column]
-            for i in range(dim):
-                basis_out[first + i, j] += inverse[i, k] * difference
+            basis_out[first + i, j] = inverse[i, 0] * a + inverse[i, 1] * b + inverse[i, 2] * c
 
 
 @view_helper
@@ -177,11 +166,10 @@ def retract(
     ``basis_out``, shape (size, size), takes an error about the old state over to the new one, to first order in
     ``delta``. It must be the unit matrix at first, or what this function or `local` has written.
     """
-    seen, columns, turn = layout.seen, layout.columns, scratch.turn
+    seen, columns, back, inverse = layout.seen, layout.columns, scratch.work[TURN], scratch.work[STEP]
     for s in range(len(seen)):
         _see(s, 0, R, p, v, b, c, layout, scratch)
-    _move(R, p, v, b, c, delta, columns, turn)
-    back, inverse = turn[0], turn[1]
+    _move(R, p, v, b, c, delta, columns, scratch.work)
     _rows_of_pose(back, basis_out)
     for s in range(len(seen)):
         kind, dim, first = seen[s, 0], seen[s, 1], seen[s, 2]
@@ -197,17 +185,17 @@ def retract(
 
 
 @view_helper
-def _move(R: Array, p: Array, v: Array, b: Array, c: Array, delta: Array, columns: Indices, turn: Array) -> None:
-    """All variables moved by themselves, in place; the first of ``turn`` becomes R'^T R."""
-    back, step, moved, shift = turn[0], turn[1], turn[2], turn[0, 0]
+def _move(R: Array, p: Array, v: Array, b: Array, c: Array, delta: Array, columns: Indices, work: Array) -> None:
+    """All variables moved by themselves, in place; ``work[TURN]`` becomes R'^T R."""
+    back, step, moved, shift = work[TURN], work[STEP], work[REST], work[TURN, 0]
     rotate(R, delta[TRANSLATION:VELOCITY], shift)
     for i in range(3):
         p[i] += shift[i]
         v[i] += delta[VELOCITY + i]
         b[i] += delta[ACC_BIAS + i]
         b[3 + i] += delta[ACC_BIAS + 3 + i]
-    for i in range(len(columns)):
-        c[columns[i]] += delta[MOTION + i]
+    for i in range(MOTION, len(columns)):
+        c[columns[i] - MOTION] += delta[i]
     exp_rotation(delta[0:3], step)
     multiply(R, step, moved)
     for i in range(3):
@@ -222,7 +210,7 @@ def _add(error: int, change: float, v: Array, c: Array, columns: Indices) -> Non
     if error < MOTION:
         v[error - VELOCITY] += change
     else:
-        c[columns[error - MOTION]] += change
+        c[columns[error] - MOTION] += change
 
 
 @view_helper
@@ -230,7 +218,7 @@ def _product(row: Array, delta: Array, columns: Indices) -> float:
     """A row of a Jacobian of `predict` times an error."""
     total = 0.0
     for j in range(len(delta)):
-        total += row[_column(j, columns)] * delta[j]
+        total += row[columns[j]] * delta[j]
     return total
 
 
@@ -251,19 +239,19 @@ def local(
 
     ``basis_out``, as of `retract`, takes an error about the other state over to the first.
     """
-    seen, columns, turn, inverse = layout.seen, layout.columns, scratch.turn[0], scratch.turn[1]
+    seen, columns, turn, inverse = layout.seen, layout.columns, scratch.work[TURN], scratch.work[STEP]
     other_R, other_p, other_v, other_b, other_c = other
     multiply_transposed(R, other_R, turn)
     log_rotation(turn, delta_out[0:3])
-    apart = scratch.turn[2, 0]
+    apart = scratch.work[REST, 0]
     for i in range(3):
         apart[i] = other_p[i] - p[i]
         delta_out[VELOCITY + i] = other_v[i] - v[i]
         delta_out[ACC_BIAS + i] = other_b[i] - b[i]
         delta_out[ACC_BIAS + 3 + i] = other_b[3 + i] - b[3 + i]
     rotate_back(R, apart, delta_out[TRANSLATION:VELOCITY])
-    for i in range(len(columns)):
-        delta_out[MOTION + i] = other_c[columns[i]] - c[columns[i]]
+    for i in range(MOTION, len(columns)):
+        delta_out[i] = other_c[columns[i] - MOTION] - c[columns[i] - MOTION]
     _rows_of_pose(turn, basis_out)
     for s in range(len(seen)):
         kind, dim, first = seen[s, 0], seen[s, 1], seen[s, 2]

@@ -41,6 +41,7 @@ at first can be used again and again:
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import compass, dvl_mount, magnetometer
@@ -48,6 +49,7 @@ from rovgraph.kernels.compile import given, kernel, view_helper
 from rovgraph.kernels.layout import CURRENT, DVL_LEVER_ARM, DVL_ROLL, DVL_SCALE, GYR_BIAS, MOTION, TRANSLATION, VELOCITY
 from rovgraph.kernels.rotations import cross, dot, rotate, rotate_back
 
+Indices = NDArray[np.int64]
 DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY = range(8)
 WORK = 6  # matrices (3, 3) that `predict` needs to calculate with
 
@@ -184,10 +186,12 @@ def _predict_rows(
     c: Array,
     rate: Array,
     params: Array,
+    columns: Indices,
     z_out: Array,
     H_out: Array,
     own_R: Array,
     own: Array,
+    own_H: Array,
     work: Array,
 ) -> None:
     """The loop of `predict_many`, with its own copies, shapes (3, 3) and (4, 6), of what may be strided."""
@@ -201,12 +205,15 @@ def _predict_rows(
             for j in range(3):
                 own_R[i, j] = R[k * of_R, i, j]
         own_c, own_params = c[k * of_c], params[k * of_params]
-        predict(kind, own_R, own[0], own[1], own[3], own_c, own[2], own_params, z_out[k], H_out[k], work)
+        predict(kind, own_R, own[0], own[1], own[3], own_c, own[2], own_params, z_out[k], own_H, work)
+        for i in range(len(own_H)):
+            for j in range(len(columns)):
+                H_out[k, i, j] = own_H[i, columns[j]]
 
 
 @kernel(
-    f"void(i8, {given(3)}, {given(2)}, {given(2)}, {given(2)}, f8[:, ::1], {given(2)}, f8[:, ::1], f8[:, ::1], "
-    "f8[:, :, ::1])"
+    f"void(i8, {given(3)}, {given(2)}, {given(2)}, {given(2)}, f8[:, ::1], {given(2)}, f8[:, ::1], i8[::1], "
+    "f8[:, ::1], f8[:, :, ::1])"
 )
 def predict_many(
     kind: int,
@@ -217,12 +224,15 @@ def predict_many(
     c: Array,
     rate: Array,
     params: Array,
+    columns: Indices,
     z_out: Array,
     H_out: Array,
 ) -> None:
     """`predict` of n epochs: every argument with the epochs in front, or with one row for all of them.
 
-    ``H_out`` must be zero.
+    Of the Jacobians ``H_out``, shape (n, dim, len(columns)), has some ``columns``: over a long dive all of them
+    would be mostly zeros.
     """
     own_R, own, work = np.empty((3, 3)), np.empty((4, 6)), np.empty((WORK, 3, 3))
-    _predict_rows(kind, R, p, v, b, c, rate, params, z_out, H_out, own_R, own, work)
+    own_H = np.zeros((z_out.shape[1], MOTION + c.shape[1]))
+    _predict_rows(kind, R, p, v, b, c, rate, params, columns, z_out, H_out, own_R, own, own_H, work)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian, states_of
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag

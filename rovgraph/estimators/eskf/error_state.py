@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, Transition
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.remembered_places import columns, common, extended
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.eskf.reinitialisation import reinitialised

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.engine.assembly import Assembler, KeyframeInterval
+from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gates, Gaussian, ProcessedMeasurement, stack_states
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.log import Measurement

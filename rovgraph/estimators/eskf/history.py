@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states, states_of
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.results import (

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rovgraph.engine.assembly import KeyframeInterval
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.estimators.optimum import optimum
