@@ -157,6 +157,16 @@ def _add_turning(row: Array, E: Array, R: Array, J: Array) -> None:
 
 
 @helper
+def predict_motion(
+    row: Array, R: Array, p: Array, v: Array, bias: Array, R_out: Array, p_out: Array, v_out: Array
+) -> None:
+    """The state at the end of one interval that is not coasted through, without derivatives."""
+    zeta, E = np.empty(9), np.empty((3, 3))
+    correct_motion(row, bias, zeta)
+    _predict(row, zeta, R, p, v, E, R_out, p_out, v_out)
+
+
+@helper
 def predict_with_transition(
     row: Array,
     R: Array,
