@@ -122,7 +122,7 @@ class Chain:
         return [(sensor, block, state.at(block.keyframe)) for sensor, block in self.blocks.items()]
 
     def initial_gates(self) -> Gates:
-        return {sensor: block.believed for sensor, block in self.blocks.items()}
+        return {sensor: block.believed.copy() for sensor, block in self.blocks.items()}
 
     def gates(self, point: State) -> Gates:
         return gates_of(self.seen(point))
