@@ -11,8 +11,8 @@ import pytest
 
 from rovgraph.config import Config, load_config
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.engine.motion import Motion
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
