@@ -68,7 +68,7 @@ def test_factor_of_a_motion_with_scales_is_linearised_as_its_error_moves():
     insert_state(values, interval.index - 1, before)
     insert_state(values, interval.index, after)
     insert_calibration(values, before.calibration, wanted)
-    (factor,) = motion(interval, wanted)
+    (factor,) = motion(interval, wanted, interval.index)
     linear = factor.linearize(values)
     A, _ = linear.jacobian()
     numeric, step = [], 1e-6

@@ -10,8 +10,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from online import falcon, replay
 
 from rovgraph.config import Config, load_config
-from rovgraph.estimators import error_state
 from rovgraph.estimators.dive import assemble, smooth
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
+from rovgraph.estimators.eskf.error_state import replay as replay_filter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.log import Log, read_log
 from rovgraph.simulate import Choices, simulated
@@ -28,7 +29,7 @@ def filtered(*files: str) -> float:
     log, config = read(*files)
     batch = assemble(log, initialise(log, config))
     began = processor()
-    error_state.replay(batch.intervals, batch.beginning, error_state.RENEW_AT_S).solve()
+    replay_filter(batch.intervals, batch.beginning, REINITIALISE_AT_S).solve()
     return processor() - began
 
 

@@ -122,15 +122,15 @@ class Chain:
         return [(sensor, block, state.at(block.keyframe)) for sensor, block in self.blocks.items()]
 
     def initial_gates(self) -> Gates:
-        return {sensor: block.believed for sensor, block in self.blocks.items()}
+        return {sensor: block.believed.copy() for sensor, block in self.blocks.items()}
 
     def gates(self, point: State) -> Gates:
         return gates_of(self.seen(point))
 
     def cost(self, point: State, gates: Gates) -> float:
         shift = np.empty((0, 6)) if self.scale_to_bias is None else self._scale_shift(point)
-        states = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
-        total = motion_cost(self.motions, self.motion_weights, *states, shift)
+        R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
+        total = motion_cost(self.motions, self.motion_weights, R, p, v, b, shift)
         total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
         for name in self._walking:
             total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
@@ -217,7 +217,7 @@ class Chain:
         InputError : the data do not determine some variable, which is named
         """
         r, A_i, A_j = self.motion_residuals(point)
-        C, targets = self._scale_columns(A_i)
+        C, targets = self._scale_columns(A_i, A_j)
         walks = [np.diff(point.calibration[name], axis=0) * self._walk_of(name) for name in self._walking]
         walk_r = np.concatenate([np.empty((len(r), 0)), *walks], axis=1)
         rows, clones = (self._rows_with_clone, CLONED) if len(stops) else (self._rows, 0)
@@ -242,7 +242,7 @@ class Chain:
         """Room for the rows of priors, of the clone's tie and of all measurements, in this order."""
         blocks, first = self.blocks.values(), np.zeros(1, np.int64)
         walking = self.d - MOTION
-        keyframes = [first, first, first, *(b.keyframe for b in blocks)]
+        keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]
         dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
         others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
         return MeasurementRows(len(self.intervals), MOTION, keyframes, dims, max([walking, clones, *others]))
@@ -299,13 +299,12 @@ class Chain:
         part = self.layout[name][1]
         return self.walk[:, part.start - MOTION : part.stop - MOTION]
 
-    def _scale_columns(self, A_i: Array) -> tuple[Array, NDArray[np.int64]]:
+    def _scale_columns(self, A_i: Array, A_j: Array) -> tuple[Array, NDArray[np.int64]]:
         """Derivatives of the motions by the IMU's scales that are estimated, and their targets."""
         names = [name for name in SCALES if name in self.layout]
         if not names or self.scale_to_bias is None:
             return np.empty((len(A_i), MOTION, 0)), np.empty(0, np.int64)
-        by_bias = A_i[:, :, 9:15].copy()
-        by_bias[:, 9:] = 0.0
+        by_bias = A_i[:, :, 9:15] + A_j[:, :, 9:15]  # of both alike, which leaves the bias's walk out of it
         by_scale = by_bias @ self.scale_to_bias
         parts = {"acc_scale": slice(0, 3), "gyr_scale": slice(3, 6)}
         C = np.concatenate([by_scale[:, :, parts[name]] for name in names], axis=2)

@@ -1,7 +1,7 @@
 """Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from rovgraph.kernels.layout import MOTION
 from rovgraph.model_aiding import WaterVelocity
 from rovgraph.sensors import CompiledModel, SensorModel
 from rovgraph.state import DIMENSION, VELOCITY, Jacobians
+
+Index = NDArray[np.int64]
 
 # the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
 SEEN = {
@@ -61,7 +63,7 @@ class ErrorLayout:
 
         self.coordinates = self._coordinates(instruments)
 
-    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Any, ...]:
+    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Index, Index, Array, Index]:
         """Columns of a full Jacobian, instruments and what they see, their numbers, rows of a basis."""
         estimated = np.flatnonzero(self.column >= 0)
         columns = estimated[np.argsort(self.column[estimated])]
