@@ -99,7 +99,9 @@ class MeasurementRows:
         C, targets : ndarray, shapes (m, dim, e) and (e,), Jacobians by other columns
         weight : ndarray, shape (m,), of squares: 0 takes a measurement out
         """
-        chain.place_rows(r, J, C, targets, weight, self._begins[sensor], self.values, self.targets)
+        packed = np.ascontiguousarray
+        begins, rows = self._begins[sensor], (self.values, self.targets)
+        chain.place_rows(packed(r), packed(J), packed(C), packed(targets), packed(weight), begins, *rows)
 
 
 @dataclass(frozen=True)
