@@ -16,12 +16,13 @@ from rovgraph.config.reading import (
     read_yaml,
     yaml_text,
 )
-from rovgraph.config.sections import ImuNoise, Mag
+from rovgraph.config.sections import ImuNoise, Mag, SensorSettings
 
 __all__ = [
     "Config",
     "ImuNoise",
     "Mag",
+    "SensorSettings",
     "beliefs",
     "describe",
     "load_config",

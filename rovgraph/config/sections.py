@@ -166,6 +166,16 @@ class Place(Section):
     )
 
 
+class SensorSettings(Section):
+    """What is believed of a sensor that was registered; one with other defaults, or more keys, derives its own."""
+
+    sd: Positive = Field(1.0, description="noise of a measurement, every component")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the sensor in body axes")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a measurement further off than this many sd is left out")
+    readmit_s: Readmission = 10.0
+
+
 class Thruster(Section):
     """One thruster: where it is and which way it pushes for a positive signal."""
 

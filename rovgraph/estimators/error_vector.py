@@ -23,19 +23,11 @@ from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.geometry import Array, exp_rotation, identities, log_rotation, rotate, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.kernels.error_coordinates import ErrorLayout
-from rovgraph.model_aiding import WaterVelocity
-from rovgraph.sensors import SensorModel, innovation
+from rovgraph.sensors import SENSORS, SensorModel, WaterVelocity, innovation
 from rovgraph.state import BIAS, DIMENSION, POSE, VELOCITY, Jacobians, State
 
 # the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
-SEEN = {
-    "dvl": VELOCITY,
-    "mag": "hard_iron",
-    "ahrs": "ahrs_offset",
-    "dvl_heading": "dvl_compass_offset",
-    "thruster": "current",
-    "dvl_water": "current",
-}
+SEEN = {s.name: s.linear_in for s in SENSORS.values() if s.linear_in is not None}
 
 
 def seen_model(model: SensorModel) -> SensorModel:
