@@ -22,7 +22,7 @@ from rovgraph.engine.scale import SCALES
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
-from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motions
+from rovgraph.kernels.motion_residual import motion_cost, motion_errors, motion_weights, whiten_motions
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 MOTION = 15  # components of a keyframe before what walks
@@ -128,8 +128,10 @@ class Chain:
         return gates_of(self.seen(point))
 
     def cost(self, point: State, gates: Gates) -> float:
-        r, _, _ = self.motion_residuals(point)
-        total = 0.5 * float(np.sum(r**2)) + 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
+        shift = np.empty((0, 6)) if self.scale_to_bias is None else self._scale_shift(point)
+        states = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
+        total = motion_cost(self.motions, self.motion_weights, *states, shift)
+        total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
         for name in self._walking:
             total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
         return total + measurement_cost(self.seen(point), gates)

@@ -54,11 +54,9 @@ class ErrorLayout:
         self.coordinates = self._coordinates(instruments)
 
     def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Any, ...]:
-        """Columns of the calibration vector, instruments and what they see, their numbers, rows of a basis."""
-        calibration: NDArray[np.int64] = np.full(self.size - MOTION, -1)
-        for place, error in enumerate(self.column[MOTION:].tolist()):
-            if error >= 0:
-                calibration[error - MOTION] = place
+        """Columns of a full Jacobian, instruments and what they see, their numbers, rows of a basis."""
+        estimated = np.flatnonzero(self.column >= 0)
+        columns = estimated[np.argsort(self.column[estimated])]
         shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in self.columns}
         models = [(model, self.columns[variable]) for variable, model in shown.items()]
         seen = [(model.kind, model.dim, part.start) for model, part in models]
@@ -66,7 +64,7 @@ class ErrorLayout:
         for row, (model, _) in zip(params, models, strict=True):
             row[: model.packed.shape[1]] = model.packed[0]
         rows = np.concatenate([np.arange(6), *(np.r_[part] for _, part in models)]).astype(np.int64)
-        return calibration, np.array(seen, np.int64).reshape(-1, 3), params, rows
+        return columns, np.array(seen, np.int64).reshape(-1, 3), params, rows
 
     def matrix(self, H: Jacobians) -> Array:
         """Jacobians by variable as one, shape (n, dim, size); what is not estimated is left out."""

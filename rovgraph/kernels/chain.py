@@ -131,16 +131,16 @@ def load_measurements(
 
 @helper
 def load_motion(
-    W: Array,
-    scale: Array,
     k: int,
     A_i: Array,
     A_j: Array,
+    r: Array,
     C: Array,
     targets: Index,
-    r: Array,
     walk: Array,
     walk_r: Array,
+    W_out: Array,
+    scale_out: Array,
 ) -> None:
     """Rows of the motion after keyframe k, below its own d; ``scale_out`` becomes that of the keyframe after it."""
     s, d = A_i.shape[1], A_i.shape[1] + walk.shape[1]

@@ -2,14 +2,15 @@
 
 The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_CACHE_DIR``, this package's
 ``__pycache__`` and the user's cache directory; where there is none, kernels are compiled anew in each process.
-Below it, one folder stands for each state of the kernels' sources, so that a kernel which calls another one in
-a changed module is compiled again, which numba's own cache does not notice.
+Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
+calls another one in a changed module is compiled again, which numba's own cache does not notice.
 """
 
 import contextlib
 import hashlib
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -62,7 +63,7 @@ def kernel(signature: str) -> Callable[[F], F]:
     """
 
     def decorate(function: F) -> F:
-        folder = cache_folder()
+        folder = cache_folder(function.__module__)
         try:
             with _cache_in(folder):
                 compiled = njit(signature, cache=folder is not None, nogil=True, error_model="numpy")(function)
@@ -78,20 +79,33 @@ def kernel(signature: str) -> Callable[[F], F]:
     return decorate
 
 
+def cache_folder(module: str) -> Path | None:
+    """Where a module's compiled kernels are kept, or None where nothing can be written; says when they are missing."""
+    parent = _writable_parent()
+    if parent is None:
+        return None
+    folder = parent / f"rovgraph-{module.rpartition('.')[2]}-{_state_of(module)}"
+    if not folder.exists():
+        _say_once("compiling rovgraph's kernels, once: this takes about half a minute")
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 @cache
-def cache_folder() -> Path | None:
-    """Where compiled kernels are kept, or None where nothing can be written; says when they are not there yet."""
+def _writable_parent() -> Path | None:
+    """The first folder that can be written, or None."""
     if config.DISABLE_JIT:
         return None
-    state = _state_of_sources()
     for parent in _candidates():
-        folder = parent / f"rovgraph-{state}"
-        if _writable(folder):
-            if not any(folder.rglob("*.nbi")):
-                logger.warning("compiling rovgraph's kernels, once: this takes about 20 s")
-            return folder
-    logger.warning("compiling rovgraph's kernels, as no cache folder can be written; set ROVGRAPH_CACHE_DIR to one")
+        if _writable(parent):
+            return parent
+    _say_once("compiling rovgraph's kernels, as no cache folder can be written; set ROVGRAPH_CACHE_DIR to one")
     return None
+
+
+@cache
+def _say_once(text: str) -> None:
+    logger.warning(text)
 
 
 def _candidates() -> Iterator[Path]:
@@ -116,12 +130,23 @@ def _writable(folder: Path) -> bool:
     return True
 
 
-def _state_of_sources() -> str:
-    """A digest of all kernels, and of what compiles them."""
+@cache
+def _state_of(module: str) -> str:
+    """A digest of a module, of all kernels that it imports, and of what compiles them."""
     digest = hashlib.sha256(f"{rovgraph.__version__} {numba.__version__} {sys.version}".encode())
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+    for name in sorted(_imported_kernels(module.rpartition(".")[2])):
+        digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
     return digest.hexdigest()[:16]
+
+
+@cache
+def _imported_kernels(name: str) -> frozenset[str]:
+    """A module of this package and those that it imports, and so on."""
+    path = Path(__file__).parent / f"{name}.py"
+    if not path.exists():  # a kernel of somebody else's
+        return frozenset()
+    own = set(re.findall(r"^from rovgraph\.kernels\.(\w+) import", path.read_text(encoding="utf-8"), re.MULTILINE))
+    return frozenset({name}).union(*(_imported_kernels(other) for other in own))
 
 
 @contextlib.contextmanager

@@ -67,13 +67,13 @@ RETURN_SD = 3.0  # a sensor that was left out for long returns with an innovatio
 @helper
 def move(x: Array, c: Array, P: Array, delta: Array, layout: ErrorLayout) -> None:
     """Move a state by ``delta`` along the error's coordinates, and its covariance's basis with it; in place."""
-    size = MOTION + len(layout.columns)
-    scratch, basis = make_scratch(layout, len(c), len(P)), np.zeros((size, size))
+    size, rows = len(layout.columns), len(layout.rows)
+    scratch, basis = make_scratch(len(layout.seen), len(c)), np.zeros((size, size))
     for i in range(size):
         basis[i, i] = 1.0
     R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     retract(R, p, v, b, c, delta[0:size], layout, scratch, basis)
-    change_basis(P, basis, layout.rows, scratch.product, scratch.filled)
+    change_basis(P, basis, layout.rows, np.empty((rows, len(P))), np.empty((rows, size + 1), np.int64))
 
 
 @kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1])")
@@ -99,7 +99,7 @@ def difference(
 ) -> None:
     """The error that leads from a state to another; ``basis_out``, the unit matrix before, takes errors back."""
     layout = ErrorLayout(columns, seen, seen_params, basis_rows)
-    scratch = make_scratch(layout, len(c), MOTION + len(columns))
+    scratch = make_scratch(len(layout.seen), len(c))
     other = (other_x[0:9].reshape(3, 3), other_x[9:12], other_x[12:15], other_x[15:21], other_c)
     own = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     local(own[0], own[1], own[2], own[3], c, other, layout, scratch, delta_out, basis_out)

@@ -15,7 +15,7 @@ import numpy as np
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coasting_covariance, coasting_error
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.motion import is_coasted, predict_with_jacobian
+from rovgraph.kernels.motion import is_coasted, predict_motion, predict_with_jacobian
 from rovgraph.kernels.motion_row import COVARIANCE
 from rovgraph.kernels.rotations import (
     inverse_jacobian_with_slope,
@@ -122,6 +122,46 @@ def motion_covariance(row: Array, S_out: Array) -> None:
     for i in range(15):
         for j in range(15):
             S_out[i, j] = row[COVARIANCE + 15 * i + j]
+
+
+@kernel("f8(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+def motion_cost(motions: Array, W: Array, R: Array, p: Array, v: Array, bias: Array, shift: Array) -> float:
+    """Half the sum of squares of the whitened residuals between n keyframes in a row.
+
+    Parameters
+    ----------
+    motions, W : ndarray, shapes (n - 1, ROW), (n - 1, 15, 15), the latter of `motion_weights`
+    R, p, v, bias : ndarray, shapes (n, 3, 3), (n, 3), (n, 3), (n, 6)
+    shift : ndarray, shape (n - 1, 6), bias that errors of the IMU's scale make in each interval, or (0, 6)
+    """
+    R_end, p_end, v_end, apart, seen = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+    r, b_i, b_j, Jr, A = np.empty(15), np.empty(6), np.empty(6), np.empty((3, 3)), np.empty((2, 15, 15))
+    cost = 0.0
+    for k in range(len(motions)):
+        for i in range(6):
+            own = shift[k, i] if len(shift) else 0.0
+            b_i[i], b_j[i] = bias[k, i] + own, bias[k + 1, i] + own
+            r[9 + i] = b_i[i] - b_j[i]
+        if is_coasted(motions[k]):
+            coasting_error(motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, r, A[0], A[1])
+        else:
+            predict_motion(motions[k], R[k], p[k], v[k], b_i, R_end, p_end, v_end)
+            multiply_transposed(R[k + 1], R_end, apart)
+            log_rotation(apart, r[0:3])
+            inverse_right_jacobian(r[0:3], Jr)
+            for i in range(3):
+                p_end[i] -= p[k + 1, i]
+                v_end[i] -= v[k + 1, i]
+            rotate_back(R[k + 1], p_end, seen)
+            rotate_back(Jr, seen, r[3:6])  # Jl^-1 is Jr^-1 transposed
+            rotate_back(R[k + 1], v_end, seen)
+            rotate_back(Jr, seen, r[6:9])
+        for i in range(15):
+            total = 0.0
+            for j in range(i + 1):
+                total += W[k, i, j] * r[j]
+            cost += 0.5 * total * total
+    return cost
 
 
 @kernel(
