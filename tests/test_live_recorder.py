@@ -20,7 +20,7 @@ from hypothesis.extra import numpy as nps
 from rovgraph.errors import InputError
 from rovgraph.live.checkpoint import ARRAY, read_checkpoint, write_checkpoint
 from rovgraph.live.message import GEODETIC, Reading
-from rovgraph.live.recorder import Recorder
+from rovgraph.live.recorder import Recorder, recorded_columns
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import STREAMS, read_log
 
@@ -206,7 +206,7 @@ import json, resource, sys, time
 import numpy as np
 from rovgraph.live.warnings import Warnings
 from rovgraph.live.message import Reading
-from rovgraph.live.recorder import Recorder
+from rovgraph.live.recorder import Recorder, recorded_columns
 said = []
 recorder = Recorder(sys.argv[1], Warnings(lambda *about: said.append(about)))
 _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
