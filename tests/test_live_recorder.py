@@ -206,7 +206,7 @@ import json, resource, sys, time
 import numpy as np
 from rovgraph.live.warnings import Warnings
 from rovgraph.live.message import Reading
-from rovgraph.live.recorder import Recorder, recorded_columns
+from rovgraph.live.recorder import Recorder
 said = []
 recorder = Recorder(sys.argv[1], Warnings(lambda *about: said.append(about)))
 _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -353,8 +353,6 @@ def test_a_checkpoint_that_fails_leaves_the_old_one_and_no_rest(tmp_path, monkey
 CHECKPOINTS = """
 import sys, numpy as np
 from rovgraph.live.checkpoint import write_checkpoint
-
-HEADER = recorded_columns()
 k = 0
 while True:
     k += 1

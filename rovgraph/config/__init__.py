@@ -14,6 +14,8 @@ from rovgraph.config.reading import (
     parse_config,
     parse_model,
     read_yaml,
+    register_settings,
+    unregister_settings,
     yaml_text,
 )
 from rovgraph.config.sections import ImuNoise, Mag, SensorSettings
@@ -30,5 +32,7 @@ __all__ = [
     "parse_config",
     "parse_model",
     "read_yaml",
+    "register_settings",
+    "unregister_settings",
     "yaml_text",
 ]

@@ -11,7 +11,18 @@ from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field
 from rovgraph.sensors.model import CompiledModel, SensorModel, evaluate, innovation
 from rovgraph.sensors.place import SEEN_PLACE, PlaceOffset
 from rovgraph.sensors.position import DEPTH, FIX, Position
-from rovgraph.sensors.sensor import SENSORS, Column, Instrument, Level, Observed, Sensor, instrument
+from rovgraph.sensors.sensor import (
+    SENSORS,
+    Column,
+    Instrument,
+    Level,
+    Observed,
+    Sensor,
+    instrument,
+    register,
+    settings,
+    unregister,
+)
 from rovgraph.sensors.thruster import THRUSTER, ModelAiding, WaterVelocity, hydrodynamics
 
 __all__ = [
@@ -37,6 +48,9 @@ __all__ = [
     "hydrodynamics",
     "innovation",
     "instrument",
+    "register",
+    "settings",
+    "unregister",
 ]
 
 for _sensor in (IMU, MAG, AHRS, DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DEPTH, FIX, SEEN_PLACE, THRUSTER):

@@ -12,8 +12,9 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rovgraph import calibration
 from rovgraph.calibration import Variable
-from rovgraph.config import Config, SensorSettings
+from rovgraph.config import Config, SensorSettings, register_settings, unregister_settings
 from rovgraph.geometry import Array
 from rovgraph.sensors.model import SensorModel
 
@@ -178,7 +179,7 @@ class Sensor:
     simulated_hz : rate at which a simulated dive samples its model with white noise; None = the simulator has a
         sampler of its own for it, or none
     calibration : variables that come with it, beside the built-in ones
-    settings : its section of the configuration, under ``sensors``; None where the configuration has one of its own
+    settings : keys of its section of the configuration, under ``sensors``; None = those of `SensorSettings`
     """
 
     name: str
@@ -211,3 +212,36 @@ class Sensor:
 
 
 SENSORS: dict[str, Sensor] = {}  # by name, in the order of a log's columns
+
+
+def register(sensor: Sensor) -> None:
+    """Let rovgraph know a sensor, its calibration variables and its section of the configuration.
+
+    Do so before a configuration is loaded, and in every process that works with the sensor.
+
+    Raises
+    ------
+    ValueError : its name, a column, or a calibration variable's name or letter is taken
+    """
+    columns = {"time", *(column for known in SENSORS.values() for column in known.column_names)}
+    taken = columns & set(sensor.column_names) or {sensor.name} & set(SENSORS)
+    if taken:
+        raise ValueError(f"sensor {sensor.name!r}: the name {min(taken)!r} is taken")
+    for variable in sensor.calibration:
+        calibration.register(variable)
+    register_settings(sensor.name, sensor.settings or SensorSettings, sensor.calibration)
+    SENSORS[sensor.name] = sensor
+
+
+def unregister(name: str) -> None:
+    """Forget the sensor that was registered last, as a test does that registers one of its own."""
+    sensor = SENSORS.pop(name)
+    unregister_settings(name, sensor.calibration)
+    for variable in reversed(sensor.calibration):
+        calibration.unregister(variable.name)
+
+
+def settings(config: Config, sensor: str) -> SensorSettings:
+    """What a configuration says of a sensor that was registered."""
+    own: SensorSettings = getattr(config.sensors, sensor)
+    return own
