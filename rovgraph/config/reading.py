@@ -50,7 +50,7 @@ class Config(Section):
     fix: Fix = Fix()
     place: Place = Place()
     sensors: Sensors = Field(default_factory=Sensors)
-    calibration: Calibration = Field(default_factory=Calibration)  # type: ignore[valid-type]
+    calibration: Calibration = Field(default_factory=Calibration)
     vehicle: Vehicle = Vehicle()
     graph: Graph = Graph()
     online: Online = Online()
@@ -64,16 +64,16 @@ class Config(Section):
 
 def register_settings(sensor: str, settings: type[SensorSettings], calibration: Sequence[Variable]) -> None:
     """Let a configuration have the keys of a sensor and of its calibration variables, which stand in `TABLE`."""
-    add_key(Sensors, sensor, settings, (Config,))
+    add_key(Sensors, sensor, settings)
     for variable in calibration:
-        add_key(Calibration, variable.name, calibration_entry(variable), (Config,))
+        add_key(Calibration, variable.name, calibration_entry(variable))
 
 
 def unregister_settings(sensor: str, calibration: Sequence[Variable]) -> None:
     """Take the keys of a sensor and of its calibration variables out again."""
-    remove_key(Sensors, sensor, (Config,))
+    remove_key(Sensors, sensor)
     for variable in calibration:
-        remove_key(Calibration, variable.name, (Config,))
+        remove_key(Calibration, variable.name)
 
 
 def yaml_text(data: dict[str, Any]) -> str:
