@@ -79,7 +79,7 @@ def reference(problem: Problem, values: gtsam.Values, seconds: float) -> Run:
     begin = time.perf_counter()
     result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
     took = time.perf_counter() - begin
-    return _run("Levenberg-Marquardt", problem, seconds, took, problem.cost(result, problem.open_gates()))
+    return _run("Levenberg-Marquardt", problem, seconds, took, problem.cost(result, problem.initial_gates()))
 
 
 def _run(solver: str, problem: Problem, seconds: float, took: float, cost: float) -> Run:

@@ -1,15 +1,12 @@
 """Keyframes and attached measurements: what goes where, and what is left out."""
 
-from dataclasses import fields, is_dataclass
-
 import numpy as np
 import pytest
-from dives import Simulated, falcon, interrupted, kept, level_log, simulated, started
+from dives import Simulated, falcon, interrupted, kept, level_log, same, simulated, started
 
 from rovgraph.config import Config
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.motion import Motion
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 
@@ -26,25 +23,6 @@ def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInte
     same(done, whole.take(log))
     assert whole.left_out == assembler.left_out
     return done, assembler
-
-
-def same(a: object, b: object) -> None:
-    """Two values, objects of attributes or arrays, are the same to rounding."""
-    if is_dataclass(a) and not isinstance(a, type):
-        assert type(a) is type(b)
-        for f in fields(a):
-            if not (isinstance(a, Motion) and f.name == "imu"):  # as far as samples were there
-                same(getattr(a, f.name), getattr(b, f.name))
-    elif isinstance(a, list):
-        assert isinstance(b, list) and len(a) == len(b)
-        for one, other in zip(a, b, strict=True):
-            same(one, other)
-    elif isinstance(a, np.ndarray):
-        np.testing.assert_allclose(b, a, rtol=1e-12, atol=1e-15)
-    elif isinstance(a, float):
-        assert b == pytest.approx(a, rel=1e-12)
-    else:
-        assert a == b
 
 
 def log_of(seconds: float = 4.0, pings=(), rate: float = 100.0, **sensors) -> Log:

@@ -60,6 +60,26 @@ def test_processor_time_and_memory_are_those_of_the_command_and_an_error_is_its_
         checkout.rovgraph("smooth", "nowhere.csv")
 
 
+def test_a_commit_is_checked_out_for_as_long_as_it_is_measured(engine, tmp_path, monkeypatch):
+    def git(*arguments: str) -> str:
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        return subprocess.run(
+            ["git", "-C", str(tmp_path), *who, *arguments], capture_output=True, text=True, check=True
+        ).stdout
+
+    git("init", "--quiet")
+    (tmp_path / "file").write_text("then")
+    git("add", "file")
+    git("commit", "--quiet", "-m", "first")
+    (tmp_path / "file").write_text("now")
+    monkeypatch.setattr("checkouts.ROOT", tmp_path)
+    with engine.checkout_of(git("rev-parse", "HEAD").strip()) as path:
+        assert (path / "file").read_text() == "then"
+    assert not path.exists() and len(git("worktree", "list").splitlines()) == 1
+    with pytest.raises(engine.Failed, match="give one with --base"), engine.checkout_of("0000000"):
+        pass
+
+
 def test_overheads_are_measured_beside_their_references():
     found = rows("overheads.py", "--rows", "recorder", "checkpoint")
     assert [row[0] for row in found] == ["1000 rows recorded", "a checkpoint of 50 arrays"]

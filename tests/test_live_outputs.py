@@ -193,7 +193,8 @@ def test_a_missing_library_names_the_extra(monkeypatch):
 
 
 def test_complaints_come_once_per_kind_and_period(said):
-    limited = Warnings(lambda *about: said.append(about), period=0.2).complain
+    now = [0.0]
+    limited = Warnings(lambda *about: said.append(about), period=0.2, clock=lambda: now[0]).complain
     for _ in range(2):
         for _ in range(50):
             limited("a", "slow", "text")
@@ -212,7 +213,6 @@ from rovgraph.live.outputs import open_output
 from rovgraph.live.solution import Solution
 v = np.zeros(3)
 out = open_output("-", Warnings(lambda *about: print(*about, file=sys.stderr)), patient=sys.argv[2] == "patient")
-slowest = 0.0
 for k in range(int(sys.argv[1])):
     out.send(Solution(float(k), v, v, v, v, v, v, 0.0))
 out.close()

@@ -17,7 +17,6 @@ from rovgraph.engine.measurements import (
     loss_and_weight,
     loss_threshold,
     make_block,
-    robust_noise,
     whitening,
 )
 from rovgraph.engine.motion import Snapshot
@@ -27,12 +26,14 @@ from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation
 from rovgraph.graph.keys import key
+from rovgraph.graph.measurement_factors import measurement_factor, measurement_keys, robust_noise
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
 
 N, STEP = 4, 1e-6
+SEGMENTS = np.arange(N) // 2
 SIZES = DIMENSION | {PLACE: PLACE_DIM} | {name: variable.dim for name, variable in TABLE.items()}
 WALKS = {name: 0.1 if name in {"hard_iron", "field_scale", "dvl_yaw"} else 0.0 for name in TABLE}
 
@@ -72,6 +73,10 @@ def wave(time: Array, rng: np.random.Generator) -> Array:
     return np.sin(2.0 * time[:, None] + rng.uniform(0, 6, 3)) * rng.standard_normal(3)
 
 
+def factor_of(block: Block, k: int) -> gtsam.CustomFactor:
+    return measurement_factor(block.at([k]), int(block.segment[k]))
+
+
 def values_of(state: State, unknowns: Unknowns) -> gtsam.Values:
     values = gtsam.Values()
     for k in range(len(state)):
@@ -103,11 +108,11 @@ def test_linearised_block_is_the_finite_difference_of_its_innovations(sensor, mo
 def test_custom_factor_is_linearised_by_gtsam_as_its_own_error_moves(sensor):
     block, state = block_of(sensor)
     values, k = values_of(state, block.unknowns), 2
-    factor = block.custom_factor(k)
+    factor = factor_of(block, k)
     linear = factor.linearize(values)
     A, b = linear.jacobian()
     np.testing.assert_allclose(b, -factor.unwhitenedError(values), atol=1e-9)
-    names = dict(zip(block.keys[k], block.variables, strict=True))
+    names = dict(zip(measurement_keys(block, block.segment)[k], block.variables, strict=True))
     column = 0
     for j in list(linear.keys()):
         dim = SIZES[names[j]]
@@ -129,9 +134,9 @@ def test_bulk_and_custom_factors_are_the_same_system(sensor, loss):
     block, state = block_of(sensor, loss=loss)
     values = values_of(state, block.unknowns)
     pushed, custom = (gtsam.GaussianFactorGraph() for _ in range(2))
-    Rows({sensor: block}).push(pushed, {sensor: block.weighted(state, np.ones(N, dtype=bool))})
+    Rows({sensor: block}, SEGMENTS).push(pushed, {sensor: block.weighted(state, np.ones(N, dtype=bool))})
     for k in range(N):
-        custom.push_back(block.custom_factor(k).linearize(values))
+        custom.push_back(factor_of(block, k).linearize(values))
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(pushed)
     expected = custom.hessian(ordering)
     for mine, gtsams in zip(pushed.hessian(ordering), expected, strict=True):
@@ -146,10 +151,12 @@ def test_all_sensors_of_a_keyframe_as_one_factor_are_the_same_system_without_wha
     rng = np.random.default_rng(1)
     gates = {sensor: rng.random(N) < 0.7 for sensor in blocks}
     together, apart = (gtsam.GaussianFactorGraph() for _ in range(2))
-    Rows(blocks).push(together, {sensor: block.weighted(state, gates[sensor]) for sensor, block in blocks.items()})
+    Rows(blocks, SEGMENTS).push(
+        together, {sensor: block.weighted(state, gates[sensor]) for sensor, block in blocks.items()}
+    )
     for sensor, block in blocks.items():
         for k in np.flatnonzero(gates[sensor]):
-            apart.push_back(block.custom_factor(int(k)).linearize(values))
+            apart.push_back(factor_of(block, int(k)).linearize(values))
     assert together.size() == N
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(together)
     for mine, gtsams in zip(together.hessian(ordering), apart.hessian(ordering), strict=True):
@@ -215,7 +222,7 @@ def test_some_of_a_block_are_its_own_measurements():
     block, state = block_of("dvl")
     some = block.at(np.array([2, 0]))
     np.testing.assert_allclose(some.normalised(state.at([2, 0])), block.normalised(state)[[2, 0]])
-    assert [row[0] for row in some.keys] == [key("pose", 2), key("pose", 0)]
+    assert [row[0] for row in measurement_keys(some, some.segment)] == [key("pose", 2), key("pose", 0)]
 
 
 def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():

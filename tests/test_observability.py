@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -19,10 +20,8 @@ from rovgraph.estimators.observability import (
     relative_covariance,
     without_spurious_information,
 )
-from rovgraph.graph.batch import make_values
-from rovgraph.graph.information import knowledge
+from rovgraph.graph.batch import make_problem, make_values
 from rovgraph.graph.keys import key
-from rovgraph.graph.marginals import covariances, marginals
 from rovgraph.simulate import CALM, SCENARIOS, Style, scenario
 from rovgraph.simulate.files import write_log
 from rovgraph.state import State
@@ -66,16 +65,23 @@ def dense(linear, order):
     return root @ root.T
 
 
+def as_graph(dive, b):
+    """GTSAM's graph of a dive whose calibration is constant, and its values at the chain's optimum."""
+    problem = make_problem(dive.intervals, b.prior, b.config, dive.beliefs, b.instruments)
+    return problem, make_values(problem, dive.state, dive.state.calibration)
+
+
 def test_information_agrees_with_a_dense_inversion_at_every_time():
     case = simulated(ONE_COMPASS, 40.0, 2, "square", **SLOW)
     log = case.log
     for sensor in list(log.streams):
         log = kept(log, sensor, (log[sensor].time > 18.0) & (log[sensor].time < 24.0))
-    dive = solved(log, ONE_COMPASS)
-    problem, values, gates = dive.problem, dive.solution.values, dive.solution.gates
+    smoother = batch(log, ONE_COMPASS)
+    dive = smoother.optimum()
+    problem, values = as_graph(dive, smoother.beginning)
     ends = [7, 12, problem.count - 1]
-    seen = knowledge(problem, values, gates, ends)
-    linear = problem.linearize(values, gates)
+    seen = dive.knowledge(ends)
+    linear = problem.linearize(values, dive.gates)
     for row, end in enumerate(ends):
         later = {key(v, i) for v in ("pose", "velocity", "bias") for i in range(end + 1, problem.count)}
         so_far, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
@@ -96,35 +102,33 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
 
 def test_information_at_the_end_is_that_of_the_smoother(straight):
     _, dive = straight
-    known = covariances(marginals(dive.problem, dive.solution))
-    last = knowledge(dive.problem, dive.solution.values, dive.solution.gates, [dive.problem.count - 1])
-    expected = np.concatenate([np.sqrt(np.diag(known[key(n)])) for n in dive.problem.unknowns.estimated])
+    last = dive.knowledge([len(dive.intervals) - 1])
+    expected = np.concatenate([np.sqrt(np.diag(dive.covariances(n)[-1])) for n in dive.unknowns.estimated])
     np.testing.assert_allclose(np.sqrt(np.diag(last.calibration[0])), expected, rtol=1e-8)
 
 
 def at_truth(case, dive):
-    """Values of the true states and calibration."""
+    """The dive at the true states and calibration."""
     time, truth = np.array([i.time for i in dive.intervals]), case.truth
     there = truth.at(time)
     bias = np.array([np.interp(time, truth.time, column) for column in case.dive.hidden["bias"].T]).T
-    hidden = {**dive.problem.unknowns.fixed, **case.dive.hidden["calibration"]}
-    return make_values(dive.problem, State(there.R_nb, there.p_n, there.v_n, bias), hidden)
+    hidden = {**dive.unknowns.fixed, **case.dive.hidden["calibration"]}
+    return replace(dive, solution=replace(dive.solution, point=State(there.R_nb, there.p_n, there.v_n, bias, hidden)))
 
 
 def test_what_noise_pretends_is_taken_off(straight):
     """Ahead at constant speed the information at the truth says that nothing is known of the misalignment."""
     case, dive = straight
-    problem, solution = dive.problem, dive.solution
-    sd = np.concatenate([np.full(TABLE[n].dim, TABLE[n].sd) for n in problem.unknowns.estimated])
-    end = [problem.count - 1]
+    sd = np.concatenate([np.full(TABLE[n].dim, TABLE[n].sd) for n in dive.unknowns.estimated])
+    end = [len(dive.intervals) - 1]
 
-    def seen(values):
-        return data_information(knowledge(problem, values, solution.gates, end).calibration, sd)
+    def seen(dive):
+        return data_information(dive.knowledge(end).calibration, sd)
 
-    truth, claimed = seen(at_truth(case, dive)), seen(solution.values)
-    corrected = without_spurious_information(problem, solution, end, claimed, sd[None])
+    truth, claimed = seen(at_truth(case, dive)), seen(dive)
+    corrected = without_spurious_information(dive, end, claimed, sd[None])
     true, told, own = (np.sqrt(np.diag(relative_covariance(D)))[0] for D in (truth[0], claimed[0], corrected[0]))
-    assert problem.unknowns.estimated[0] == "dvl_yaw"
+    assert dive.unknowns.estimated[0] == "dvl_yaw"
     assert true > 0.99
     assert told < 0.9  # else there would be nothing to take off
     assert own > 0.95

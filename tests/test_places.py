@@ -28,15 +28,16 @@ from rovgraph.config import Config
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.motion import Snapshot
+from rovgraph.engine.optimum import OTHERS
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array
-from rovgraph.graph.information import OTHERS, knowledge
 from rovgraph.graph.keys import calibration_key, key, key_name
-from rovgraph.graph.marginals import covariances, marginals, newest_covariance
+from rovgraph.graph.marginals import covariances, marginals
+from rovgraph.graph.optimum import GraphOptimum
 from rovgraph.graph.places import matched
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.live.message import Reading
@@ -146,6 +147,12 @@ def lost() -> Simulated:
 def misled() -> Simulated:
     """The same dive with as many false landmarks as true ones."""
     return circle(dropouts=((53.0, 77.0),), false_places=0.5)
+
+
+def graph_of(case: Simulated) -> GraphOptimum:
+    best = batch(case.log, case.config).optimum()
+    assert isinstance(best, GraphOptimum)
+    return best
 
 
 def of_places(estimate: Estimate) -> pd.DataFrame:
@@ -267,32 +274,34 @@ def test_what_was_recognised_narrows_the_next_comparison():
 
 
 def test_a_filter_forgets_what_it_has_not_seen_for_longest(lost):
-    most = filtered(lost.log, changed(lost.config, place={"remembered": 1}), renew=False)
-    both = filtered(lost.log, lost.config, renew=False)
-    size = both.error.size
-    assert {len(k.places) for k in most.filtered} == {0, 1} and {len(k.places) for k in both.filtered} == {0, 1, 2}
-    assert all(k.P.shape == (size + 2 * len(k.places),) * 2 for k in both.filtered)
-    assert len(most.smoothed().trajectory) == len(both.filtered)
-    assert both.filtered[-1].P[3, 3] < most.filtered[-1].P[3, 3]
+    intervals = batch(lost.log, lost.config).intervals
+    most = ErrorStateFilter(initialise(lost.log, changed(lost.config, place={"remembered": 1})))
+    both = ErrorStateFilter(initialise(lost.log, lost.config))
+    few, all_of = ([f.step(interval).filtered for interval in intervals] for f in (most, both))
+    size = both.engine.layout.size
+    assert {len(k.places) for k in few} == {0, 1} and {len(k.places) for k in all_of} == {0, 1, 2}
+    assert all(k.P.shape == (size + 2 * len(k.places),) * 2 for k in all_of)
+    assert len(most.smoothed().trajectory) == len(all_of)
+    assert all_of[-1].P[3, 3] < few[-1].P[3, 3]
 
 
 def test_a_renewed_filter_knows_the_places_as_the_graph_does(lost):
-    best = batch(lost.log, lost.config).optimum()
+    best = graph_of(lost)
     numbers = sorted(set(best.problem.blocks["place"].place.tolist()))
-    P = newest_covariance(best.problem, best.solution, numbers)
-    known = covariances(marginals(best.problem, best.solution))
+    P = best.newest_covariance(numbers)
+    known = covariances(marginals(best.problem, best.solution.point, best.gates))
     for k, number in enumerate(numbers[::-1]):
         own = P[len(P) - 2 * (k + 1) :, len(P) - 2 * (k + 1) :][:2, :2]
         np.testing.assert_allclose(own, known[key("place", number)], rtol=1e-5)
     estimator = filtered(lost.log, lost.config)
-    assert {p.number for p in estimator.filtered[-1].places} == set(numbers)
-    for place, true in zip(sorted(estimator.filtered[-1].places, key=lambda p: p.name), SMALL["places"], strict=True):
+    assert {p.number for p in estimator.known.places} == set(numbers)
+    for place, true in zip(sorted(estimator.known.places, key=lambda p: p.name), SMALL["places"], strict=True):
         np.testing.assert_allclose(place.position, true, atol=0.5)
 
 
 def test_late_and_restored_it_remembers_the_same_places(lost, tmp_path):
     beginning = initialise(lost.log, lost.config)
-    reference = filtered(lost.log, lost.config, renew=False).filtered[-1]
+    reference = filtered(lost.log, lost.config, renew=False).known
     measurements = list(lost.log.measurements())
     late = sorted(measurements, key=lambda m: m.time + (1.5 if m.sensor == "place" else 0.0))
     engine = FixedLag(beginning, 5.0, 0.3)
@@ -312,13 +321,13 @@ def test_late_and_restored_it_remembers_the_same_places(lost, tmp_path):
 
 
 def test_information_about_the_calibration_is_the_graphs_with_places_in_it(lost):
-    best = batch(lost.log, lost.config).optimum()
-    end, solution = best.problem.count - 1, best.solution
-    seen = knowledge(best.problem, solution.values, solution.gates, [end // 3, 2 * end // 3, end])
-    names, column = best.problem.unknowns.estimated, OTHERS
-    known = covariances(marginals(best.problem, solution))
+    best = graph_of(lost)
+    end = best.problem.count - 1
+    seen = best.knowledge([end // 3, 2 * end // 3, end])
+    names, column = best.unknowns.estimated, OTHERS
+    known = covariances(marginals(best.problem, best.solution.point, best.gates))
     for name in names:
-        P = known[calibration_key(best.problem.unknowns, name, int(best.problem.segment[-1]))]
+        P = known[calibration_key(best.unknowns, name, int(best.problem.index[-1]))]
         own = slice(column, column + len(P))
         np.testing.assert_allclose(seen.covariance[-1][own, own], P, rtol=1e-4)
         column += len(P)

@@ -212,7 +212,7 @@ def test_lever_arms_are_taken_relative_to_the_states_origin():
     w = rate - state.bias[:, 3:]
     for sensor in here:
         expected = here[sensor].model.predict(state, rate)[0]
-        if sensor == "thruster":  # what is scale_to_bias is scale_to_bias at the origin
+        if sensor == "thruster":  # what is felt is felt at the origin
             expected = expected + np.cross(w, np.cross(w, origin))
         np.testing.assert_allclose(there[sensor].model.predict(at_origin, rate)[0], expected, atol=1e-12)
 

@@ -228,9 +228,7 @@ class Graph(Section):
     max_gap_s: Positive = Field(1.0, description="longest time between keyframes")
     min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
     solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
-    segment_s: Positive = Field(
-        10.0, description="isam2: a calibration variable has a new value this often; else the interval of its history"
-    )
+    segment_s: Positive = Field(10.0, description="isam2: calibration has a new value this often")
     lag_s: Positive = Field(5.0, description="how late a measurement may come online; without effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
 

@@ -122,15 +122,15 @@ class Chain:
         return [(sensor, block, state.at(block.keyframe)) for sensor, block in self.blocks.items()]
 
     def initial_gates(self) -> Gates:
-        return {sensor: block.believed for sensor, block in self.blocks.items()}
+        return {sensor: block.believed.copy() for sensor, block in self.blocks.items()}
 
     def gates(self, point: State) -> Gates:
         return gates_of(self.seen(point))
 
     def cost(self, point: State, gates: Gates) -> float:
         shift = np.empty((0, 6)) if self.scale_to_bias is None else self._scale_shift(point)
-        states = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
-        total = motion_cost(self.motions, self.motion_weights, *states, shift)
+        R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
+        total = motion_cost(self.motions, self.motion_weights, R, p, v, b, shift)
         total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
         for name in self._walking:
             total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
@@ -242,7 +242,7 @@ class Chain:
         """Room for the rows of priors, of the clone's tie and of all measurements, in this order."""
         blocks, first = self.blocks.values(), np.zeros(1, np.int64)
         walking = self.d - MOTION
-        keyframes = [first, first, first, *(b.keyframe for b in blocks)]
+        keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]
         dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
         others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
         return MeasurementRows(len(self.intervals), MOTION, keyframes, dims, max([walking, clones, *others]))

@@ -196,7 +196,8 @@ class SquareRoot:
     def border_by(self, given: Index) -> Array:
         """How the optimum of the whole border moves with k of its components, shape (c, k)."""
         others = np.setdiff1d(np.arange(len(self.border)), given)
-        R, free = np.linalg.qr(self.border[:, [*others, *given]], mode="r"), len(others)
+        R: Array = np.asarray(np.linalg.qr(self.border[:, [*others, *given]], mode="r"))
+        free = len(others)
         out = np.zeros((len(self.border), len(given)))
         out[given] = np.eye(len(given))
         out[others] = -_solve_upper(R[:free, :free], R[:free, free:])

@@ -87,7 +87,7 @@ class ChainOptimum:
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
-            return self._covariances[:, COLUMNS[variable], COLUMNS[variable]]
+            return np.asarray(self._covariances[:, COLUMNS[variable], COLUMNS[variable]])
         border, part = self.chain.layout[variable]
         if not border:
             return self._covariances[:, part, part]
@@ -97,7 +97,7 @@ class ChainOptimum:
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         chosen = np.concatenate([np.arange(MOTION), *(self.chain.target(n) for n in self.unknowns.estimated)])
-        return self.information.newest_covariance()[np.ix_(chosen, chosen)]
+        return np.asarray(self.information.newest_covariance()[np.ix_(chosen, chosen)])
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""

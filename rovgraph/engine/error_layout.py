@@ -1,7 +1,7 @@
 """Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from rovgraph.instruments import Instrument
 from rovgraph.kernels.layout import MOTION
 from rovgraph.sensors import SENSORS, CompiledModel, SensorModel, WaterVelocity
 from rovgraph.state import DIMENSION, Jacobians
+
+Index = NDArray[np.int64]
 
 # the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
 SEEN = {s.name: s.linear_in for s in SENSORS.values() if s.linear_in is not None}
@@ -53,7 +55,7 @@ class ErrorLayout:
 
         self.coordinates = self._coordinates(instruments)
 
-    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Any, ...]:
+    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Index, Index, Array, Index]:
         """Columns of a full Jacobian, instruments and what they see, their numbers, rows of a basis."""
         estimated = np.flatnonzero(self.column >= 0)
         columns = estimated[np.argsort(self.column[estimated])]

@@ -202,8 +202,8 @@ class FilterEngine:
         if gates is not None:
             gates.clear()
             gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
-        known = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
-        processed += [ProcessedMeasurement(m, before.x, before.c, *rest) for m, *rest in known]
+        met = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
+        processed += [ProcessedMeasurement(m, before.x, before.c, own, w) for m, own, w in met]
         return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places)
 
     def _of_block(self, known: Gaussian, m: KeyframeMeasurement) -> tuple[Array, Array]:

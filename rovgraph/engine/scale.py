@@ -25,7 +25,7 @@ def wanted(beliefs: Mapping[str, Belief]) -> bool:
 
 
 def scale_to_bias(signal_b: Array, R_bs: Array) -> Array:
-    """Derivative of the bias that is scale_to_bias by the scales.
+    """Derivative by the scales of the bias that they act as.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def scale_to_bias(signal_b: Array, R_bs: Array) -> Array:
 
 
 def biased(state: State, S: Array) -> State:
-    """The state with the bias that is scale_to_bias; ``S`` has shape (n, 6, 6)."""
+    """The state with the bias that the scales act as; ``S`` has shape (n, 6, 6)."""
     scales = [np.broadcast_to(state.calibration[name], (len(state), 3)) for name in SCALES]
     bias = state.bias + (S @ np.concatenate(scales, axis=-1)[..., None])[..., 0]
     return State(state.R_nb, state.p_n, state.v_n, bias, state.calibration)

@@ -12,8 +12,6 @@ from rovgraph.kernels.motion import transitions as motion_transitions
 from rovgraph.kernels.motion_residual import motion_errors, motion_weights
 from rovgraph.state import State
 
-_NONE = np.empty((0, 15, 15))
-
 
 def predict(interval: KeyframeInterval, state: State) -> State:
     """The state at the end of an interval, from the IMU alone, or from nothing while it is silent.
@@ -23,9 +21,7 @@ def predict(interval: KeyframeInterval, state: State) -> State:
     interval : with motion
     state : State of one epoch, of the keyframe before
     """
-    ends = np.empty((1, 3, 3)), np.empty((1, 3)), np.empty((1, 3))
-    motion_transitions(_rows([interval]), *_arrays([(interval, state)]), *ends, _NONE, _NONE)
-    return replace(state, R_nb=ends[0], p_n=ends[1], v_n=ends[2])
+    return transitions([interval], [state])[0][0]
 
 
 def transitions(intervals: Sequence[KeyframeInterval], before: Sequence[State]) -> tuple[list[State], Array, Array]:

@@ -60,11 +60,14 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
         both = _isam2(batch, progress)
         estimates = [one for one in both if estimate in ("both", one.kind)]
     else:
-        estimates = []
-        if estimate != "filtered":
-            estimates.append(_solve(batch, progress))
+        estimates, states = [], None
         if estimate != "smoothed":
-            estimates.append(_filter(batch, progress))
+            passed = _filter(batch, progress)
+            estimates.append(passed.solve())
+            states = None if batch.measurements else passed.states()  # where the filter went is close by
+        if estimate != "filtered":
+            progress("smoothing", 0.5)
+            estimates.insert(0, batch.solve(states))
     return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
 
 
@@ -75,22 +78,17 @@ def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
     return batch
 
 
-def _solve(batch: BatchSmoother, progress: Progress) -> Estimate:
-    progress("smoothing", 0.1)
-    return batch.solve()
-
-
-def _filter(batch: BatchSmoother, progress: Progress) -> Estimate:
+def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
     filtering = partial(progress, "filtering")
     measurements = batch.measurements
     if not measurements:
-        return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering).solve()
+        return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering)
     estimator = ErrorStateFilter(batch.beginning, REINITIALISE_AT_S)  # learns how late they are while they come
     for k, measurement in enumerate(measurements):
         if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:
             filtering(k / len(measurements))
     estimator.finish()
-    return estimator.solve()
+    return estimator
 
 
 def _isam2(batch: BatchSmoother, progress: Progress) -> list[Estimate]:

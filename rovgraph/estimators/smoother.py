@@ -25,7 +25,7 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.log import Log, Measurement
-from rovgraph.state import BIAS, POSE, VELOCITY
+from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
 PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
@@ -81,22 +81,29 @@ class BatchSmoother:
         self.intervals += done
         return done
 
-    def solve(self) -> Estimate:
-        """The smoothed trajectory with its uncertainty."""
-        return smoothed(self.optimum(), self.beginning)
+    def solve(self, states: State | None = None) -> Estimate:
+        """The smoothed trajectory with its uncertainty; ``states`` as `optimum` takes them."""
+        return smoothed(self.optimum(states), self.beginning)
 
-    def optimum(self) -> Optimum:
-        """The graph of the dive and its optimum."""
+    def optimum(self, states: State | None = None) -> Optimum:
+        """The dive and its optimum.
+
+        Parameters
+        ----------
+        states : State of its keyframes to begin with, calibration at the end of the dive; None = dead reckoning
+        """
         b = self.beginning
-        dive, calibration, priors = self, None, beliefs(b.config)
+        dive, priors = self, beliefs(b.config)
+        calibration = None if states is None else newest_calibration(states.calibration)
         for _ in range(MAX_PLACINGS):
-            states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
+            if states is None:
+                states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
             best = optimum(dive.intervals, b, states, calibration)
             found = best.state.calibration
             anew = dive.placed_again(found)
             if anew is None:
                 break
-            dive, calibration = anew, {name: value.reshape(-1, value.shape[-1])[-1] for name, value in found.items()}
+            dive, states, calibration = anew, None, newest_calibration(found)
         return best
 
     def placed_again(self, calibration: Mapping[str, Array]) -> "BatchSmoother | None":
@@ -124,6 +131,11 @@ class BatchSmoother:
         states = dead_reckon(self.intervals, b, means)
         trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
+
+
+def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
+    """The last of values of shape (n, dim) or (dim,), shape (dim,)."""
+    return {name: value.reshape(-1, value.shape[-1])[-1] for name, value in calibration.items()}
 
 
 def smoothed(best: Optimum, b: InitialConditions) -> Estimate:

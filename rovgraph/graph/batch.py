@@ -84,7 +84,7 @@ class Problem:
 
     def initial_gates(self) -> Gates:
         """Open, but for places that look like others."""
-        return {sensor: block.believed for sensor, block in self.blocks.items()}
+        return {sensor: block.believed.copy() for sensor, block in self.blocks.items()}
 
     def gates(self, point: gtsam.Values) -> Gates:
         """Which measurements lie within their gate."""

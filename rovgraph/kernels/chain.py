@@ -50,34 +50,41 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
     if pivot < 0 or first < 0 or column < 0:
         return  # it never is; the compiler must know it to use vector instructions
     count = last - first
-    square = 0.0
+    square, other = 0.0, 0.0
     for i in range(count):
         v[i] = W[first + i, column]
         W[first + i, column] = 0.0
-        square += v[i] * v[i]
+    for i in range(count // 2):  # two sums do not wait for each other
+        square += v[2 * i] * v[2 * i]
+        other += v[2 * i + 1] * v[2 * i + 1]
+    square += other
+    if count % 2:
+        square += v[count - 1] * v[count - 1]
     if square == 0.0:
         return
     top = W[pivot, column]
     norm = -math.copysign(math.sqrt(top * top + square), top)
     lead = top - norm
     gain = 1.0 / (lead * norm)  # -2 over the square of (lead, v)
+    W[pivot, column] = 0.0
     begin = column // LANES * LANES
     width = (W.shape[1] // LANES - column // LANES) * LANES
     for c in range(width):
         w[c] = lead * W[pivot, begin + c]
     for i in range(count):
         factor = v[i]
+        if factor == 0.0:
+            continue
         for c in range(width):
             w[c] += factor * W[first + i, begin + c]
+    factor = gain * lead
     for c in range(width):
-        w[c] *= gain
-    for c in range(column - begin + 1):
-        w[c] = 0.0
-    for c in range(width):
-        W[pivot, begin + c] += lead * w[c]
+        W[pivot, begin + c] += factor * w[c]
     W[pivot, column] = norm
     for i in range(count):
-        factor = v[i]
+        factor = gain * v[i]
+        if factor == 0.0:
+            continue
         for c in range(width):
             W[first + i, begin + c] += factor * w[c]
 

@@ -160,13 +160,10 @@ def _add_turning(row: Array, E: Array, R: Array, J: Array) -> None:
 def predict_motion(
     row: Array, R: Array, p: Array, v: Array, bias: Array, R_out: Array, p_out: Array, v_out: Array
 ) -> None:
-    """The state at the end of one interval, whose bias is that at its beginning."""
-    if is_coasted(row):
-        coast(row, R, p, v, R_out, p_out, v_out)
-    else:
-        zeta, E = np.empty(9), np.empty((3, 3))
-        correct_motion(row, bias, zeta)
-        _predict(row, zeta, R, p, v, E, R_out, p_out, v_out)
+    """The state at the end of one interval that is not coasted through, without derivatives."""
+    zeta, E = np.empty(9), np.empty((3, 3))
+    correct_motion(row, bias, zeta)
+    _predict(row, zeta, R, p, v, E, R_out, p_out, v_out)
 
 
 @helper
@@ -233,13 +230,7 @@ def transitions(
     motions : ndarray, shape (n, ROW)
     R, p, v, bias : ndarray, shapes (n, 3, 3), (n, 3), (n, 3), (n, 6), at their beginnings
     R_out, p_out, v_out : the same at their ends
-    F_out, Q_out : ndarray, shape (n, 15, 15), transitions and process noise; or (0, 15, 15), where only the states
-        are wanted
+    F_out, Q_out : ndarray, shape (n, 15, 15), transitions and process noise
     """
     for k in range(len(motions)):
-        if len(F_out) == 0:
-            predict_motion(motions[k], R[k], p[k], v[k], bias[k], R_out[k], p_out[k], v_out[k])
-        else:
-            predict_with_transition(
-                motions[k], R[k], p[k], v[k], bias[k], R_out[k], p_out[k], v_out[k], F_out[k], Q_out[k]
-            )
+        predict_with_transition(motions[k], R[k], p[k], v[k], bias[k], R_out[k], p_out[k], v_out[k], F_out[k], Q_out[k])

@@ -99,4 +99,4 @@ def _keyframe(snapshot: FilterSnapshot) -> Keyframe:
 def _smoothed(engine: FilterEngine, keyframes: Sequence[Keyframe]) -> Gaussian:
     """The newest of some keyframes, from all data so far."""
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
-    return reinitialised(engine, [interval for interval, _, _ in keyframes], states)
+    return reinitialised(engine, [interval for interval, _, _ in keyframes], states)[0]

@@ -57,6 +57,7 @@ class ErrorStateFilter:
         self.transitions: list[Transition] = []
         self.gates: Gates = {}
         self._due = list(self.reinitialise_at)
+        self._smoothed: State | None = None  # of the keyframes up to the newest reinitialisation
 
     @property
     def intervals(self) -> list[KeyframeInterval]:
@@ -70,6 +71,20 @@ class ErrorStateFilter:
     def finish(self) -> list[KeyframeInterval]:
         """Close the last interval."""
         return self._take(self.assembler.finish())
+
+    def states(self) -> State:
+        """Of every keyframe, as well as it is known: smoothed up to the newest reinitialisation, then filtered."""
+        filtered, smoothed = self.history.states, self._smoothed
+        if smoothed is None:
+            return filtered
+        rest = slice(len(smoothed), None)
+        return State(
+            np.concatenate([smoothed.R_nb, filtered.R_nb[rest]]),
+            np.concatenate([smoothed.p_n, filtered.p_n[rest]]),
+            np.concatenate([smoothed.v_n, filtered.v_n[rest]]),
+            np.concatenate([smoothed.bias, filtered.bias[rest]]),
+            filtered.calibration,
+        )
 
     def latest(self) -> State:
         """The newest keyframe's state, at the IMU, calibration included."""
@@ -85,7 +100,8 @@ class ErrorStateFilter:
         self.history.append(interval, self.known, done.processed)
         if self._due and interval.time - self.intervals[0].time >= self._due[0]:
             self._due.pop(0)
-            self.known = reinitialised(self.engine, self.intervals, self.history.states)
+            self.known, smoothed = reinitialised(self.engine, self.intervals, self.states())
+            self._smoothed = smoothed
             self.history.replace_last(self.known)
         self.assembler.time_offsets.assume(self.latest().calibration)
         return done

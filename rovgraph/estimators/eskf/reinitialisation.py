@@ -13,7 +13,7 @@ from rovgraph.estimators.optimum import optimum
 from rovgraph.state import PLACE_DIM, State
 
 
-def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], states: State) -> Gaussian:
+def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], states: State) -> tuple[Gaussian, State]:
     """The newest keyframe, with every factor of the dive linearised at the optimum.
 
     Parameters
@@ -21,6 +21,11 @@ def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], s
     engine : the filter's
     intervals : the dive so far
     states : State of all its keyframes to begin with; its newest calibration is taken
+
+    Returns
+    -------
+    Gaussian : of the newest keyframe
+    State : of all keyframes, to begin with the next time
     """
     initial, layout = engine.initial, engine.layout
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
@@ -40,7 +45,7 @@ def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], s
         newest.bias,
         {name: value.reshape(-1) for name, value in newest.calibration.items()},
     )
-    return Gaussian.of(newest, P, places)
+    return Gaussian.of(newest, P, places), best.state
 
 
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:
