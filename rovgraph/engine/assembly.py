@@ -21,7 +21,7 @@ from typing import Any, cast
 import numpy as np
 
 from rovgraph.config import Config, beliefs, mount_matrix
-from rovgraph.engine.admission import admitted, standard_deviation
+from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.late_stamp_window import window_around
@@ -29,12 +29,12 @@ from rovgraph.engine.motion import Motion, Snapshot
 from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
 from rovgraph.engine.scale import scale_to_bias, wanted
 from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
-from rovgraph.engine.whole_log import ONCE_PER_INTERVAL, SHORTEST_S, WholeLog
+from rovgraph.engine.whole_log import SHORTEST_S, WholeLog
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
 from rovgraph.log import Log, Measurement
 from rovgraph.log.packing import pack, unpack
-from rovgraph.model_aiding import ModelAiding
+from rovgraph.sensors import SENSORS, ModelAiding
 from rovgraph.state import State
 
 SOME = 4096  # measurements of a log that are objects at one time
@@ -265,7 +265,7 @@ class Assembler:
         for m in self._between:
             if m.sensor not in seen:
                 taken.append(m)
-            if m.sensor in ONCE_PER_INTERVAL:
+            if SENSORS[m.sensor].once_per_interval:
                 seen.add(m.sensor)
         if self._aiding is not None and not self._samples.gap(samples):
             aiding = self._aiding.between(self._start, time, samples, lambda t: self._samples.rate(samples, t)[0])
@@ -295,7 +295,7 @@ class Assembler:
             landmark, z = self._sighting(m), np.zeros(instrument.model.dim)
             if landmark is None:
                 return []
-        sd = standard_deviation(m.sensor, m.values, instrument, self.config)
+        sd = SENSORS[m.sensor].standard_deviation(m.values, instrument, self.config)
         place = (m.sensor, self._index, self._segment, m.time, m.row)
         scaled = self._scale_to_bias(every, self._start, m.time)
         return [KeyframeMeasurement(*place, z, sd, rate_b, rate_sd, motion, self.bias, window, scaled, landmark)]

@@ -18,6 +18,7 @@ from rovgraph.estimators.first_seconds import Level, first_heading, first_positi
 from rovgraph.geometry import Array, level_from_force, matrix_from_rpy, rpy_from_matrix
 from rovgraph.instruments import Instrument, heading_sources, instruments
 from rovgraph.log import Log
+from rovgraph.sensors import SENSORS
 from rovgraph.state import State
 
 STILL_GYR_SD = 3e-3  # a vehicle that looks still may turn this much [rad/s]
@@ -51,8 +52,8 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
     present = log.sensors | set(expected)
-    used = [s for s in ("dvl", "dvl_water", "depth", "fix", "place") if s in present] + heading_sources(config, present)
-    used += _thrusters(log, config)
+    own = [s for s in sensors if s in present and s != "thruster" and SENSORS[s].heading_source is None]
+    used = own + heading_sources(config, present) + _thrusters(log, config)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 
