@@ -1,6 +1,9 @@
 """Measurements in the order of time become keyframes and what lies between them.
 
-A keyframe stands at every DVL ping, and wherever `graph.max_gap_s` passes without one.
+A keyframe stands at every DVL ping, and wherever `graph.max_gap_s` passes without one. A ping that comes up to
+`Graph.ping_due_s` later makes the keyframe itself: where the period of pings is about ``max_gap_s``, rounding would
+otherwise decide whether a ping has a keyframe.
+
 Any other measurement belongs to the keyframe before it and carries the IMU's motion
 from there to its own time, so nothing is rounded to a keyframe. Batch and incremental
 estimators consume the same `Interval` objects.
@@ -10,7 +13,7 @@ longer than that, and counting each sample would make the estimate too sure of i
 """
 
 import math
-from bisect import insort
+from bisect import bisect_right, insort
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -242,17 +245,18 @@ class Assembler:
 
     def _take_until(self, time: float) -> list[Interval]:
         """Place what has waited for the IMU up to a time."""
+        due = self.config.graph.ping_due_s
         done: list[Interval] = []
         while self._waiting and self._waiting[0].time <= time:
             m = self._waiting.pop(0)
-            done += self._silence(m.time)
+            done += self._silence(m.time, due)
             if m.sensor == "imu":
                 done += [self._close(m.time, None)] if m.time - self._start > SHORTEST_S else []
             elif m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
                 done.append(self._close(m.time, m))
             else:
                 self._between.append(m)
-        return done + self._silence(time)
+        return done + self._silence(time, due)
 
     def finish(self) -> list[Interval]:
         """Place the rest, and a last keyframe at the last IMU sample."""
@@ -260,6 +264,7 @@ class Assembler:
         if end == -math.inf:
             return []
         done = self._take_until(end)
+        done += self._silence(end, 0.0)
         self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
         if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
@@ -289,11 +294,11 @@ class Assembler:
         self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
         self._waiting = [m for m in self._waiting if m.time >= time]
 
-    def _silence(self, time: float) -> list[Interval]:
-        """Keyframes for a time without pings."""
+    def _silence(self, time: float, ping_due_s: float) -> list[Interval]:
+        """Keyframes for a time without pings; one that is ``ping_due_s`` late may still come."""
         done = []
         gap = self.config.graph.max_gap_s
-        while time - self._start > gap:
+        while time - self._start > gap + ping_due_s:
             done.append(self._close(self._start + gap, None))
         return done
 
@@ -301,12 +306,14 @@ class Assembler:
         """Make a keyframe at ``time`` and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
+        samples = samples[: int(samples[:, 0].searchsorted(time + self._around)) + 1]
         pim, gap_s = None, 0.0
         attached: list[Attached] = []
+        later = bisect_right(self._between, time, key=_time)
         if self._index >= 0:
-            pim, gap_s, attached = self._integrate(samples, every, time)
+            pim, gap_s, attached = self._integrate(samples, every, self._between[:later], time)
         before = self._start
-        self._index, self._start, self._between = self._index + 1, time, []
+        self._index, self._start, self._between = self._index + 1, time, self._between[later:]
         if time - self._segment_start >= self.config.graph.segment_s:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._samples.rate(samples, time)
@@ -317,10 +324,10 @@ class Assembler:
         return Interval(self._index, time, self._segment, rate_b, rate_sd, pim, gap_s, attached, scaled)
 
     def _integrate(
-        self, samples: Array, every: Array, time: float
+        self, samples: Array, every: Array, between: list[Placed], time: float
     ) -> tuple[gtsam.PreintegratedCombinedMeasurements, float, list[Attached]]:
         taken, seen = [], set()
-        for m in self._between:
+        for m in between:
             if m.sensor not in seen:
                 taken.append(m)
             if m.sensor in ONCE_PER_INTERVAL:
