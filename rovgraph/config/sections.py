@@ -225,12 +225,23 @@ class Graph(Section):
     """How the graph is built and solved."""
 
     keyframe: Literal["dvl"] = Field("dvl", description="what makes a keyframe")
-    max_gap_s: Positive = Field(1.0, description="longest time between keyframes")
+    max_gap_s: Positive = Field(
+        1.0, description="longest time between keyframes; a ping up to a quarter of it later makes the keyframe itself"
+    )
     min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
     solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
     segment_s: Positive = Field(10.0, description="isam2: calibration has a new value this often")
     lag_s: Positive = Field(5.0, description="how late a measurement may come online; without effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
+
+    @property
+    def ping_due_s(self) -> float:
+        """How much later than `max_gap_s` a ping still makes the keyframe [s].
+
+        A quarter of it, more than the periods of DVLs vary by; and at least `min_gap_s`, so that one which comes
+        later still is far enough from the keyframe before it to make its own.
+        """
+        return max(0.25 * self.max_gap_s, self.min_gap_s)
 
 
 def _stamped(sensor: str) -> str:
