@@ -20,8 +20,8 @@ from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
 from rovgraph.geometry import Array, cross, earth_rate_n, identity, rotate, transpose
 from rovgraph.instruments import HEADING_STREAMS
-from rovgraph.kernels.dead_reckoning import reckon_attitude
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
+from rovgraph.kernels.dead_reckoning import reckon_attitude
 from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
 
@@ -83,7 +83,9 @@ class _Pings:
         return self.velocity_b + cross(bias[self.epoch, 3:], self.arm)
 
 
-def dead_reckon(intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]) -> State:
+def dead_reckon(
+    intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]
+) -> State:
     """The state at every keyframe, at the IMU.
 
     Parameters
