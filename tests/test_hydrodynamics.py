@@ -16,7 +16,7 @@ from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, rotate
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log, Stream
-from rovgraph.model_aiding import ModelAiding, WaterVelocity
+from rovgraph.sensors import ModelAiding, WaterVelocity
 from rovgraph.simulate import Choices, Dive, simulate
 from rovgraph.simulate import simulated as simulated_dive
 from rovgraph.simulate.autopilot import Steps, VelocityControl
