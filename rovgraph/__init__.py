@@ -35,8 +35,8 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 Layers (imports go downwards only)
 ----------------------------------
 cli / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph / engine /
-instruments / config, log, trajectory / model_aiding / sensors / vehicle /
-state, calibration, thesis / kernels / geometry, workers / errors.
+instruments / log / sensors / config, trajectory / vehicle /
+state, calibration, thesis / kernels / geometry, workers, fast_csv / errors.
 """
 
 __version__ = "0.1.0"

@@ -99,6 +99,7 @@ def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "
     return offset, deviation
 
 
+STATE_LETTERS = frozenset("xvbn")  # of the graph's other variables
 MOUNT = ("dvl_roll", "dvl_pitch", "dvl_yaw")  # of the DVL's axes in the body's
 
 TABLE: dict[str, Variable] = {
@@ -303,10 +304,24 @@ def register(variable: Variable) -> None:
     ------
     ValueError : its name or letter is taken
     """
-    if variable.name in TABLE or any(variable.letter == other.letter for other in TABLE.values()):
+    letters = {other.letter for other in TABLE.values()} | STATE_LETTERS
+    if variable.name in TABLE or variable.letter in letters or len(variable.letter) != 1:
         raise ValueError(f"calibration variable {variable.name!r}: its name or its letter {variable.letter!r} is taken")
     TABLE[variable.name] = variable
     _lay_out(variable)
+
+
+def unregister(name: str) -> None:
+    """Take out the variable that was registered last.
+
+    Raises
+    ------
+    ValueError : another one is last, or it is built in
+    """
+    last = next(reversed(TABLE))
+    if name != last or LAYOUT[name].stop <= SIZE:
+        raise ValueError(f"calibration variable {name!r} is not the one that was registered last, {last!r}")
+    del TABLE[name], LAYOUT[name]
 
 
 @dataclass(frozen=True)

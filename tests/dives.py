@@ -1,15 +1,19 @@
 """Small simulated dives for the tests, as `Log` objects that never touch a file."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from rovgraph.config import Config, load_config
+from rovgraph.engine.filter_step import FilterStep, Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.motion import Motion
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.incremental import IncrementalEstimator
@@ -84,6 +88,19 @@ def level_log(seconds: float, acc: Array, gyr: Array, rate: float = 100.0, **sen
         rows = np.arange(len(at)) + 10_000
         streams[name] = Stream(name, STREAMS[name], np.asarray(at, float), np.asarray(values, float), rows)
     return Log("dive.csv", streams)
+
+
+class RecordingFilter(ErrorStateFilter):
+    """An error-state filter that keeps what is known of each keyframe so far, in ``filtered``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.filtered: list[Gaussian] = []
+
+    def step(self, interval: KeyframeInterval) -> FilterStep:
+        done = super().step(interval)
+        self.filtered.append(self.known)
+        return done
 
 
 @dataclass(frozen=True)
@@ -171,3 +188,22 @@ def attitude_errors(trajectory: Trajectory, case: Simulated) -> Array:
 
 def rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def same(a: object, b: object) -> None:
+    """Two values, objects of attributes or arrays, are the same to rounding."""
+    if is_dataclass(a) and not isinstance(a, type):
+        assert type(a) is type(b)
+        for f in fields(a):
+            if not (isinstance(a, Motion) and f.name == "imu"):  # as far as samples were there
+                same(getattr(a, f.name), getattr(b, f.name))
+    elif isinstance(a, list):
+        assert isinstance(b, list) and len(a) == len(b)
+        for one, other in zip(a, b, strict=True):
+            same(one, other)
+    elif isinstance(a, np.ndarray):
+        np.testing.assert_allclose(b, a, rtol=1e-12, atol=1e-15)
+    elif isinstance(a, float):
+        assert b == pytest.approx(a, rel=1e-12)
+    else:
+        assert a == b

@@ -16,13 +16,13 @@ PACKAGE = ROOT / "rovgraph"
 # Bottom first. Members of one layer are independent: they may not import each other.
 LAYERS = (
     {"errors"},
-    {"geometry", "workers"},
+    {"geometry", "workers", "fast_csv"},
     {"kernels"},
     {"state", "calibration", "thesis"},
     {"vehicle"},
+    {"config", "trajectory"},
     {"sensors"},
-    {"model_aiding"},
-    {"config", "log", "trajectory"},
+    {"log"},
     {"instruments"},
     {"engine"},
     {"graph"},

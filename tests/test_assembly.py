@@ -1,15 +1,14 @@
 """Keyframes and attached measurements: what goes where, and what is left out."""
 
-from dataclasses import fields, is_dataclass
-
 import numpy as np
 import pytest
-from dives import Simulated, falcon, interrupted, kept, level_log, simulated, started
+from dives import Simulated, falcon, interrupted, kept, level_log, same, simulated, started
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rovgraph.config import Config
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.motion import Motion
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 
@@ -26,25 +25,6 @@ def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInte
     same(done, whole.take(log))
     assert whole.left_out == assembler.left_out
     return done, assembler
-
-
-def same(a: object, b: object) -> None:
-    """Two values, objects of attributes or arrays, are the same to rounding."""
-    if is_dataclass(a) and not isinstance(a, type):
-        assert type(a) is type(b)
-        for f in fields(a):
-            if not (isinstance(a, Motion) and f.name == "imu"):  # as far as samples were there
-                same(getattr(a, f.name), getattr(b, f.name))
-    elif isinstance(a, list):
-        assert isinstance(b, list) and len(a) == len(b)
-        for one, other in zip(a, b, strict=True):
-            same(one, other)
-    elif isinstance(a, np.ndarray):
-        np.testing.assert_allclose(b, a, rtol=1e-12, atol=1e-15)
-    elif isinstance(a, float):
-        assert b == pytest.approx(a, rel=1e-12)
-    else:
-        assert a == b
 
 
 def log_of(seconds: float = 4.0, pings=(), rate: float = 100.0, **sensors) -> Log:
@@ -96,6 +76,47 @@ def test_a_log_without_dvl_has_keyframes_all_the_same():
     [(index, fix)] = found(intervals, "fix")
     assert (index, fix.keyframe) == (2, 1)
     assert fix.motion.dt == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("late", [1e-9, 1e-3, 0.04, 0.2, 0.25 - 1e-9])
+def test_a_ping_that_comes_late_makes_the_keyframe_of_the_gap(late):
+    intervals, _ = assembled(log_of(4.0, [0.5, 1.5 + late, 2.5 + late]))
+    np.testing.assert_allclose([i.time for i in intervals], [0.0, 0.5, 1.5 + late, 2.5 + late, 3.5 + late, 4.0])
+    assert all(a.motion.dt == 0.0 for _, a in found(intervals, "dvl"))
+
+
+def test_a_ping_that_comes_later_still_makes_a_keyframe_beside_that_of_the_gap():
+    intervals, _ = assembled(log_of(4.0, [0.5, 1.751, 3.4]))
+    assert times(intervals) == [0.0, 0.5, 1.5, 1.751, 2.751, 3.4, 4.0]
+    assert all(a.motion.dt == 0.0 for _, a in found(intervals, "dvl"))
+
+
+@given(
+    period=st.sampled_from([0.5, 1.0, 2.0, 3.0]),
+    rounding=st.lists(st.floats(-1e-4, 1e-4), min_size=6, max_size=6),
+    min_gap=st.sampled_from([0.05, 0.3]),
+)
+@settings(deadline=None, max_examples=50)
+def test_keyframes_do_not_depend_on_the_rounding_of_the_pings_period(period, rounding, min_gap):
+    config = Config.model_validate({"graph": {"min_gap_s": min_gap}})
+    pings = period * np.arange(1, 7)
+    exact, _ = assembled(log_of(6.5 * period, pings), config)
+    rounded, _ = assembled(log_of(6.5 * period, pings + rounding), config)
+    np.testing.assert_allclose([i.time for i in rounded], [i.time for i in exact], atol=2e-4)
+    assert [a.keyframe for _, a in found(rounded, "dvl")] == [a.keyframe for _, a in found(exact, "dvl")]
+    assert all(a.motion.dt == 0.0 for _, a in found(rounded, "dvl"))
+
+
+def test_what_is_measured_while_a_ping_is_due_belongs_to_the_keyframe_before_it():
+    fixes = (np.array([1.4, 1.5, 1.7, 1.9]), np.tile([1.0, 2.0, 0.5], (4, 1)))
+    intervals, _ = assembled(log_of(3.0, [0.5], fix=fixes))
+    assert times(intervals) == [0.0, 0.5, 1.5, 2.5, 3.0]
+    assert [(a.keyframe, round(a.motion.dt, 6)) for _, a in found(intervals, "fix")] == [
+        (1, 0.9),
+        (1, 1.0),
+        (2, 0.2),
+        (2, 0.4),
+    ]
 
 
 def test_a_ping_soon_after_another_is_attached_instead_of_making_a_keyframe():
@@ -211,10 +232,19 @@ def test_sensors_that_are_not_in_use_are_ignored():
 def test_an_interval_is_given_once_the_imu_is_half_a_window_past_its_ping():
     config = Config()
     assembler = Assembler(config, instruments(config), np.zeros(6))
-    given: list[tuple[float, float]] = []
+    done: list[tuple[float, float]] = []
     for m in log_of(1.0, [0.203, 0.6]).measurements():
-        given += [(m.time, i.time) for i in assembler.add(m)]
-    assert given == [(0.0, 0.0), (0.26, 0.203), (0.65, 0.6)]
+        done += [(m.time, i.time) for i in assembler.add(m)]
+    assert done == [(0.0, 0.0), (0.26, 0.203), (0.65, 0.6)]
+
+
+def test_the_keyframe_of_a_gap_is_given_once_no_ping_is_due():
+    config = Config()
+    assembler = Assembler(config, instruments(config), np.zeros(6))
+    done: list[tuple[float, float]] = []
+    for m in log_of(3.0, [0.5]).measurements():
+        done += [(m.time, i.time) for i in assembler.add(m)]
+    assert done == [(0.0, 0.0), (0.55, 0.5), (1.81, 1.5), (2.81, 2.5)]
 
 
 def test_an_imu_of_one_sample_makes_one_keyframe():

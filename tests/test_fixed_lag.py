@@ -72,6 +72,14 @@ def test_the_order_of_arrival_within_300_ms_changes_nothing(beginning, measureme
     same(live(beginning, first + shuffled(rest, 0.3), hold)[1], reference.filtered, 1e-9)
 
 
+def test_pings_about_as_far_apart_as_keyframes_may_be_make_the_same_keyframes_in_any_order():
+    case = simulated(falcon(), 40.0, seed=6, dvl_rate=1.0, dvl_jitter=0.4)
+    measurements, beginning = list(case.log.measurements()), initialise(case.log, case.config)
+    reference = fed(ErrorStateFilter(beginning), case.log)
+    first, rest = measurements[:50], measurements[50:]
+    same(live(beginning, first + shuffled(rest, 2.0), 0.1)[1], reference.filtered, 1e-9)
+
+
 def test_a_ping_three_seconds_late_is_used_at_its_own_time(beginning, measurements, reference):
     k = next(k for k, m in enumerate(measurements) if m.sensor == "dvl" and m.time > 20.0)
     late = next(j for j, m in enumerate(measurements) if m.time > measurements[k].time + 3.0)

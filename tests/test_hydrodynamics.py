@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from dives import altered, as_log, batch, beginning, changed, kept, rms, without
+from dives import altered, as_log, batch, beginning, changed, kept, rms, same, without
 
 from rovgraph.config import Config
 from rovgraph.engine.aiding import OLDEST_SIGNAL_S, PIECE_S
@@ -16,7 +16,7 @@ from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, rotate
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log, Stream
-from rovgraph.model_aiding import ModelAiding, WaterVelocity
+from rovgraph.sensors import ModelAiding, WaterVelocity
 from rovgraph.simulate import Choices, Dive, simulate
 from rovgraph.simulate import simulated as simulated_dive
 from rovgraph.simulate.autopilot import Steps, VelocityControl
@@ -203,6 +203,12 @@ def test_signals_that_stop_or_start_late_are_left_out_and_counted(still):
     assert 10.0 < used.min() < 11.0 and 29.0 < used.max() < 30.0 + OLDEST_SIGNAL_S
     reasons = {reason for sensor, reason in some.assembler.left_out if sensor == "thruster"}
     assert reasons == {"pieces before the first signal", f"pieces without a signal for {OLDEST_SIGNAL_S:g} s"}
+
+
+def test_signals_of_a_whole_log_are_taken_as_those_that_come_one_by_one(still):
+    one, whole = batch(still.log, still.config), BatchSmoother(beginning(still.log, still.config))
+    same(one.intervals, whole.take(still.log))
+    assert whole.assembler.left_out == one.assembler.left_out
 
 
 def test_without_hydrodynamics_signals_change_nothing(still):

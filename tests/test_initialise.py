@@ -21,7 +21,7 @@ from dives import (
 
 from rovgraph.config import Config, parse_config
 from rovgraph.errors import InputError
-from rovgraph.estimators.first_seconds import trusted_first
+from rovgraph.estimators.headings import trusted_first
 from rovgraph.estimators.initialise import UNKNOWN_HEADING_SD, initialise, sample_density
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix, wrap_angle
 from rovgraph.log import Log

@@ -20,10 +20,11 @@ from hypothesis.extra import numpy as nps
 from rovgraph.errors import InputError
 from rovgraph.live.checkpoint import ARRAY, read_checkpoint, write_checkpoint
 from rovgraph.live.message import GEODETIC, Reading
-from rovgraph.live.recorder import HEADER, Recorder
+from rovgraph.live.recorder import Recorder, recorded_columns
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import STREAMS, read_log
 
+HEADER = recorded_columns()
 EPOCH = 1.7e9
 RNG = np.random.default_rng(3)
 

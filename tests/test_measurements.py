@@ -151,7 +151,9 @@ def test_all_sensors_of_a_keyframe_as_one_factor_are_the_same_system_without_wha
     rng = np.random.default_rng(1)
     gates = {sensor: rng.random(N) < 0.7 for sensor in blocks}
     together, apart = (gtsam.GaussianFactorGraph() for _ in range(2))
-    Rows(blocks, SEGMENTS).push(together, {sensor: block.weighted(state, gates[sensor]) for sensor, block in blocks.items()})
+    Rows(blocks, SEGMENTS).push(
+        together, {sensor: block.weighted(state, gates[sensor]) for sensor, block in blocks.items()}
+    )
     for sensor, block in blocks.items():
         for k in np.flatnonzero(gates[sensor]):
             apart.push_back(factor_of(block, int(k)).linearize(values))

@@ -9,16 +9,17 @@ import warnings
 from collections.abc import Callable, Iterator
 
 from rovgraph.check.agreement import headings, vertical
-from rovgraph.check.findings import Finding, Level, Report, Timing
+from rovgraph.check.findings import Finding, Report, Timing
 from rovgraph.check.fixes import track
 from rovgraph.check.frozen_dvl import dvl_frozen_intervals, standstill, without_frozen_pings
 from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
 from rovgraph.check.times import overlap, presence, regularity, timing
-from rovgraph.check.values import angles, bottom_lock, depths, frozen, gravity, magnetic_field, turn_rates
+from rovgraph.check.values import angles, frozen, gravity, own, turn_rates
 from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.log import Log
+from rovgraph.sensors import Level
 
 __all__ = ["Finding", "Level", "Report", "Timing", "dvl_frozen_intervals", "examine", "warn", "without_frozen_pings"]
 
@@ -31,11 +32,9 @@ CHECKS: tuple[Check, ...] = (
     turn_rates,
     angles,
     headings,
-    magnetic_field,
-    bottom_lock,
+    own,
     standstill,
     frozen,
-    depths,
     vertical,
     track,
     places,

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding, Level, integral
+from rovgraph.check.findings import Finding, integral
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log, Stream
+from rovgraph.sensors import Level
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]

@@ -2,15 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.log import Log, Stream
-
-Level = Literal["ok", "warning", "error"]
+from rovgraph.sensors import Level
 
 
 @dataclass(frozen=True)

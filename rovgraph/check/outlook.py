@@ -25,7 +25,7 @@ def plan(log: Log, config: Config) -> Iterator[Finding]:
 
 
 def keyframes(log: Log, config: Config) -> int:
-    """Keyframes to expect: valid pings, and one wherever ``graph.max_gap_s`` passes without."""
+    """Keyframes to expect: valid pings, and those wherever ``graph.max_gap_s`` passes without."""
     first, last = log["imu"].time[[0, -1]]
     times = np.empty(0)
     if "dvl" in log:
@@ -33,7 +33,9 @@ def keyframes(log: Log, config: Config) -> int:
         times = pings[(pings > first) & (pings < last)]
     gaps = np.diff(np.concatenate([[first], times, [last]]))
     apart = gaps >= config.graph.min_gap_s
-    between = np.maximum(np.ceil(gaps / config.graph.max_gap_s - 1e-9) - 1.0, 0.0)
+    waited = np.full(len(gaps), config.graph.ping_due_s)
+    waited[-1] = 0.0  # no ping is due after the end
+    between = np.maximum(np.ceil((gaps - waited) / config.graph.max_gap_s - 1e-9) - 1.0, 0.0)
     return int(1 + apart.sum() + between.sum())
 
 

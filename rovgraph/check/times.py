@@ -8,11 +8,10 @@ from rovgraph.check.findings import Finding, Timing, repeats, since, told
 from rovgraph.config import Config
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
+from rovgraph.sensors import SENSORS
 
 GAP_PERIODS = 5.0  # longer than this many periods is a gap
 REPEATED = 0.2  # share of repeated samples that a sensor does not produce by itself
-# slowest and fastest rates that make sense [Hz]
-RATES = {"imu": (5.0, 4000.0), "dvl": (0.1, 100.0), "depth": (0.05, 1000.0), "mag": (0.5, 4000.0)}
 
 
 def timing(stream: Stream) -> Timing:
@@ -40,16 +39,9 @@ def timing(stream: Stream) -> Timing:
 
 def presence(log: Log, config: Config) -> Iterator[Finding]:
     """Sensors that are missing, and what that means."""
-    if "imu" not in log:
-        yield Finding(
-            "imu",
-            "error",
-            "no IMU: nothing carries attitude from ping to ping; give acc_x, acc_y, acc_z, gyr_x, gyr_y, gyr_z",
-        )
-    if "dvl" not in log:
-        yield Finding(
-            "dvl", "warning", "no DVL: position is lost within a minute between fixes; give dvl_vx, dvl_vy, dvl_vz"
-        )
+    for sensor in SENSORS.values():
+        if sensor.if_missing is not None and sensor.name not in log:
+            yield Finding(sensor.name, *sensor.if_missing)
     if not heading_sources(config, log.sensors):
         known = (
             "heading starts at start.heading_deg and drifts with the gyro"
@@ -57,10 +49,6 @@ def presence(log: Log, config: Config) -> Iterator[Finding]:
             else "give mag, ahrs_yaw or dvl_heading, or at least start.heading_deg"
         )
         yield Finding("log", "warning", f"no heading source in use: {known}")
-    if "depth" not in log:
-        yield Finding("depth", "warning", "no depth: the vertical drifts; give depth if there is a pressure sensor")
-    if "fix" not in log:
-        yield Finding("fix", "ok", "no position fixes: the error of position grows with the distance")
 
 
 def overlap(log: Log, config: Config) -> Iterator[Finding]:
@@ -87,7 +75,7 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
         if np.isnan(t.rate):
             yield Finding(sensor, "warning", "a single measurement")
             continue
-        low, high = RATES.get(sensor, (0.0, np.inf))
+        low, high = SENSORS[sensor].usual_rates
         if not low <= t.rate <= high:
             yield Finding(
                 sensor,
@@ -117,7 +105,7 @@ def _moves(stream: Stream) -> bool:
 
 def _gaps(log: Log, config: Config, t: Timing) -> Iterator[Finding]:
     """Silences of sensors that sample all the time."""
-    if t.sensor in ("fix", "place") or t.count < 3:
+    if SENSORS[t.sensor].occasional or t.count < 3:
         return
     limit = GAP_PERIODS / t.rate
     periods = np.diff(log[t.sensor].time)

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import Finding, Level, frozen_runs, integral, since, told
+from rovgraph.check.findings import Finding, frozen_runs, integral, since, told
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log
+from rovgraph.sensors import SENSORS, Level
 
 GRAVITY_RANGE = (9.3, 10.3)  # plausible mean specific force [m/s2]
 GRAVITY_ANGLE = np.deg2rad(25.0)  # of mean specific force from upwards
@@ -88,50 +89,11 @@ def angles(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("ahrs", "error", f"roll or pitch reaches {largest:.4g} rad; in degrees? Say units: {{ahrs: deg}}")
 
 
-def bottom_lock(log: Log, config: Config) -> Iterator[Finding]:
-    """Share of valid pings, and their speed."""
-    if "dvl" not in log:
-        return
-    stream = log["dvl"]
-    valid = stream["dvl_valid"] == 1.0
-    share = float(valid.mean())
-    yield Finding("dvl", "ok" if share >= 0.8 else "warning", f"bottom lock {share:.1%} of {len(stream)} pings")
-    if not valid.any():
-        return
-    speed = np.linalg.norm(stream.data[valid, :3], axis=1)
-    usual, limit = float(np.median(speed)), config.dvl.max_speed_mps
-    component = np.abs(stream.data[valid, :3]).max(axis=1)
-    lost = int((component > limit).sum())
-    if usual > max(limit, 10.0):
-        yield Finding("dvl", "error", f"median speed {usual:.3g} m/s; in mm/s or cm/s? Say units: {{dvl: mm/s}}")
-    elif lost > 0.05 * len(speed):
-        yield Finding("dvl", "warning", f"{lost} pings are faster than dvl.max_speed_mps = {limit:g} and are left out")
-    else:
-        tail = f"; {lost} faster than {limit:g} m/s are left out" if lost else ""
-        yield Finding("dvl", "ok", f"median speed {usual:.2f} m/s{tail}")
-
-
-def depths(log: Log, config: Config) -> Iterator[Finding]:
-    """Depth positive down, and in metres."""
-    if "depth" not in log:
-        return
-    depth = log["depth"]["depth"]
-    if np.median(depth) < -0.5:
-        yield Finding("depth", "warning", f"median depth {np.median(depth):.2f} m; depth counts downwards: mirrored?")
-    if np.ptp(depth) > 1000.0:
-        yield Finding("depth", "warning", f"depth spans {np.ptp(depth):.4g} m; in cm or mm? Say units: {{depth: mm}}")
-
-
-def magnetic_field(log: Log, config: Config) -> Iterator[Finding]:
-    """The field's magnitude is constant but for iron near the magnetometer."""
-    if "mag" not in log:
-        return
-    size = np.linalg.norm(log["mag"].data, axis=1)
-    low, middle, high = np.percentile(size, [5, 50, 95])
-    spread = (high - low) / middle if middle > 0 else np.inf
-    level: Level = "warning" if spread > 0.4 else "ok"
-    hint = "; large hard iron, calibrate it (rovgraph calibrate)" if level == "warning" else ""
-    yield Finding("mag", level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}")
+def own(log: Log, config: Config) -> Iterator[Finding]:
+    """What each sensor finds in its own values."""
+    for sensor, stream in log.streams.items():
+        for level, text in SENSORS[sensor].look(stream.data, config):
+            yield Finding(sensor, level, text)
 
 
 def frozen(log: Log, config: Config) -> Iterator[Finding]:

@@ -14,14 +14,17 @@ from rovgraph.config.reading import (
     parse_config,
     parse_model,
     read_yaml,
+    register_settings,
+    unregister_settings,
     yaml_text,
 )
-from rovgraph.config.sections import ImuNoise, Mag
+from rovgraph.config.sections import ImuNoise, Mag, SensorSettings
 
 __all__ = [
     "Config",
     "ImuNoise",
     "Mag",
+    "SensorSettings",
     "beliefs",
     "describe",
     "load_config",
@@ -29,5 +32,7 @@ __all__ = [
     "parse_config",
     "parse_model",
     "read_yaml",
+    "register_settings",
+    "unregister_settings",
     "yaml_text",
 ]

@@ -65,7 +65,10 @@ def _key(location: tuple[int | str, ...]) -> str:
 
 def _unknown_key(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
     *parents, last = map(str, location)
-    near = difflib.get_close_matches(last, list(_kind(model, location[:-1]).model_fields), 1, cutoff=0.0)
+    known = list(_kind(model, location[:-1]).model_fields)
+    if not known:
+        return f"unknown key {'.'.join([*parents, last])}: no sensor of that name is registered"
+    near = difflib.get_close_matches(last, known, 1, cutoff=0.0)
     return f"unknown key {'.'.join([*parents, last])}, nearest known key is {'.'.join([*parents, near[0]])}"
 
 

@@ -30,8 +30,8 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
 
 
-def _calibration_entry(variable: Variable) -> type[BaseModel]:
-    """The configuration of one row of the calibration table."""
+def calibration_entry(variable: Variable) -> type[BaseModel]:
+    """The configuration of one row of the calibration table, as a section."""
     tail = "_deg" if variable.angular else ""
     scale = float(np.rad2deg(1.0)) if variable.angular else 1.0
     unit = "degrees" if variable.angular else variable.unit
@@ -51,13 +51,14 @@ def _calibration_entry(variable: Variable) -> type[BaseModel]:
             Field(round(variable.walk * scale, 12), description=f"random walk [{unit}/rts]; 0 = constant"),
         ),
     }
-    return create_model(
+    entry = create_model(
         f"Calibration_{variable.name}", __base__=Section, __module__=__name__, __doc__=variable.about, **fields
     )
+    globals()[entry.__name__] = entry  # where pickle looks for it
+    return entry
 
 
-_ENTRIES = {name: _calibration_entry(v) for name, v in TABLE.items()}
-globals().update({entry.__name__: entry for entry in _ENTRIES.values()})  # where pickle looks for them
+_ENTRIES = {name: calibration_entry(v) for name, v in TABLE.items()}
 Calibration: type[BaseModel] = create_model(
     "Calibration",
     __base__=Section,

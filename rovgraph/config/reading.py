@@ -1,7 +1,7 @@
 """`Config`, and how it is read, written and described."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
@@ -10,9 +10,10 @@ from pydantic import BaseModel, Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rovgraph.calibration import MOUNT, TABLE, Belief
+from rovgraph.calibration import MOUNT, TABLE, Belief, Variable
 from rovgraph.config.error_messages import complaint
-from rovgraph.config.priors import Calibration
+from rovgraph.config.priors import Calibration, calibration_entry
+from rovgraph.config.registered import add_key, remove_key
 from rovgraph.config.sections import (
     Depth,
     Dvl,
@@ -24,6 +25,8 @@ from rovgraph.config.sections import (
     Online,
     Place,
     Section,
+    Sensors,
+    SensorSettings,
     Start,
     Triple,
     Vehicle,
@@ -46,7 +49,8 @@ class Config(Section):
     depth: Depth = Depth()
     fix: Fix = Fix()
     place: Place = Place()
-    calibration: Calibration = Calibration()
+    sensors: Sensors = Field(default_factory=Sensors)
+    calibration: Calibration = Field(default_factory=Calibration)
     vehicle: Vehicle = Vehicle()
     graph: Graph = Graph()
     online: Online = Online()
@@ -56,6 +60,20 @@ class Config(Section):
     def to_yaml(self) -> str:
         """The effective configuration, every key written out."""
         return yaml_text(self.model_dump(mode="json"))
+
+
+def register_settings(sensor: str, settings: type[SensorSettings], calibration: Sequence[Variable]) -> None:
+    """Let a configuration have the keys of a sensor and of its calibration variables, which stand in `TABLE`."""
+    add_key(Sensors, sensor, settings)
+    for variable in calibration:
+        add_key(Calibration, variable.name, calibration_entry(variable))
+
+
+def unregister_settings(sensor: str, calibration: Sequence[Variable]) -> None:
+    """Take the keys of a sensor and of its calibration variables out again."""
+    remove_key(Sensors, sensor)
+    for variable in calibration:
+        remove_key(Calibration, variable.name)
 
 
 def yaml_text(data: dict[str, Any]) -> str:

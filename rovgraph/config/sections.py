@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 from pydantic_core import PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
@@ -16,9 +16,7 @@ Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
-Stamped = Literal[
-    "imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "place", "thruster"
-]
+STAMPED = ("imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "place", "thruster")
 HeadingSource = Literal["mag", "dvl", "ahrs"]
 
 
@@ -166,6 +164,20 @@ class Place(Section):
     )
 
 
+class SensorSettings(Section):
+    """What is believed of a sensor that was registered; one with other defaults, or more keys, derives its own."""
+
+    sd: Positive = Field(1.0, description="noise of a measurement, every component")
+    lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the sensor in body axes")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="a measurement further off than this many sd is left out")
+    readmit_s: Readmission = 10.0
+
+
+class Sensors(Section):
+    """Sensors that were registered, each with the keys of its own `SensorSettings`."""
+
+
 class Thruster(Section):
     """One thruster: where it is and which way it pushes for a positive signal."""
 
@@ -213,12 +225,32 @@ class Graph(Section):
     """How the graph is built and solved."""
 
     keyframe: Literal["dvl"] = Field("dvl", description="what makes a keyframe")
-    max_gap_s: Positive = Field(1.0, description="longest time between keyframes")
+    max_gap_s: Positive = Field(
+        1.0, description="longest time between keyframes; a ping up to a quarter of it later makes the keyframe itself"
+    )
     min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
     solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
     segment_s: Positive = Field(10.0, description="isam2: calibration has a new value this often")
     lag_s: Positive = Field(5.0, description="how late a measurement may come online; without effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
+
+    @property
+    def ping_due_s(self) -> float:
+        """How much later than `max_gap_s` a ping still makes the keyframe [s].
+
+        A quarter of it, more than the periods of DVLs vary by; and at least `min_gap_s`, so that one which comes
+        later still is far enough from the keyframe before it to make its own.
+        """
+        return max(0.25 * self.max_gap_s, self.min_gap_s)
+
+
+def _stamped(sensor: str) -> str:
+    """Refuses what is no sensor, among them those that are registered."""
+    known = (*STAMPED, *Sensors.model_fields)
+    if sensor not in known:
+        expected = ", ".join(map(repr, known[:-1])) + f" or {known[-1]!r}"
+        raise PydanticCustomError("literal_error", "expected {expected}", {"expected": expected})
+    return sensor
 
 
 class Online(Section):
@@ -227,6 +259,6 @@ class Online(Section):
     hold_s: NotNegative = Field(
         0.3, description="measurements wait this long for late ones; what is later than that costs more"
     )
-    delay_s: dict[Stamped, float] = Field(
+    delay_s: dict[Annotated[str, AfterValidator(_stamped)], float] = Field(
         {}, description="sensor: how much older its measurements are than their stamps, e.g. dvl: 0.15"
     )

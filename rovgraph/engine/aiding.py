@@ -11,7 +11,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.log import Measurement
-from rovgraph.model_aiding import ModelAiding
+from rovgraph.sensors import ModelAiding
 
 PIECE_S = 0.25  # longest
 OLDEST_SIGNAL_S = 1.0  # a thruster's signal is believed to last that long

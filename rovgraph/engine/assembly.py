@@ -1,6 +1,9 @@
 """Measurements in the order of time become keyframes and what lies between them.
 
-A keyframe stands at every DVL ping, and wherever `graph.max_gap_s` passes without one.
+A keyframe stands at every DVL ping, and wherever `graph.max_gap_s` passes without one. A ping that comes up to
+`Graph.ping_due_s` later makes the keyframe itself: where the period of pings is about ``max_gap_s``, rounding would
+otherwise decide whether a ping has a keyframe.
+
 Any other measurement belongs to the keyframe before it and carries the IMU's motion
 from there to its own time, so nothing is rounded to a keyframe. Batch and incremental
 estimators consume the same `KeyframeInterval` objects.
@@ -10,7 +13,7 @@ longer than that, and counting each sample would make the estimate too sure of i
 """
 
 import math
-from bisect import insort
+from bisect import bisect_right, insort
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -21,7 +24,7 @@ from typing import Any, cast
 import numpy as np
 
 from rovgraph.config import Config, beliefs, mount_matrix
-from rovgraph.engine.admission import admitted, standard_deviation
+from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.late_stamp_window import window_around
@@ -29,12 +32,12 @@ from rovgraph.engine.motion import Motion, Snapshot
 from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
 from rovgraph.engine.scale import scale_to_bias, wanted
 from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
-from rovgraph.engine.whole_log import ONCE_PER_INTERVAL, SHORTEST_S, WholeLog
+from rovgraph.engine.whole_log import SHORTEST_S, WholeLog
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
 from rovgraph.log import Log, Measurement
 from rovgraph.log.packing import pack, unpack
-from rovgraph.model_aiding import ModelAiding
+from rovgraph.sensors import SENSORS, ModelAiding
 from rovgraph.state import State
 
 SOME = 4096  # measurements of a log that are objects at one time
@@ -181,10 +184,11 @@ class Assembler:
 
     def _take_until(self, time: float) -> list[KeyframeInterval]:
         """Place what has waited for the IMU up to a time."""
+        due = self.config.graph.ping_due_s
         done: list[KeyframeInterval] = []
         while self._waiting and self._waiting[0].time <= time:
             m = self._waiting.popleft()
-            done += self._silence(m.time)
+            done += self._silence(m.time, due)
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
                 self._look_at(m.time)
                 done.append(self._close(m.time, None))
@@ -193,7 +197,7 @@ class Assembler:
                 done.append(self._close(m.time, m))
             elif m.sensor != "imu":
                 self._between.append(m)
-        return done + self._silence(time)
+        return done + self._silence(time, due)
 
     def finish(self) -> list[KeyframeInterval]:
         """Place the rest, and a last keyframe at the last IMU sample."""
@@ -201,11 +205,12 @@ class Assembler:
         if end == -math.inf:
             return []
         done = self._take_until(end)
+        self._look_at(math.inf)
+        done += self._silence(end, 0.0)
         self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
         if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
             return done
-        self._look_at(math.inf)
         return [*done, self._close(end, None)]
 
     def _admissible(self, m: Measurement) -> bool:
@@ -219,13 +224,13 @@ class Assembler:
         self._waiting = deque(m for m in self._waiting if m.time >= time)
         return self._close(time, None)
 
-    def _silence(self, time: float) -> list[KeyframeInterval]:
-        """Keyframes for a time without pings."""
+    def _silence(self, time: float, ping_due_s: float) -> list[KeyframeInterval]:
+        """Keyframes for a time without pings; one that is ``ping_due_s`` late may still come."""
         done = []
         gap = self.config.graph.max_gap_s
-        while time - self._start > gap:
+        while time - self._start > gap + ping_due_s:
             if self._log is not None:
-                self._look(self._log.count_after(self._start, gap))
+                self._look(self._log.count_after(self._start, gap + ping_due_s))
             done.append(self._close(self._start + gap, None))
         return done
 
@@ -245,12 +250,14 @@ class Assembler:
         """Make a keyframe at ``time`` and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
+        samples = samples[: int(samples[:, 0].searchsorted(time + self._around)) + 1]
+        later = bisect_right(self._between, time, key=_time)
         motion: Motion | None = None
         attached: list[KeyframeMeasurement] = []
         if self._index >= 0:
-            motion, attached = self._integrate(samples, every, time)
+            motion, attached = self._integrate(samples, every, self._between[:later], time)
         before = self._start
-        self._index, self._start, self._between = self._index + 1, time, []
+        self._index, self._start, self._between = self._index + 1, time, self._between[later:]
         if time - self._segment_start >= self.config.graph.segment_s:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._samples.rate(samples, time)
@@ -260,12 +267,14 @@ class Assembler:
         self._samples.forget(time, self._around)
         return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, motion, attached, scaled)
 
-    def _integrate(self, samples: Array, every: Array, time: float) -> tuple[Motion, list[KeyframeMeasurement]]:
+    def _integrate(
+        self, samples: Array, every: Array, between: list[StampedMeasurement], time: float
+    ) -> tuple[Motion, list[KeyframeMeasurement]]:
         taken, seen = [], set()
-        for m in self._between:
+        for m in between:
             if m.sensor not in seen:
                 taken.append(m)
-            if m.sensor in ONCE_PER_INTERVAL:
+            if SENSORS[m.sensor].once_per_interval:
                 seen.add(m.sensor)
         if self._aiding is not None and not self._samples.gap(samples):
             aiding = self._aiding.between(self._start, time, samples, lambda t: self._samples.rate(samples, t)[0])
@@ -295,7 +304,7 @@ class Assembler:
             landmark, z = self._sighting(m), np.zeros(instrument.model.dim)
             if landmark is None:
                 return []
-        sd = standard_deviation(m.sensor, m.values, instrument, self.config)
+        sd = SENSORS[m.sensor].standard_deviation(m.values, instrument, self.config)
         place = (m.sensor, self._index, self._segment, m.time, m.row)
         scaled = self._scale_to_bias(every, self._start, m.time)
         return [KeyframeMeasurement(*place, z, sd, rate_b, rate_sd, motion, self.bias, window, scaled, landmark)]

@@ -10,21 +10,13 @@ from rovgraph.calibration import LAYOUT, TABLE, calibration_size
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
 from rovgraph.kernels.layout import MOTION
-from rovgraph.model_aiding import WaterVelocity
-from rovgraph.sensors import CompiledModel, SensorModel
-from rovgraph.state import DIMENSION, VELOCITY, Jacobians
+from rovgraph.sensors import SENSORS, CompiledModel, SensorModel, WaterVelocity
+from rovgraph.state import DIMENSION, Jacobians
 
 Index = NDArray[np.int64]
 
 # the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
-SEEN = {
-    "dvl": VELOCITY,
-    "mag": "hard_iron",
-    "ahrs": "ahrs_offset",
-    "dvl_heading": "dvl_compass_offset",
-    "thruster": "current",
-    "dvl_water": "current",
-}
+SEEN = {s.name: s.linear_in for s in SENSORS.values() if s.linear_in is not None}
 
 
 def seen_model(model: SensorModel) -> CompiledModel:

@@ -13,8 +13,9 @@ from rovgraph.instruments import Instrument
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.correction import linearize
 from rovgraph.kernels.weighting import LOSSES
-from rovgraph.sensors import Position, SensorModel
-from rovgraph.state import VELOCITY
+from rovgraph.sensors import SENSORS
+
+_FRAME = {"velocity": at.SEES_VELOCITY, "heading": at.SEES_HEADING, "position": at.SEES_POSITION}
 
 
 def compiled(instrument: Instrument, time_offset_estimated: bool) -> bool:
@@ -36,22 +37,14 @@ def sensor_table(instruments: Mapping[str, Instrument], given: Sequence[str]) ->
         row[at.LOSS], row[at.BEND] = LOSSES.index(instrument.loss), loss_threshold(instrument.loss, dim)
         row[at.GATE] = np.inf if instrument.gate_sd is None else instrument.gate_sd
         row[at.READMIT] = instrument.readmit_s
-        row[at.SEEN_FRAME], row[at.SEES : at.SEES + 3] = _sees(model)
+        observed = SENSORS[sensor].observes
+        row[at.SEEN_FRAME], row[at.SEES : at.SEES + 3] = _FRAME[observed.frame], np.isin(np.arange(3), observed.axes)
         gain = np.zeros((3, 3))
         if dim <= 3:
             gain[:dim, :dim] = instrument.rate_gain @ instrument.rate_gain.T
         row[at.GAIN : at.GAIN + 9] = gain.ravel()
         row[at.PARAMS : at.PARAMS + len(packed[sensor])] = packed[sensor]
     return out
-
-
-def _sees(model: SensorModel) -> tuple[int, Array]:
-    """In which frame, and along which axes, an error shows in a sensor at once."""
-    if isinstance(model, Position):
-        return at.SEES_POSITION, np.isin(np.arange(3), model.axes).astype(float)
-    if VELOCITY in model.state:
-        return at.SEES_VELOCITY, np.ones(3)
-    return at.SEES_HEADING, np.array([0.0, 0.0, 1.0])
 
 
 def measurement_row(m: KeyframeMeasurement) -> Array:

@@ -17,10 +17,10 @@ from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
 from rovgraph.log import Log, Measurement
 from rovgraph.log.streams import arrivals, in_precedence
+from rovgraph.sensors import SENSORS
 
 SHORTEST_S = 1e-3  # an interval
 SOME = 4096  # measurements of a log that are objects at one time
-ONCE_PER_INTERVAL = {"mag", "ahrs", "dvl_heading", "depth"}
 
 
 class WholeLog:
@@ -121,7 +121,7 @@ class WholeLog:
         whole = np.diff(edges) > graph.max_gap_s - graph.min_gap_s - SHORTEST_S
         whole |= (edges[:-1] < self.begin) | (edges[1:] > self.end - SHORTEST_S)  # what is left out there is counted
         for k, name in enumerate(names):
-            if name in ONCE_PER_INTERVAL:
+            if SENSORS[name].once_per_interval:
                 own = np.flatnonzero(which == k)
                 wanted[own] = whole[part[own]] | (np.diff(part[own], prepend=-1) > 0)
         return wanted

@@ -1,35 +1,94 @@
 """Dead reckoning: gyro levelled by gravity and turned by a compass, DVL integrated.
 
-What a pilot has without an estimator, and the initial guess of one. Attitude is a
-complementary filter with bias feedback (Mahony et al. 2008) at the keyframes' rate,
-the mounting is the nominal one, and every ping is believed that `graph` lets in.
+What a pilot has without an estimator, and the initial guess of one. The attitude is that of
+`rovgraph.kernels.dead_reckoning`, whose gains follow the believed noise. Calibration is held at its means, and every
+ping is believed that `graph` lets in, at its own time. Between pings velocity is linear in body axes; where there are
+none for longer it is that through the water, if that is measured, and the current of the pings around.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.estimators.first_seconds import trusted_first, yaw_correction
-from rovgraph.geometry import Array, cross, exp_rotation, rotate, wrap_angle
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
+from rovgraph.geometry import Array, cross, earth_rate_n, identity, rotate, transpose
 from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.kernels.dead_reckoning import reckon_attitude
+from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
 
-LEVEL_S = 10.0  # time constant of levelling by gravity
-COMPASS_S = 5.0  # and of following the compass
-FIRST_DOWN = np.array([0.0, 0.0, 1.0])
+KEEPS_HEADING_S = 20.0  # for so long what is fixed in the body is fixed in n
+FRESH_S = 2.0  # for so long a ping says how fast the vehicle is
+HELD_SD = 0.3  # by which it is faster or slower after that [m/s]
+CURRENT_S = 30.0  # of pings that tell the current
 
 
-def dead_reckon(
-    intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]
-) -> State:
+@dataclass(frozen=True)
+class _Epochs:
+    """Keyframes, and what is measured at them and between them, m in the order of time.
+
+    Attributes
+    ----------
+    time : ndarray, shape (m,) [s]
+    dt, dR, dv : ndarray, shape (m,), (m, 3, 3), (m, 3), motion since the epoch before
+    assumed : ndarray, shape (m, 6), bias that the motion is for
+    bridged, silent : ndarray of bool, shape (m,), samples of the IMU are missing there; for longer
+    keyframe : ndarray of int, shape (n,), epochs of the keyframes
+    measured : epoch -> measurement
+    """
+
+    time: Array
+    dt: Array
+    dR: Array
+    dv: Array
+    assumed: Array
+    bridged: NDArray[np.bool_]
+    silent: NDArray[np.bool_]
+    keyframe: NDArray[np.intp]
+    measured: dict[int, KeyframeMeasurement]
+
+    def of(self, sensor: str | None) -> tuple[NDArray[np.intp], list[KeyframeMeasurement]]:
+        """Epochs and measurements of a sensor."""
+        found = {k: a for k, a in self.measured.items() if a.sensor == sensor}
+        return np.array([*found], dtype=np.intp), [*found.values()]
+
+
+@dataclass(frozen=True)
+class _Pings:
+    """Velocity of the IMU by n pings, over ground or through the water.
+
+    Attributes
+    ----------
+    epoch : ndarray of int, shape (n,)
+    velocity_b : ndarray, shape (n, 3), but for what the gyro's bias does over the lever arm [m/s]
+    variance : ndarray, shape (n,), of a horizontal component
+    arm : ndarray, shape (3,), lever arm of the DVL from the IMU [m]
+    """
+
+    epoch: NDArray[np.intp]
+    velocity_b: Array
+    variance: Array
+    arm: Array
+
+    def corrected(self, bias: Array) -> Array:
+        """Velocity of the IMU, body axes, shape (n, 3), with the bias of all epochs, shape (m, 6)."""
+        return self.velocity_b + cross(bias[self.epoch, 3:], self.arm)
+
+
+def dead_reckon(intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]) -> State:
     """The state at every keyframe, at the IMU.
 
     Parameters
     ----------
-    intervals : of `rovgraph.engine.assembly.Assembler`, the first without motion
+    intervals : of `rovgraph.graph.assembly.Assembler`, the first without motion
     beginning : the resolved start
     calibration : all calibration variables, at their means
 
@@ -37,78 +96,151 @@ def dead_reckon(
     -------
     State of ``len(intervals)`` epochs
     """
-    start = beginning.prior.state
-    R, bias = start.R_nb[0], start.bias[0].copy()
-    attitudes, biases = [], []
-    compass = _compass(beginning)
-    for interval in intervals:
-        if interval.motion is not None:
-            R, bias = _turn(R, bias, interval, beginning, compass, calibration)
-        attitudes.append(R)
-        biases.append(bias.copy())
-    R_nb = np.array(attitudes)
-    v_n = _velocities(intervals, R_nb, np.array(biases), beginning, calibration)
-    time = np.array([i.time for i in intervals])
-    step = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(time)[:, None]
-    p_n = start.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
-    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb, beginning, float(calibration["depth_offset"][0]))
-    return State(R_nb, p_n, v_n, np.array(biases), dict(calibration))
-
-
-def _compass(beginning: InitialConditions) -> str | None:
     sources: list[str] = [s for s in HEADING_STREAMS if s in beginning.instruments]
-    return next(iter(trusted_first(beginning.config, sources)), None)
+    compass = next(iter(trusted_first(beginning.config, sources)), None)
+    epochs = _gather(intervals, {"dvl", "dvl_water", compass})
+    bottom, water = (_pings(epochs, sensor, beginning, calibration) for sensor in ("dvl", "dvl_water"))
+    R_nb, bias = _attitudes(epochs, bottom, compass, beginning, calibration)
+    v_n = _velocities(epochs, R_nb, bias, bottom, water, calibration["current"])
+    step = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(epochs.time)[:, None]
+    k = epochs.keyframe
+    p_n = (beginning.prior.state.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)]))[k]
+    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb[k], beginning, float(calibration["depth_offset"][0]))
+    return State(R_nb[k], p_n, v_n[k], bias[k], dict(calibration))
 
 
-def _turn(
-    R: Array,
-    bias: Array,
-    interval: KeyframeInterval,
-    beginning: InitialConditions,
-    compass: str | None,
-    calibration: Mapping[str, Array],
-) -> tuple[Array, Array]:
-    """Attitude and bias at the end of an interval."""
+def _motion(interval: KeyframeInterval) -> tuple[float, Array, Array, Array]:
+    """Duration of an interval, its rotation and velocity, and the bias that they are for."""
     motion = interval.motion
-    assert motion is not None
-    dt = motion.duration
-    excess = bias - motion.bias
-    turn = motion.dR @ exp_rotation(-dt * excess[3:])
-    correction_n = np.zeros(3)
-    for a in interval.measurements:
-        if a.sensor == compass and a.keyframe == interval.index - 1:
-            there = State((R @ a.motion.dR)[None], np.zeros((1, 3)), np.zeros((1, 3)), bias[None], calibration)
-            error = yaw_correction(beginning.instruments[compass], a.z[None], there)[0]
-            correction_n += FIRST_DOWN * wrap_angle(error) * min(dt / COMPASS_S, 1.0)
-    up_measured = turn.T @ (motion.dv / dt)
-    up_measured = up_measured / max(float(np.linalg.norm(up_measured)), 1e-9)
-    R = R @ turn
-    correction = cross(up_measured, -R[2]) * min(dt / LEVEL_S, 1.0) + R.T @ correction_n
-    bias = bias.copy()
-    bias[3:] -= correction / (4.0 * LEVEL_S)
-    return R @ exp_rotation(correction), bias
+    if motion is None:
+        return 0.0, identity(3), np.zeros(3), np.zeros(6)
+    return motion.duration, motion.dR, motion.dv, motion.bias
 
 
-def _velocities(
-    intervals: Sequence[KeyframeInterval],
-    R_nb: Array,
-    biases: Array,
-    beginning: InitialConditions,
-    calibration: Mapping[str, Array],
-) -> Array:
-    """Velocity of the IMU in n from the pings at keyframes, held or interpolated between them."""
-    pings = [(i.index, a) for i in intervals for a in i.measurements if a.sensor == "dvl" and a.keyframe == i.index]
+def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | None]) -> _Epochs:
+    """The epochs of all keyframes and of some sensors."""
+    rows: list[tuple[int, float, float, Array, Array, Array, KeyframeMeasurement | None]] = []
+    for number, interval in enumerate(intervals):
+        used = [a for a in interval.measurements if a.sensor in sensors]
+        own = [(number, a.time, a.motion.dt, a.motion.dR, a.motion.dv, a.bias, a) for a in used]
+        between = sum(a.keyframe != interval.index for a in used)
+        rows += [*own[:between], (number, interval.time, *_motion(interval), None), *own[between:]]
+    number_of, time, elapsed, rotations, velocities, assumed, measured = zip(*rows, strict=True)
+    is_keyframe, of = np.array([a is None for a in measured]), np.array(number_of)
+    dt, dR, dv = np.array(elapsed), np.concatenate(rotations).reshape(-1, 3, 3), np.array(velocities)
+    begin, begin_R, begin_v = np.roll(dt, 1), np.roll(dR, 1, axis=0), np.roll(dv, 1, axis=0)
+    anew = np.roll(is_keyframe, 1)
+    begin[anew], begin_R[anew], begin_v[anew] = 0.0, identity(3), 0.0
+    return _Epochs(
+        np.array(time),
+        dt - begin,
+        transpose(begin_R) @ dR,
+        rotate(transpose(begin_R), dv - begin_v),
+        np.array(assumed),
+        np.array([i.bridged for i in intervals])[of],
+        np.array([i.motion is not None and i.motion.coasted for i in intervals])[of],
+        np.flatnonzero(is_keyframe),
+        {k: a for k, a in enumerate(measured) if a is not None},
+    )
+
+
+def _pings(epochs: _Epochs, sensor: str, beginning: InitialConditions, calibration: Mapping[str, Array]) -> _Pings:
+    k, pings = epochs.of(sensor)
     if not pings:
-        return np.zeros((len(intervals), 3))
-    index = np.array([k for k, _ in pings])
-    here = State(R_nb[index], R_nb[index, 0], R_nb[index, 0], biases[index], dict(calibration))
-    z = np.array([a.z for _, a in pings]) / (1.0 + calibration["dvl_scale"])
-    rate_b = np.array([a.rate_b for _, a in pings]) - biases[index, 3:]
-    arm = beginning.instruments["dvl"].model.lever_arm_b + calibration["dvl_lever_arm"]  # type: ignore[attr-defined]
-    v_b = np.einsum("nij,nj->ni", dvl_mounting(here), z) - cross(rate_b, arm)
-    v_n = np.einsum("nij,nj->ni", R_nb[index], v_b)
-    time = np.array([i.time for i in intervals])
-    return np.column_stack([np.interp(time, time[index], column) for column in v_n.T])
+        return _Pings(k, np.zeros((0, 3)), np.zeros(0), np.zeros(3))
+    still = np.zeros((1, 3))
+    R_bs = dvl_mounting(State(np.eye(3)[None], still, still, np.zeros((1, 6)), calibration))[0]
+    model: Any = beginning.instruments[sensor].model
+    arm = model.lever_arm_b + calibration["dvl_lever_arm"]
+    z, sd, rate_b = (np.array([getattr(a, name) for a in pings]) for name in ("z", "sd", "rate_b"))
+    velocity_b = z @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(rate_b, arm)
+    own = 0.5 * (np.sum(sd**2, axis=1) - np.min(sd**2, axis=1))  # the smallest is that of the vertical
+    return _Pings(k, velocity_b, own + np.dot(arm, arm) * np.array([a.rate_sd for a in pings]) ** 2, arm)
+
+
+def _attitudes(
+    epochs: _Epochs, bottom: _Pings, compass: str | None, beginning: InitialConditions, calibration: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """Attitude and bias at all epochs, shapes (m, 3, 3), (m, 6).
+
+    Tilt hardly depends on heading: it is found first, and with it what the compass says of heading.
+    """
+    start, config, m = beginning.prior, beginning.config, len(epochs.time)
+    bias, gyr_sd, env = start.state.bias[0], start.bias_sd[3:].max(), config.environment
+    dvl, turns = np.tile([0.0, 0.0, 0.0, math.inf], (m, 1)), np.tile([0.0, math.inf, 0.0], (m, 1))
+    dvl[bottom.epoch] = np.column_stack([bottom.velocity_b, bottom.variance])
+    P = np.zeros((2, 3, 3))
+    P[0] = np.diag([start.v_sd.max(), start.rpy_sd[:2].max(), gyr_sd]) ** 2
+    P[1] = np.diag([0.0, start.rpy_sd[2], gyr_sd]) ** 2
+    held = 2.0 * KEEPS_HEADING_S * HELD_SD**2
+    numbers = np.array([env.gravity_mps2, FRESH_S, held, 0.0, *_earth_rate(config), *bottom.arm])
+    dv = epochs.dv - epochs.dt[:, None] * (bias[:3] - epochs.assumed[:, :3])
+    motion = (epochs.silent, epochs.dt, epochs.dR, dv, epochs.assumed[:, 3:].copy(), _densities(epochs, config))
+    R_nb, gyr, reference = np.empty((m, 3, 3)), np.empty((m, 3)), np.zeros((m, 3, 3))
+    began = start.state.R_nb[0].copy(), bias[3:].copy(), P
+    arguments: Any = (*motion, dvl, turns, reference, *began, numbers, R_nb, gyr)
+    reckon_attitude(*arguments)
+    k, headings = epochs.of(compass)
+    if headings:
+        instrument, z = beginning.instruments[headings[0].sensor], np.array([a.z for a in headings])
+        turn = solve_turn(instrument, z, R_nb[k], calibration)
+        noise = turn_noise(instrument, R_nb[k], turn, calibration, beliefs(config))
+        turns[k], reference[:] = np.column_stack([turn, noise.variance, noise.by_tilt]), R_nb
+        numbers[3] = P[1, 0, 0] = noise.deviation_var
+        reckon_attitude(*arguments)
+    return R_nb, np.hstack([np.tile(bias[:3], (m, 1)), gyr])
+
+
+def _densities(epochs: _Epochs, config: Config) -> Array:
+    """Squared densities of the noise of specific force, of rate, and of the gyro's walk, shape (m, 3).
+
+    The accelerometer's bias is fixed in the body, which turns: noise that lasts for `KEEPS_HEADING_S`.
+    """
+    noise = config.imu.noise
+    acc = noise.acc**2 + 2.0 * KEEPS_HEADING_S * config.imu.acc_bias_sd_mps2**2
+    own, bridged = [acc, noise.gyr**2, noise.gyr_walk**2], [BRIDGE_ACC**2, BRIDGE_GYR**2, noise.gyr_walk**2]
+    return np.where(epochs.bridged[:, None], bridged, own)
+
+
+def _earth_rate(config: Config) -> Array:
+    env = config.environment
+    return earth_rate_n(np.deg2rad(env.latitude_deg or 0.0)) if env.earth_rotation else np.zeros(3)
+
+
+def _velocities(epochs: _Epochs, R_nb: Array, bias: Array, bottom: _Pings, water: _Pings, current: Array) -> Array:
+    """Velocity of the IMU in n at all epochs, shape (m, 3): linear between pings in body axes, held beyond them."""
+    k, v_b = bottom.epoch, bottom.corrected(bias)
+    if len(water.epoch):
+        lost, drifting_b = _through_water(epochs.time, R_nb, bias, bottom, water, current)
+        k, v_b = np.concatenate([k, lost]), np.concatenate([v_b, drifting_b])
+        order = np.argsort(k)
+        k, v_b = k[order], v_b[order]
+    if not len(k):
+        return np.zeros((len(R_nb), 3))
+    return rotate(R_nb, np.column_stack([np.interp(epochs.time, epochs.time[k], column) for column in v_b.T]))
+
+
+def _through_water(
+    time: Array, R_nb: Array, bias: Array, bottom: _Pings, water: _Pings, current: Array
+) -> tuple[NDArray[np.intp], Array]:
+    """Epochs of water pings far from any on the bottom, and velocity over ground there, body axes, shape (n, 3).
+
+    The current is what the velocities over ground and through the water differ by, a mean over `CURRENT_S`, and
+    linear where the bottom is lost; without any ping on it, it is the one that is believed.
+    """
+    k, w_n = water.epoch, rotate(R_nb[water.epoch], water.corrected(bias))
+    c_n, lost = np.append(current, 0.0), np.full(len(k), True)
+    if len(bottom.epoch):
+        known = time[bottom.epoch]
+        through = np.column_stack([np.interp(known, time[k], column) for column in w_n.T])
+        sums = np.vstack([np.zeros(3), np.cumsum(rotate(R_nb[bottom.epoch], bottom.corrected(bias)) - through, axis=0)])
+        first, last = known.searchsorted([known - 0.5 * CURRENT_S, known + 0.5 * CURRENT_S])
+        means = (sums[last] - sums[first]) / (last - first)[:, None]
+        c_n = np.column_stack([np.interp(time[k], known, column) for column in means.T])
+        after = known.searchsorted(time[k])
+        apart = [np.abs(time[k] - known[np.clip(after - side, 0, len(known) - 1)]) for side in (0, 1)]
+        lost = np.minimum(*apart) > FRESH_S
+    return k[lost], rotate(transpose(R_nb[k]), w_n + c_n)[lost]
 
 
 def _depths(

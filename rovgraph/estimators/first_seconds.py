@@ -11,11 +11,10 @@ import numpy as np
 
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy, rotate, rpy_from_matrix, wrap_angle
+from rovgraph.estimators.headings import solve_turn, trusted_first
+from rovgraph.geometry import Array, exp_rotation, rotate, wrap_angle
 from rovgraph.instruments import Instrument
 from rovgraph.log import Log, Stream
-from rovgraph.sensors import innovation
-from rovgraph.state import POSE, State
 
 WINDOW_S = 5.0  # over which a log is levelled, and a sensor's first value taken
 WITHIN_S = 30.0  # of the log's beginning: first headings and fixes
@@ -42,6 +41,11 @@ class Level(NamedTuple):
     rate_b: Array
     quiet: bool
     seconds: float
+
+    @property
+    def shows_bias(self) -> bool:
+        """Whether the mean rate is the gyro's bias."""
+        return self.quiet and self.seconds >= 1.0
 
 
 def level(log: Log, config: Config) -> Level:
@@ -91,19 +95,6 @@ def _opening(stream: Stream, begin: float, seconds: float) -> Stream:
     return stream.take((stream.time >= begin) & (stream.time <= begin + seconds))
 
 
-def trusted_first(config: Config, sources: list[str]) -> list[str]:
-    """Heading sources with those first whose offset is held fixed, or known best.
-
-    Parameters
-    ----------
-    config : priors of the offsets
-    sources : of "mag", "ahrs", "dvl_heading"
-    """
-    priors = beliefs(config)
-    offset = {"mag": "mag_offset", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
-    return sorted(sources, key=lambda s: priors[offset[s]].sd if priors[offset[s]].estimate else 0.0)
-
-
 def first_heading(
     log: Log, config: Config, sensors: dict[str, Instrument], sources: list[str], levelled: Array, gyro_bias: Array
 ) -> tuple[float, str]:
@@ -133,12 +124,8 @@ def first_heading(
         stream = stream.take(np.unique(np.linspace(0, len(stream) - 1, HEADINGS).astype(int)))
         imu = _opening(log["imu"], begin, stream.time[-1] - begin)
         turned = _turned(imu.time, imu.data[:, 3:] @ mount_matrix(config.imu.mount_rpy_deg).T - gyro_bias)
-        yaws = []
-        for z, there in zip(
-            stream.data, levelled @ turned[imu.time.searchsorted(stream.time, "right") - 1], strict=True
-        ):
-            own = solve_yaw(sensors[source], z[: sensors[source].model.dim], there, means)
-            yaws.append(own - rpy_from_matrix(there)[2])
+        there = levelled @ turned[imu.time.searchsorted(stream.time, "right") - 1]
+        yaws = solve_turn(sensors[source], stream.data[:, : sensors[source].model.dim], there, means)
         apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
         return float(yaws[int(np.argmin(apart))]), source
     raise InputError(
@@ -151,49 +138,6 @@ def _turned(time: Array, rate_b: Array) -> Array:
     """Rotations from the body's axes at each sample of the gyro to those at the first, shape (n, 3, 3)."""
     steps = exp_rotation(0.5 * (rate_b[1:] + rate_b[:-1]) * np.diff(time)[:, None])
     return np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
-
-
-def yaw_correction(instrument: Instrument, z: Array, state: State) -> Array:
-    """Rotation about down that best explains heading measurements, shape (n,) [rad].
-
-    One Gauss-Newton step of the instrument's own model, so it serves every source alike.
-
-    Parameters
-    ----------
-    instrument : a heading source
-    z : ndarray, shape (n, dim)
-    state : State of n epochs
-    """
-    predicted, H = instrument.model.predict(state, np.zeros((len(state), 3)))
-    # a turn about down is R_bn e_z in body axes
-    slope = np.einsum("nij,nj->ni", H[POSE][..., :3], state.R_nb[:, 2, :])
-    r = innovation(instrument.model, z, predicted)
-    return np.asarray(np.sum(slope * r, axis=1) / np.maximum(np.sum(slope**2, axis=1), 1e-12))
-
-
-def solve_yaw(instrument: Instrument, z: Array, attitude: Array, calibration: dict[str, Array]) -> float:
-    """Yaw at which an attitude predicts a heading measurement [rad].
-
-    By Gauss-Newton from four sides, as far as it fits best.
-
-    Parameters
-    ----------
-    instrument : a heading source
-    z : ndarray, shape (dim,)
-    attitude : ndarray, shape (3, 3), R_nb, of which roll and pitch count
-    calibration : name -> ndarray, shape (dim of variable,), all that the instrument depends on
-    """
-    zero = np.zeros((4, 3))
-    yaw = np.arange(4) * 0.5 * np.pi
-    tilt = rpy_from_matrix(attitude)[:2]
-    for _ in range(10):
-        R = matrix_from_rpy(np.column_stack([np.tile(tilt, (4, 1)), yaw]))
-        state = State(R, zero, zero, np.zeros((4, 6)), calibration)
-        yaw = yaw + np.clip(yaw_correction(instrument, np.tile(z, (4, 1)), state), -0.5, 0.5)
-    R = matrix_from_rpy(np.column_stack([np.tile(tilt, (4, 1)), yaw]))
-    state = State(R, zero, zero, np.zeros((4, 6)), calibration)
-    misfit = innovation(instrument.model, z, instrument.model.predict(state, zero)[0])
-    return float(yaw[np.argmin(np.linalg.norm(misfit, axis=1))])
 
 
 def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]) -> tuple[Array, Array]:

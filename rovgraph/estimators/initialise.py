@@ -15,9 +15,10 @@ from rovgraph.engine.noise_floor import NOISIER
 from rovgraph.engine.preintegration import scatter
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
-from rovgraph.geometry import Array, level_from_force, matrix_from_rpy, rpy_from_matrix
+from rovgraph.geometry import Array, earth_rate_n, level_from_force, matrix_from_rpy, rpy_from_matrix
 from rovgraph.instruments import Instrument, heading_sources, instruments
 from rovgraph.log import Log
+from rovgraph.sensors import SENSORS
 from rovgraph.state import State
 
 STILL_GYR_SD = 3e-3  # a vehicle that looks still may turn this much [rad/s]
@@ -51,14 +52,16 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
     present = log.sensors | set(expected)
-    used = [s for s in ("dvl", "dvl_water", "depth", "fix", "place") if s in present] + heading_sources(config, present)
-    used += _thrusters(log, config)
+    own = [s for s in sensors if s in present and s != "thruster" and SENSORS[s].heading_source is None]
+    used = own + heading_sources(config, present) + _thrusters(log, config)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 
     first = level(log, config)
     bias, bias_sd = _bias(config, first, assumptions)
     R_nb, rpy_sd = _attitude(log, config, sensors, sources, first, bias[3:], assumptions)
+    if first.shows_bias and config.environment.earth_rotation:  # a gyro that stands still shows the Earth's rate, too
+        bias[3:] -= R_nb.T @ earth_rate_n(np.deg2rad(config.environment.latitude_deg or 0.0))
     p_n, p_sd = first_position(log, config, R_nb, assumptions)
     rpy, start = np.rad2deg(rpy_from_matrix(R_nb)), config.start
     filled = start.model_copy(
@@ -185,7 +188,7 @@ def _bias(config: Config, first: Level, assumptions: list[str]) -> tuple[Array, 
     """Bias of the first keyframe and its sd, shapes (6,)."""
     gyr_sd = np.deg2rad(config.imu.gyr_bias_sd_dps)
     bias, sd = np.zeros(6), np.repeat([config.imu.acc_bias_sd_mps2, gyr_sd], 3)
-    if first.quiet and first.seconds >= 1.0:
+    if first.shows_bias:
         bias[3:] = first.rate_b
         sd[3:] = min(gyr_sd, float(np.hypot(config.imu.noise.gyr / np.sqrt(first.seconds), STILL_GYR_SD)))
         assumptions.append(f"gyro bias from the first {first.seconds:.0f} s, taken as standing still")

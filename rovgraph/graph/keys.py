@@ -1,20 +1,14 @@
 """Keys of the graph's variables: x pose, v velocity, b bias, n place, one letter per calibration."""
 
-import gtsam
-
 from rovgraph.calibration import TABLE
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
-_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n"} | {v.name: v.letter for v in TABLE.values()}
-_FIRST = {variable: int(gtsam.symbol(letter, 0)) for variable, letter in _LETTER.items()}
+_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n"}
+_SIZE = DIMENSION | {PLACE: PLACE_DIM}
 _INDICES = 1 << 56  # of a letter
-_DIMENSION = {
-    _FIRST[variable] // _INDICES: dim
-    for variable, dim in (DIMENSION | {PLACE: PLACE_DIM} | {v.name: v.dim for v in TABLE.values()}).items()
-}
-
-_STATES = {_FIRST[variable] // _INDICES for variable in DIMENSION}
+_PLACES = ord(_LETTER[PLACE])
+_STATES = {ord(_LETTER[variable]) for variable in DIMENSION}
 
 
 def key(variable: str, index: int = 0) -> int:
@@ -25,17 +19,19 @@ def key(variable: str, index: int = 0) -> int:
     variable : "pose", "velocity", "bias", "place" or a name of the calibration table
     index : keyframe; number of a place; for calibration that walks its value, else 0
     """
-    return _FIRST[variable] + index  # consecutive, as gtsam.symbol makes them
+    letter = _LETTER[variable] if variable in _LETTER else TABLE[variable].letter
+    return ord(letter) * _INDICES + index  # as gtsam.symbol makes them
 
 
 def dimension(key: int) -> int:
     """Of the variable that a key is of, in its tangent space."""
-    return _DIMENSION[key // _INDICES]
+    variable = _variable(key // _INDICES)
+    return _SIZE[variable] if variable in _SIZE else TABLE[variable].dim
 
 
 def is_place(key: int) -> bool:
     """Whether a key is of a place."""
-    return key // _INDICES == _FIRST[PLACE] // _INDICES
+    return key // _INDICES == _PLACES
 
 
 def key_index(key: int) -> tuple[bool, int]:
@@ -46,12 +42,17 @@ def key_index(key: int) -> tuple[bool, int]:
 
 def key_name(key: int) -> str:
     """What a key stands for, in words: for messages."""
-    symbol = gtsam.Symbol(key)
-    letter = chr(symbol.chr())
-    variable = next(name for name, own in _LETTER.items() if own == letter)
+    letter, index = divmod(key, _INDICES)
+    variable = _variable(letter)
     if variable == PLACE:
-        return f"place {symbol.index()}"
-    return f"{variable} of keyframe {symbol.index()}" if variable in DIMENSION else variable
+        return f"place {index}"
+    return f"{variable} of keyframe {index}" if variable in DIMENSION else variable
+
+
+def _variable(letter: int) -> str:
+    """Whose letter it is."""
+    letters = _LETTER | {variable.name: variable.letter for variable in TABLE.values()}
+    return next(name for name, own in letters.items() if ord(own) == letter)
 
 
 def calibration_key(unknowns: Unknowns, name: str, index: int) -> int:

@@ -1,5 +1,14 @@
 """The error of a state in coordinates in which measurements are linear, and how it moves from state to state.
 
+A Kalman filter linearises at an estimate which it then corrects. Measured in coordinates that turn with the
+correction, its errors become smaller than they are: it takes its own corrections of heading, misalignment and hard
+iron for knowledge (Huang, Mourikis and Roumeliotis 2010). An invariant filter chooses coordinates that stay (Barrau
+and Bonnabel 2017). Here these are attitude and position in n, and for one variable of each instrument the error of
+what that instrument sees: of velocity as the DVL sees it, of hard iron as the field that the magnetometer sees, of a
+compass offset as the heading it shows, of a current as the water's velocity along the vehicle's axes, which drag
+shows. A measurement is linear in them whatever heading and mounting are, so correcting one teaches nothing about
+those.
+
 The error vector is that of `rovgraph.kernels.layout`, of the calibration only what is estimated. From a state x to
 another x', attitude and position in n stay as they are, and of each instrument s one variable y_s moves so that
 what the instrument sees, z_s = h_s(x), moves as its Jacobian H_s at x says:
@@ -11,8 +20,8 @@ of the pose and of each y_s differ from the unit matrix:
 
     B_R = B_p = R'^T R,    H_s' B = H_s,  so  B_s = Y'^-1 (H_s - (H_s' without Y') B)
 
-An instrument sees one variable y_s and depends on no other that is seen (Huang, Mourikis and Roumeliotis 2010;
-Barrau and Bonnabel 2017; `rovgraph.estimators.error_vector` says why).
+An instrument sees one variable y_s and depends on no other that is seen. Which ones these are stands in
+`rovgraph.engine.error_layout`.
 """
 
 from typing import NamedTuple

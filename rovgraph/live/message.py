@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.log.streams import LAT_LON, OPTIONAL, STREAMS, THRUSTER
+from rovgraph.log.streams import LAT_LON, THRUSTER
+from rovgraph.sensors import SENSORS
 
 GEODETIC = "geodetic"  # a fix in latitude, longitude [deg], sd [m]: becomes "fix" once there is an origin
 
@@ -16,7 +17,7 @@ class Reading(NamedTuple):
 
     Attributes
     ----------
-    sensor : key of `STREAMS`, "thruster" or `GEODETIC`
+    sensor : key of `SENSORS` or `GEODETIC`
     values : ndarray, shape (k,), SI, the stream's columns; what is optional and absent is NaN
         (``dvl_valid``: 1)
     """
@@ -55,10 +56,12 @@ def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:
     """
     cells = {name: value for name, value in cells.items() if np.isfinite(value)}
     found = []
-    for sensor, columns in STREAMS.items():
+    for sensor, known in SENSORS.items():
+        if not known.columns:
+            continue
         lost = sensor == "dvl" and cells.get("dvl_valid") == 0.0  # a ping without bottom lock needs no velocities
-        if lost or all(c in cells for c in columns if c not in OPTIONAL):
-            values = np.array([cells.get(c, 1.0 if c == "dvl_valid" else np.nan) for c in columns])
+        if lost or all(c in cells for c in known.required):
+            values = np.array([cells.get(c, 1.0 if c == "dvl_valid" else np.nan) for c in known.column_names])
             found.append(Reading(sensor, values))
     if all(name in cells for name in LAT_LON):
         found.append(Reading(GEODETIC, np.array([*(cells[n] for n in LAT_LON), cells.get("fix_sd", np.nan)])))

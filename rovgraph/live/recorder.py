@@ -19,7 +19,7 @@ from pathlib import Path
 from rovgraph.errors import InputError
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.live.warnings import Warnings
-from rovgraph.log.streams import COLUMNS, LAT_LON, RECEIVED, STREAMS
+from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, all_columns
 
 FLUSH_S = 0.1  # from a row to the operating system
 SYNC_S = 1.0  # from there to the disk
@@ -27,11 +27,11 @@ CLOSE_S = 3.0  # longest wait for a disk that does not answer
 BACKLOG = 200_000  # rows kept while the disk is full; then the oldest are lost
 BLOCK = 1 << 16  # read at a time, from the end
 THRUSTERS = tuple(f"thruster_{i}" for i in range(1, 9))
-HEADER = (*COLUMNS, *THRUSTERS, RECEIVED)
 
-_COLUMNS = STREAMS | {GEODETIC: (*LAT_LON, "fix_sd"), "thruster": THRUSTERS}
-_PLACES = {sensor: tuple(map(HEADER.index, columns)) for sensor, columns in _COLUMNS.items()}
-_FIRST_LINE = (",".join(HEADER) + "\n").encode()
+
+def recorded_columns() -> tuple[str, ...]:
+    """Columns of a recording."""
+    return (*all_columns(), *THRUSTERS, RECEIVED)
 
 
 class Recorder:
@@ -59,7 +59,11 @@ class Recorder:
         self._pending = b""  # rows that were taken from the queue, but for what the system took
         self._unsynced = False
         self._stop = threading.Event()
-        self._file = _opened(self.path)
+        names = recorded_columns()
+        columns = {**STREAMS, GEODETIC: (*LAT_LON, "fix_sd"), "thruster": THRUSTERS}
+        self._places = {sensor: tuple(map(names.index, own)) for sensor, own in columns.items()}
+        self._width = len(names)
+        self._file = _opened(self.path, (",".join(names) + "\n").encode())
         self._threads = [
             threading.Thread(target=self._every, args=(period, work), name=f"recorder: {work.__name__}", daemon=True)
             for period, work in ((FLUSH_S, self._hand_over), (SYNC_S, self._sync))
@@ -76,10 +80,10 @@ class Recorder:
         arrival : by the host's clock, seconds since 1970
         readings : one per sensor, in SI
         """
-        cells = [""] * len(HEADER)
+        cells = [""] * self._width
         cells[0], cells[-1] = repr(float(time)), f"{arrival:.6f}"
         for sensor, values in readings:
-            places = _PLACES[sensor]
+            places = self._places[sensor]
             if len(values) > len(places):
                 self._complain(str(self.path), "left out", f"{sensor}: {len(places)} of {len(values)} values recorded")
             for place, value in zip(places, values.tolist(), strict=False):
@@ -138,7 +142,7 @@ class Recorder:
             self._complain(str(self.path), "disk", f"cannot be written ({reason}), still trying; free some space")
 
 
-def _opened(path: Path) -> int:
+def _opened(path: Path, first_line: bytes) -> int:
     """Descriptor of a recording, at the end of its last whole line.
 
     Raises
@@ -148,7 +152,7 @@ def _opened(path: Path) -> int:
     file = None
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0), 0o644)
-        _continue(path, file)
+        _continue(path, file, first_line)
     except (OSError, InputError) as error:
         if file is not None:
             os.close(file)
@@ -158,14 +162,14 @@ def _opened(path: Path) -> int:
     return file
 
 
-def _continue(path: Path, file: int) -> None:
+def _continue(path: Path, file: int, first_line: bytes) -> None:
     """Check the header, or write it, and cut off a last line that is torn or blank after a power cut."""
-    found = os.read(file, len(_FIRST_LINE))
-    if not _FIRST_LINE.startswith(found):
+    found = os.read(file, len(first_line))
+    if not first_line.startswith(found):
         raise InputError(f"{path}: is no recording that can be continued, line 1 differs; choose another file")
-    if found != _FIRST_LINE:
+    if found != first_line:
         os.ftruncate(file, 0)
-        os.write(file, _FIRST_LINE)
+        os.write(file, first_line)
         return
     end = os.fstat(file).st_size
     os.ftruncate(file, end - _torn(file, end))

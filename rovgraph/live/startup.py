@@ -11,11 +11,10 @@ from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
 from rovgraph.estimators.initialise import initialise
 from rovgraph.log import Measurement
 from rovgraph.log.streams import gathered
+from rovgraph.sensors import SENSORS
 
 MARGIN_S = 0.5  # beyond the window, for data that come late
 AGAIN_S = 1.0  # between attempts
-LATER = {"dvl", "depth", "fix", "place"}  # sensors that may have their first measurement later
-COMPASSES = {"ahrs", "dvl_heading"}  # these too, where the configuration names its heading sources
 
 
 @dataclass
@@ -60,7 +59,9 @@ class Startup:
         if imu:
             first = imu[-1] - WITHIN_S
             self.measurements = [m for m in self.measurements if m.time >= first]
-        expected = LATER | (COMPASSES if self.config.heading.sources is not None else set())
+        named = self.config.heading.sources is not None
+        later = [s for s in SENSORS.values() if s.may_begin_later]
+        expected = {s.name for s in later if s.heading_source is None or named}
         log = gathered(self.measurements, "so far", origin)
         try:
             beginning = initialise(log, self.config, expected)

@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import Array
-from rovgraph.log.streams import COLUMNS, LABEL, LAT_LON, OPTIONAL, RECEIVED, STREAMS, THRUSTER, Log, Stream, is_column
+from rovgraph.log.streams import (
+    LABEL,
+    LAT_LON,
+    RECEIVED,
+    STREAMS,
+    THRUSTER,
+    Log,
+    Stream,
+    all_columns,
+    is_column,
+    is_optional,
+)
 from rovgraph.log.table import Table, read_table
 from rovgraph.log.units import factors, near_miss, nearest
 
@@ -112,7 +123,9 @@ def _names(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
     """
     for target, source in columns.items():
         if not is_column(target):
-            raise InputError(f"{table.source}: columns: {target} is unknown, nearest is {nearest(target, COLUMNS)}")
+            raise InputError(
+                f"{table.source}: columns: {target} is unknown, nearest is {nearest(target, all_columns())}"
+            )
         if source not in table.names:
             near = nearest(source, table.names)
             raise InputError(f"{table.source}: columns: {target}: the log has no {source!r}, nearest is {near!r}")
@@ -231,7 +244,7 @@ def _select(
     data : ndarray, shape (n, k)
     complete : ndarray of bool, shape (n,)
     """
-    required = [c for c in columns if c not in OPTIONAL]
+    required = [c for c in columns if not is_optional(c)]
     absent = [c for c in required if c not in cells]
     if absent:
         if len(absent) < len(required):
@@ -243,7 +256,7 @@ def _select(
     complete, partly = filled.all(axis=1), filled.any(axis=1)
     if sensor == "dvl":
         complete, partly = _pings(data, complete, partly, line, source)
-    for name in OPTIONAL & {c for c in columns if c.endswith("_sd")}:
+    for name in (c for c in columns if c.endswith("_sd") and is_optional(c)):
         _known_sd(name, data[:, columns.index(name)], line, source)
     if sensor == "place":
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place

@@ -11,30 +11,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.sensors import SENSORS
 
-STREAMS: dict[str, tuple[str, ...]] = {
-    "imu": ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z"),
-    "mag": ("mag_x", "mag_y", "mag_z"),
-    "ahrs": ("ahrs_yaw", "ahrs_roll", "ahrs_pitch"),
-    "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_valid", "dvl_sd"),
-    "dvl_water": ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz"),
-    "dvl_heading": ("dvl_heading",),
-    "dvl_altitude": ("dvl_altitude",),
-    "depth": ("depth",),
-    "fix": ("fix_north", "fix_east", "fix_sd"),
-    "place": ("place_id", "place_sd"),
-}
-OPTIONAL = frozenset({"ahrs_roll", "ahrs_pitch", "dvl_valid", "dvl_sd", "fix_sd", "place_sd"})
+
+class _Streams(Mapping[str, tuple[str, ...]]):
+    """The columns of every sensor that has fixed ones, as they are registered now."""
+
+    def __getitem__(self, sensor: str) -> tuple[str, ...]:
+        if not SENSORS[sensor].columns:
+            raise KeyError(sensor)
+        return SENSORS[sensor].column_names
+
+    def __iter__(self) -> Iterator[str]:
+        return (sensor.name for sensor in SENSORS.values() if sensor.columns)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+STREAMS: Mapping[str, tuple[str, ...]] = _Streams()  # sensor -> its columns
 LABEL = "place_id"  # a column of names, not of quantities
 LAT_LON = ("fix_lat", "fix_lon")
-COLUMNS = ("time", *(c for columns in STREAMS.values() for c in columns), *LAT_LON)
 RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
 THRUSTER = re.compile(r"thruster_[1-9]\d*")
 
 
+def all_columns() -> tuple[str, ...]:
+    """Columns that a log may have, but for thrusters."""
+    return ("time", *(c for columns in STREAMS.values() for c in columns), *LAT_LON)
+
+
 def is_column(name: str) -> bool:
     """Whether a log may have a column of this name."""
-    return name in COLUMNS or THRUSTER.fullmatch(name) is not None
+    others = name == "time" or name in LAT_LON or THRUSTER.fullmatch(name) is not None
+    return others or any(name in sensor.column_names for sensor in SENSORS.values())
+
+
+def is_optional(name: str) -> bool:
+    """Whether a measurement is complete without this column."""
+    return any(c.optional for sensor in SENSORS.values() for c in sensor.columns if c.name == name)
 
 
 def label_number(label: str) -> float:

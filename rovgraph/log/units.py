@@ -10,7 +10,8 @@ from collections.abc import Container, Iterable, Mapping
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.log.streams import COLUMNS, STREAMS
+from rovgraph.log.streams import LAT_LON, all_columns
+from rovgraph.sensors import SENSORS
 
 _DEG = float(np.deg2rad(1.0))
 _G = 9.80665  # standard gravity [m/s2]
@@ -29,35 +30,23 @@ UNITS: dict[str, dict[str, float]] = {
     "latitude": {"deg": 1.0, "degE7": 1e-7, "rad": 1.0 / _DEG},
 }
 
-GROUPS: dict[str, tuple[str, ...]] = {
-    "time": ("time",),
-    "acc": STREAMS["imu"][:3],
-    "gyr": STREAMS["imu"][3:],
-    "mag": STREAMS["mag"],
-    "ahrs": STREAMS["ahrs"],
-    "dvl": ("dvl_vx", "dvl_vy", "dvl_vz", "dvl_sd", *STREAMS["dvl_water"]),
-    "dvl_heading": ("dvl_heading",),
-    "dvl_altitude": ("dvl_altitude",),
-    "depth": ("depth",),
-    "fix": ("fix_north", "fix_east", "fix_sd", "fix_lat", "fix_lon"),
-    "place": ("place_sd",),
-}
 
-_KIND_OF_GROUP = {
-    "time": "time",
-    "acc": "acceleration",
-    "gyr": "rate",
-    "mag": "field",
-    "ahrs": "angle",
-    "dvl": "speed",
-    "dvl_heading": "angle",
-    "dvl_altitude": "length",
-    "depth": "length",
-    "fix": "length",
-    "place": "length",
-}
-KINDS: dict[str, str] = {c: _KIND_OF_GROUP[group] for group, columns in GROUPS.items() for c in columns}
-KINDS |= {"fix_lat": "latitude", "fix_lon": "latitude"}
+def groups() -> dict[str, tuple[str, ...]]:
+    """The columns that share a unit, by the name that a configuration gives them."""
+    out: dict[str, tuple[str, ...]] = {"time": ("time",)}
+    for sensor in SENSORS.values():
+        for column in sensor.columns:
+            if column.quantity is not None:
+                group = column.group or sensor.name
+                out[group] = (*out.get(group, ()), column.name)
+    out["fix"] += LAT_LON
+    return out
+
+
+def quantities() -> dict[str, str]:
+    """Column -> what it measures, a key of `UNITS`."""
+    measured = [c for sensor in SENSORS.values() for c in sensor.columns if c.quantity is not None]
+    return {"time": "time", **{c.name: str(c.quantity) for c in measured}, **dict.fromkeys(LAT_LON, "latitude")}
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -80,18 +69,19 @@ def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
     InputError : unknown column, group or unit, with the nearest known one
     """
     out: dict[str, float] = {}
-    for key, unit in sorted(units.items(), key=lambda item: item[0] in KINDS and item[0] not in GROUPS):
-        columns = GROUPS.get(key, (key,) if key in KINDS else ())
+    by_group, kinds = groups(), quantities()
+    for key, unit in sorted(units.items(), key=lambda item: item[0] in kinds and item[0] not in by_group):
+        columns = by_group.get(key, (key,) if key in kinds else ())
         if not columns:
-            near = nearest(key, [*GROUPS, *KINDS])
+            near = nearest(key, [*by_group, *kinds])
             raise InputError(f"{source}: units: {key} is no column or group that has a unit, nearest is {near}")
-        known = [unit for c in columns for unit in UNITS[KINDS[c]]]
+        known = [unit for c in columns for unit in UNITS[kinds[c]]]
         if unit not in known:
             raise InputError(
                 f"{source}: units: {key}: unknown unit {unit!r}, nearest is {nearest(unit, known)!r}; "
                 f"known are {', '.join(dict.fromkeys(known))}"
             )
-        out |= {c: UNITS[KINDS[c]][unit] for c in columns if unit in UNITS[KINDS[c]]}
+        out |= {c: UNITS[kinds[c]][unit] for c in columns if unit in UNITS[kinds[c]]}
     return out
 
 
@@ -103,5 +93,5 @@ def near_miss(name: str, present: Container[str]) -> str | None:
     name : unknown column
     present : columns that the log has; one that is there was not misspelled
     """
-    near = difflib.get_close_matches(name.strip().lower(), COLUMNS, 1, cutoff=0.79)
+    near = difflib.get_close_matches(name.strip().lower(), all_columns(), 1, cutoff=0.79)
     return near[0] if near and near[0] not in present else None

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rovgraph.config import mount_matrix
 from rovgraph.geometry import Array, rotate, rpy_from_matrix, transpose, wrap_angle
 from rovgraph.instruments import instruments
-from rovgraph.sensors import field_direction
+from rovgraph.sensors import SENSORS, field_direction
 from rovgraph.simulate.imu import specific_force_and_rate, to_imu_axes, walk, white
 from rovgraph.simulate.magnetism import compass_turn
 from rovgraph.simulate.noise import correlated, remembered
@@ -80,9 +80,9 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
     sample = _Sampler(truth, calibration, rng)
     frames = [_inertial(sample, motion, bias), _pings(sample, path)]
-    frames += [
-        f for make in (_depths, _attitudes, _fixes, _signals, _sightings) if (f := make(sample, path)) is not None
-    ]
+    makers = (_depths, _attitudes, _fixes, _signals, _sightings)
+    frames += [frame for make in makers if (frame := make(sample, path)) is not None]
+    frames += [_regular(sample, path, s.name, 1.0 / s.simulated_hz) for s in SENSORS.values() if s.simulated_hz]
     log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
     hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
@@ -221,10 +221,8 @@ def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
 
 
 def _depths(sample: _Sampler, path: Path) -> pd.DataFrame | None:
-    if sample.truth.depth_rate is None:
-        return None
-    motion = path.motion(sample.epochs(path, 1.0 / sample.truth.depth_rate))
-    return _frame(motion.time, ["depth"], sample.noisy("depth", motion))
+    rate = sample.truth.depth_rate
+    return None if rate is None else _regular(sample, path, "depth", 1.0 / rate)
 
 
 def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
@@ -242,10 +240,15 @@ def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
 
 
 def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
-    if sample.truth.fix_interval is None:
-        return None
-    motion = path.motion(sample.epochs(path, sample.truth.fix_interval))
-    return _frame(motion.time, ["fix_north", "fix_east"], sample.noisy("fix", motion))
+    interval = sample.truth.fix_interval
+    return None if interval is None else _regular(sample, path, "fix", interval)
+
+
+def _regular(sample: _Sampler, path: Path, sensor: str, interval: float) -> pd.DataFrame:
+    """A sensor with a clock of its own and white noise; its first columns are the measurement."""
+    motion = path.motion(sample.epochs(path, interval))
+    z = sample.noisy(sensor, motion)
+    return _frame(motion.time, list(SENSORS[sensor].column_names[: z.shape[1]]), z)
 
 
 def _sightings(sample: _Sampler, path: Path) -> pd.DataFrame | None:

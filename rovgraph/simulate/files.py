@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config, Mag
+from rovgraph.sensors import SENSORS
 from rovgraph.simulate.dive import Dive
 
 TRUTH_RATE = 10.0  # rows per second of truth.csv
@@ -82,8 +83,7 @@ def secrets(dive: Dive) -> dict[str, Any]:
 def figures(dive: Dive) -> dict[str, Any]:
     """Length of the dive and number of measurements of each sensor."""
     log = dive.log_frame
-    first = {"imu": "acc_x", "dvl": "dvl_vx", "dvl_heading": "dvl_heading", "mag": "mag_x", "depth": "depth"}
-    first |= {"ahrs": "ahrs_yaw", "fix": "fix_north", "place": "place_id", "thruster": "thruster_1"}
+    first = {s.name: s.column_names[0] for s in SENSORS.values() if s.columns} | {"thruster": "thruster_1"}
     counts = {sensor: int(log[c].notna().sum()) for sensor, c in first.items() if c in log}
     moved = dive.truth.p_n.max(axis=0) - dive.truth.p_n.min(axis=0)
     return {

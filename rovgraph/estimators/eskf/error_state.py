@@ -77,9 +77,14 @@ class ErrorStateFilter:
         filtered, smoothed = self.history.states, self._smoothed
         if smoothed is None:
             return filtered
-        rest = filtered.at(slice(len(smoothed), None))
-        pairs = ((getattr(smoothed, name), getattr(rest, name)) for name in ("R_nb", "p_n", "v_n", "bias"))
-        return State(*(np.concatenate(pair) for pair in pairs), filtered.calibration)
+        rest = slice(len(smoothed), None)
+        return State(
+            np.concatenate([smoothed.R_nb, filtered.R_nb[rest]]),
+            np.concatenate([smoothed.p_n, filtered.p_n[rest]]),
+            np.concatenate([smoothed.v_n, filtered.v_n[rest]]),
+            np.concatenate([smoothed.bias, filtered.bias[rest]]),
+            filtered.calibration,
+        )
 
     def latest(self) -> State:
         """The newest keyframe's state, at the IMU, calibration included."""

@@ -13,9 +13,7 @@ from rovgraph.estimators.optimum import optimum
 from rovgraph.state import PLACE_DIM, State
 
 
-def reinitialised(
-    engine: FilterEngine, intervals: Sequence[KeyframeInterval], states: State
-) -> tuple[Gaussian, State]:
+def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], states: State) -> tuple[Gaussian, State]:
     """The newest keyframe, with every factor of the dive linearised at the optimum.
 
     Parameters

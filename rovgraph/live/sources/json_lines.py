@@ -12,14 +12,14 @@ from rovgraph.live.message import GEODETIC, Message, readings
 from rovgraph.live.sources.lines import LineDecoder, Refused, json_number, json_object, shown
 from rovgraph.live.sources.source import Notify
 from rovgraph.log.reading import ACC_GAP
-from rovgraph.log.streams import LABEL, LAT_LON, OPTIONAL, STREAMS, THRUSTER, is_column, label_number
+from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, THRUSTER, is_column, label_number
 from rovgraph.log.units import factors, near_miss
+from rovgraph.sensors import SENSORS
 
 ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
 UNKNOWN = 20  # unknown keys that are told apart
 
-_SENSOR = {c: sensor for sensor, columns in STREAMS.items() for c in columns if c not in OPTIONAL}
-_SENSOR |= dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
+_OTHERS = dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
 
 
 def json_lines(url: str, notify: Notify, config: Config) -> LineDecoder:
@@ -52,6 +52,7 @@ class JsonRow:
         self._names = {theirs: ours for ours, theirs in config.columns.items()}
         self._scale = factors(config.units, url)
         self._unknown: set[str] = set()
+        self._sensors = {c: sensor.name for sensor in SENSORS.values() for c in sensor.required} | _OTHERS
         self._acc: tuple[Array, float | None, float] | None = None  # the last one, its stamp and arrival
 
     def message(self, line: bytes, arrival: float) -> Message | None:
@@ -66,7 +67,7 @@ class JsonRow:
         _check(cells)
         alone = self._join(cells, stamp, arrival)
         found = readings(cells)
-        lost = {sensor for name in cells if (sensor := _sensor(name))} - {r.sensor for r in found} - alone
+        lost = {sensor for name in cells if (sensor := self._sensor(name))} - {r.sensor for r in found} - alone
         if lost:
             self._notify("incomplete", f"{', '.join(sorted(lost))}: not all of its columns are in the line")
         return Message(self._url, arrival, stamp, found) if found else None
@@ -95,6 +96,10 @@ class JsonRow:
         else:
             self._notify("unknown key", "more keys are ignored", once=True)
 
+    def _sensor(self, column: str) -> str | None:
+        """Whose column it is, where it says nothing without others."""
+        return "thruster" if THRUSTER.fullmatch(column) else self._sensors.get(column)
+
     def _join(self, cells: dict[str, float], stamp: float | None, arrival: float) -> set[str]:
         """Give a rate the acceleration that came before it, where they come on separate lines.
 
@@ -105,18 +110,13 @@ class JsonRow:
         with_acc, with_gyr = (all(name in cells for name in names) for names in (ACC, GYR))
         if with_acc:
             self._acc = np.array([cells[name] for name in ACC]), stamp, arrival
-            return set() if with_gyr else {"imu"} - {_SENSOR[n] for n in GYR if n in cells}
+            return set() if with_gyr else {"imu"} - {self._sensors[n] for n in GYR if n in cells}
         if with_gyr and not any(name in cells for name in ACC):
             if self._acc is None or _age(self._acc[1:], stamp, arrival) > ACC_GAP:
                 self._notify("no acceleration", f"a rate without an acceleration of the last {ACC_GAP:g} s is left out")
                 return {"imu"}
             cells.update(zip(ACC, self._acc[0].tolist(), strict=True))
         return set()
-
-
-def _sensor(column: str) -> str | None:
-    """Whose column it is, where it says nothing without others."""
-    return "thruster" if THRUSTER.fullmatch(column) else _SENSOR.get(column)
 
 
 def _age(before: tuple[float | None, float], stamp: float | None, arrival: float) -> float:

@@ -86,7 +86,7 @@ class Study(Section):
     runs: Annotated[int, Field(ge=1)] = Field(20, description="dives of a cell")
     history: bool = Field(False, description="a filter beside a smoother, for the error against time")
     held_track: bool = Field(False, description="the track without estimating the misalignment, too")
-    vehicle: Config = Config()
+    vehicle: Config = Field(default_factory=Config)
     common: Cell = Cell()
     grid: Grid = Grid()
     cells: tuple[Cell, ...] = ()

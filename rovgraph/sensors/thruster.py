@@ -21,14 +21,18 @@ is the mean of its signal over the time that a linear rise lasts, `RISE_SHARE` o
 between 10 and 90 percent.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from rovgraph.config import Config
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
 from rovgraph.kernels.measurements import WATER_VELOCITY
-from rovgraph.sensors import evaluate
+from rovgraph.sensors.model import evaluate
+from rovgraph.sensors.sensor import Instrument, Observed, Sensor, instrument
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 from rovgraph.vehicle import Hydrodynamics
 
@@ -147,3 +151,52 @@ class WaterVelocity:
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, self.state, state, rate_b)
+
+
+def hydrodynamics(config: Config) -> Hydrodynamics:
+    """The vehicle of a configuration, as a body in water; the body's origin is its centre of mass.
+
+    Raises
+    ------
+    InputError : a thruster without a direction
+    """
+    vehicle = config.vehicle
+    directions = np.array([t.direction for t in vehicle.thrusters], float).reshape(-1, 3)
+    idle = np.flatnonzero(~directions.any(axis=1))
+    if idle.size:
+        raise InputError(f"vehicle.thrusters.{idle[0]}.direction: 0, 0, 0 points nowhere; any other length will do")
+    return Hydrodynamics(
+        mass=vehicle.mass_kg + np.array(vehicle.added_mass_kg),
+        inertia=np.array(vehicle.inertia_kgm2) + np.array(vehicle.added_inertia_kgm2),
+        drag_linear=np.array(vehicle.drag_linear),
+        drag_quadratic=np.array(vehicle.drag_quadratic),
+        turning_drag_linear=np.array(vehicle.turning_drag_linear),
+        turning_drag_quadratic=np.array(vehicle.turning_drag_quadratic),
+        centre_of_buoyancy=np.array(vehicle.centre_of_buoyancy_m),
+        buoyancy=vehicle.mass_kg * config.environment.gravity_mps2,
+        thrust_curve=np.array(vehicle.thrust),
+        thruster_positions=np.array([t.position_m for t in vehicle.thrusters], float).reshape(-1, 3),
+        thruster_directions=directions / np.linalg.norm(directions, axis=1, keepdims=True),
+    )
+
+
+def thrusters(config: Config, origin_b: Array) -> Instrument:
+    """Thrust and drag; the sd is that of a mean over one second."""
+    vehicle = config.vehicle
+    model = ModelAiding(hydrodynamics(config), origin_b, config.environment.gravity_mps2, vehicle.thrust_rise_s)
+    return instrument(vehicle, model, vehicle.acceleration_sd_mps2, ("x", "y", "z"))
+
+
+def _of_mean(values: Array, believed: Instrument, config: Config) -> Array:
+    """Of a mean over ``values[3]`` seconds."""
+    return believed.sd / math.sqrt(values[3])
+
+
+THRUSTER = Sensor(
+    "thruster",
+    (),  # as many as the vehicle has
+    thrusters,
+    standard_deviation=_of_mean,
+    observes=Observed("velocity"),
+    linear_in="current",
+)

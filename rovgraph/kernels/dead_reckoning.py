@@ -1,0 +1,223 @@
+"""Attitude of dead reckoning: the gyro integrated, levelled by gravity, turned by a compass.
+
+    R_j = Exp(-w_ie dt) R_i dR Exp(-dt b'),   v_j = v_i + R_i dv + g dt
+
+carry attitude and velocity from one epoch to the next, with the IMU's preintegrated motion dR, dv and b' the gyro's
+bias beyond the one that was assumed in it. With errors in n, R_nb the true attitude and R the estimate,
+R_nb = Exp(phi) R, and beta = -R db that of the gyro's bias,
+
+    phi' = beta + gyro noise,   (v_north, v_east)' = g (-phi_east, phi_north) + accelerometer noise
+
+so each horizontal axis by itself is a chain of velocity, tilt and drift. The DVL's velocity corrects it: gravity is
+what the accelerometer shows beyond the DVL's acceleration. The third chain is that of a compass's deviation, heading
+and drift,
+
+    deviation <- a deviation + noise,   a = exp(-|turn| / 1 rad)
+
+in which the compass measures deviation plus heading. Gains are those of a Kalman filter of each chain
+(Gelb 1974, section 4.2): a complementary filter with bias feedback (Mahony et al. 2008) whose gains follow the noise.
+"""
+
+import math
+
+import numpy as np
+
+from rovgraph.geometry import Array
+from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.rotations import cross, dot, exp_rotation, multiply, rotate, rotate_back
+
+ANGLE, DRIFT = 1, 2  # components of a chain, after velocity or deviation
+DEVIATES_OVER = 1.0  # a turn by which a compass comes to deviate otherwise [rad]
+FULL_SD = 4.0  # of a velocity's innovation; what is larger corrects as one of that size
+
+
+@helper
+def _copy(A: Array, B_out: Array) -> None:
+    """Of a matrix; a loop, since numba compiles assigned slices slowly."""
+    for i in range(3):
+        for j in range(3):
+            B_out[i, j] = A[i, j]
+
+
+@helper
+def _propagate(P: Array, kept: float, pull: float, noise: float, dt: float, density: Array, work: Array) -> None:
+    """P <- F P F' + Q of a chain.
+
+    Of the first component ``kept`` is left, an angle changes it by ``pull`` [1/s], ``noise`` is added to its variance.
+    """
+    F, M = work[0], work[1]
+    F[0, 0], F[0, ANGLE], F[0, DRIFT] = kept, pull * dt, 0.5 * pull * dt * dt
+    F[ANGLE, 0], F[ANGLE, ANGLE], F[ANGLE, DRIFT] = 0.0, 1.0, dt
+    F[DRIFT, 0], F[DRIFT, ANGLE], F[DRIFT, DRIFT] = 0.0, 0.0, 1.0
+    for i in range(ANGLE, DRIFT + 1):  # half before and half after: noise of the angle reaches velocity, too
+        P[i, i] += 0.5 * density[i] * dt
+    multiply(F, P, M)
+    for i in range(3):
+        for j in range(3):
+            P[i, j] = dot(M[i], F[j])
+    P[0, 0] += noise
+    for i in range(ANGLE, DRIFT + 1):
+        P[i, i] += 0.5 * density[i] * dt
+
+
+@helper
+def _correct(P: Array, with_angle: float, variance: float, gain_out: Array) -> float:
+    """Gains of a chain whose first component plus ``with_angle`` times its angle is measured; the innovation's sd."""
+    for i in range(3):
+        gain_out[i] = P[i, 0] + with_angle * P[i, ANGLE]
+    S = gain_out[0] + with_angle * gain_out[ANGLE] + variance
+    for i in range(3):
+        gain_out[i] /= S
+    for i in range(3):
+        for j in range(i + 1):
+            P[i, j] -= gain_out[i] * gain_out[j] * S
+            P[j, i] = P[i, j]
+    return math.sqrt(S)
+
+
+@helper
+def _turn(R: Array, north: float, east: float, down: float, work: Array) -> None:
+    """R <- Exp(phi) R, phi in n."""
+    phi, D, M = work[0, 0], work[1], work[2]
+    phi[0], phi[1], phi[2] = north, east, down
+    exp_rotation(phi, D)
+    multiply(D, R, M)
+    _copy(M, R)
+
+
+@helper
+def _move(R: Array, v_n: Array, dR: Array, dv: Array, silent: bool, work: Array) -> None:
+    """Attitude and horizontal velocity after a motion; while the IMU is silent heading alone changes."""
+    if silent:
+        _turn(R, 0.0, 0.0, math.atan2(dR[1, 0], dR[0, 0]), work)
+        return
+    change, M = work[0, 0], work[1]
+    rotate(R, dv, change)
+    v_n[0] += change[0]
+    v_n[1] += change[1]
+    multiply(R, dR, M)
+    _copy(M, R)
+
+
+@helper
+def _level(R: Array, v_n: Array, bias: Array, P: Array, v_b: Array, variance: float, work: Array) -> None:
+    """Velocity, tilt and the horizontal bias of the gyro corrected by the velocity ``v_b`` in body axes."""
+    measured, gain, beta = work[0, 0], work[0, 1], work[0, 2]
+    rotate(R, v_b, measured)
+    north, east = measured[0] - v_n[0], measured[1] - v_n[1]
+    full = FULL_SD * _correct(P, 0.0, variance, gain)
+    share = min(1.0, full / max(math.hypot(north, east), 1e-12))
+    north, east = share * north, share * east
+    v_n[0] += gain[0] * north
+    v_n[1] += gain[0] * east
+    beta[0], beta[1], beta[2] = gain[DRIFT] * east, -gain[DRIFT] * north, 0.0
+    rotate_back(R, beta, measured)
+    for i in range(3):
+        bias[i] -= measured[i]
+    _turn(R, gain[ANGLE] * east, -gain[ANGLE] * north, 0.0, work)
+
+
+@helper
+def _head(R: Array, v_n: Array, bias: Array, P: Array, innovation: float, variance: float, work: Array) -> float:
+    """Heading and the vertical bias of the gyro corrected by a compass; how much more it deviates than was taken."""
+    gain = work[0, 1]
+    innovation -= 2.0 * math.pi * math.floor(innovation / (2.0 * math.pi) + 0.5)
+    _correct(P, 1.0, variance, gain)
+    deviation: float = gain[0] * innovation
+    angle, drift = gain[ANGLE] * innovation, gain[DRIFT] * innovation
+    _turn(R, 0.0, 0.0, angle, work)
+    north, east = v_n[0], v_n[1]
+    v_n[0] = math.cos(angle) * north - math.sin(angle) * east
+    v_n[1] = math.sin(angle) * north + math.cos(angle) * east
+    for i in range(3):
+        bias[i] -= R[2, i] * drift
+    return deviation
+
+
+@helper
+def _angle_about_down(R: Array, reference: Array) -> float:
+    """By which an attitude is turned from another."""
+    sine = dot(R[1], reference[0]) - dot(R[0], reference[1])
+    return math.atan2(sine, dot(R[0], reference[0]) + dot(R[1], reference[1]))
+
+
+@kernel(
+    "void(b1[::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1],"
+    " f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1])"
+)
+def reckon_attitude(
+    silent: Array,
+    dt: Array,
+    dR: Array,
+    dv: Array,
+    assumed: Array,
+    density: Array,
+    dvl: Array,
+    compass: Array,
+    reference: Array,
+    R_start: Array,
+    bias_start: Array,
+    P_start: Array,
+    numbers: Array,
+    R_out: Array,
+    bias_out: Array,
+) -> None:
+    """Attitude and gyro bias at m epochs, each after the measurement that it has.
+
+    Parameters
+    ----------
+    silent : shape (m,), bool, the IMU was silent since the epoch before
+    dt, dR, dv : shapes (m,), (m, 3, 3), (m, 3), motion since then [s, -, m/s]
+    assumed : shape (m, 3), gyro bias that dR is for [rad/s]
+    density : shape (m, 3), squared densities of the noise of specific force, of rate, and of the gyro's walk
+    dvl : shape (m, 4), velocity of the IMU by the DVL, body axes, but for what the gyro's bias does over the lever
+        arm [m/s], and the variance of an axis, infinite = no ping
+    compass : shape (m, 3), angle about down from the attitude ``reference``, shape (m, 3, 3), to the one that the
+        compass shows [rad], its variance, infinite = no heading, and what it grows by with the variance of tilt
+    R_start, bias_start, P_start : shapes (3, 3), (3,), (2, 3, 3), before the first epoch, covariances of the chains
+        of velocity and tilt, and of deviation and heading
+    numbers : shape (10,), gravity [m/s^2]; for how long a ping says how fast the vehicle is [s], and the squared
+        density of the noise of a velocity that is held from then on; variance of the compass's deviation [rad^2];
+        rate of the Earth in n [rad/s]; lever arm of the DVL from the IMU [m]
+    R_out, bias_out : shapes (m, 3, 3), (m, 3)
+    """
+    gravity, fresh_s, held, deviation_var = numbers[0], numbers[1], numbers[2], numbers[3]
+    w_ie_n, arm = numbers[4:7], numbers[7:10]
+    R, bias, v_n, v_b = R_start.copy(), bias_start.copy(), np.zeros(3), np.zeros(3)
+    tilt, heading, deviation = P_start[0].copy(), P_start[1].copy(), 0.0
+    since_ping, since_velocity = 0.0, 0.0
+    work, turn, moved = np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros(3)
+    for k in range(len(dt)):
+        if dt[k] > 0.0:
+            for i in range(3):
+                moved[i] = -dt[k] * (bias[i] - assumed[k, i])
+            exp_rotation(moved, work[0])
+            multiply(dR[k], work[0], turn)
+            _move(R, v_n, turn, dv[k], silent[k], work)
+            _turn(R, -dt[k] * w_ie_n[0], -dt[k] * w_ie_n[1], -dt[k] * w_ie_n[2], work)
+            kept = math.exp(-abs(math.atan2(turn[1, 0], turn[0, 0])) / DEVIATES_OVER)
+            deviation *= kept
+            pull = 0.0 if silent[k] else gravity
+            _propagate(tilt, 1.0, pull, density[k, 0] * dt[k], dt[k], density[k], work)
+            _propagate(heading, kept, 0.0, (1.0 - kept * kept) * deviation_var, dt[k], density[k], work)
+            since_ping += dt[k]
+            since_velocity += dt[k]
+
+        variance = dvl[k, 3]
+        if variance < math.inf:
+            cross(bias, arm, v_b)
+            for i in range(3):
+                v_b[i] += dvl[k, i]
+            since_ping = 0.0
+        elif since_ping > fresh_s and since_velocity > 0.5 * fresh_s:
+            variance = held / since_velocity
+        if variance < math.inf:
+            since_velocity = 0.0
+            _level(R, v_n, bias, tilt, v_b, variance, work)
+        if compass[k, 1] < math.inf:
+            variance = compass[k, 1] + compass[k, 2] * tilt[ANGLE, ANGLE]
+            innovation = compass[k, 0] - _angle_about_down(R, reference[k]) - deviation
+            deviation += _head(R, v_n, bias, heading, innovation, variance, work)
+        _copy(R, R_out[k])
+        for i in range(3):
+            bias_out[k, i] = bias[i]

@@ -1,0 +1,57 @@
+"""Every sensor in one place: measurement model, noise, admission, what it observes, and what can be wrong with it.
+
+One module per sensor holds its model and its `Sensor`; `SENSORS` has them all by the name of their log stream.
+docs/own-sensor.md shows how to `register` one of your own.
+"""
+
+from rovgraph.sensors.compass import AHRS, DVL_HEADING, CompassHeading
+from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER, DvlVelocity, dvl_mounting
+from rovgraph.sensors.inertial import IMU
+from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field_direction
+from rovgraph.sensors.model import CompiledModel, SensorModel, evaluate, innovation
+from rovgraph.sensors.place import SEEN_PLACE, PlaceOffset
+from rovgraph.sensors.position import DEPTH, FIX, Position
+from rovgraph.sensors.sensor import (
+    SENSORS,
+    Column,
+    Instrument,
+    Level,
+    Observed,
+    Sensor,
+    instrument,
+    register,
+    settings,
+    unregister,
+)
+from rovgraph.sensors.thruster import THRUSTER, ModelAiding, WaterVelocity, hydrodynamics
+
+__all__ = [
+    "DEFAULT_DIP",
+    "SENSORS",
+    "Column",
+    "CompassHeading",
+    "CompiledModel",
+    "DvlVelocity",
+    "Instrument",
+    "Level",
+    "MagneticField",
+    "ModelAiding",
+    "Observed",
+    "PlaceOffset",
+    "Position",
+    "Sensor",
+    "SensorModel",
+    "WaterVelocity",
+    "dvl_mounting",
+    "evaluate",
+    "field_direction",
+    "hydrodynamics",
+    "innovation",
+    "instrument",
+    "register",
+    "settings",
+    "unregister",
+]
+
+for _sensor in (IMU, MAG, AHRS, DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DEPTH, FIX, SEEN_PLACE, THRUSTER):
+    SENSORS[_sensor.name] = _sensor

@@ -1,0 +1,98 @@
+"""Compasses that give a heading: the IMU's own, and the DVL's."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from rovgraph.calibration import LAYOUT, MOUNT
+from rovgraph.config import Config, mount_matrix
+from rovgraph.geometry import Array
+from rovgraph.kernels import measurements as kernels
+from rovgraph.sensors.dvl import TIME_OFFSET
+from rovgraph.sensors.model import evaluate
+from rovgraph.sensors.sensor import Column, Instrument, Observed, Sensor, instrument
+from rovgraph.state import BIAS, POSE, Jacobians, State
+
+
+@dataclass(frozen=True)
+class CompassHeading:
+    """Magnetic heading of an instrument's x axis with its deviation curve.
+
+    Attributes
+    ----------
+    sensor : "ahrs" or "dvl_heading"
+    offset, curve : names of its calibration variables
+    declination : [rad], east positive; one for all epochs or for each
+    R_bs : ndarray, shape (3, 3), mounting of the instrument; the DVL's own comes from
+        the calibration variables instead
+    """
+
+    sensor: str
+    offset: str
+    curve: str
+    declination: float | Array
+    R_bs: Array = field(default_factory=lambda: np.eye(3))
+    dim = 1
+    angular = True
+    state = (POSE, BIAS)
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        mount = MOUNT if self.sensor == "dvl_heading" else ()
+        return (self.offset, self.curve, *mount)
+
+    @property
+    def kind(self) -> int:
+        return kernels.DVL_COMPASS if self.sensor == "dvl_heading" else kernels.COMPASS
+
+    @cached_property
+    def packed(self) -> Array:
+        """Declination, places of offset and curve in the calibration vector, the instrument's x axis in b."""
+        declination = np.atleast_1d(self.declination)
+        own = LAYOUT[self.offset].start, LAYOUT[self.curve].start, *self.R_bs[:, 0]
+        return np.column_stack([declination, np.tile(own, (len(declination), 1))])
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        return evaluate(self, (POSE,), state, rate_b)
+
+
+def of_imu(config: Config, origin_b: Array) -> Instrument:
+    """The heading that the IMU makes itself."""
+    declination = float(np.deg2rad(config.environment.declination_deg))
+    model = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, mount_matrix(config.imu.mount_rpy_deg))
+    return instrument(config.heading, model, np.deg2rad(config.heading.ahrs_sd_deg), ("heading",))
+
+
+def of_dvl(config: Config, origin_b: Array) -> Instrument:
+    """The heading of the DVL's compass."""
+    declination = float(np.deg2rad(config.environment.declination_deg))
+    model = CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination)
+    sd = np.deg2rad(config.heading.dvl_sd_deg)
+    return instrument(config.heading, model, sd, ("heading",), time_offset=TIME_OFFSET)
+
+
+AHRS = Sensor(
+    "ahrs",
+    (
+        Column("ahrs_yaw", "angle"),
+        Column("ahrs_roll", "angle", optional=True),
+        Column("ahrs_pitch", "angle", optional=True),
+    ),
+    of_imu,
+    once_per_interval=True,
+    observes=Observed("heading", (2,)),
+    linear_in="ahrs_offset",
+    heading_source="ahrs",
+    may_begin_later=True,
+)
+DVL_HEADING = Sensor(
+    "dvl_heading",
+    (Column("dvl_heading", "angle"),),
+    of_dvl,
+    once_per_interval=True,
+    observes=Observed("heading", (2,)),
+    linear_in="dvl_compass_offset",
+    heading_source="dvl",
+    may_begin_later=True,
+)

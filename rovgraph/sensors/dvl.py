@@ -1,0 +1,146 @@
+"""The Doppler velocity log: velocity over ground and through the water."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.calibration import MOUNT
+from rovgraph.config import Config, mount_matrix
+from rovgraph.geometry import Array, matrix_from_rpy, skew
+from rovgraph.kernels import measurements as kernels
+from rovgraph.sensors.model import evaluate
+from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Level, Observed, Sensor, instrument
+from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
+
+TIME_OFFSET = "dvl_time_offset"  # of the stamps of all that a ping measures
+
+
+def dvl_mounting(state: State) -> Array:
+    """R_bs of the DVL for each epoch, shape (n, 3, 3)."""
+    rpy = np.empty((len(state), 3))
+    for k, name in enumerate(MOUNT):
+        rpy[:, k] = state.calibration[name][..., 0]
+    return matrix_from_rpy(rpy)
+
+
+@dataclass(frozen=True)
+class DvlVelocity:
+    """Velocity of the DVL in its own axes, over ground (3.17) or relative to the water.
+
+    Attributes
+    ----------
+    lever_arm_b : ndarray, shape (3,) or (n, 3), DVL relative to the state's origin [m]
+    sensor : "dvl" over ground, "dvl_water" relative to the water
+    """
+
+    lever_arm_b: Array
+    sensor: str = "dvl"
+    dim = 3
+    angular = False
+    state = (POSE, VELOCITY, BIAS)
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        return _DVL_WATER if self.sensor == "dvl_water" else _DVL
+
+    @property
+    def kind(self) -> int:
+        return kernels.DVL_WATER if self.sensor == "dvl_water" else kernels.DVL
+
+    @cached_property
+    def packed(self) -> Array:
+        """The lever arm."""
+        return np.array(self.lever_arm_b, dtype=float, ndmin=2)
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        return evaluate(self, self.state, state, rate_b)
+
+
+_DVL = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm")
+_DVL_WATER = (*_DVL, "current")
+
+
+def over_ground(config: Config, origin_b: Array) -> Instrument:
+    """Bottom track."""
+    return _instrument("dvl", config.dvl.velocity_sd_mps, config, origin_b)
+
+
+def through_water(config: Config, origin_b: Array) -> Instrument:
+    """Water track."""
+    return _instrument("dvl_water", config.dvl.water_velocity_sd_mps, config, origin_b)
+
+
+def _instrument(sensor: str, sd: tuple[float, float, float], config: Config, origin_b: Array) -> Instrument:
+    dvl = config.dvl
+    model = DvlVelocity(np.array(dvl.lever_arm_m) - origin_b, sensor)
+    gain = mount_matrix(dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
+    return instrument(dvl, model, sd, ("x", "y", "z"), gain, TIME_OFFSET)
+
+
+def _refused(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    yield "no bottom lock", values[:, 3] == 0.0
+    yield from _too_fast(values, config)
+
+
+def _too_fast(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    yield "faster than dvl.max_speed_mps", np.abs(values[:, :3]).max(axis=1) > config.dvl.max_speed_mps
+
+
+def _standard_deviation(values: Array, believed: Instrument, config: Config) -> Array:
+    """The instrument's sd, or the ping's own where that is more, and a part of the speed."""
+    sd = believed.sd
+    if values[4] > 0.0:
+        sd = np.maximum(sd, min(values[4], LARGEST_SD))
+    if config.dvl.scale_sd:
+        sd = np.hypot(sd, config.dvl.scale_sd * np.linalg.norm(values[:3]))
+    return sd
+
+
+def _bottom_lock(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+    """Share of valid pings, and their speed."""
+    valid = values[:, 3] == 1.0
+    share = float(valid.mean())
+    yield "ok" if share >= 0.8 else "warning", f"bottom lock {share:.1%} of {len(values)} pings"
+    if not valid.any():
+        return
+    velocity = values[valid, :3]
+    usual, limit = float(np.median(np.linalg.norm(velocity, axis=1))), config.dvl.max_speed_mps
+    lost = int((np.abs(velocity).max(axis=1) > limit).sum())
+    if usual > max(limit, 10.0):
+        yield "error", f"median speed {usual:.3g} m/s; in mm/s or cm/s? Say units: {{dvl: mm/s}}"
+    elif lost > 0.05 * len(velocity):
+        yield "warning", f"{lost} pings are faster than dvl.max_speed_mps = {limit:g} and are left out"
+    else:
+        tail = f"; {lost} faster than {limit:g} m/s are left out" if lost else ""
+        yield "ok", f"median speed {usual:.2f} m/s{tail}"
+
+
+DVL = Sensor(
+    "dvl",
+    (
+        *(Column(name, "speed") for name in ("dvl_vx", "dvl_vy", "dvl_vz")),
+        Column("dvl_valid", optional=True),
+        Column("dvl_sd", "speed", optional=True),
+    ),
+    over_ground,
+    refused=_refused,
+    standard_deviation=_standard_deviation,
+    observes=Observed("velocity"),
+    linear_in=VELOCITY,
+    may_begin_later=True,
+    usual_rates=(0.1, 100.0),
+    if_missing=("warning", "no DVL: position is lost within a minute between fixes; give dvl_vx, dvl_vy, dvl_vz"),
+    look=_bottom_lock,
+)
+DVL_WATER = Sensor(
+    "dvl_water",
+    tuple(Column(name, "speed", group="dvl") for name in ("dvl_water_vx", "dvl_water_vy", "dvl_water_vz")),
+    through_water,
+    refused=_too_fast,
+    observes=Observed("velocity"),
+    linear_in="current",
+)
+DVL_ALTITUDE = Sensor("dvl_altitude", (Column("dvl_altitude", "length"),))

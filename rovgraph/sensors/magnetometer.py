@@ -1,0 +1,92 @@
+"""The magnetometer: the Earth's field in the IMU's axes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.config import Config, mount_matrix
+from rovgraph.geometry import Array
+from rovgraph.kernels import measurements as kernels
+from rovgraph.sensors.model import evaluate
+from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Sensor, instrument
+from rovgraph.state import BIAS, POSE, Jacobians, State
+
+DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
+
+
+def field_direction(declination: Array | float, dip: Array | float) -> Array:
+    """Unit vector of the magnetic field in n, shape (..., 3)."""
+    d, i = np.broadcast_arrays(np.asarray(declination, float), np.asarray(dip, float))
+    return np.stack([np.cos(i) * np.cos(d), np.cos(i) * np.sin(d), np.sin(i)], axis=-1)
+
+
+@dataclass(frozen=True)
+class MagneticField:
+    """Magnetometer vector in IMU axes (3.14), soft iron beyond its calibration (3.2) a symmetric matrix.
+
+    Attributes
+    ----------
+    declination, dip : [rad], declination east positive, dip down positive
+    magnitude : length of the field, in the log's unit
+    R_bs : ndarray, shape (3, 3), mounting of the IMU
+    """
+
+    declination: float
+    dip: float
+    magnitude: float
+    R_bs: Array = field(default_factory=lambda: np.eye(3))
+    sensor = "mag"
+    dim = 3
+    angular = False
+    state = (POSE, BIAS)
+    calibration = ("mag_offset", "mag_deviation", "hard_iron", "soft_iron", "field_dip", "field_scale")
+    kind = kernels.MAGNETOMETER
+
+    @cached_property
+    def packed(self) -> Array:
+        """Declination, dip, magnitude, the mounting row by row."""
+        return np.array([[self.declination, self.dip, self.magnitude, *self.R_bs.ravel()]])
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        return evaluate(self, (POSE,), state, rate_b)
+
+
+def magnetometer(config: Config, origin_b: Array) -> Instrument:
+    """A heading error of ``heading.mag_sd_deg`` turns the horizontal part of the field."""
+    env = config.environment
+    dip = DEFAULT_DIP if env.dip_deg is None else float(np.deg2rad(env.dip_deg))
+    magnitude = 1.0 if env.field_norm is None else env.field_norm
+    declination = float(np.deg2rad(env.declination_deg))
+    model = MagneticField(declination, dip, magnitude, mount_matrix(config.imu.mount_rpy_deg))
+    sd = np.deg2rad(config.heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
+    return instrument(config.heading, model, sd, ("x", "y", "z"))
+
+
+def _refused(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    yield "exactly zero", (values == 0.0).all(axis=1)
+
+
+def _magnitude(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+    """The field's magnitude is constant but for iron near the magnetometer."""
+    low, middle, high = np.percentile(np.linalg.norm(values, axis=1), [5, 50, 95])
+    spread = (high - low) / middle if middle > 0 else np.inf
+    level: Level = "warning" if spread > 0.4 else "ok"
+    hint = "; large hard iron, calibrate it (rovgraph calibrate)" if level == "warning" else ""
+    yield level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}"
+
+
+MAG = Sensor(
+    "mag",
+    tuple(Column(name, "field") for name in ("mag_x", "mag_y", "mag_z")),
+    magnetometer,
+    refused=_refused,
+    once_per_interval=True,
+    observes=Observed("heading", (2,)),
+    linear_in="hard_iron",
+    heading_source="mag",
+    usual_rates=(0.5, 4000.0),
+    look=_magnitude,
+)

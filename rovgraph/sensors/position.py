@@ -1,0 +1,107 @@
+"""Sensors of position: depth, and fixes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.calibration import LAYOUT
+from rovgraph.config import Config
+from rovgraph.geometry import Array
+from rovgraph.kernels import measurements as kernels
+from rovgraph.sensors.model import evaluate
+from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Sensor, instrument, own_sd
+from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
+
+DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
+
+
+@dataclass(frozen=True)
+class Position:
+    """Some of north, east, down of a point on the vehicle: depth sensor or position fix.
+
+    Attributes
+    ----------
+    sensor : "depth" or "fix"
+    lever_arm_b : ndarray, shape (3,), of the sensor relative to the state's origin [m]
+    axes : indices of the components measured, (2,) for depth, (0, 1) for a fix
+    offset : name of the calibration variable that is added, or None
+    """
+
+    sensor: str
+    lever_arm_b: Array
+    axes: tuple[int, ...]
+    offset: str | None = None
+    angular = False
+    state = (POSE, VELOCITY, BIAS)
+    kind = kernels.POSITION
+
+    @property
+    def dim(self) -> int:
+        return len(self.axes)
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        return () if self.offset is None else (self.offset,)
+
+    @cached_property
+    def packed(self) -> Array:
+        """The lever arm, the offset's place in the calibration vector or -1, the components measured."""
+        offset = -1 if self.offset is None else LAYOUT[self.offset].start
+        return np.array([[*self.lever_arm_b, offset, *self.axes]], dtype=float)
+
+    def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
+        return evaluate(self, (POSE,), state, rate_b)
+
+
+def pressure_sensor(config: Config, origin_b: Array) -> Instrument:
+    """Depth, positive down."""
+    depth = config.depth
+    model = Position("depth", np.array(depth.lever_arm_m) - origin_b, (2,), "depth_offset")
+    return instrument(depth, model, depth.sd_m, ("down",))
+
+
+def positioning(config: Config, origin_b: Array) -> Instrument:
+    """Fixes, north and east."""
+    fix = config.fix
+    model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1))
+    return instrument(fix, model, fix.sd_m, ("north", "east"))
+
+
+def _too_deep(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    yield "deeper than any sea", np.abs(values[:, 0]) > DEEPEST_M
+
+
+def _range(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+    """Depth positive down, and in metres."""
+    depth = values[:, 0]
+    if np.median(depth) < -0.5:
+        yield "warning", f"median depth {np.median(depth):.2f} m; depth counts downwards: mirrored?"
+    if np.ptp(depth) > 1000.0:
+        yield "warning", f"depth spans {np.ptp(depth):.4g} m; in cm or mm? Say units: {{depth: mm}}"
+
+
+DEPTH = Sensor(
+    "depth",
+    (Column("depth", "length"),),
+    pressure_sensor,
+    refused=_too_deep,
+    once_per_interval=True,
+    observes=Observed("position", (2,)),
+    may_begin_later=True,
+    usual_rates=(0.05, 1000.0),
+    if_missing=("warning", "no depth: the vertical drifts; give depth if there is a pressure sensor"),
+    look=_range,
+)
+FIX = Sensor(
+    "fix",
+    (Column("fix_north", "length"), Column("fix_east", "length"), Column("fix_sd", "length", optional=True)),
+    positioning,
+    standard_deviation=own_sd(2),  # 0 is how receivers say that they do not know
+    observes=Observed("position", (0, 1)),
+    may_begin_later=True,
+    occasional=True,
+    if_missing=("ok", "no position fixes: the error of position grows with the distance"),
+)

@@ -1,0 +1,247 @@
+"""A sensor in one place: its stream, model, noise, admission, what it observes, and what can be wrong with it.
+
+`Sensor` carries all that rovgraph knows of one; `SENSORS` holds every sensor by the name of its log stream. Log
+reader, assembly, estimators, simulator, checks and the online mode read it.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rovgraph import calibration
+from rovgraph.calibration import Variable
+from rovgraph.config import Config, SensorSettings, register_settings, unregister_settings
+from rovgraph.geometry import Array
+from rovgraph.sensors.model import SensorModel
+
+LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
+
+Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length"]
+Frame = Literal["position", "velocity", "heading"]
+Level = Literal["ok", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a log.
+
+    Attributes
+    ----------
+    name : as the log has it
+    quantity : what it measures, which says the units that a log may use; None = a number without a unit
+    optional : a measurement is complete without it
+    group : the name under which a log's unit is declared; None = the sensor's
+    """
+
+    name: str
+    quantity: Quantity | None = None
+    optional: bool = False
+    group: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.quantity is not None and self.quantity not in get_args(Quantity):
+            raise ValueError(f"column {self.name}: {self.quantity!r} is none of {', '.join(get_args(Quantity))}")
+
+
+@dataclass(frozen=True)
+class Observed:
+    """In which frame, and along which axes, an error of the state shows in a sensor at once.
+
+    Attributes
+    ----------
+    frame : "position" in n, "velocity" in n, or "heading"
+    axes : of 0, 1, 2
+    """
+
+    frame: Frame
+    axes: tuple[int, ...] = (0, 1, 2)
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """A measurement model and the belief about its noise.
+
+    Attributes
+    ----------
+    model : the measurement model
+    sd : ndarray, shape (dim,), standard deviation of a measurement
+    loss : "none", "huber" or "cauchy"
+    gate_sd : normalised innovation beyond which a measurement is left out, or None
+    readmit_s : time of being left out after which a filter doubts itself [s]
+    components : names of the components, dim of them
+    rate_gain : ndarray, shape (dim, 3), how an error of the measured rate [rad/s] enters:
+        through the DVL's lever arm, at the nominal mounting
+    time_offset : name of the calibration variable that says how late its stamps are, or None
+    """
+
+    model: SensorModel
+    sd: Array
+    loss: str
+    gate_sd: float | None
+    readmit_s: float
+    components: tuple[str, ...]
+    rate_gain: Array
+    time_offset: str | None = None
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        """Calibration variables that its measurements depend on."""
+        own = self.model.calibration
+        return own if self.time_offset is None else (*own, self.time_offset)
+
+
+class Limits(Protocol):
+    """A section of the configuration that says how far a sensor is believed."""
+
+    @property
+    def loss(self) -> str: ...
+    @property
+    def gate_sd(self) -> float | None: ...
+
+
+def instrument(
+    limits: Limits,
+    model: SensorModel,
+    sd: ArrayLike,
+    components: tuple[str, ...],
+    rate_gain: Array | None = None,
+    time_offset: str | None = None,
+) -> Instrument:
+    """A model with noise, and with loss, gate and readmission as a section of the configuration has them.
+
+    Parameters
+    ----------
+    limits : the section; without ``readmit_s`` the sensor is never readmitted
+    model, components, time_offset : of `Instrument`
+    sd : of each component, or one for all
+    rate_gain : of `Instrument`; None = an error of the rate does not enter
+    """
+    gain = np.zeros((model.dim, 3)) if rate_gain is None else rate_gain
+    spread = np.broadcast_to(np.asarray(sd, float), (model.dim,))
+    readmit_s = getattr(limits, "readmit_s", np.inf)
+    return Instrument(model, spread, limits.loss, limits.gate_sd, readmit_s, components, gain, time_offset)
+
+
+def none_refused(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """No reason to leave out any measurement."""
+    yield from ()
+
+
+def of_instrument(values: Array, believed: Instrument, config: Config) -> Array:
+    """The instrument's standard deviation, shape (dim,)."""
+    return believed.sd
+
+
+def own_sd(column: int) -> Callable[[Array, Instrument, Config], Array]:
+    """A measurement's own standard deviation, in a column of its stream, where it is known."""
+
+    def standard_deviation(values: Array, believed: Instrument, config: Config) -> Array:
+        own = float(values[column])
+        return np.full(len(believed.sd), min(own, LARGEST_SD)) if own > 0.0 else believed.sd
+
+    return standard_deviation
+
+
+def nothing_found(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+    """Nothing to say of the values."""
+    yield from ()
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """All that rovgraph knows of a sensor.
+
+    Attributes
+    ----------
+    name : of its log stream
+    columns : of the stream; the first ``dim`` are the measurement
+    instrument : from the configuration, and the point of the body that the state belongs to, shape (3,) [m], to the
+        model with its noise; None where it is logged only
+    refused : from columns, shape (n, k), and the configuration to reasons to leave measurements out, each with a
+        mask, shape (n,); the first that holds counts
+    standard_deviation : from the columns of one measurement, shape (k,), the instrument and the configuration to its
+        sd, shape (dim,)
+    once_per_interval : taken once between keyframes, as its errors last longer than that
+    observes : what a filter inflates when it readmits the sensor
+    linear_in : the variable that its model is linear in whatever the others are, which gives the filter's error its
+        coordinates; for compiled models
+    heading_source : its name in ``heading.sources``, where it is a compass; it is used as that key says
+    may_begin_later : a dive online may begin before its first measurement; a compass's, where ``heading.sources``
+        is given
+    occasional : it speaks only now and then, so a gap means nothing
+    usual_rates : slowest and fastest that make sense [Hz]
+    if_missing : what it means that a log has none
+    look : what is wrong or worth knowing of its values, from columns, shape (n, k), and the configuration
+    simulated_hz : rate at which a simulated dive samples its model with white noise; None = the simulator has a
+        sampler of its own for it, or none
+    calibration : variables that come with it, beside the built-in ones
+    settings : keys of its section of the configuration, under ``sensors``; None = those of `SensorSettings`
+    """
+
+    name: str
+    columns: tuple[Column, ...]
+    instrument: Callable[[Config, Array], Instrument] | None = None
+    refused: Callable[[Array, Config], Iterator[tuple[str, NDArray[np.bool_]]]] = none_refused
+    standard_deviation: Callable[[Array, Instrument, Config], Array] = of_instrument
+    once_per_interval: bool = False
+    observes: Observed = Observed("velocity")
+    linear_in: str | None = None
+    heading_source: str | None = None
+    may_begin_later: bool = False
+    occasional: bool = False
+    usual_rates: tuple[float, float] = (0.0, np.inf)
+    if_missing: tuple[Level, str] | None = None
+    look: Callable[[Array, Config], Iterator[tuple[Level, str]]] = nothing_found
+    simulated_hz: float | None = None
+    calibration: tuple[Variable, ...] = ()
+    settings: type[SensorSettings] | None = None
+
+    @cached_property
+    def column_names(self) -> tuple[str, ...]:
+        """Of all columns."""
+        return tuple(column.name for column in self.columns)
+
+    @cached_property
+    def required(self) -> tuple[str, ...]:
+        """Names of the columns without which a measurement is not complete."""
+        return tuple(column.name for column in self.columns if not column.optional)
+
+
+SENSORS: dict[str, Sensor] = {}  # by name, in the order of a log's columns
+
+
+def register(sensor: Sensor) -> None:
+    """Let rovgraph know a sensor, its calibration variables and its section of the configuration.
+
+    Do so before a configuration is loaded, and in every process that works with the sensor.
+
+    Raises
+    ------
+    ValueError : its name, a column, or a calibration variable's name or letter is taken
+    """
+    columns = {"time", *(column for known in SENSORS.values() for column in known.column_names)}
+    taken = columns & set(sensor.column_names) or {sensor.name} & set(SENSORS)
+    if taken:
+        raise ValueError(f"sensor {sensor.name!r}: the name {min(taken)!r} is taken")
+    for variable in sensor.calibration:
+        calibration.register(variable)
+    register_settings(sensor.name, sensor.settings or SensorSettings, sensor.calibration)
+    SENSORS[sensor.name] = sensor
+
+
+def unregister(name: str) -> None:
+    """Forget the sensor that was registered last, as a test does that registers one of its own."""
+    sensor = SENSORS.pop(name)
+    unregister_settings(name, sensor.calibration)
+    for variable in reversed(sensor.calibration):
+        calibration.unregister(variable.name)
+
+
+def settings(config: Config, sensor: str) -> SensorSettings:
+    """What a configuration says of a sensor that was registered."""
+    own: SensorSettings = getattr(config.sensors, sensor)
+    return own
