@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -173,7 +174,8 @@ def test_a_name_that_is_taken_is_refused_and_nothing_is_changed(depth2):
         Sensor("depth2", (Column("depth3", "length"),)),
         Sensor("depth3", (Column("depth2", "length"),)),
         Sensor("depth3", (Column("time"),)),
-        Sensor("depth3", (Column("depth3"),), calibration=(depth2.SCALE,)),
+        Sensor("gyr", (Column("gyr", "rate"),)),
+        Sensor("depth3", (Column("depth3"),), calibration=(replace(depth2.SCALE, name="k", letter="Q"), depth2.SCALE)),
     ):
         with pytest.raises(ValueError, match="taken"):
             register(sensor)
