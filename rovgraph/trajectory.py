@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from rovgraph.errors import DataWarning, InputError
+from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, rpy_jacobian, transpose
 
 POSITION = ["north", "east", "down"]
@@ -126,7 +127,7 @@ class Trajectory:
         """
         frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
         frame["time"] = frame["time"].map("{:.4f}".format)
-        frame.to_csv(path, mode="a" if more else "w", header=not more, index=False, float_format="%.7g")
+        write_csv(frame, path, append=more)
 
     def write_tum(self, path: Path) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes."""

@@ -10,7 +10,9 @@ import pandas as pd
 import pytest
 
 from rovgraph.config import Config, load_config
+from rovgraph.engine.filter_step import FilterStep, Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.motion import Motion
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
 from rovgraph.estimators.estimate import Estimate
@@ -86,6 +88,19 @@ def level_log(seconds: float, acc: Array, gyr: Array, rate: float = 100.0, **sen
         rows = np.arange(len(at)) + 10_000
         streams[name] = Stream(name, STREAMS[name], np.asarray(at, float), np.asarray(values, float), rows)
     return Log("dive.csv", streams)
+
+
+class RecordingFilter(ErrorStateFilter):
+    """An error-state filter that keeps what is known of each keyframe so far, in ``filtered``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.filtered: list[Gaussian] = []
+
+    def step(self, interval: KeyframeInterval) -> FilterStep:
+        done = super().step(interval)
+        self.filtered.append(self.known)
+        return done
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dives import attitude_errors, falcon, fed, interrupted, position_errors, simulated
+from dives import RecordingFilter, attitude_errors, falcon, fed, interrupted, position_errors, simulated
 
 import rovgraph.engine.alignment as alignment
-from rovgraph.engine.alignment import aligned, attitude_poorly_known, with_attitude
+from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
+from rovgraph.engine.filter_step import Gaussian
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rpy_from_matrix
@@ -19,12 +21,11 @@ GRAVITY = 9.81
 def met():
     """A filter in the middle of a dive, the next interval, and the true attitude at its keyframe."""
     case = simulated(falcon(), 45.0, seed=6, dvl_rate=4.0)
-    estimator = fed(ErrorStateFilter(initialise(case.log, case.config)), case.log)
+    estimator = fed(RecordingFilter(initialise(case.log, case.config)), case.log)
     index = 80
     interval = estimator.intervals[index + 1]
-    between = [a for a in interval.measurements if a.keyframe == index]
     true = case.truth.R_nb[np.searchsorted(case.truth.time, estimator.intervals[index].time)]
-    return estimator, estimator.filtered[index], interval, between, true
+    return estimator.engine, estimator.filtered[index], interval, true
 
 
 def doubted(known, turn_n: Array, sd: Array):
@@ -33,43 +34,47 @@ def doubted(known, turn_n: Array, sd: Array):
     P = known.P.copy()
     P[:3, :], P[:, :3] = 0.0, 0.0
     P[:3, :3] = R_nb.T @ np.diag(np.asarray(sd) ** 2) @ R_nb
-    return replace(known, state=replace(known.state, R_nb=R_nb[None]), P=P)
+    return Gaussian.of(replace(known.state, R_nb=R_nb[None]), P)
+
+
+def without_measurements(interval: KeyframeInterval) -> KeyframeInterval:
+    return replace(interval, measurements=[])
 
 
 def test_an_attitude_is_vague_from_a_tilt_of_four_degrees_or_a_heading_of_ten(met):
     _, known, *_ = met
-    assert not attitude_poorly_known(known)
-    assert not attitude_poorly_known(doubted(known, np.zeros(3), np.deg2rad([3.9, 3.9, 9.9])))
-    assert attitude_poorly_known(doubted(known, np.zeros(3), np.deg2rad([0.1, 4.1, 0.1])))
-    assert attitude_poorly_known(doubted(known, np.zeros(3), np.deg2rad([0.1, 0.1, 10.1])))
+    assert not poorly_known(known)
+    assert not poorly_known(doubted(known, np.zeros(3), np.deg2rad([3.9, 3.9, 9.9])))
+    assert poorly_known(doubted(known, np.zeros(3), np.deg2rad([0.1, 4.1, 0.1])))
+    assert poorly_known(doubted(known, np.zeros(3), np.deg2rad([0.1, 0.1, 10.1])))
 
 
 @pytest.mark.parametrize("off", [-130.0, -60.0, 25.0, 90.0, 170.0])
 def test_a_heading_that_is_far_off_is_found_from_one_sample_of_the_compasses(met, off):
-    estimator, known, interval, between, true = met
+    engine, known, interval, true = met
     lost = doubted(known, np.deg2rad([0.0, 0.0, off]), np.deg2rad([0.5, 0.5, 70.0]))
-    found = aligned(lost, interval, between, estimator.recursion.measurements, GRAVITY)
+    found = aligned(lost, interval, engine.linearize, GRAVITY)
     error = np.rad2deg(log_rotation(true @ found.state.R_nb[0].T))
     assert abs(error[2]) < 6.0  # a step of those that are tried, and what compasses are off by
 
 
 def test_without_a_compass_nothing_is_turned(met):
-    estimator, known, interval, _, _ = met
+    engine, known, interval, _ = met
     lost = doubted(known, np.deg2rad([0.0, 0.0, 90.0]), np.deg2rad([0.5, 0.5, 70.0]))
-    assert aligned(lost, interval, [], estimator.recursion.measurements, GRAVITY) is lost
+    assert aligned(lost, without_measurements(interval), engine.linearize, GRAVITY) is lost
 
 
 def test_a_tilt_that_is_far_off_is_levelled_by_the_specific_force(met):
-    estimator, known, interval, _, true = met
+    engine, known, interval, true = met
     lost = doubted(known, np.deg2rad([9.0, -12.0, 0.0]), np.deg2rad([10.0, 10.0, 1.0]))
-    found = aligned(lost, interval, [], estimator.recursion.measurements, GRAVITY)
+    found = aligned(lost, without_measurements(interval), engine.linearize, GRAVITY)
     assert np.abs(rpy_from_matrix(found.state.R_nb[0]) - rpy_from_matrix(true))[:2].max() < np.deg2rad(2.0)
 
 
 def test_what_cannot_be_gravity_levels_nothing(met):
-    estimator, known, interval, _, _ = met
+    engine, known, interval, _ = met
     lost = doubted(known, np.deg2rad([9.0, -12.0, 0.0]), np.deg2rad([10.0, 10.0, 1.0]))
-    same = aligned(lost, interval, [], estimator.recursion.measurements, 2.0 * GRAVITY)
+    same = aligned(lost, without_measurements(interval), engine.linearize, 2.0 * GRAVITY)
     np.testing.assert_array_equal(same.state.R_nb, lost.state.R_nb)
 
 
@@ -88,7 +93,8 @@ def test_facing_elsewhere_knows_no_more_and_no_less(met):
 
 def test_a_velocity_that_is_known_in_n_alone_does_not_turn(met):
     _, known, *_ = met
-    lost = doubted(replace(known, state=replace(known.state, v_n=np.array([[0.5, 0.1, 0.0]]))), np.zeros(3), [1, 1, 1])
+    moving = Gaussian.of(replace(known.state, v_n=np.array([[0.5, 0.1, 0.0]])), known.P)
+    lost = doubted(moving, np.zeros(3), [1, 1, 1])
     turned = with_attitude(lost, exp_rotation(np.array([0.0, 0.0, 1.2])) @ lost.state.R_nb[0])
     np.testing.assert_array_equal(turned.state.v_n, lost.state.v_n)
     np.testing.assert_array_equal(turned.P[6:9, 6:9], lost.P[6:9, 6:9])
@@ -107,8 +113,8 @@ def after_silences(seeds: range) -> tuple[int, Array, Array]:
             log = interrupted(case.log, begin, seconds, *sensors)
             estimator = fed(ErrorStateFilter(initialise(log, case.config)), log)
             track = estimator.solve().trajectory
-            for sensor in ("dvl", "mag"):
-                kept_out += sum(u.weight == 0.0 for u in estimator._used[sensor])
+            residuals = estimator.solve().residuals
+            kept_out += int((residuals["sensor"].isin(["dvl", "mag"]) & (residuals["weight"] == 0.0)).sum())
             late = track.time > begin + seconds + 10.0
             sd = np.sqrt(np.diagonal(track.cov_theta, axis1=1, axis2=2))
             off = np.abs(attitude_errors(track, case) / sd)[late].max(axis=0)

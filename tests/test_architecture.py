@@ -16,7 +16,7 @@ PACKAGE = ROOT / "rovgraph"
 # Bottom first. Members of one layer are independent: they may not import each other.
 LAYERS = (
     {"errors"},
-    {"geometry", "workers"},
+    {"geometry", "workers", "fast_csv"},
     {"kernels"},
     {"state", "calibration", "thesis"},
     {"vehicle"},

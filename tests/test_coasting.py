@@ -81,7 +81,7 @@ def test_the_factor_is_the_residual_whitened(interval):
     values.insert(state_values(1, AFTER))
     (r, A_i, A_j), S = residual(interval, BEFORE, AFTER), covariance(interval)
     fixed = {name: np.zeros(3) for name in SCALES}
-    factor = motion_factor(interval, Unknowns(fixed, {}))
+    factor = motion_factor(interval, Unknowns(fixed, {}), interval.index)
     assert 2.0 * factor.error(values) == pytest.approx(r @ np.linalg.solve(S, r))
     A, _ = factor.linearize(values).jacobian()
     both = np.concatenate([A_i[:, :9], A_j[:, :9], A_i[:, 9:], A_j[:, 9:]], axis=1)

@@ -7,50 +7,53 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from dives import (
+    RecordingFilter,
     Simulated,
     altered,
     attitude_errors,
     batch,
-    beginning,
     changed,
     falcon,
     fed,
-    kept,
     position_errors,
     rms,
     simulated,
     started,
     without,
 )
-from rovgraph.estimators.innovations import Innovations
 from scipy.optimize import minimize
 from test_consistency import OVERCONFIDENT, band, drawn, nees
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
-from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.measurements import loss_and_weight
+from rovgraph.engine import error_layout
+from rovgraph.engine.filter import FilterEngine
+from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement
+from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.measurements import loss_and_weight, loss_threshold
 from rovgraph.engine.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
 from rovgraph.engine.transition import predict, transitions
-from rovgraph.estimators import error_vector
-from rovgraph.estimators.error_vector import ErrorVector
-from rovgraph.estimators.eskf.error_state import ErrorStateFilter, alike, replay, replay_together, smoothed_together
+from rovgraph.estimators.eskf.error_state import replay
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
+from rovgraph.kernels.correction import RETURN_SD
+from rovgraph.kernels.robust_update import MAX_REWEIGHTINGS, SETTLED, innovation_covariance, joseph, reweight
+from rovgraph.kernels.weighting import LOSSES
 from rovgraph.log import Log
 from rovgraph.sensors import innovation
 from rovgraph.simulate import Style
-from rovgraph.state import DIMENSION, State
+from rovgraph.state import DIMENSION, VELOCITY, State
 
 DEG = np.deg2rad(1.0)
 
 
-def filtered(log: Log, config: Config) -> ErrorStateFilter:
-    return fed(ErrorStateFilter(initialise(log, config)), log)
+def filtered(log: Log, config: Config) -> RecordingFilter:
+    return fed(RecordingFilter(initialise(log, config)), log)
 
 
-def covariances(estimator: ErrorStateFilter, smoothed: bool = False) -> Array:
+def covariances(estimator: RecordingFilter, smoothed: bool = False) -> Array:
     """Of every keyframe, shape (n, size, size)."""
     return np.array([k.P for k in (estimator.backward() if smoothed else estimator.filtered)])
 
@@ -61,7 +64,7 @@ def case() -> Simulated:
 
 
 @pytest.fixture(scope="session")
-def estimator(case) -> ErrorStateFilter:
+def estimator(case) -> RecordingFilter:
     return filtered(case.log, case.config)
 
 
@@ -132,61 +135,94 @@ def test_process_noise_is_that_of_noisy_samples():
 
 
 def test_all_measurements_of_a_keyframe_together_are_linearised_as_each_alone(estimator):
-    interval = max(estimator.intervals, key=lambda i: len({a.sensor for a in i.measurements}))
-    state = estimator.filtered[interval.index].state
+    """By the filter's kernel as by the models that the smoother uses."""
+    engine, interval = estimator.engine, max(estimator.intervals, key=lambda i: len({m.sensor for m in i.measurements}))
+    known = estimator.filtered[interval.index]
     assert len(interval.measurements) > 2
-    assert any(a.motion.dt for a in interval.measurements)
-    (r,), (H,), [parts] = estimator.recursion.measurements.linearize(state, [interval.measurements])
-    for attached, part in zip(interval.measurements, parts, strict=True):
-        alone, jacobians = estimator.recursion.measurements.block([attached]).linearize(state)
+    assert any(m.motion.dt for m in interval.measurements)
+    r, H = engine.linearize(known, interval.measurements)
+    for m, part in zip(interval.measurements, parts_of(interval.measurements), strict=True):
+        alone, jacobians = engine.block([m]).linearize(known.state)
         np.testing.assert_allclose(r[part], alone[0], atol=1e-9)
-        np.testing.assert_allclose(H[part], estimator.error.matrix(jacobians)[0], atol=1e-9)
+        np.testing.assert_allclose(H[part], engine.layout.matrix(jacobians)[0], atol=1e-9)
+
+
+def parts_of(measurements: list[KeyframeMeasurement]) -> list[slice]:
+    """The rows of each measurement, of all their rows."""
+    ends = np.cumsum([0, *(len(m.z) for m in measurements)]).tolist()
+    return [slice(*pair) for pair in pairwise(ends)]
 
 
 # coordinates of the error
 
 
-def error_vector_and_state(rng: np.random.Generator) -> tuple[ErrorVector, State]:
-    everything = {n: {"estimate": True} for n in ("dvl_roll", "dvl_pitch", "dvl_scale", "ahrs_offset", "mag_offset")}
-    config = falcon(calibration=everything, environment={"field_norm": 48.0})
-    sensors = instruments(config)
-    estimated = [n for i in sensors.values() for n in i.model.calibration]
-    calibration = {n: 0.05 * rng.standard_normal(TABLE[n].dim) for n in estimated}
-    state = moving(0.1)[0]
-    return ErrorVector(dict.fromkeys(estimated), sensors), replace(state, calibration=calibration)
+def engine_and_estimate(rng: np.random.Generator) -> tuple[FilterEngine, Gaussian]:
+    """A filter that estimates all calibration, and an estimate with any covariance."""
+    environment = {"field_norm": 48.0}
+    names = [n for i in instruments(falcon(environment=environment)).values() for n in i.model.calibration]
+    config = falcon(calibration={n: {"estimate": True} for n in names}, environment=environment)
+    calibration = {
+        n: 0.05 * rng.standard_normal(TABLE[n].dim) if n in names else np.zeros(v.dim) for n, v in TABLE.items()
+    }
+    state = replace(moving(0.1)[0], calibration=calibration)
+    prior = StatePrior(state, np.ones(3), np.ones(3), np.ones(3), np.ones(6))
+    engine = FilterEngine(InitialConditions(config, instruments(config), prior, []))
+    assert engine.layout.size == 15 + sum(TABLE[n].dim for n in set(names))
+    root = rng.standard_normal((engine.layout.size, engine.layout.size))
+    return engine, Gaussian.of(state, root @ root.T)
 
 
 def test_the_local_error_is_the_inverse_of_the_retraction():
     rng = np.random.default_rng(1)
-    error, state = error_vector_and_state(rng)
-    delta = 0.2 * rng.standard_normal(error.size)
-    moved, _ = error.retract(state, delta[None])
-    np.testing.assert_allclose(error.local(state, moved)[0][0], delta, atol=1e-9)
+    engine, known = engine_and_estimate(rng)
+    delta = 0.2 * rng.standard_normal(engine.layout.size)
+    moved = engine.retract(known, delta, known.P)
+    np.testing.assert_allclose(engine.local(known, moved)[0], delta, atol=1e-9)
 
 
 def test_a_change_of_basis_carries_errors_from_one_state_to_another():
     """What lies at delta + e about a state lies at basis e about where delta leads."""
     rng = np.random.default_rng(2)
-    error, state = error_vector_and_state(rng)
-    delta, e = 1e-4 * rng.standard_normal(error.size), 1e-6 * rng.standard_normal(error.size)
-    moved, [basis] = error.retract(state, delta[None])
-    [about_moved] = error.local(moved, error.retract(state, (delta + e)[None])[0])[0]
+    engine, known = engine_and_estimate(rng)
+    delta, e = (size * rng.standard_normal(engine.layout.size) for size in (1e-4, 1e-6))
+    moved = engine.retract(known, delta, known.P)
+    basis = engine.local(moved, known)[1]
+    about_moved = engine.local(moved, engine.retract(known, delta + e, known.P))[0]
     np.testing.assert_allclose(about_moved, basis @ e, atol=1e-9)
-    further, [there] = error.retract(moved, delta[None])
-    [back] = error.local(moved, further)[1]
-    np.testing.assert_allclose(back @ there, np.eye(error.size), atol=1e-6)
+    np.testing.assert_allclose(engine.local(known, moved)[1] @ basis, np.eye(len(basis)), atol=1e-6)
+    np.testing.assert_allclose(moved.P, basis @ known.P @ basis.T, rtol=1e-6, atol=1e-6 * np.abs(known.P).max())
 
 
-@pytest.mark.parametrize("sensor", error_vector.SEEN)
+def test_a_change_of_basis_is_the_derivative_of_the_retraction_in_coordinates_of_where_it_leads():
+    """By finite differences; turns along the way do not add up, but each instrument sees them as its Jacobians say."""
+    rng = np.random.default_rng(4)
+    engine, known = engine_and_estimate(rng)
+    size, step = engine.layout.size, 1e-6
+    delta = 0.2 * rng.standard_normal(size)
+    moved = engine.retract(known, delta, known.P)
+    columns = []
+    for e in step * np.eye(size):
+        ends = [engine.local(moved, engine.retract(known, delta + s * e, known.P))[0] for s in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2.0 * step))
+    derivative, basis = np.column_stack(columns), engine.local(moved, known)[1]
+    assert np.abs(basis - np.eye(size)).max() > 0.1
+    np.testing.assert_allclose(derivative[:, 3:], basis[:, 3:], atol=1e-6)
+    for sensor in error_layout.SEEN:
+        model = error_layout.seen_model(engine.initial.instruments[sensor].model)
+        H, there = (engine.layout.matrix(model.predict(k.state, np.zeros((1, 3)))[1])[0] for k in (known, moved))
+        np.testing.assert_allclose(there @ derivative, H, atol=1e-6 * np.abs(H).max())
+
+
+@pytest.mark.parametrize("sensor", error_layout.SEEN)
 def test_what_an_instrument_sees_is_linear_in_the_error(sensor):
     """At the size of an unknown heading and mounting, where the first order of `State` is off by per cents."""
     rng = np.random.default_rng(3)
-    error, state = error_vector_and_state(rng)
-    model = error_vector.seen_model(instruments(falcon(environment={"field_norm": 48.0}))[sensor].model)
-    delta = 0.1 * rng.standard_normal(error.size)
-    z, H = model.predict(state, np.zeros((1, 3)))
-    moved = model.predict(error.retract(state, delta[None])[0], np.zeros((1, 3)))[0]
-    linear = (error.matrix(H) @ delta)[0]
+    engine, known = engine_and_estimate(rng)
+    model = error_layout.seen_model(instruments(falcon(environment={"field_norm": 48.0}))[sensor].model)
+    delta = 0.1 * rng.standard_normal(engine.layout.size)
+    z, H = model.predict(known.state, np.zeros((1, 3)))
+    moved = model.predict(engine.retract(known, delta, known.P).state, np.zeros((1, 3)))[0]
+    linear = (engine.layout.matrix(H) @ delta)[0]
     np.testing.assert_allclose(innovation(model, moved, z)[0], linear, atol=1e-9 * max(np.abs(z).max(), 1.0))
 
 
@@ -201,10 +237,17 @@ def problem(rng: np.random.Generator, spoilt: float = 0.0) -> tuple[Array, list[
     return root @ root.T + 0.1 * np.eye(5), r, H
 
 
-def updated(P: Array, r: list[Array], H: list[Array], loss: str) -> tuple[Array, Array, list[float]]:
-    ends = np.cumsum([0, *map(len, r)]).tolist()
-    parts = [slice(*pair) for pair in pairwise(ends)]
-    return Innovations(P[None], [np.concatenate(r)], [np.vstack(H)], [parts], [[loss] * len(r)]).update()[0]
+def updated(P: Array, r: list[Array], H: list[Array], loss: str) -> tuple[Array, Array, Array]:
+    """The kernels' correction, covariance after it and weights."""
+    first, P = np.cumsum([0, *map(len, r)]), P.copy()
+    rows, J = np.concatenate(r), np.vstack(H)
+    m, n = J.shape
+    HP, S, root, inverse, weight, delta = (np.empty(k) for k in ((m, n), (m, m), m, (m, m), len(r), n))
+    innovation_covariance(P, J, HP, S)
+    bends = np.array([loss_threshold(loss, len(own)) for own in r])
+    reweight(rows, S, first, np.full(len(r), LOSSES.index(loss)), bends, root, inverse, weight)
+    joseph(P, rows, J, HP, root, inverse, delta)
+    return delta, P, weight
 
 
 def test_an_update_without_losses_is_kalmans():
@@ -214,7 +257,7 @@ def test_an_update_without_losses_is_kalmans():
     information = np.linalg.inv(P) + J.T @ J
     np.testing.assert_allclose(posterior, np.linalg.inv(information), atol=1e-9)
     np.testing.assert_allclose(delta, np.linalg.solve(information, J.T @ np.concatenate(r)), atol=1e-9)
-    assert weights == [1.0] * 3
+    np.testing.assert_array_equal(weights, 1.0)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
@@ -229,6 +272,73 @@ def test_an_update_with_a_loss_minimises_the_robust_cost(loss):
     best = minimize(cost, delta, tol=1e-10)
     assert cost(delta) < best.fun + 1e-4
     assert weights[0] < 0.5
+
+
+def kalman(P: Array, r: Array, H: Array, parts: list[slice], losses: list[str]) -> tuple[Array, Array, Array]:
+    """A Kalman filter's update, iterated with the weights of losses, and Joseph's covariance: a textbook's."""
+    weights, eye = np.ones(len(parts)), np.eye(len(P))
+    for _ in range(MAX_REWEIGHTINGS):
+        noise = np.concatenate([np.full(len(r[part]), 1.0 / w) for part, w in zip(parts, weights, strict=True)])
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(noise))
+        left = r - H @ K @ r
+        last, weights = (
+            weights,
+            np.array([loss_and_weight(left[None, part], loss)[1][0] for part, loss in zip(parts, losses, strict=True)]),
+        )
+        if np.abs(weights - last).max() < SETTLED:
+            break
+    return K @ r, (eye - K @ H) @ P @ (eye - K @ H).T + K @ np.diag(noise) @ K.T, weights
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("where", ["between", "here"])
+def test_a_correction_is_a_textbooks_kalman_update_moved_along_the_coordinates(estimator, where, loss):
+    initial = estimator.beginning
+    lossy = {sensor: replace(instrument, loss=loss) for sensor, instrument in initial.instruments.items()}
+    engine = FilterEngine(replace(initial, instruments=lossy))
+    interval = max(estimator.intervals[60:], key=lambda i: len(getattr(i, where)))
+    known = estimator.filtered[interval.index - 1]
+    if where == "here":
+        known = engine.predict(interval, known).predicted
+    measurements: list[KeyframeMeasurement] = getattr(interval, where)
+    measurements = [replace(m, z=m.z + 10.0 * m.sd) if m is measurements[-1] else m for m in measurements]
+    processed: list[ProcessedMeasurement] = []
+    after = engine.correct(known, measurements, None, processed)
+    (r, H), parts = engine.linearize(known, measurements), parts_of(measurements)
+    losses = [engine.initial.instruments[m.sensor].loss for m in measurements]
+    delta, P, weights = kalman(known.P, r, H, parts, losses)
+    expected = engine.retract(known, delta, P)
+    np.testing.assert_allclose(after.x, expected.x, atol=1e-9)
+    np.testing.assert_allclose(after.c, expected.c, atol=1e-9)
+    np.testing.assert_allclose(after.P, expected.P, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose([one.weight for one in processed], weights, atol=1e-9)
+    assert (min(weights) < 1.0) == (loss != "none")
+    for one, part in zip(processed, parts, strict=True):
+        S = H[part] @ known.P @ H[part].T + np.eye(len(r[part]))
+        assert one.nis == pytest.approx(r[part] @ np.linalg.solve(S, r[part]))
+
+
+def test_a_step_is_a_correction_a_prediction_and_a_correction(estimator):
+    engine = estimator.engine
+    interval = next(i for i in estimator.intervals[40:] if i.between and i.here)
+    before = estimator.filtered[interval.index - 1]
+    step = engine.step(interval, before, {})
+    departed = engine.correct(before, interval.between, {}, [])
+    transition = engine.predict(interval, departed)
+    filtered = engine.correct(transition.predicted, interval.here, {}, [])
+    for one, other in (
+        (step.departed, departed),
+        (step.transition.predicted, transition.predicted),
+        (step.filtered, filtered),
+    ):
+        np.testing.assert_array_equal(one.x, other.x)
+        np.testing.assert_array_equal(one.c, other.c)
+        np.testing.assert_array_equal(one.P, other.P)
+    F, Q = transition.F, transition.Q
+    np.testing.assert_allclose(transition.predicted.P, F @ departed.P @ F.T + Q, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(step.transition.F, F)
+    assert [one.measurement for one in step.processed] == [*interval.between, *interval.here]
+    np.testing.assert_array_equal(before.x, estimator.filtered[interval.index - 1].x)
 
 
 # dives
@@ -299,7 +409,7 @@ def test_covariances_are_symmetric_and_positive(estimator, smoothed):
 
 def test_calibration_converges_to_the_truth(case, estimator):
     estimate, hidden = estimator.solve(), case.dive.hidden["calibration"]
-    for name in estimator.recursion.unknowns.estimated:
+    for name in estimator.engine.unknowns.estimated:
         history = estimate.history[name]
         assert (np.abs(history.value[-1] - hidden[name]) < 3.5 * history.sd[-1]).all(), name
     for name, part in (("dvl_yaw", 0.5), ("dvl_compass_offset", 0.2), ("hard_iron", 0.9)):
@@ -308,7 +418,7 @@ def test_calibration_converges_to_the_truth(case, estimator):
 
 def test_smoothed_constants_are_the_same_at_all_times(estimator):
     histories = estimator.smoothed().history
-    for name in estimator.recursion.unknowns.estimated:
+    for name in estimator.engine.unknowns.estimated:
         history = histories[name]
         np.testing.assert_allclose(history.value, history.value[[-1]].repeat(len(history.value), 0), atol=2e-3)
 
@@ -326,47 +436,7 @@ def test_calibration_that_walks_keeps_an_uncertainty(case):
 def test_feeding_measurements_and_replaying_intervals_are_the_same(case, estimator):
     again = replay(batch(case.log, case.config).intervals, initialise(case.log, case.config))
     np.testing.assert_allclose(again.solve().trajectory.p_n, estimator.solve().trajectory.p_n, atol=1e-12)
-    np.testing.assert_array_equal(again.latest().p_n, again.filtered[-1].state.p_n)
-
-
-def spoilt_logs(case: Simulated) -> list[Log]:
-    """The dive; one that ends early; one without pings for a while; one whose pings jump and come back."""
-    dvl, imu = case.log["dvl"], case.log["imu"]
-    data = dvl.data.copy()
-    jumps = (dvl.time > 20.0) & (dvl.time < 26.0)
-    data[jumps, 0] += 2.0
-    return [
-        case.log,
-        kept(case.log, "imu", imu.time < 31.0),
-        kept(case.log, "dvl", (dvl.time < 15.0) | (dvl.time > 19.0)),
-        altered(case.log, "dvl", data),
-    ]
-
-
-def test_filters_side_by_side_are_each_as_they_are_alone(case):
-    batches = [batch(log, case.config) for log in spoilt_logs(case)]
-    both = [(b, reinitialise_at) for b in batches for reinitialise_at in ((), (10.0,))]
-    together = [ErrorStateFilter(b.beginning, reinitialise_at) for b, reinitialise_at in both]
-    replay_together(together, [b.intervals for b, _ in both])
-    alone = [replay(b.intervals, b.beginning, reinitialise_at) for b, reinitialise_at in both]
-    for one, other in zip(together, alone, strict=True):
-        for a, b in zip(one.filtered, other.filtered, strict=True):
-            np.testing.assert_array_equal(a.state.p_n, b.state.p_n)
-            np.testing.assert_array_equal(a.P, b.P)
-        assert one.solve().summary == other.solve().summary
-    assert together[6].solve().summary["nis"]["dvl"]["rejected"] > 10
-    smoothed = smoothed_together(together[::2])
-    for one, other in zip(smoothed, alone[::2], strict=True):
-        np.testing.assert_array_equal(one.trajectory.p_n, other.smoothed().trajectory.p_n)
-
-
-def test_filters_are_alike_that_differ_in_their_start_alone(case):
-    short, other = beginning(spoilt_logs(case)[1], case.config), changed(case.config, depth={"sd_m": 0.5})
-    first = beginning(case.log, case.config)
-    turned = first.config.model_copy(update={"start": first.config.start.model_copy(update={"heading_deg": 90.0})})
-    assert alike(first, short) and alike(first, replace(first, config=turned))
-    assert not alike(first, beginning(case.log, other))
-    assert not alike(first, beginning(without(case.log, "depth"), case.config))
+    np.testing.assert_array_equal(again.latest().p_n, again.known.state.p_n)
 
 
 def test_innovations_are_normal_with_the_covariance_predicted(case, estimator):
@@ -386,7 +456,7 @@ def spoilt(case: Simulated, wrong: Array | slice, by: float = 1.0) -> Log:
     return altered(case.log, "dvl", data)
 
 
-def dvl_weights(estimator: ErrorStateFilter) -> dict[float, float]:
+def dvl_weights(estimator: RecordingFilter) -> dict[float, float]:
     residuals = estimator.solve().residuals
     dvl = residuals[residuals["sensor"] == "dvl"]
     return dict(zip(dvl["time"], dvl["weight"], strict=True))
@@ -424,6 +494,58 @@ def test_a_sensor_that_is_kept_out_for_long_is_let_in_again_and_moves_nothing_by
     k = int(np.searchsorted(t.time, back - 1e-6))
     jump = np.linalg.norm(t.v_n[k] - t.v_n[k - 1])
     assert 0.5 < jump < 3.0 * np.linalg.norm(t.v_sd[k - 1])
+
+
+def left_out(estimator: RecordingFilter, off: float, since: float) -> tuple[Gaussian, Gaussian, bool, dict[str, float]]:
+    """A keyframe before and after a ping that is off by some sd, its sensor left out for some time.
+
+    Also whether the ping was let in, and the gates after it.
+    """
+    engine, index = estimator.engine, 100
+    known = engine.predict(estimator.intervals[index], estimator.departed[index - 1]).predicted
+    [ping] = [m for m in estimator.intervals[index].here if m.sensor == "dvl"]
+    r, H = engine.linearize(known, [ping])
+    along = np.linalg.cholesky(H @ known.P @ H.T + np.eye(3))[:, 0]
+    aside = replace(ping, z=ping.z - engine.block([ping]).innovations(known.state)[0])
+    r, H = engine.linearize(known, [aside])
+    np.testing.assert_allclose(r, 0.0, atol=1e-9)
+    shift = np.linalg.solve(engine.block([ping]).W[0], along * off)
+    processed: list[ProcessedMeasurement] = []
+    gates = {} if since == 0.0 else {"dvl": ping.time - since}
+    after = engine.correct(known, [replace(aside, z=aside.z + shift)], gates, processed)
+    assert np.sqrt(processed[0].nis) == pytest.approx(off)
+    return known, after, processed[0].weight > 0.0, gates
+
+
+def test_a_measurement_beyond_its_gate_changes_nothing_and_is_remembered(estimator):
+    gate = estimator.beginning.instruments["dvl"].gate_sd
+    known, after, let_in, gates = left_out(estimator, 1.01 * gate, 0.0)
+    assert not let_in and list(gates) == ["dvl"]
+    np.testing.assert_array_equal(after.x, known.x)
+    np.testing.assert_array_equal(after.P, known.P)
+    *_, let_in, gates = left_out(estimator, 0.99 * gate, 0.0)
+    assert let_in and not gates
+
+
+def test_a_sensor_that_was_left_out_for_long_returns_within_three_sd(estimator):
+    long = 1.01 * estimator.beginning.instruments["dvl"].readmit_s
+    assert not left_out(estimator, 1.01 * RETURN_SD, long)[2]
+    *_, let_in, gates = left_out(estimator, 0.99 * RETURN_SD, long)
+    assert let_in and not gates
+
+
+def test_a_sensor_that_was_left_out_for_long_inflates_what_it_sees_and_nothing_else(estimator):
+    """As something that no model knows would have to have moved the velocity, for the ping to be as it is."""
+    engine, long = estimator.engine, 1.01 * estimator.beginning.instruments["dvl"].readmit_s
+    known, after, let_in, gates = left_out(estimator, 50.0, long)
+    assert not let_in and list(gates) == ["dvl"]
+    np.testing.assert_array_equal(after.x, known.x)
+    own = engine.layout.columns[VELOCITY]
+    grown = after.P - known.P
+    assert grown[own, own][0, 0] > 0.0
+    np.testing.assert_allclose(grown[own, own], grown[own, own][0, 0] * np.eye(3), atol=1e-12)
+    grown[own, own] = 0.0
+    np.testing.assert_array_equal(grown, 0.0)
 
 
 def test_a_dvl_that_vanishes_and_returns_leaves_an_honest_track():
@@ -467,7 +589,7 @@ def test_a_filter_without_a_compass_never_learns_its_heading(case):
 
 
 def test_in_plain_coordinates_it_would_believe_to(case, monkeypatch):
-    monkeypatch.setattr(error_vector, "SEEN", {})
+    monkeypatch.setattr(error_layout, "SEEN", {})
     first, last = heading_sd_without_a_compass(case)
     assert last < 0.95 * first
 

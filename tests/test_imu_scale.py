@@ -1,13 +1,15 @@
 """Scale errors of accelerometer and gyro: derivatives, and what a dive shows of them."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 from dives import Simulated, batch, falcon, renewed, simulated, started, true_at
-from rovgraph.estimators.error_recursion import ErrorStateRecursion
 from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
+from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.transition import predict
@@ -66,7 +68,7 @@ def test_factor_of_a_motion_with_scales_is_linearised_as_its_error_moves():
     insert_state(values, interval.index - 1, before)
     insert_state(values, interval.index, after)
     insert_calibration(values, before.calibration, wanted)
-    (factor,) = motion(interval, wanted)
+    (factor,) = motion(interval, wanted, interval.index)
     linear = factor.linearize(values)
     A, _ = linear.jacobian()
     numeric, step = [], 1e-6
@@ -85,15 +87,16 @@ def test_factor_of_a_motion_with_scales_is_linearised_as_its_error_moves():
 def test_transition_of_the_filter_holds_the_derivative_by_the_scales():
     interval, _, before, _ = interval_and_states()
     case = scaled(noise=True, seconds=40.0)
-    recursion = ErrorStateRecursion(batch(case.log, started(case)).beginning)
-    step = recursion.predict(interval, Gaussian(before, recursion.start().P))
+    engine = FilterEngine(batch(case.log, started(case)).beginning)
+    before = replace(before, calibration={**engine.unknowns.fixed, **before.calibration})
+    transition = engine.predict(interval, Gaussian.of(before, engine.start().P))
     d = 1e-5
     for name in SCALES:
-        columns = step.F[:15, recursion.error.columns[name]]
+        columns = transition.F[:15, engine.layout.columns[name]]
         for c in range(3):
             ends = [predict(interval, before.retract(name, s * d * np.eye(3)[c])) for s in (1, -1)]
             turn = log_rotation(transpose(ends[1].R_nb) @ ends[0].R_nb)[0]
-            shift = rotate(transpose(step.predicted.state.R_nb), ends[0].p_n - ends[1].p_n)[0]
+            shift = rotate(transpose(transition.predicted.state.R_nb), ends[0].p_n - ends[1].p_n)[0]
             change = np.concatenate([turn, shift, (ends[0].v_n - ends[1].v_n)[0], np.zeros(6)])
             np.testing.assert_allclose(columns[:, c], change / (2 * d), atol=1e-4)
             assert np.abs(change).max() > 0

@@ -1,11 +1,13 @@
 """The chain's square root says what dense linear algebra says of the same rows."""
 
+import importlib.util
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -257,10 +259,28 @@ def test_a_measurement_of_weight_zero_says_nothing():
     gated.r[::2] = 1e6
     kept = without.sensors[1]
     for name in ("keyframe", "r", "J", "C", "weight"):
-        setattr(kept, name, getattr(gated, name)[1::2].copy())
+        setattr(kept, name, getattr(gated, name)[1::2])
     a, b = chain.eliminate(), without.eliminate()
     assert_close(a.solve()[0], b.solve()[0])
     assert a.left == pytest.approx(b.left)
+
+
+def test_what_a_border_tied_to_the_first_keyframe_says_is_said_of_that_keyframe():
+    """So that an attitude at the start is known beside every later keyframe."""
+    free, tie_sd = random_chain(6, 15, 0, 4), 1e-6
+    P = free.covariance()
+    one = np.eye(3)[None] / tie_sd
+    J = np.zeros((1, 3, 15))
+    J[0, :, :3] = one[0]
+    tied = random_chain(6, 15, 0, 4)
+    tied.c += 3
+    tied.border_rows = np.insert(tied.border_rows, [4, 4, 4], 0.0, axis=1)
+    tied.sensors.append(Sensor(np.zeros(1, dtype=np.int64), np.zeros((1, 3)), J, -one, np.arange(19, 22), np.ones(1)))
+    root = tied.eliminate((5,))
+    known, cross = root.filtered_covariances()[0], root.covariances(root.border_covariance())[1]
+    assert_close(known[19:, 19:], P[:3, :3])
+    assert_close(known[:15, 19:], P[75:90, :3])
+    assert_close(cross[3, :, 4:], P[45:60, :3])
 
 
 def random_walk(n: int, s: int, prior_sd: float, step_sd: float) -> Chain:
@@ -336,6 +356,29 @@ def test_more_border_priors_than_are_folded_at_a_time_count_all():
     chain = random_chain(3, 3, 0, 4)
     chain.border_rows = np.random.default_rng(3).standard_normal((200, 5))
     assert_close(chain.eliminate().border_covariance(), chain.covariance()[9:, 9:])
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> ModuleType:
+    """``benchmarks/chain.py``, which is a script and no part of the package."""
+    path = Path(__file__).parents[1] / "benchmarks" / "chain.py"
+    spec = importlib.util.spec_from_file_location("chain_benchmark", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_dive_has_the_solution_and_the_sds_of_gtsams_qr(benchmark):
+    errors = benchmark.accuracy(200, 0.1)["chain"]
+    assert max(errors.solution, errors.sd) < 1e-9
+
+
+def test_the_benchmark_times_every_solver(benchmark):
+    """Banded Cholesky has no place for a border."""
+    for border, solvers in ((False, {"chain", "solveh_banded", "GTSAM"}), (True, {"chain", "GTSAM"})):
+        assert {name.split(",")[0] for name in benchmark.speed(40, border, repeats=1) if "'" not in name} == solvers
 
 
 WITHOUT_COMPILER = """

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 import pandas as pd
 import pytest
-from dives import Simulated, altered, batch, falcon, renewed, simulated, started
+from dives import Simulated, altered, batch, falcon, incremental, renewed, simulated, started
 
 from rovgraph import check
 from rovgraph.calibration import TABLE, calibration_size
@@ -67,7 +67,11 @@ def case(depth2: ModuleType) -> Simulated:
 @pytest.fixture(scope="module")
 def estimates(case: Simulated) -> dict[str, Estimate]:
     config = started(case)
-    return {"smoothed": batch(case.log, config).solve(), "filtered": renewed(case.log, config).solve()}
+    return {
+        "smoothed": batch(case.log, config).solve(),
+        "filtered": renewed(case.log, config).solve(),
+        "isam2": incremental(case.log, config).solve(),
+    }
 
 
 def scale_of(estimate: Estimate) -> CalibrationEstimate:
@@ -107,7 +111,7 @@ def test_its_keys_are_those_of_a_configuration(depth2):
         parse_config("sensors: {depth2: {sdd: 1}}")
 
 
-def test_smoother_and_filter_recover_its_scale(estimates):
+def test_smoother_filter_and_isam2_recover_its_scale(estimates):
     for estimate in estimates.values():
         found = scale_of(estimate)
         assert found.estimated

@@ -217,7 +217,7 @@ class Chain:
         InputError : the data do not determine some variable, which is named
         """
         r, A_i, A_j = self.motion_residuals(point)
-        C, targets = self._scale_columns(A_i)
+        C, targets = self._scale_columns(A_i, A_j)
         walks = [np.diff(point.calibration[name], axis=0) * self._walk_of(name) for name in self._walking]
         walk_r = np.concatenate([np.empty((len(r), 0)), *walks], axis=1)
         rows, clones = (self._rows_with_clone, CLONED) if len(stops) else (self._rows, 0)
@@ -299,13 +299,12 @@ class Chain:
         part = self.layout[name][1]
         return self.walk[:, part.start - MOTION : part.stop - MOTION]
 
-    def _scale_columns(self, A_i: Array) -> tuple[Array, NDArray[np.int64]]:
+    def _scale_columns(self, A_i: Array, A_j: Array) -> tuple[Array, NDArray[np.int64]]:
         """Derivatives of the motions by the IMU's scales that are estimated, and their targets."""
         names = [name for name in SCALES if name in self.layout]
         if not names or self.scale_to_bias is None:
             return np.empty((len(A_i), MOTION, 0)), np.empty(0, np.int64)
-        by_bias = A_i[:, :, 9:15].copy()
-        by_bias[:, 9:] = 0.0
+        by_bias = A_i[:, :, 9:15] + A_j[:, :, 9:15]  # of both alike, which leaves the bias's walk out of it
         by_scale = by_bias @ self.scale_to_bias
         parts = {"acc_scale": slice(0, 3), "gyr_scale": slice(3, 6)}
         C = np.concatenate([by_scale[:, :, parts[name]] for name in names], axis=2)

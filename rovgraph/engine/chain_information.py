@@ -1,4 +1,5 @@
-"""What whitened rows say of a chain of keyframes and a border of constants: `rovgraph.kernels.chain` for callers.
+"""What whitened rows say of a chain of keyframes and a border of constants: `rovgraph.kernels.chain` and
+`rovgraph.kernels.chain_posterior` for callers.
 
 Right-hand sides are minus the residuals where a Gauss-Newton step is wanted. Variables of the border whose error is
 considered, not estimated (Schmidt), come last in it: `SquareRoot.solve` and `SquareRoot.border_covariance` take how
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from rovgraph.geometry import Array, transpose
-from rovgraph.kernels import chain
+from rovgraph.kernels import chain, chain_posterior
 from rovgraph.kernels.chain import Index
 
 
@@ -99,7 +100,9 @@ class MeasurementRows:
         C, targets : ndarray, shapes (m, dim, e) and (e,), Jacobians by other columns
         weight : ndarray, shape (m,), of squares: 0 takes a measurement out
         """
-        chain.place_rows(r, J, C, targets, weight, self._begins[sensor], self.values, self.targets)
+        packed = np.ascontiguousarray
+        begins, rows = self._begins[sensor], (self.values, self.targets)
+        chain.place_rows(packed(r), packed(J), packed(C), packed(targets), packed(weight), begins, *rows)
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,7 @@ class SquareRoot:
         free, y = len(self.border) - held, np.zeros((len(self.border), 1))
         y[:free, 0] = _solve_upper(self.border[:free, :free], self.border[:free, -1])
         x = self.conditionals[:, :, -1:].copy()
-        chain.back_substitute(self.conditionals, y, x)
+        chain_posterior.back_substitute(self.conditionals, y, x)
         return x[..., 0], y[:, 0]
 
     @cached_property
@@ -138,7 +141,7 @@ class SquareRoot:
         """Derivative of the keyframes' optimum by the border, shape (n, d, c)."""
         n, d, c = *self.conditionals.shape[:2], len(self.border)
         out = np.zeros((n, d, c))
-        chain.back_substitute(self.conditionals, np.eye(c), out)
+        chain_posterior.back_substitute(self.conditionals, np.eye(c), out)
         return out
 
     def border_covariance(self, believed: Array | None = None) -> Array:
@@ -176,7 +179,7 @@ class SquareRoot:
     def _covariances(self, P_y: Array, count: int) -> tuple[Array, Array, Array]:
         n, d = self.conditionals.shape[:2]
         cross, P, following = self.x_by_y @ P_y, np.empty((n, d, d)), np.empty((count, d, d))
-        chain.covariances(self.conditionals, self.x_by_y, cross, P, following)
+        chain_posterior.covariances(self.conditionals, self.x_by_y, cross, P, following)
         return P, cross, following
 
     def filtered_covariances(self) -> Array:
@@ -206,7 +209,7 @@ class SquareRoot:
     def draw(self, white: Array) -> Array:
         """A draw of the keyframes' error where the border is held, from white noise, shape (n, d)."""
         out = white[:, :, None].copy()
-        chain.back_substitute(self.conditionals, np.zeros((len(self.border), 1)), out)
+        chain_posterior.back_substitute(self.conditionals, np.zeros((len(self.border), 1)), out)
         return out[..., 0]
 
     def log_determinant(self) -> float:

@@ -12,8 +12,9 @@ The errors x_k of the keyframes (d components each) and y of the border (c compo
                           R_y y = z_y + white noise,     R_y upper triangular
 
 (Golub and Van Loan 2013, 5.1 and 5.2; Bierman 1977, chapters IV and X), from which solution, covariances, draws
-and sensitivities follow backwards in time. The information matrix is never formed: that squares the condition
-number, and a motion's rows tell positions to 1e-3 m where the prior may tell them to 1000 m.
+and sensitivities follow backwards in time (`rovgraph.kernels.chain_posterior`). The information matrix is never
+formed: that squares the condition number, and a motion's rows tell positions to 1e-3 m where the prior may tell
+them to 1000 m.
 
 A target is the place of a column that rows have beyond their own: below d a component of x_k, from d on a
 component of y. What a negative target stands for is ignored.
@@ -281,6 +282,7 @@ def eliminate(
             load_motion(k, A_i, A_j, r, C, C_targets, walk, walk_r, W, scale)
             triangularise(W, d, d, 2 * d, v, w)
             append_rows(W, d, 2 * d, d, d + c + 1, 0, V)
+        # before the last keyframe, where scale is that of the next by now, a motion determines all that is a number
         failing = max(failing, undetermined(W, scale, 0, d, k * d))
         if failing >= 0:
             return failing
@@ -289,123 +291,6 @@ def eliminate(
                 conditionals_out[k, i, j] = W[i, j]
     append_rows(Y, 0, c, 0, c + 1, 0, border_out)
     return undetermined(Y, scale, d, d + c, (n - 1) * d)
-
-
-@kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
-def back_substitute(conditionals: Array, y: Array, x_out: Array) -> None:
-    """Solve R_k x_k = z_k - S_k x_{k+1} - T_k y backwards in time, for m right-hand sides.
-
-    With z of `eliminate` and the border's solution, the solution; with zeros and a unit matrix, the derivative of
-    the solution by the border; with white noise and zeros, a draw of the error where the border is held.
-
-    Parameters
-    ----------
-    conditionals : shape (n, d, 2 d + c + 1), of `eliminate`
-    y : shape (c, m)
-    x_out : shape (n, d, m), z to begin with, then x
-    """
-    n, d, m, c = x_out.shape[0], x_out.shape[1], x_out.shape[2], y.shape[0]
-    totals, known = np.zeros(m), np.zeros((2 * d + c, m))  # x_k, x_{k+1}, y, in the order of the conditionals' columns
-    for j in range(c):
-        for col in range(m):
-            known[2 * d + j, col] = y[j, col]
-    for k in range(n - 1, -1, -1):
-        for i in range(d - 1, -1, -1):
-            if m == 1:  # a sum in a register, at a quarter of the time
-                total = x_out[k, i, 0]
-                for j in range(i + 1, 2 * d + c):
-                    total -= conditionals[k, i, j] * known[j, 0]
-                known[i, 0] = total / conditionals[k, i, i]
-                continue
-            for col in range(m):
-                totals[col] = x_out[k, i, col]
-            for j in range(i + 1, 2 * d + c):
-                factor = conditionals[k, i, j]
-                for col in range(m):
-                    totals[col] -= factor * known[j, col]
-            for col in range(m):
-                known[i, col] = totals[col] / conditionals[k, i, i]
-        for i in range(d):
-            for col in range(m):
-                x_out[k, i, col] = known[d + i, col] = known[i, col]
-
-
-@helper
-def multiply_padded(A: Array, B: Array, inner: int, upper: bool, C_out: Array) -> None:
-    """A B of ``inner`` columns of A; those left of the diagonal count as 0 where A is ``upper`` triangular."""
-    for i in range(C_out.shape[0]):
-        for c in range(C_out.shape[1]):
-            C_out[i, c] = 0.0
-        for j in range(i if upper else 0, inner):
-            factor = A[i, j]
-            for c in range(C_out.shape[1]):
-                C_out[i, c] += factor * B[j, c]
-
-
-@helper
-def invert_triangle(R: Array, inverse_out: Array) -> None:
-    """Inverse of an upper triangular matrix."""
-    d, width = inverse_out.shape
-    for i in range(d - 1, -1, -1):
-        for c in range(width):
-            inverse_out[i, c] = 0.0
-        inverse_out[i, i] = 1.0
-        for j in range(i + 1, d):
-            factor = R[i, j]
-            for c in range(width):
-                inverse_out[i, c] -= factor * inverse_out[j, c]
-        for c in range(width):
-            inverse_out[i, c] /= R[i, i]
-
-
-@kernel("void(f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1])")
-def covariances(conditionals: Array, x_by_y: Array, cross: Array, P_out: Array, next_out: Array) -> None:
-    """Marginal covariances of the keyframes, backwards in time.
-
-        H_k = R^-1 (I + S H_{k+1} S') R^-T,   P_k = H_k + X_k P_y X_k',   P_{k,k+1} = -R^-1 S H_{k+1} + X_k P_y X_{k+1}'
-
-    H is the covariance where the border is held and X = dx/dy, so covariances are sums of squares.
-
-    Parameters
-    ----------
-    conditionals : shape (n, d, 2 d + c + 1), of `eliminate`
-    x_by_y : shape (n, d, c), X, of `back_substitute`
-    cross : shape (n, d, c), X P_y, the covariance of keyframes (rows) with the border
-    P_out : shape (n, d, d)
-    next_out : shape (n - 1, d, d), of a keyframe (rows) with that after it; or (0, d, d)
-    """
-    n, d, c = x_by_y.shape
-    width, factors, transposed = padded(d), np.zeros((d, 2 * d)), np.zeros((2 * d, padded(d)))
-    inverse, S, H, gain = np.zeros((d, width)), np.zeros((d, width)), np.zeros((d, width)), np.zeros((d, width))
-    gain_H, P = np.zeros((d, width)), np.zeros((d, width))
-    # of this keyframe, and right of it of that after it
-    X_t, by_border = np.zeros((c, 2 * width)), np.zeros((d, 2 * width))
-    for k in range(n - 1, -1, -1):
-        invert_triangle(conditionals[k], inverse)
-        if k < n - 1:
-            for i in range(d):
-                for j in range(d):
-                    S[i, j] = conditionals[k, i, d + j]
-            multiply_padded(inverse, S, d, True, gain)
-            multiply_padded(gain, H, d, False, gain_H)
-        for i in range(d):
-            for j in range(d):
-                factors[i, j], factors[i, d + j] = inverse[i, j], gain_H[i, j]
-                transposed[j, i], transposed[d + j, i] = inverse[i, j], gain[i, j]
-        multiply_padded(factors, transposed, 2 * d, True, P)
-        for i in range(c):
-            for j in range(d):
-                X_t[i, width + j] = X_t[i, j]
-                X_t[i, j] = x_by_y[k, j, i]
-        multiply_padded(cross[k], X_t, c, False, by_border)
-        for i in range(d):
-            for j in range(i, d):
-                H[i, j] = H[j, i] = P[i, j]
-                P_out[k, i, j] = P_out[k, j, i] = P[i, j] + by_border[i, j]
-        if k < next_out.shape[0]:
-            for i in range(d):
-                for j in range(d):
-                    next_out[k, i, j] = by_border[i, width + j] - gain_H[i, j]
 
 
 @kernel("void(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[::1], i8[::1], f8[:, ::1], i8[:, ::1])")

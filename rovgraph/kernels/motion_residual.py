@@ -63,8 +63,8 @@ def motion_error(
             A_i_out[i, j] = Jr[i, 0] * J[0, j] + Jr[i, 1] * J[1, j] + Jr[i, 2] * J[2, j]
         for j in range(3):
             A_j_out[i, j] = -Jr[j, i]  # Jl^-1 is Jr^-1 transposed
-    _linear_error(3, away[0], R_j, J, r_out, A_i_out, A_j_out)
-    _linear_error(6, away[1], R_j, J, r_out, A_i_out, A_j_out)
+    for k in range(2):
+        _linear_error(3 + 3 * k, away[k], R_j, J, r_out, A_i_out, A_j_out)
     for i in range(3):  # position is perturbed in body axes
         x, y, z = A_j_out[3 + i, 3], A_j_out[3 + i, 4], A_j_out[3 + i, 5]
         for j in range(3):

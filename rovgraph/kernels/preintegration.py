@@ -135,9 +135,11 @@ def _propagate(F: Array, dt: float, noise: Array, duration: float, X: Array) -> 
     ``X`` has shape (21, 9): the covariance of zeta, of the biases with zeta, and H'. The biases' own is known.
     """
     _apply(F, dt, X)
-    for k in range(3):
-        _apply_to_bias(F, dt, k, noise[2] * noise[2] * duration, noise[3] * noise[3] * duration, X, 9)
-        _apply_to_bias(F, dt, k, -1.0, -1.0, X, 15)
+    acc_variance, gyr_variance = noise[2] * noise[2] * duration, noise[3] * noise[3] * duration
+    for row in range(9, 16, 6):
+        for k in range(3):
+            _apply_to_bias(F, dt, k, acc_variance, gyr_variance, X, row)
+        acc_variance = gyr_variance = -1.0  # in H stands -I
     for i in range(9):
         for j in range(i):
             X[i, j], X[j, i] = X[j, i], X[i, j]

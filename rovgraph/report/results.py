@@ -15,6 +15,7 @@ import pandas as pd
 
 from rovgraph.config import Config
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
+from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.report.folder import STAMP, SUMMARY
@@ -58,9 +59,9 @@ def write_results(
     for estimate in estimates:
         estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv")
         estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}.tum")
-    calibration_frame(estimates).to_csv(folder / "calibration.csv", index=False, float_format="%.7g")
-    _residual_frame(estimates[0]).to_csv(folder / "residuals.csv", index=False, float_format="%.7g")
-    _history_frame(estimates).to_csv(folder / "history.csv", index=False, float_format="%.7g")
+    write_csv(calibration_frame(estimates), folder / "calibration.csv")
+    write_csv(_residual_frame(estimates[0]), folder / "residuals.csv")
+    write_csv(_history_frame(estimates), folder / "history.csv")
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
     summary = summarise(estimates, log, config, assumptions, seconds)
     (folder / SUMMARY).write_text(
