@@ -90,7 +90,7 @@ def dead_reckon(
 
     Parameters
     ----------
-    intervals : of `rovgraph.graph.assembly.Assembler`, the first without motion
+    intervals : of `rovgraph.engine.assembly.Assembler`, the first without motion
     beginning : the resolved start
     calibration : all calibration variables, at their means
 
