@@ -22,9 +22,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 
-from rovgraph.estimators.kalman import FILTERS, Asked, run_filters
-from rovgraph.estimators.kalman.processes import length
-from rovgraph.estimators.kalman.setup import prepare
+from rovgraph.estimators.thesis import FILTERS, Asked, run_filters
+from rovgraph.estimators.thesis.processes import length
+from rovgraph.estimators.thesis.setup import prepare
 from rovgraph.live.checkpoint import write_checkpoint
 from rovgraph.live.feed import Feed
 from rovgraph.live.message import Reading

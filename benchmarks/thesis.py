@@ -24,7 +24,7 @@ import pandas as pd
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.kalman import FILTERS, Filter, run_filter
+from rovgraph.estimators.thesis import FILTERS, Filter, run_filter
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
 from rovgraph.log import Log, Stream, log_from_frame
 from rovgraph.sensors import field_direction

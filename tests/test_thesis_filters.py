@@ -30,21 +30,21 @@ from rovgraph import thesis
 from rovgraph.config import Config, beliefs, load_config, mount_matrix
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate
-from rovgraph.estimators.kalman import FILTERS, Filter, FilterJob, run_filter, run_filters
-from rovgraph.estimators.kalman import quaternion as quat
-from rovgraph.estimators.kalman.dvl import DvlModel, Ping
-from rovgraph.estimators.kalman.known import KnownMotion
-from rovgraph.estimators.kalman.mti import Accelerometer, Mti, reference_field
-from rovgraph.estimators.kalman.processes import (
+from rovgraph.estimators.thesis import FILTERS, Filter, FilterJob, run_filter, run_filters
+from rovgraph.estimators.thesis import quaternion as quat
+from rovgraph.estimators.thesis.dvl import DvlModel, Ping
+from rovgraph.estimators.thesis.known import KnownMotion
+from rovgraph.estimators.thesis.mti import Accelerometer, Mti, reference_field
+from rovgraph.estimators.thesis.processes import (
     ConstantAcceleration,
     HydrodynamicModel,
     KnownAttitude,
     Process,
     length,
 )
-from rovgraph.estimators.kalman.recursion import Recursion
-from rovgraph.estimators.kalman.setup import Setup, prepare
-from rovgraph.estimators.kalman.timetable import timetable
+from rovgraph.estimators.thesis.recursion import Recursion
+from rovgraph.estimators.thesis.setup import Setup, prepare
+from rovgraph.estimators.thesis.timetable import timetable
 from rovgraph.geometry import Array, matrix_from_rpy, skew, transpose, wrap_angle
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log, Stream, read_log

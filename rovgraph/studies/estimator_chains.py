@@ -19,8 +19,8 @@ from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.kalman import Filter, FilterJob, run_filters
 from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.thesis import Filter, FilterJob, run_filters
 from rovgraph.log import Log
 
 Stage = Callable[[Any], Any]

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
-from rovgraph.estimators.kalman import FILTERS, Filter
 from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.thesis import FILTERS, Filter
 from rovgraph.studies.estimator_chains import EstimatorSpec, Stage, assembled, reinitialised, stepped
 
 _REINITIALISED = "filter reinitialised from the graph of the dive so far"

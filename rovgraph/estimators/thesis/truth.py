@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rovgraph.estimators.kalman.processes import Layout
-from rovgraph.estimators.kalman.quaternion import from_matrix, unit
+from rovgraph.estimators.thesis.processes import Layout
+from rovgraph.estimators.thesis.quaternion import from_matrix, unit
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
 from rovgraph.trajectory import Trajectory
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from rovgraph.estimators.kalman.core import times
+from rovgraph.estimators.thesis.core import times
 from rovgraph.geometry import Array, skew
 
 

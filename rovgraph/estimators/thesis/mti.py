@@ -14,11 +14,11 @@ from typing import Protocol, Self
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.estimators.kalman.core import Linearized, Quadratic, times
-from rovgraph.estimators.kalman.epochs import Epochs, Index
-from rovgraph.estimators.kalman.known import KnownMotion
-from rovgraph.estimators.kalman.processes import Layout, centripetal, length
-from rovgraph.estimators.kalman.quaternion import Turn, by_vector
+from rovgraph.estimators.thesis.core import Linearized, Quadratic, times
+from rovgraph.estimators.thesis.epochs import Epochs, Index
+from rovgraph.estimators.thesis.known import KnownMotion
+from rovgraph.estimators.thesis.processes import Layout, centripetal, length
+from rovgraph.estimators.thesis.quaternion import Turn, by_vector
 from rovgraph.geometry import Array, rotate, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import MagneticField, field_direction

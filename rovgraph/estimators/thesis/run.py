@@ -8,11 +8,11 @@ from typing import Any, TypeVar
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.kalman.outcome import estimate_of
-from rovgraph.estimators.kalman.recursion import Recursion, run_together
-from rovgraph.estimators.kalman.setup import prepare
-from rovgraph.estimators.kalman.truth import TrueMotion
-from rovgraph.estimators.kalman.variants import FILTERS, Filter
+from rovgraph.estimators.thesis.outcome import estimate_of
+from rovgraph.estimators.thesis.recursion import Recursion, run_together
+from rovgraph.estimators.thesis.setup import prepare
+from rovgraph.estimators.thesis.truth import TrueMotion
+from rovgraph.estimators.thesis.variants import FILTERS, Filter
 from rovgraph.log import Log
 from rovgraph.trajectory import Trajectory
 
@@ -51,7 +51,7 @@ def run_filter(which: str | Filter, log: Log, config: Config, truth: Trajectory 
     -------
     Estimate : ``kind`` is the filter's name; trajectory of the body's origin at the first
         epoch, the pings and the last epoch; innovations of every ping and every tenth IMU
-        sample, whitened, see `rovgraph.estimators.kalman.outcome`
+        sample, whitened, see `rovgraph.estimators.thesis.outcome`
 
     Raises
     ------

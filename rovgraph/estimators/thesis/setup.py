@@ -10,10 +10,10 @@ from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.kalman.dvl import DvlModel, Ping, pings
-from rovgraph.estimators.kalman.known import KnownMotion, known_motion
-from rovgraph.estimators.kalman.mti import Accelerometer, ImuModel, Mti, reference_field
-from rovgraph.estimators.kalman.processes import (
+from rovgraph.estimators.thesis.dvl import DvlModel, Ping, pings
+from rovgraph.estimators.thesis.known import KnownMotion, known_motion
+from rovgraph.estimators.thesis.mti import Accelerometer, ImuModel, Mti, reference_field
+from rovgraph.estimators.thesis.processes import (
     ConstantAcceleration,
     HydrodynamicModel,
     KnownAttitude,
@@ -21,8 +21,8 @@ from rovgraph.estimators.kalman.processes import (
     Process,
     length,
 )
-from rovgraph.estimators.kalman.quaternion import from_matrix, rate_matrix
-from rovgraph.estimators.kalman.variants import Filter, Numbers
+from rovgraph.estimators.thesis.quaternion import from_matrix, rate_matrix
+from rovgraph.estimators.thesis.variants import Filter, Numbers
 from rovgraph.geometry import Array
 from rovgraph.instruments import hydrodynamics, instruments
 from rovgraph.log import Log

@@ -51,7 +51,7 @@ class Filter:
     Attributes
     ----------
     name, section, about : its key in `FILTERS`, the thesis's section, one line for people
-    motion : process model, see `rovgraph.estimators.kalman.processes`
+    motion : process model, see `rovgraph.estimators.thesis.processes`
     accelerometer, magnetometer, compass : whether these are measured; the gyro is, wherever
         the attitude is not given
     misalignment : the DVL's three angles are states

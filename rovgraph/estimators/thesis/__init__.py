@@ -7,7 +7,7 @@ numbers (`variants`). Frames and axes are this package's, the numbers are conver
 motion is the same.
 """
 
-from rovgraph.estimators.kalman.run import FilterJob, run_filter, run_filters
-from rovgraph.estimators.kalman.variants import FILTERS, Filter, Numbers
+from rovgraph.estimators.thesis.run import FilterJob, run_filter, run_filters
+from rovgraph.estimators.thesis.variants import FILTERS, Filter, Numbers
 
 __all__ = ["FILTERS", "Filter", "FilterJob", "Numbers", "run_filter", "run_filters"]

@@ -23,11 +23,11 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rovgraph.estimators.kalman.core import Linearized, Quadratic, diagonal, times
-from rovgraph.estimators.kalman.epochs import Epochs, Index
-from rovgraph.estimators.kalman.known import KnownMotion
-from rovgraph.estimators.kalman.quaternion import RATES, Turn, by_vector, matrix
-from rovgraph.estimators.kalman.variants import Filter, Numbers
+from rovgraph.estimators.thesis.core import Linearized, Quadratic, diagonal, times
+from rovgraph.estimators.thesis.epochs import Epochs, Index
+from rovgraph.estimators.thesis.known import KnownMotion
+from rovgraph.estimators.thesis.quaternion import RATES, Turn, by_vector, matrix
+from rovgraph.estimators.thesis.variants import Filter, Numbers
 from rovgraph.geometry import Array, cross, exp_rotation, right_jacobian, skew, transpose
 from rovgraph.thesis import SAMPLE_S
 from rovgraph.vehicle import Hydrodynamics

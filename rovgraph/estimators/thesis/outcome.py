@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from rovgraph.calibration import MOUNT
 from rovgraph.config import mount_matrix
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, Estimate, History
-from rovgraph.estimators.kalman.dvl import HEADING, ping_rows
-from rovgraph.estimators.kalman.quaternion import SECOND, rate_matrix, unit
-from rovgraph.estimators.kalman.recursion import Innovations, Recursion
 from rovgraph.estimators.results import calibration_estimates, calibration_history
+from rovgraph.estimators.thesis.dvl import HEADING, ping_rows
+from rovgraph.estimators.thesis.quaternion import SECOND, rate_matrix, unit
+from rovgraph.estimators.thesis.recursion import Innovations, Recursion
 from rovgraph.geometry import Array, rotate, transpose
 from rovgraph.trajectory import Trajectory
 

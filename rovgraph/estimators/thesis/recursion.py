@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.kalman.core import Innovate, Linearized, diagonal, iterated_update, propagate_covariance
-from rovgraph.estimators.kalman.dvl import HEADING, DvlModel, ping_rows
-from rovgraph.estimators.kalman.epochs import Epochs, widened
-from rovgraph.estimators.kalman.mti import ImuModel
-from rovgraph.estimators.kalman.processes import moving
-from rovgraph.estimators.kalman.setup import Setup
-from rovgraph.estimators.kalman.timetable import Timetable, timetable
-from rovgraph.estimators.kalman.truth import TrueMotion
+from rovgraph.estimators.thesis.core import Innovate, Linearized, diagonal, iterated_update, propagate_covariance
+from rovgraph.estimators.thesis.dvl import HEADING, DvlModel, ping_rows
+from rovgraph.estimators.thesis.epochs import Epochs, widened
+from rovgraph.estimators.thesis.mti import ImuModel
+from rovgraph.estimators.thesis.processes import moving
+from rovgraph.estimators.thesis.setup import Setup
+from rovgraph.estimators.thesis.timetable import Timetable, timetable
+from rovgraph.estimators.thesis.truth import TrueMotion
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.thesis import SAMPLE_S
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from rovgraph.calibration import MOUNT, Belief
 from rovgraph.config import Config
-from rovgraph.estimators.kalman.core import Linearized, times
-from rovgraph.estimators.kalman.epochs import Epochs, Index
-from rovgraph.estimators.kalman.known import KnownMotion
-from rovgraph.estimators.kalman.processes import Layout
-from rovgraph.estimators.kalman.quaternion import matrix, rate_matrix, unit
+from rovgraph.estimators.thesis.core import Linearized, times
+from rovgraph.estimators.thesis.epochs import Epochs, Index
+from rovgraph.estimators.thesis.known import KnownMotion
+from rovgraph.estimators.thesis.processes import Layout
+from rovgraph.estimators.thesis.quaternion import matrix, rate_matrix, unit
 from rovgraph.geometry import Array, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.log import Log
