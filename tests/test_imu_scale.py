@@ -47,7 +47,7 @@ def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows():
     smoother = batch(case.log, started(case))
     chain = smoother.optimum()
     graph = smooth_graph(smoother.intervals, smoother.beginning, chain.state)
-    assert chain.cost == pytest.approx(graph.cost, rel=1e-6)
+    assert chain.solution.cost == pytest.approx(graph.solution.cost, rel=1e-6)
     for name in SCALES:
         np.testing.assert_allclose(chain.covariances(name)[-1], graph.covariances(name)[-1], rtol=1e-3, atol=1e-12)
 

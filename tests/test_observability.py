@@ -81,7 +81,7 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
     problem, values = as_graph(dive, smoother.beginning)
     ends = [7, 12, problem.count - 1]
     seen = dive.knowledge(ends)
-    linear = problem.linearize(values, dive.gates)
+    linear = problem.linearize(values, dive.solution.gates)
     for row, end in enumerate(ends):
         later = {key(v, i) for v in ("pose", "velocity", "bias") for i in range(end + 1, problem.count)}
         so_far, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()

@@ -10,7 +10,7 @@ from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.chain import COLUMNS, MOTION, Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
-from rovgraph.engine.gauss_newton import Gates, Solution, minimise
+from rovgraph.engine.gauss_newton import Solution, minimise
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, blocks_of, weights_of
@@ -47,25 +47,9 @@ class ChainOptimum:
     def state(self) -> State:
         return self.solution.point
 
-    @property
-    def gates(self) -> Gates:
-        return self.solution.gates
-
     @cached_property
     def weights(self) -> Mapping[str, Array]:
-        return weights_of(self.chain.seen(self.state), self.gates)
-
-    @property
-    def cost(self) -> float:
-        return self.solution.cost
-
-    @property
-    def iterations(self) -> int:
-        return self.solution.iterations
-
-    @property
-    def converged(self) -> bool:
-        return self.solution.converged
+        return weights_of(self.chain.seen(self.state), self.solution.gates)
 
     @property
     def places(self) -> Mapping[int, Array]:
@@ -74,7 +58,7 @@ class ChainOptimum:
     @cached_property
     def information(self) -> SquareRoot:
         """All factors linearised at the optimum and eliminated."""
-        return self.chain.eliminate(self.state, self.gates)
+        return self.chain.eliminate(self.state, self.solution.gates)
 
     @cached_property
     def _border_covariance(self) -> Array:
@@ -107,7 +91,7 @@ class ChainOptimum:
         """As `rovgraph.engine.optimum.Optimum`."""
         held = replace(self.chain, unknowns=self.unknowns.of(()))
         white = np.random.default_rng(seed).standard_normal((len(self.intervals), MOTION))
-        noise = held.eliminate(self.state, self.gates).draw(white)
+        noise = held.eliminate(self.state, self.solution.gates).draw(white)
         more, less = (
             self._knowledge_at(held.moved(self.state, ChainStep(sign * noise, np.empty(0)), 1.0), keyframes)
             for sign in (1.0, -1.0)
@@ -130,7 +114,7 @@ class ChainOptimum:
         return ChainOptimum(without, solution), out
 
     def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
-        P = self.chain.eliminate(point, self.gates, keyframes).filtered_covariances()
+        P = self.chain.eliminate(point, self.solution.gates, keyframes).filtered_covariances()
         attitude = self.chain.d + self.chain.c + np.arange(3)
         calibration = [self.chain.target(name) for name in self.unknowns.estimated]
         chosen = np.concatenate([np.arange(9, MOTION), attitude, *calibration])

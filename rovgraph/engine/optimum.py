@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
-from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.unknowns import Unknowns
@@ -48,8 +48,8 @@ class Optimum(Protocol):
     beliefs, unknowns : the calibration variables
     blocks : sensor -> its measurements
     state : State of n epochs; calibration that walks has shape (n, dim), all other (dim,)
-    gates, weights : sensor -> which measurements are let in, and their weights, shape (m,)
-    cost, iterations, converged : of the solver
+    weights : sensor -> weights of its measurements, shape (m,)
+    solution : gates, cost and iterations; its point is in the solver's own form
     places : number of a place -> ndarray, shape (2,), north and east [m]
     """
 
@@ -64,15 +64,9 @@ class Optimum(Protocol):
     @property
     def state(self) -> State: ...
     @property
-    def gates(self) -> Gates: ...
-    @property
     def weights(self) -> Mapping[str, Array]: ...
     @property
-    def cost(self) -> float: ...
-    @property
-    def iterations(self) -> int: ...
-    @property
-    def converged(self) -> bool: ...
+    def solution(self) -> Solution[Any]: ...
     @property
     def places(self) -> Mapping[int, Array]: ...
 

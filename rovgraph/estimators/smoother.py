@@ -170,9 +170,9 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
         residual_frame(best.blocks, residual_states(best), best.weights),
         {
             "keyframes": n,
-            "cost": best.cost,
-            "iterations": best.iterations,
-            "converged": best.converged,
+            "cost": best.solution.cost,
+            "iterations": best.solution.iterations,
+            "converged": best.solution.converged,
             "bridged_intervals": sum(i.bridged for i in intervals),
             "held_at_prior": list(known.held),
         },

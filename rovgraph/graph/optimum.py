@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from rovgraph.calibration import TABLE, Belief
-from rovgraph.engine.gauss_newton import Gates, Solution
+from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
@@ -44,25 +44,9 @@ class GraphOptimum:
     def state(self) -> State:
         return self.problem.states(self.solution.point)
 
-    @property
-    def gates(self) -> Gates:
-        return self.solution.gates
-
     @cached_property
     def weights(self) -> Mapping[str, Array]:
-        return self.problem.weights(self.solution.point, self.gates)
-
-    @property
-    def cost(self) -> float:
-        return self.solution.cost
-
-    @property
-    def iterations(self) -> int:
-        return self.solution.iterations
-
-    @property
-    def converged(self) -> bool:
-        return self.solution.converged
+        return self.problem.weights(self.solution.point, self.solution.gates)
 
     @cached_property
     def places(self) -> Mapping[int, Array]:
@@ -72,7 +56,7 @@ class GraphOptimum:
 
     @cached_property
     def _covariances(self) -> dict[int, Array]:
-        return covariances(marginals(self.problem, self.solution.point, self.gates))
+        return covariances(marginals(self.problem, self.solution.point, self.solution.gates))
 
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -80,19 +64,19 @@ class GraphOptimum:
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
-        return newest_covariance(self.problem, self.solution.point, self.gates, places)
+        return newest_covariance(self.problem, self.solution.point, self.solution.gates, places)
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
-        return knowledge(self.problem, self.solution.point, self.gates, keyframes)
+        return knowledge(self.problem, self.solution.point, self.solution.gates, keyframes)
 
     def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
         """As `rovgraph.engine.optimum.Optimum`."""
-        noise = noise_of_states(self.problem, self.solution.point, self.gates, seed)
+        noise = noise_of_states(self.problem, self.solution.point, self.solution.gates, seed)
         more, less = (self.solution.point.retract(noise.scale(sign)) for sign in (1.0, -1.0))
         return (
-            knowledge(self.problem, more, self.gates, keyframes),
-            knowledge(self.problem, less, self.gates, keyframes),
+            knowledge(self.problem, more, self.solution.gates, keyframes),
+            knowledge(self.problem, less, self.solution.gates, keyframes),
         )
 
     def holding(self, names: Sequence[str]) -> tuple["GraphOptimum", Mapping[str, Array]]:
