@@ -37,11 +37,11 @@ from rovgraph.engine.remembered_places import (
     with_another,
     without_oldest,
 )
-from rovgraph.engine.sensor_rows import compiled, measurement_row, sensor_table
+from rovgraph.engine.sensor_rows import KeyframeRows, compiled, measurement_row, sensor_table
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import correct, difference, linearize, move_estimate
+from rovgraph.kernels.correction import correct, difference, move_estimate
 from rovgraph.kernels.prediction import predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 
@@ -140,14 +140,23 @@ class FilterEngine:
             if m.sensor in self._given:
                 own_r, own_H = self._of_block(known, m)
             else:
-                own_r, own_H = np.zeros(len(m.z)), np.zeros((len(m.z), self.layout.size))
-                scale = _EXACT if m.scale_to_bias is None else m.scale_to_bias[None]
-                which = np.array([self._index[m.sensor]])
-                rows = (measurement_row(m)[None], which, self._sensors, self.layout.column, scale, self._gravity)
-                linearize(known.x, known.c, *rows, own_r, own_H)
+                own_r, own_H = self.rows([m]).linearize(known.x, known.c)
             r.append(own_r)
             H.append(own_H)
         return np.concatenate(r), np.vstack(H)
+
+    def knows(self, sensor: str) -> bool:
+        """Whether the kernels know a sensor's equation."""
+        return sensor not in self._given
+
+    def rows(self, measurements: Sequence[KeyframeMeasurement]) -> KeyframeRows:
+        """Measurements of one keyframe that the kernels know."""
+        scaled = measurements[0].scale_to_bias is not None
+        scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
+        rows = np.array([measurement_row(m) for m in measurements])
+        which = np.array([self._index[m.sensor] for m in measurements])
+        layout = self.layout
+        return KeyframeRows(rows, which, self._sensors, layout.column, layout.size, scale, self._gravity)
 
     def block(self, measurements: Sequence[KeyframeMeasurement], unknowns: Unknowns | None = None) -> Block:
         """Measurements of one sensor; ``unknowns`` are the filter's own unless given."""

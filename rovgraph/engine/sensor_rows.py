@@ -1,14 +1,17 @@
 """Sensors and their measurements as rows of numbers for the filter's kernels."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.engine.measurements import loss_threshold
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
 from rovgraph.kernels import measurement_row as at
+from rovgraph.kernels.correction import linearize
 from rovgraph.kernels.weighting import LOSSES
 from rovgraph.sensors import SENSORS
 
@@ -57,3 +60,43 @@ def measurement_row(m: KeyframeMeasurement) -> Array:
     row[at.DV : at.DV + 3], row[at.DP : at.DP + 3] = m.motion.dv, m.motion.dp
     row[at.ASSUMED : at.ASSUMED + 6] = m.bias
     return row
+
+
+@dataclass(frozen=True)
+class KeyframeRows:
+    """Measurements of one keyframe that the kernels know.
+
+    Attributes
+    ----------
+    rows, which : ndarray, shapes (m, ROW), (m,), of the measurements, and the sensor that each is of
+    sensors : ndarray, of `sensor_table`
+    column : ndarray of int, shape (15 + C,), place of each component in the error, -1 where it is not estimated
+    size : of the error
+    scale : ndarray, shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
+    gravity : [m/s^2]
+    """
+
+    rows: Array
+    which: NDArray[np.int64]
+    sensors: Array
+    column: NDArray[np.int64]
+    size: int
+    scale: Array
+    gravity: float
+
+    @property
+    def count(self) -> int:
+        """Components of all measurements."""
+        return int(self.sensors[self.which, at.DIM].sum())
+
+    def linearize(self, x: Array, c: Array, weighted: bool = False) -> tuple[Array, Array]:
+        """Whitened innovations, shape (k,), and Jacobians, shape (k, size), on request weighted by the losses.
+
+        Parameters
+        ----------
+        x, c : ndarray, shapes (21,), (C,), as of `rovgraph.engine.filter_step.Gaussian`
+        """
+        r = np.zeros(self.count)
+        H = np.zeros((len(r), self.size))
+        linearize(x, c, self.rows, self.which, self.sensors, self.column, self.scale, self.gravity, weighted, r, H)
+        return r, H

@@ -16,14 +16,15 @@ from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.scale import SCALES
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.smoother import smoothed
-from rovgraph.graph.factors import drift, landmark_prior, motion, priors
+from rovgraph.graph.factors import Factor, drift, landmark_prior, motion, priors
 from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.measurement_factors import measurement_factor
+from rovgraph.graph.measurement_factors import keyframe_factor, measurement_factor
 from rovgraph.graph.optimum import GraphOptimum
 from rovgraph.graph.places import insert_places, resolved_associations, segmented_problem
 from rovgraph.graph.values import insert_calibration, state_values
@@ -101,15 +102,20 @@ class IncrementalEstimator:
             factors += drift(self.unknowns, segment, interval.time - self._begun)
             insert_calibration(values, known.state.calibration, self.unknowns, segment)
             self._begun = interval.time
+        known_to_kernels: dict[tuple[int, int], list[KeyframeMeasurement]] = {}
         for one in processed:
-            landmark = one.measurement.landmark
-            if one.weight > 0.0 or landmark is not None:  # a place that fits none of its name is one by itself
-                block = self.filter.block([one.measurement], self.unknowns)
-                factors.append(measurement_factor(block, one.measurement.segment))
+            m, landmark = one.measurement, one.measurement.landmark
+            if self.filter.knows(m.sensor):
+                if one.weight > 0.0:
+                    known_to_kernels.setdefault((m.keyframe, m.segment), []).append(m)
+            elif one.weight > 0.0 or landmark is not None:  # a place that fits none of its name is one by itself
+                block = self.filter.block([m], self.unknowns)
+                factors.append(measurement_factor(block, m.segment))
                 if landmark is not None and landmark.number not in self._places:
                     self._places.add(landmark.number)
                     insert_places(values, block, known.state)
                     factors.append(landmark_prior(landmark.number))
+        factors += [self._factor(own, *at) for at, own in known_to_kernels.items()]
         self.engine.add(factors, values)
         if any(m.landmark for m in interval.measurements):
             interval = replace(interval, measurements=[one.measurement for one in processed])
@@ -147,6 +153,16 @@ class IncrementalEstimator:
         intervals = resolved_associations(self.intervals)
         problem, solution = segmented_problem(intervals, self.beginning, self.beliefs, self.engine.values())
         return smoothed(GraphOptimum(intervals, self.beginning, self.beliefs, problem, solution), self.beginning)
+
+    def _factor(self, measurements: Sequence[KeyframeMeasurement], keyframe: int, segment: int) -> Factor:
+        """All measurements of a keyframe that the kernels know."""
+        filter, unknowns = self.filter, self.unknowns
+        instruments = [self.beginning.instruments[m.sensor] for m in measurements]
+        touched = {name for instrument in instruments for name in instrument.calibration}
+        if measurements[0].scale_to_bias is not None:
+            touched.update(SCALES)
+        names = [name for name in unknowns.estimated if name in touched]
+        return keyframe_factor(filter.rows(measurements), filter.layout, unknowns, names, keyframe, segment)
 
     def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
         for interval in intervals:

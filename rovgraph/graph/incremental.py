@@ -37,7 +37,7 @@ def isam2_params(part: float = 1.0) -> gtsam.ISAM2Params:
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.relinearizeSkip = 1
-    params.findUnusedFactorSlots = True
+    params.enablePartialRelinearizationCheck = True  # down the tree, as far as anything has moved
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(part * WILDFIRE))
     thresholds = gtsam.ISAM2ThresholdMap()
     for letter, changes in THRESHOLDS.items():

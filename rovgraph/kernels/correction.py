@@ -57,7 +57,7 @@ from rovgraph.kernels.robust_update import (
     normalised_squared,
     reweight,
 )
-from rovgraph.kernels.weighting import whiten
+from rovgraph.kernels.weighting import loss_weight, whiten
 
 Index = NDArray[np.int64]
 
@@ -203,7 +203,7 @@ def admit(nis: float, time: float, sensor: Array, since: Array, index: int) -> b
     return True
 
 
-@kernel("void(f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
+@kernel("void(f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8, b1, f8[::1], f8[:, ::1])")
 def linearize(
     x: Array,
     c: Array,
@@ -213,16 +213,29 @@ def linearize(
     column: Index,
     scale: Array,
     gravity: float,
+    weighted: bool,
     r_out: Array,
     H_out: Array,
 ) -> None:
-    """Whitened innovations and Jacobians of m measurements of a keyframe, none of them `GIVEN`; as `correct` takes."""
+    """Whitened innovations and Jacobians of m measurements of a keyframe, none of them `GIVEN`; as `correct` takes.
+
+    ``weighted`` ones are multiplied by the root of the weight of their loss.
+    """
     begin = 0
     for j in range(len(which)):
         sensor = sensors[which[j]]
         end = begin + int(sensor[DIM])
         own = scale[j] if len(scale) else scale[:, :, 0]
         linearize_one(x, c, rows[j], sensor, own, column, gravity, r_out[begin:end], H_out[begin:end])
+        if weighted:
+            square = 0.0
+            for a in range(begin, end):
+                square += r_out[a] * r_out[a]
+            root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
+            for a in range(begin, end):
+                r_out[a] *= root
+                for i in range(H_out.shape[1]):
+                    H_out[a, i] *= root
         begin = end
 
 
