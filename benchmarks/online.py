@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rovgraph.estimators.error_recursion import ErrorStateRecursion
 
 from rovgraph.config import load_config
 from rovgraph.estimators.dive import assemble, smooth
@@ -65,7 +64,7 @@ class Replay:
     seconds : of the dive
     wall, processor : what it took, processor time of all processes [s]
     update_ms : what each update took, shape (n,)
-    waited : for the second process, as only a replay does [s]
+    waited : for the thread that smooths, as only a replay does [s]
     memory_mb : of this process, in each quarter
     """
 
@@ -116,7 +115,7 @@ def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
     print(f"processor time of all processes {done.processor:.1f} s, {seconds / done.processor:.0f} times real time")
     print(f"update: mean {ms.mean():.2f} ms, p99 {np.percentile(ms, 99):.1f} ms, max {ms.max():.0f} ms")
     print(f"mean by quarter: {np.round(quarters, 2)} ms; the last is {quarters[3] / quarters[1]:.2f} times the second")
-    print(f"waited for the second process, as only a replay does: {done.waited:.1f} s")
+    print(f"waited for the thread that smooths, as only a replay does: {done.waited:.1f} s")
     print(f"longest: {np.sort(ms)[-10:].round()} ms")
     print(f"memory: {memory[1]:.0f} MB at half, {memory[3]:.0f} MB at the end, {memory[3] / memory[1] - 1:+.1%}")
 
@@ -126,19 +125,14 @@ def callbacks(seconds: float, seed: int) -> None:
     dive, config = simulated("lawnmower", seed, falcon(), Choices(duration=seconds))
     log = log_from_frame(dive.log_frame)
     beginning = initialise(log, config)
-    batch = assemble(log, beginning)
-    recursion, gates, filter_steps = ErrorStateRecursion(beginning), dict[str, float](), []
-    known = recursion.start()
-    for interval in batch.intervals:
-        filter_steps.append(recursion.through(interval, known, gates))
-        known = filter_steps[-1].filtered
+    intervals = assemble(log, beginning).intervals
     for kept, period in ((True, UPDATE_S), (False, UPDATE_S), (False, 0.0)):
         isam2 = IncrementalEstimator(beginning, period)
         if not kept:
-            isam2.engine.copy_values()
+            del isam2.engine._theta  # without a reference to it the bindings copy it for each callback
         began = time.process_time()
-        for interval, filter_step in zip(batch.intervals, filter_steps, strict=True):
-            isam2.take(interval, filter_step.filtered, filter_step.used)
+        for interval in intervals:
+            isam2.step(interval)
         values = "kept" if kept else "copied for each callback"
         often = f"once in {period:g} s" if period else "for each keyframe"
         print(f"values {values}, updates {often}: {time.process_time() - began:.1f} s of CPU", flush=True)
@@ -183,7 +177,7 @@ def recorded(path: Path, config_path: Path, reference: Path, after: float) -> No
     wall = time.perf_counter() - began
     assert navigator.engine is not None
     marks = navigator.passed
-    trajectory = navigator.engine.recursion.trajectory([m.interval for m in marks], [m.known for m in marks])
+    trajectory = navigator.engine.trajectory([m.interval for m in marks], [m.known for m in marks])
     result = evaluate(trajectory, read_reference(reference), start=after)
     seconds = float(log["imu"].time[-1] - log["imu"].time[0])
     print(f"{seconds:.0f} s in {wall:.1f} s, {seconds / wall:.0f} times real time")

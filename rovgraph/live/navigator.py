@@ -18,7 +18,7 @@ from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
-from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
@@ -228,7 +228,7 @@ class Navigator:
         """The first seconds are over, or an estimate goes on from its state."""
         config = beginning.config
         if self.smooth:
-            self.isam2 = IncrementalEstimator(beginning)
+            self.isam2 = IncrementalEstimator(beginning, UPDATE_S)
         self.engine = FixedLag(beginning, config.graph.lag_s, config.online.hold_s, self._pass, learn_noise=True)
         if state is not None:
             self.engine.restore(state)
