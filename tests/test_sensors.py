@@ -5,10 +5,9 @@ import pytest
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, parse_config
-from rovgraph.config.sections import STAMPED
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rotate, transpose, wrap_angle
 from rovgraph.instruments import instruments
-from rovgraph.sensors import SENSORS, field_direction, innovation
+from rovgraph.sensors import field_direction, innovation
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, State
 
 CONFIG = parse_config(
@@ -245,7 +244,3 @@ def test_a_rotated_world_rotates_the_dvl_not():
     by_turn = rotate(H[POSE][..., :3], up) + rotate(H["velocity"], np.cross([0, 0, 1.0], state.v_n))
     np.testing.assert_allclose(by_turn, 0.0, atol=1e-12)
     assert BIAS in H
-
-
-def test_every_sensor_may_be_given_a_delay_in_the_configuration():
-    assert set(STAMPED) == set(SENSORS)
