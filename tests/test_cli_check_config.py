@@ -228,3 +228,10 @@ def test_the_example_of_the_manual_is_a_log(tmp_path):
     path.write_text(manual.split("```csv\n")[1].split("```")[0])
     example = read_log(path)
     assert {s: len(example[s]) for s in example.sensors} == {"imu": 3, "dvl": 2, "ahrs": 3, "depth": 2}
+
+
+def test_every_sensor_may_be_given_a_delay():
+    from rovgraph.config.sections import STAMPED
+    from rovgraph.sensors import SENSORS
+
+    assert set(STAMPED) == set(SENSORS)

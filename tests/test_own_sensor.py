@@ -195,6 +195,13 @@ def test_a_sensor_that_is_unregistered_leaves_nothing_behind():
     assert before == (dict(STREAMS), dict(TABLE), calibration_size(), list(describe()), set(instruments(Config())))
 
 
+@pytest.mark.parametrize("own", [{"linear_in": "current"}, {"heading_source": "mag"}])
+def test_what_only_built_in_sensors_have_is_refused(own):
+    with pytest.raises(ValueError, match="built-in"):
+        register(Sensor("sonar", (Column("sonar", "length"),), **own))
+    assert "sonar" not in SENSORS
+
+
 def test_a_column_of_an_unknown_quantity_is_refused():
     with pytest.raises(ValueError, match="none of"):
         Column("turbidity", "murk")  # type: ignore[arg-type]

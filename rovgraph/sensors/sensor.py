@@ -168,9 +168,9 @@ class Sensor:
         sd, shape (dim,)
     once_per_interval : taken once between keyframes, as its errors last longer than that
     observes : what a filter inflates when it readmits the sensor
-    linear_in : the variable that its model is linear in whatever the others are, which gives the filter's error its
-        coordinates; for compiled models
-    heading_source : its name in ``heading.sources``, where it is a compass; it is used as that key says
+    linear_in : of built-in sensors, the variable that the model is linear in whatever the others are, which gives
+        the filter's error its coordinates
+    heading_source : of built-in compasses, the name in ``heading.sources``, which says whether it is used
     may_begin_later : a dive online may begin before its first measurement; a compass's, where ``heading.sources``
         is given
     occasional : it speaks only now and then, so a gap means nothing
@@ -222,8 +222,11 @@ def register(sensor: Sensor) -> None:
 
     Raises
     ------
-    ValueError : its name, a column, or a calibration variable's name or letter is taken
+    ValueError : its name, a column, or a calibration variable's name or letter is taken; it has what only built-in
+        sensors have
     """
+    if sensor.linear_in is not None or sensor.heading_source is not None:
+        raise ValueError(f"sensor {sensor.name!r}: linear_in and heading_source are for built-in sensors")
     columns = [column for known in SENSORS.values() for column in known.columns]
     groups = {column.group for column in columns}
     taken = {sensor.name} & (set(SENSORS) | groups) or set(sensor.column_names) & {
@@ -249,11 +252,17 @@ def _register_calibration(variables: tuple[Variable, ...]) -> None:
 
 
 def unregister(name: str) -> None:
-    """Forget the sensor that was registered last, as a test does that registers one of its own."""
-    sensor = SENSORS.pop(name)
-    unregister_settings(name, sensor.calibration)
+    """Forget the sensor that was registered last, as a test does that registers one of its own.
+
+    Raises
+    ------
+    ValueError : calibration variables of another one were registered after its own
+    """
+    sensor = SENSORS[name]
     for variable in reversed(sensor.calibration):
         calibration.unregister(variable.name)
+    unregister_settings(name, sensor.calibration)
+    del SENSORS[name]
 
 
 def settings(config: Config, sensor: str) -> SensorSettings:
