@@ -74,12 +74,11 @@ def test_the_filter_is_as_good_as_isam2_at_its_newest_keyframe(case, filtered):
             newest[interval.index] = isam2.latest().p_n[0]
     arm = np.array(case.config.imu.lever_arm_m)
     keyframes = list(newest)
-    states = [filtered.filtered[k].state for k in keyframes]
     true = case.truth.at(np.array([filtered.intervals[k].time for k in keyframes]))
     at_imu = true.p_n + true.R_nb @ arm
     errors = [
         rms(np.linalg.norm(p - at_imu, axis=1))
-        for p in (np.array([newest[k] for k in keyframes]), np.array([s.p_n[0] for s in states]))
+        for p in (np.array([newest[k] for k in keyframes]), filtered.history.states.p_n[keyframes])
     ]
     assert errors[1] < 1.05 * errors[0]
 
