@@ -31,7 +31,7 @@ from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, make_problem, make_values, solution_at, solve
+from rovgraph.graph.batch import Problem, make_problem, make_values, solve
 from rovgraph.graph.information import eliminate
 from rovgraph.graph.keys import key
 from rovgraph.graph.optimum import GraphOptimum
@@ -69,16 +69,23 @@ def smooth_graph(
     return GraphOptimum(recognised_dive, initial, beliefs, together, solve(together, values))
 
 
-def segmented_problem(
+def segmented_optimum(
     intervals: Sequence[KeyframeInterval],
     initial: InitialConditions,
     beliefs: Mapping[str, Belief],
     values: gtsam.Values,
-) -> tuple[Problem, Solution[gtsam.Values]]:
-    """The graph whose calibration has a value for each segment of time, and the optimum that iSAM2 has found of it."""
+) -> GraphOptimum:
+    """The optimum of the graph whose calibration has a value for each segment of time, as iSAM2's has.
+
+    Parameters
+    ----------
+    intervals, initial : the dive, each landmark given to its place
+    beliefs : of the calibration, all of which walks
+    values : iSAM2's, to begin with
+    """
     segments = np.array([interval.segment for interval in intervals])
     problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments, segments)
-    return problem, solution_at(problem, values)
+    return GraphOptimum(list(intervals), initial, beliefs, problem, solve(problem, values))
 
 
 def recognised(
