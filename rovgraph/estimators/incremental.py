@@ -27,7 +27,7 @@ from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.keys import key
 from rovgraph.graph.measurement_factors import keyframe_factor, measurement_factor
 from rovgraph.graph.optimum import GraphOptimum
-from rovgraph.graph.places import insert_places, resolved_associations, segmented_optimum
+from rovgraph.graph.places import apart_from, insert_places, resolved_associations, segmented_optimum
 from rovgraph.graph.values import insert_calibration, state_values
 from rovgraph.log import Measurement
 from rovgraph.state import PLACE, State
@@ -66,6 +66,7 @@ class IncrementalEstimator:
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0])
         self.intervals: list[KeyframeInterval] = []
         self._places: set[int] = set()  # that iSAM2 knows
+        self._own_places: dict[float, int] = {}  # time of a landmark -> number of the place that it is by itself
         self._native: list[list[Factor]] = []  # of each keyframe, those that are no measurements
         self._due = list(RELINEARISE_AT_S)
         self._begun = 0.0  # when the newest segment began [s]
@@ -108,7 +109,9 @@ class IncrementalEstimator:
                 insert_places(values, self.filter.block([m], self.unknowns), known.state)
         self._native.append(self._motion(interval))
         self.engine.add([*self._native[-1], *self._factors(admitted)], values)
-        if any(m.landmark for m in interval.measurements):
+        own = {m.time: m.landmark.number for m in interval.measurements if m.landmark is not None}
+        if own:
+            self._own_places |= own
             interval = replace(interval, measurements=[one.measurement for one in processed])
         self.intervals.append(interval)
         if self._due and interval.time - self.intervals[0].time >= self._due[0]:
@@ -152,25 +155,28 @@ class IncrementalEstimator:
         return smoothed(self._optimum(), self.beginning)
 
     def _optimum(self) -> GraphOptimum:
-        """All of the dive so far, from iSAM2's estimate on."""
-        return segmented_optimum(
-            resolved_associations(self.intervals), self.beginning, self.beliefs, self.engine.values()
-        )
+        """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
+        given = self.beginning, self.beliefs
+        best = segmented_optimum(resolved_associations(self.intervals), *given, self.engine.values())
+        block = best.blocks.get(PLACE)
+        if block is None or not (out := block.time[block.believed & ~best.gates[PLACE]]).size:
+            return best
+        apart = [apart_from(interval, {t: self._own_places[t] for t in out.tolist()}) for interval in self.intervals]
+        return segmented_optimum(resolved_associations(apart), *given, self.engine.values())
 
     def _relinearise(self) -> None:
         """Go on from the optimum of the dive so far, with all factors linearised there, and what it lets in."""
         best = self._optimum()
         self.engine = Incremental(self.unknowns)
-        self._places = set()
+        before, self._places = self._places | set(best.places), set()
         gates = {sensor: iter(gate.tolist()) for sensor, gate in best.gates.items()}
         factors: list[Factor] = []
         for interval, native in zip(best.intervals, self._native, strict=True):
             admitted = [m for m in interval.measurements if next(gates[m.sensor])]
             factors += [*native, *self._factors(admitted)]
         values = best.solution.point
-        for number in best.places:
-            if number not in self._places:
-                values.erase(key(PLACE, number))
+        for number in before - self._places:
+            values.erase(key(PLACE, number))
         self.engine.add(factors, values)
         self.engine.update()
         self._know()

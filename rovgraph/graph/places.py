@@ -85,6 +85,9 @@ def segmented_optimum(
     """
     segments = np.array([interval.segment for interval in intervals])
     problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments, segments)
+    values = gtsam.Values(values)
+    if (block := problem.blocks.get(PLACE)) is not None:
+        insert_places(values, block, problem.states(values).at(block.keyframe))
     return GraphOptimum(list(intervals), initial, beliefs, problem, solve(problem, values))
 
 
@@ -116,6 +119,16 @@ def resolved_associations(intervals: Sequence[KeyframeInterval]) -> list[Keyfram
     """A dive whose landmarks have been given to places one by one: what fits no other of its name is not believed."""
     seen = _landmarks(intervals)
     return _given(intervals, _resolved(seen, [_number(a) for a in seen]))
+
+
+def apart_from(interval: KeyframeInterval, numbers: Mapping[float, int]) -> KeyframeInterval:
+    """An interval whose landmarks of some times are each of the place of that number."""
+    found = {
+        a.time: replace(a, landmark=a.landmark._replace(number=numbers[a.time]))
+        for a in interval.measurements
+        if a.landmark is not None and a.time in numbers
+    }
+    return _given([interval], found)[0]
 
 
 def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
