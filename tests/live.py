@@ -51,7 +51,7 @@ class Flight:
 
 
 def navigator(case: Simulated, trust: bool = True) -> Navigator:
-    return Navigator(case.config, patient=True, renew=False, clocks=Clocks(trust=trust))
+    return Navigator(case.config, patient=True, reinitialise=False, clocks=Clocks(trust=trust))
 
 
 def flown(case: Simulated, alter: Alter = lambda m: [m], rate: float = 4.0) -> Flight:

@@ -1,16 +1,20 @@
-"""The live filter: the same estimate whatever the order of arrival, late data put where they belong, renewal."""
+"""The live filter: one estimate whatever the order of arrival, late data where they belong, re-initialisation."""
+
+import threading
+from collections.abc import Callable
 
 import numpy as np
 import pytest
-from dives import Simulated, falcon, fed, simulated
-from rovgraph.estimators.refiner import Refiner
+from dives import RecordingFilter, Simulated, falcon, fed, simulated
 
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.eskf.error_state import ErrorStateFilter
-from rovgraph.estimators.eskf.fixed_lag import FixedLag, InsertResult
+from rovgraph.errors import InputError
+from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
 from rovgraph.estimators.initialise import initialise
+from rovgraph.live import reinitialisations
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
+from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.log import Measurement
 
 LAG, HOLD = 5.0, 0.3
@@ -32,8 +36,8 @@ def measurements(case) -> list[Measurement]:
 
 
 @pytest.fixture(scope="module")
-def reference(case, beginning) -> ErrorStateFilter:
-    return fed(ErrorStateFilter(beginning), case.log)
+def reference(case, beginning) -> RecordingFilter:
+    return fed(RecordingFilter(beginning), case.log)
 
 
 def live(
@@ -75,7 +79,7 @@ def test_the_order_of_arrival_within_300_ms_changes_nothing(beginning, measureme
 def test_pings_about_as_far_apart_as_keyframes_may_be_make_the_same_keyframes_in_any_order():
     case = simulated(falcon(), 40.0, seed=6, dvl_rate=1.0, dvl_jitter=0.4)
     measurements, beginning = list(case.log.measurements()), initialise(case.log, case.config)
-    reference = fed(ErrorStateFilter(beginning), case.log)
+    reference = fed(RecordingFilter(beginning), case.log)
     first, rest = measurements[:50], measurements[50:]
     same(live(beginning, first + shuffled(rest, 2.0), 0.1)[1], reference.filtered, 1e-9)
 
@@ -94,7 +98,7 @@ def test_pings_that_are_found_to_be_late_are_put_where_they_belong_from_then_on(
     case = simulated(config, 40.0, seed=6, dvl_rate=3.0, calibration=offset)
     beginning = initialise(case.log, case.config)
     engine, known = live(beginning, list(case.log.measurements()))
-    recorded = fed(ErrorStateFilter(beginning), case.log)
+    recorded = fed(RecordingFilter(beginning), case.log)
     same(known, recorded.filtered, 1e-12)
     assert engine._assembler.time_offsets.off(known[-1].state.calibration) < 0.02
     assert abs(known[-1].state.calibration["dvl_time_offset"][0] - 0.1) < 0.02
@@ -162,23 +166,79 @@ def test_memory_does_not_grow(beginning, measurements):
     assert sizes[1][1] <= 2 * sizes[0][1] + 100
 
 
-def test_a_renewal_of_the_second_process_makes_it_the_renewed_filter(case, beginning, measurements):
-    renewed = fed(ErrorStateFilter(beginning, (5.0, 10.0, 20.0)), case.log)
-    refiner = Refiner((5.0, 10.0, 20.0))
-    refiner.begin(beginning)
-    try:
-        known: list[Gaussian] = []
-        engine = FixedLag(beginning, LAG, HOLD, passed=lambda m: known.append(m.known), settled=refiner.take)
-        asked = False
-        for measurement in measurements:
-            engine.add(measurement)
-            if not asked and engine.marks and engine.marks[-1].interval.time > measurements[0].time + 30.0:
-                engine.settle()
-                refiner.ask(engine.marks[0].interval.index)
-                index, better = refiner.answer(wait=True)
-                assert engine.adopt(index, better)
-                asked = True
-        engine.finish()
-    finally:
-        refiner.close()
-    same(known[-20:], renewed.filtered[-20:], 1e-5, rtol=1e-2)  # of two optima, each within its tolerance
+DUE = 15.0  # for a re-initialisation [s]
+
+
+@pytest.fixture
+def once(monkeypatch) -> None:
+    monkeypatch.setattr(reinitialisations, "REINITIALISE_AT_S", (DUE,))
+
+
+def reinitialised(
+    beginning: InitialConditions,
+    measurements: list[Measurement],
+    thread: Reinitialisations,
+    lag: float = LAG,
+    at: Callable[[float], None] = lambda time: None,
+) -> list[Gaussian]:
+    """Every keyframe; ``at`` is called with the time since the start at each of them."""
+    known: list[Gaussian] = []
+
+    def passed(mark: FilterSnapshot) -> None:
+        known.append(mark.known)
+        thread.take(mark)
+
+    engine, newest = FixedLag(beginning, lag, HOLD, passed=passed), -1
+    for measurement in measurements:
+        engine.add(measurement)
+        if engine.marks and engine.marks[-1].interval.index > newest:
+            newest = engine.marks[-1].interval.index
+            at(engine.marks[-1].interval.time - measurements[0].time)
+            thread.step(engine)
+    engine.finish()
+    thread.close()
+    return known
+
+
+@pytest.mark.parametrize("lag", [LAG, 20.0])
+def test_a_reinitialisation_in_the_thread_makes_it_the_reinitialised_filter(once, case, beginning, measurements, lag):
+    """From the keyframe at which it was due, with those since taken again."""
+    recorded = fed(RecordingFilter(beginning, (DUE,)), case.log)
+    thread = Reinitialisations(patient=True)
+    known = reinitialised(beginning, measurements, thread, lag)
+    assert not thread.news
+    same(known[-20:], recorded.filtered[-20:], 1e-5, rtol=1e-2)  # of two optima, each within its tolerance
+
+
+def test_a_reinitialisation_that_takes_longer_than_the_lag_makes_it_the_same(
+    once, monkeypatch, case, beginning, measurements
+):
+    recorded = fed(RecordingFilter(beginning, (DUE,)), case.log)
+    thread, smooth, released = Reinitialisations(patient=False), reinitialisations._smoothed, threading.Event()
+
+    def slow(*arguments):
+        released.wait()
+        return smooth(*arguments)
+
+    def release(time: float) -> None:
+        if time > DUE + 2.0 * LAG:
+            released.set()
+            thread.patient = True
+
+    monkeypatch.setattr(reinitialisations, "_smoothed", slow)
+    known = reinitialised(beginning, measurements, thread, at=release)
+    assert not thread.news
+    same(known[-20:], recorded.filtered[-20:], 1e-5, rtol=1e-2)
+
+
+def test_a_reinitialisation_that_fails_is_said_once_and_leaves_the_filter_as_it_is(
+    once, monkeypatch, beginning, measurements, reference
+):
+    def fails(*arguments):
+        raise InputError("the data do not determine pose of keyframe 3")
+
+    monkeypatch.setattr(reinitialisations, "_smoothed", fails)
+    thread = Reinitialisations(patient=True)
+    same(reinitialised(beginning, measurements, thread), reference.filtered, 1e-12)
+    [text] = thread.news
+    assert "pose of keyframe 3" in text

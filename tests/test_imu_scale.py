@@ -16,6 +16,7 @@ from rovgraph.engine.transition import predict
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import log_rotation, rotate, transpose
 from rovgraph.graph.factors import motion
+from rovgraph.graph.places import smooth_graph
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.simulate import Style, Waves
 from rovgraph.state import VELOCITY, State
@@ -39,6 +40,16 @@ def test_a_dive_that_tilts_far_shows_the_scales_of_accelerometer_and_gyro(estima
         error, sd = errors(estimate, name, true)
         assert (np.abs(error) < sd).all()
         assert (sd < 0.25 * 0.01).all()
+
+
+def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows():
+    case = scaled(noise=True, seconds=40.0)
+    smoother = batch(case.log, started(case))
+    chain = smoother.optimum()
+    graph = smooth_graph(smoother.intervals, smoother.beginning, chain.state)
+    assert chain.cost == pytest.approx(graph.cost, rel=1e-6)
+    for name in SCALES:
+        np.testing.assert_allclose(chain.covariances(name)[-1], graph.covariances(name)[-1], rtol=1e-3, atol=1e-12)
 
 
 def test_scales_that_are_known_are_held_and_fit():

@@ -371,7 +371,7 @@ def test_a_late_first_fix_or_depth_leaves_the_start_as_unknown_as_the_way_since(
     log = lively.log
     for sensor in ("fix", "depth"):
         log = kept(log, sensor, log[sensor].time > UNDER_WAY + 18.0)
-    assert (initialise(log, free(lively)).start.p_sd > 15.0).all()
+    assert (initialise(log, free(lively)).prior.p_sd > 15.0).all()
 
 
 def test_the_antennas_lever_arm_is_taken_off_the_first_fix():

@@ -19,7 +19,7 @@ SD = np.array([[1.0, 0.05, 0.01], [0.05, 0.3, 0.01]])  # velocity, tilt, drift; 
 
 
 def reckoned(
-    R_nb, rate_b=(0.0, 0.0, 0.0), n=100, *, start=None, bias=(0.0, 0.0, 0.0), w_ie_n=np.zeros(3), held=1.0, **rows
+    R_nb, rate_b=(0.0, 0.0, 0.0), n=100, *, start=None, bias=(0.0, 0.0, 0.0), w_ie_n=(0.0, 0.0, 0.0), held=1.0, **rows
 ):
     """Attitudes and biases of a vehicle that turns at a constant rate and does not move, seen with a gyro's bias."""
     rate_b, bias = np.asarray(rate_b, float), np.asarray(bias, float)
@@ -58,7 +58,7 @@ def test_without_measurements_the_gyro_is_integrated():
 def test_pings_at_rest_level_it_and_show_the_horizontal_bias_of_the_gyro():
     bias = np.array([0.004, -0.003, 0.002])
     tilted = matrix_from_rpy([0.05, -0.04, 1.0])
-    R, b, true = reckoned(np.eye(3), n=1500, start=tilted, bias=bias, dvl=at_rest(1500))
+    R, b, _ = reckoned(np.eye(3), n=1500, start=tilted, bias=bias, dvl=at_rest(1500))
     assert_allclose(rpy_from_matrix(R[-1])[:2], 0.0, atol=1e-3)
     assert_allclose(b[-1, :2], bias[:2], atol=1e-4)
 

@@ -328,7 +328,7 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(case, tmp_path, monkeypat
     monkeypatch.setattr("rovgraph.live.files.KEEP_S", 0.0)
     said: list[str] = []
     warnings = Warnings(lambda source, kind, text: said.append(text))
-    nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
+    nav = Navigator(case.config, reinitialise=False, clocks=Clocks(trust=True))
     files = Files(tmp_path, case.config, warnings)
     full = Full(monkeypatch, nav, 15.0, 25.0)
     Session(nav, [], warnings, 2.0, files).run(message(m) for m in case.log.measurements())
@@ -354,7 +354,7 @@ def test_a_checkpoint_that_is_damaged_is_said_in_one_line(case, tmp_path):
 def recorded(folder: Path, case: Simulated, until: float) -> None:
     """A run that was ended at some time."""
     warnings = Warnings()
-    nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
+    nav = Navigator(case.config, reinitialise=False, clocks=Clocks(trust=True))
     files = Files(folder, case.config, warnings)
     Session(nav, [], warnings, 2.0, files).run(message(m) for m in case.log.measurements() if m.time < until)
     files.close()
@@ -373,7 +373,7 @@ def test_a_recording_that_cannot_be_read_is_said_and_the_track_before_stands(cas
 
 def test_resuming_what_received_nothing_begins_anew_and_writes_what_is_json(case, tmp_path):
     recorded(tmp_path, case, 0.0)
-    nav = Navigator(case.config, renew=False, clocks=Clocks(trust=True))
+    nav = Navigator(case.config, reinitialise=False, clocks=Clocks(trust=True))
     files = Files(tmp_path, case.config, Warnings(), resume=True)
     session = Session(nav, [], Warnings(), 2.0, files)
     session.resume()

@@ -6,13 +6,14 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pandas as pd
 import pytest
-from dives import Simulated, altered, batch, falcon, renewed, simulated, started
+from dives import Simulated, altered, batch, falcon, incremental, renewed, simulated, started
 
 from rovgraph import check
 from rovgraph.calibration import TABLE, calibration_size
@@ -66,7 +67,11 @@ def case(depth2: ModuleType) -> Simulated:
 @pytest.fixture(scope="module")
 def estimates(case: Simulated) -> dict[str, Estimate]:
     config = started(case)
-    return {"smoothed": batch(case.log, config).solve(), "filtered": renewed(case.log, config).solve()}
+    return {
+        "smoothed": batch(case.log, config).solve(),
+        "filtered": renewed(case.log, config).solve(),
+        "isam2": incremental(case.log, config).solve(),
+    }
 
 
 def scale_of(estimate: Estimate) -> CalibrationEstimate:
@@ -106,7 +111,7 @@ def test_its_keys_are_those_of_a_configuration(depth2):
         parse_config("sensors: {depth2: {sdd: 1}}")
 
 
-def test_smoother_and_filter_recover_its_scale(estimates):
+def test_smoother_filter_and_isam2_recover_its_scale(estimates):
     for estimate in estimates.values():
         found = scale_of(estimate)
         assert found.estimated
@@ -173,7 +178,8 @@ def test_a_name_that_is_taken_is_refused_and_nothing_is_changed(depth2):
         Sensor("depth2", (Column("depth3", "length"),)),
         Sensor("depth3", (Column("depth2", "length"),)),
         Sensor("depth3", (Column("time"),)),
-        Sensor("depth3", (Column("depth3"),), calibration=(depth2.SCALE,)),
+        Sensor("gyr", (Column("gyr", "rate"),)),
+        Sensor("depth3", (Column("depth3"),), calibration=(replace(depth2.SCALE, name="k", letter="Q"), depth2.SCALE)),
     ):
         with pytest.raises(ValueError, match="taken"):
             register(sensor)

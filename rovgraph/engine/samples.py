@@ -111,8 +111,8 @@ class Samples:
         return np.concatenate([[False], periods > known])
 
     def reach(self, count: int) -> None:
-        """Look at the first samples of a log only."""
-        self._last = count
+        """Look at the first samples of a log only, at no fewer than before."""
+        count = self._last = max(count, self._last)
         self.longest_step = self._longest_steps[min(count, len(self._longest_steps)) - 1]
 
     @property

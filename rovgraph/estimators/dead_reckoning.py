@@ -20,8 +20,8 @@ from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
 from rovgraph.geometry import Array, cross, earth_rate_n, identity, rotate, transpose
 from rovgraph.instruments import HEADING_STREAMS
-from rovgraph.kernels.dead_reckoning import reckon_attitude
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
+from rovgraph.kernels.dead_reckoning import reckon_attitude
 from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
 
@@ -83,12 +83,14 @@ class _Pings:
         return self.velocity_b + cross(bias[self.epoch, 3:], self.arm)
 
 
-def dead_reckon(intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]) -> State:
+def dead_reckon(
+    intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]
+) -> State:
     """The state at every keyframe, at the IMU.
 
     Parameters
     ----------
-    intervals : of `rovgraph.graph.assembly.Assembler`, the first without motion
+    intervals : of `rovgraph.engine.assembly.Assembler`, the first without motion
     beginning : the resolved start
     calibration : all calibration variables, at their means
 
@@ -223,7 +225,7 @@ def _velocities(epochs: _Epochs, R_nb: Array, bias: Array, bottom: _Pings, water
 def _through_water(
     time: Array, R_nb: Array, bias: Array, bottom: _Pings, water: _Pings, current: Array
 ) -> tuple[NDArray[np.intp], Array]:
-    """Epochs of water pings far from any on the bottom, and velocity over ground there, body axes, shape (n, 3).
+    """Epochs of water pings while the bottom is lost, and velocity over ground there, body axes, shape (n, 3).
 
     The current is what the velocities over ground and through the water differ by, a mean over `CURRENT_S`, and
     linear where the bottom is lost; without any ping on it, it is the one that is believed.
@@ -237,9 +239,9 @@ def _through_water(
         first, last = known.searchsorted([known - 0.5 * CURRENT_S, known + 0.5 * CURRENT_S])
         means = (sums[last] - sums[first]) / (last - first)[:, None]
         c_n = np.column_stack([np.interp(time[k], known, column) for column in means.T])
-        after = known.searchsorted(time[k])
-        apart = [np.abs(time[k] - known[np.clip(after - side, 0, len(known) - 1)]) for side in (0, 1)]
-        lost = np.minimum(*apart) > FRESH_S
+        before, behind = known.searchsorted(time[k], "right"), known.searchsorted(time[k], "left")
+        bounds = np.concatenate([[-math.inf], known, [math.inf]])
+        lost = (before == behind) & (bounds[before + 1] - bounds[before] > FRESH_S)
     return k[lost], rotate(transpose(R_nb[k]), w_n + c_n)[lost]
 
 

@@ -18,6 +18,7 @@ from rovgraph.config import Config, SensorSettings, register_settings, unregiste
 from rovgraph.geometry import Array
 from rovgraph.sensors.model import SensorModel
 
+RESERVED = ("time", "received", "fix_lat", "fix_lon")  # columns of a log that are no sensor's
 LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
 
 Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length"]
@@ -223,14 +224,28 @@ def register(sensor: Sensor) -> None:
     ------
     ValueError : its name, a column, or a calibration variable's name or letter is taken
     """
-    columns = {"time", *(column for known in SENSORS.values() for column in known.column_names)}
-    taken = columns & set(sensor.column_names) or {sensor.name} & set(SENSORS)
+    columns = [column for known in SENSORS.values() for column in known.columns]
+    groups = {column.group for column in columns}
+    taken = {sensor.name} & (set(SENSORS) | groups) or set(sensor.column_names) & {
+        *RESERVED,
+        *(c.name for c in columns),
+    }
     if taken:
-        raise ValueError(f"sensor {sensor.name!r}: the name {min(taken)!r} is taken")
-    for variable in sensor.calibration:
-        calibration.register(variable)
+        raise ValueError(f"sensor {sensor.name!r}: the name {min(map(str, taken))!r} is taken")
+    _register_calibration(sensor.calibration)
     register_settings(sensor.name, sensor.settings or SensorSettings, sensor.calibration)
     SENSORS[sensor.name] = sensor
+
+
+def _register_calibration(variables: tuple[Variable, ...]) -> None:
+    """Register all variables, or none."""
+    for k, variable in enumerate(variables):
+        try:
+            calibration.register(variable)
+        except ValueError:
+            for before in reversed(variables[:k]):
+                calibration.unregister(before.name)
+            raise
 
 
 def unregister(name: str) -> None:
