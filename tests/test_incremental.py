@@ -16,6 +16,7 @@ from dives import (
     rms,
     simulated,
 )
+from live import message
 
 from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.engine.unknowns import Unknowns
@@ -23,12 +24,15 @@ from rovgraph.errors import InputError
 from rovgraph.estimators import incremental as incremental_module
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
-from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.estimators.eskf.fixed_lag import FixedLag
+from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, transpose
 from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.keys import key
 from rovgraph.graph.measurement_factors import measurement_factor
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
 from rovgraph.state import POSE
 from rovgraph.studies.estimator_chains import outcomes
@@ -297,3 +301,40 @@ def test_comparing_both_estimates_runs_isam2_once(case, monkeypatch):
     found = list(outcomes(chosen, case.log, case.config))
     assert [o.error for o in found] == [None, None] and ran == [1]
     assert [o.estimate.kind for o in found] == ["filtered", "smoothed"]
+
+
+# data as they arrive
+
+
+def test_online_puts_out_isam2s_estimate(case, monkeypatch):
+    """The filter goes on from iSAM2's newest keyframe once a second, and ends where the dive does."""
+    adopted, adopt = [], FixedLag.adopt_passed
+    monkeypatch.setattr(
+        FixedLag,
+        "adopt_passed",
+        lambda engine, known, gates: adopted.append(known) or adopt(engine, known, gates),
+    )
+    nav = Navigator(case.config, patient=True, smooth=True, clocks=Clocks(trust=True))
+    for m in case.log.measurements():
+        nav.take(message(m))
+    nav.finish()
+    seconds = case.log["imu"].time[-1] - case.config.graph.lag_s
+    assert 0.6 * seconds < len(adopted) <= seconds / UPDATE_S
+    assert nav.isam2 is not None and not [e for e in nav._take_events() if e.kind == "lost"]
+    solution, smoothed = nav.solution(), batch(case.log, case.config).solve().trajectory
+    assert np.abs((solution.position - smoothed.p_n[-1]) / smoothed.p_sd[-1]).max() < 0.5
+    np.testing.assert_allclose(solution.position_sd, smoothed.p_sd[-1], rtol=0.1)
+    known, truth = nav.isam2.solve().trajectory, smoothed.at(nav.isam2.solve().trajectory.time)
+    assert np.linalg.norm(known.p_n - truth.p_n, axis=1).max() < 0.1
+
+
+def test_a_filter_that_goes_on_from_its_own_estimate_stays_where_it_is(case):
+    engine, passed = FixedLag(initialise(case.log, case.config), 5.0, 0.3), []
+    engine.passed = passed.append
+    for m in case.log.measurements():
+        if m.time < 30.0:
+            engine.add(m)
+    before = engine.marks[-1].known
+    engine.adopt_passed(passed[-1].known, passed[-1].gates)
+    np.testing.assert_allclose(engine.marks[-1].known.x, before.x, atol=1e-12)
+    np.testing.assert_allclose(engine.marks[-1].known.P, before.P, atol=1e-15)

@@ -85,8 +85,7 @@ class IncrementalEstimator:
     def step(self, interval: KeyframeInterval) -> FilterStep:
         """Take an interval: predicted and gated from what iSAM2 knows of the keyframe before, then given to it."""
         done = self.filter.step(interval, self.known, self.gates)
-        self.known = done.filtered
-        self.take(interval, self.known, done.processed)
+        self.take(interval, done.filtered, done.processed)
         self.history.append(interval, self.known, done.processed)
         return done
 
@@ -99,6 +98,7 @@ class IncrementalEstimator:
         known : where to linearise it at first
         processed : its measurements
         """
+        self.known = known
         values = state_values(interval.index, known.state)
         if not self.intervals or interval.segment > self.intervals[-1].segment:
             insert_calibration(values, known.state.calibration, self.unknowns, interval.segment)
