@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
-from dives import Simulated, as_log, attitude_errors, batch, changed, falcon, renewed, true_at
+from dives import Simulated, as_log, attitude_errors, batch, changed, falcon, incremental, renewed, true_at
 from scipy.stats import chi2
 
 from rovgraph.config import Config
@@ -22,6 +22,7 @@ from rovgraph.trajectory import Trajectory
 SEEDS = range(1, 25)
 SECONDS, PING_RATE = 100.0, 2.5  # fewer pings than a real DVL
 QUANTITIES = ("position", "velocity", "attitude")
+KINDS = ("smoothed", "filtered", "isam2 smoothed", "isam2 filtered")
 OVERCONFIDENT = 3.0
 
 
@@ -44,18 +45,21 @@ def nees(trajectory: Trajectory, case: Simulated, epoch: int) -> Array:
 
 
 def one_dive(seed: int) -> Array:
-    """NEES of one dive: smoothed at mid-dive, filtered at the end, smoothed with a boastful DVL; shape (3, 3)."""
+    """NEES of one dive: smoothed at mid-dive and filtered at the end, twice, smoothed with a boastful DVL; (5, 3)."""
     case, config = drawn(seed)
     smoothed = batch(case.log, config).solve().trajectory
     filtered = renewed(case.log, config).solve().trajectory
+    isam2 = incremental(case.log, config)
+    whole, newest = isam2.solve().trajectory, isam2.filtered().trajectory
     sd = [s / OVERCONFIDENT for s in config.dvl.velocity_sd_mps]
     boastful = batch(case.log, changed(config, dvl={"velocity_sd_mps": sd})).solve().trajectory
     middle = len(smoothed) // 2
-    return np.array([nees(smoothed, case, middle), nees(filtered, case, -1), nees(boastful, case, middle)])
+    ends = [(smoothed, middle), (filtered, -1), (whole, middle), (newest, -1), (boastful, middle)]
+    return np.array([nees(trajectory, case, epoch) for trajectory, epoch in ends])
 
 
 def all_dives(seeds: range) -> Array:
-    """NEES of many dives, shape (dives, 3 kinds, 3 quantities)."""
+    """NEES of many dives, shape (dives, 5 kinds, 3 quantities)."""
     with ProcessPoolExecutor(2) as pool:
         return np.array(list(pool.map(one_dive, seeds)))
 
@@ -72,14 +76,14 @@ def band(dives: int) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("quantity", range(3), ids=QUANTITIES)
-@pytest.mark.parametrize("kind", range(2), ids=("smoothed", "filtered"))
+@pytest.mark.parametrize("kind", range(4), ids=KINDS)
 def test_errors_are_as_large_as_the_estimate_says(mean_nees, kind, quantity):
     low, high = band(len(SEEDS))
     assert low < mean_nees[kind, quantity] < high
 
 
 def test_a_dvl_declared_three_times_too_good_is_found_out(mean_nees):
-    assert (mean_nees[2] > band(len(SEEDS))[1]).any()
+    assert (mean_nees[4] > band(len(SEEDS))[1]).any()
 
 
 if __name__ == "__main__":  # python tests/test_consistency.py FIRST LAST: the same by hand, on other dives
@@ -88,5 +92,5 @@ if __name__ == "__main__":  # python tests/test_consistency.py FIRST LAST: the s
     first, last = (int(a) for a in sys.argv[1:3])
     found = all_dives(range(first, last))
     print("band", np.round(band(len(found)), 2), *QUANTITIES)
-    for name, row in zip(("smoothed", "filtered", "overconfident"), found.mean(axis=0), strict=True):
+    for name, row in zip((*KINDS, "overconfident"), found.mean(axis=0), strict=True):
         print(f"{name:14}", np.round(row, 2))

@@ -16,17 +16,27 @@ from dives import (
     rms,
     simulated,
 )
+from live import message
 
+from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
+from rovgraph.estimators import incremental as incremental_module
+from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
-from rovgraph.estimators.incremental import IncrementalEstimator
+from rovgraph.estimators.eskf.fixed_lag import FixedLag
+from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, transpose
 from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.keys import key
+from rovgraph.graph.measurement_factors import measurement_factor
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
 from rovgraph.state import POSE
+from rovgraph.studies.estimator_chains import outcomes
+from rovgraph.studies.estimators import select
 
 DEG = np.deg2rad(1.0)
 
@@ -74,12 +84,11 @@ def test_the_filter_is_as_good_as_isam2_at_its_newest_keyframe(case, filtered):
             newest[interval.index] = isam2.latest().p_n[0]
     arm = np.array(case.config.imu.lever_arm_m)
     keyframes = list(newest)
-    states = [filtered.filtered[k].state for k in keyframes]
     true = case.truth.at(np.array([filtered.intervals[k].time for k in keyframes]))
     at_imu = true.p_n + true.R_nb @ arm
     errors = [
         rms(np.linalg.norm(p - at_imu, axis=1))
-        for p in (np.array([newest[k] for k in keyframes]), np.array([s.p_n[0] for s in states]))
+        for p in (np.array([newest[k] for k in keyframes]), filtered.history.states.p_n[keyframes])
     ]
     assert errors[1] < 1.05 * errors[0]
 
@@ -200,3 +209,132 @@ def test_a_callback_gets_the_linearisation_point_itself_while_the_engine_keeps_i
     engine.update()
     engine.update()
     assert given and all((values is theta) == kept for values in given)
+
+
+# filtered and smoothed from one pass
+
+
+def apart(one, other) -> Array:
+    """How far two trajectories are apart, in units of the other's sd, shape (n, 6): position, then attitude in n."""
+    a, b = one.trajectory, other.trajectory
+    turn = np.einsum("nij,nj->ni", b.R_nb, log_rotation(transpose(b.R_nb) @ a.R_nb))
+    sd = np.sqrt(np.diagonal(b.cov_theta, axis1=1, axis2=2))
+    return np.abs(np.concatenate([(a.p_n - b.p_n) / b.p_sd, turn / sd], axis=1))
+
+
+def test_what_isam2_smooths_at_its_end_is_the_chains_optimum(case, whole):
+    chain = batch(case.log, case.config).solve()
+    assert apart(whole.solve(), chain).max() < 0.05
+    np.testing.assert_allclose(whole.solve().trajectory.p_sd, chain.trajectory.p_sd, rtol=0.02)
+
+
+def test_what_isam2_knows_of_its_newest_keyframe_is_what_the_dive_so_far_shows(case, whole):
+    """Each filtered keyframe against the optimum of all data up to it, from the graph of a chain."""
+    dive = batch(case.log, case.config)
+    filtered, off = whole.history.states, []
+    for end in range(30, len(dive.intervals), 30):
+        states = filtered.at(np.arange(end + 1))
+        best = smooth_chain(dive.intervals[: end + 1], dive.beginning, states)
+        sd = np.sqrt(np.diag(best.newest_covariance()))
+        newest = best.state.at([end])
+        turn = log_rotation(transpose(newest.R_nb) @ filtered.R_nb[end : end + 1])[0]
+        off.append(np.concatenate([turn, newest.R_nb[0].T @ (filtered.p_n[end] - newest.p_n[0])]) / sd[:6])
+    assert len(off) > 5
+    assert np.abs(off).max() < 1.0
+    assert rms(np.array(off)) < 0.3
+
+
+def test_isam2_and_the_filter_agree_on_every_keyframe_but_the_first_seconds(case, whole, filtered):
+    off = apart(whole.filtered(), filtered.solve())
+    later = whole.filtered().trajectory.time > 10.0
+    assert rms(off[later]) < 0.3
+
+
+def test_isam2s_filtered_estimate_is_of_the_pass_itself(case, whole):
+    """What came later does not change it, and its residuals are innovations."""
+    half = Log(case.log.source, {s: _until(stream, 40.0) for s, stream in case.log.streams.items()})
+    short, full = fed(IncrementalEstimator(whole.beginning), half).filtered().trajectory, whole.filtered().trajectory
+    n = int(np.searchsorted(full.time, 39.0))
+    np.testing.assert_allclose(short.p_n[:n], full.p_n[:n], atol=1e-9)
+    nis = whole.filtered().summary["nis"]["dvl"]
+    assert 0.6 * nis["dim"] < nis["mean"] < 1.5 * nis["dim"]
+
+
+def test_isam2_keeps_gross_outliers_out_by_its_own_innovations(case, whole):
+    wrong = np.arange(100, 200, 20)
+    estimator = incremental(spoilt(case, wrong), case.config)
+    times = set(case.log["dvl"].time[wrong])
+    for estimate in (estimator.filtered(), estimator.solve()):
+        dvl = estimate.residuals[estimate.residuals["sensor"] == "dvl"]
+        assert set(dvl.loc[(dvl["weight"] == 0.0) & (dvl["time"] > 5.0), "time"]) == times
+    a, b = estimator.filtered().trajectory, whole.filtered().trajectory
+    assert np.linalg.norm(a.p_n - b.p_n, axis=1).max() < 0.1
+
+
+def test_the_factor_of_a_keyframe_is_that_of_its_measurements_one_by_one(whole, case):
+    """The kernels' rows, weighted by their losses, and GTSAM's robust factors of the blocks."""
+    interval = next(i for i in whole.intervals[50:] if i.here and len(i.between) > 1)
+    values = whole.engine.values()
+    for measurements in (interval.here, interval.between):
+        apart_, together = gtsam.GaussianFactorGraph(), gtsam.GaussianFactorGraph()
+        for m in measurements:
+            block = whole.filter.block([m], whole.unknowns)
+            apart_.push_back(measurement_factor(block, m.segment).linearize(values))
+        (factor,) = whole._factors(measurements)
+        together.push_back(factor.linearize(values))
+        order = gtsam.Ordering.ColamdGaussianFactorGraph(together)
+        for mine, other in zip(together.hessian(order), apart_.hessian(order), strict=True):
+            np.testing.assert_allclose(mine / np.abs(other).max(), other / np.abs(other).max(), atol=1e-9)
+
+
+def test_smooth_writes_both_estimates_of_one_pass(case):
+    config = changed(case.config, graph={"solver": "isam2"})
+    kinds = [estimate.kind for estimate in smooth(case.log, config).estimates]
+    assert kinds == ["smoothed", "filtered", "dead_reckoning"]
+
+
+def test_comparing_both_estimates_runs_isam2_once(case, monkeypatch):
+    ran = []
+    original = incremental_module.run_isam2
+    monkeypatch.setattr(incremental_module, "run_isam2", lambda *given: ran.append(1) or original(*given))
+    chosen = select(["isam2-filtered-a", "isam2-smoothed-a"])
+    found = list(outcomes(chosen, case.log, case.config))
+    assert [o.error for o in found] == [None, None] and ran == [1]
+    assert [o.estimate.kind for o in found] == ["filtered", "smoothed"]
+
+
+# data as they arrive
+
+
+def test_online_puts_out_isam2s_estimate(case, monkeypatch):
+    """The filter goes on from iSAM2's newest keyframe once a second, and ends where the dive does."""
+    adopted, adopt = [], FixedLag.adopt_passed
+    monkeypatch.setattr(
+        FixedLag,
+        "adopt_passed",
+        lambda engine, known, gates: adopted.append(known) or adopt(engine, known, gates),
+    )
+    nav = Navigator(case.config, patient=True, smooth=True, clocks=Clocks(trust=True))
+    for m in case.log.measurements():
+        nav.take(message(m))
+    nav.finish()
+    seconds = case.log["imu"].time[-1] - case.config.graph.lag_s
+    assert 0.6 * seconds < len(adopted) <= seconds / UPDATE_S
+    assert nav.isam2 is not None and not [e for e in nav._take_events() if e.kind == "lost"]
+    solution, smoothed = nav.solution(), batch(case.log, case.config).solve().trajectory
+    assert np.abs((solution.position - smoothed.p_n[-1]) / smoothed.p_sd[-1]).max() < 0.5
+    np.testing.assert_allclose(solution.position_sd, smoothed.p_sd[-1], rtol=0.1)
+    known, truth = nav.isam2.solve().trajectory, smoothed.at(nav.isam2.solve().trajectory.time)
+    assert np.linalg.norm(known.p_n - truth.p_n, axis=1).max() < 0.1
+
+
+def test_a_filter_that_goes_on_from_its_own_estimate_stays_where_it_is(case):
+    engine, passed = FixedLag(initialise(case.log, case.config), 5.0, 0.3), []
+    engine.passed = passed.append
+    for m in case.log.measurements():
+        if m.time < 30.0:
+            engine.add(m)
+    before = engine.marks[-1].known
+    engine.adopt_passed(passed[-1].known, passed[-1].gates)
+    np.testing.assert_allclose(engine.marks[-1].known.x, before.x, atol=1e-12)
+    np.testing.assert_allclose(engine.marks[-1].known.P, before.P, atol=1e-15)

@@ -7,6 +7,13 @@ from typing import Annotated
 import typer
 
 
+class Engine(StrEnum):
+    """What estimates."""
+
+    batch = "batch"
+    isam2 = "isam2"
+
+
 class Which(StrEnum):
     """Which estimate to make."""
 
@@ -19,6 +26,9 @@ def smooth(
     log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
+    engine: Annotated[
+        Engine | None, typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; else graph.solver")
+    ] = None,
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
@@ -43,6 +53,8 @@ def smooth(
 
     out = Path("results-" + log.name.split(".")[0]) if out is None else out
     settings = load_config(config)
+    if engine is not None:
+        settings = settings.model_copy(update={"graph": settings.graph.model_copy(update={"solver": engine.value})})
     warn_of_unused(config, log)
     check_writable(out, force)
     began = time.perf_counter()

@@ -24,14 +24,16 @@ from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.smoother import smoothed
 from rovgraph.graph.factors import Factor, drift, landmark_prior, motion, priors
 from rovgraph.graph.incremental import Incremental
+from rovgraph.graph.keys import key
 from rovgraph.graph.measurement_factors import keyframe_factor, measurement_factor
 from rovgraph.graph.optimum import GraphOptimum
-from rovgraph.graph.places import insert_places, resolved_associations, segmented_problem
+from rovgraph.graph.places import apart_from, insert_places, resolved_associations, segmented_optimum
 from rovgraph.graph.values import insert_calibration, state_values
 from rovgraph.log import Measurement
-from rovgraph.state import State
+from rovgraph.state import PLACE, State
 
 UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
+RELINEARISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0)  # all factors: before, heading and compasses may be far off
 STIFF = 2e-4  # walk of a constant, as a part of its prior's sd per root second
 
 
@@ -64,6 +66,9 @@ class IncrementalEstimator:
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0])
         self.intervals: list[KeyframeInterval] = []
         self._places: set[int] = set()  # that iSAM2 knows
+        self._own_places: dict[float, int] = {}  # time of a landmark -> number of the place that it is by itself
+        self._native: list[list[Factor]] = []  # of each keyframe, those that are no measurements
+        self._due = list(RELINEARISE_AT_S)
         self._begun = 0.0  # when the newest segment began [s]
         self.updated = -1
 
@@ -80,8 +85,7 @@ class IncrementalEstimator:
     def step(self, interval: KeyframeInterval) -> FilterStep:
         """Take an interval: predicted and gated from what iSAM2 knows of the keyframe before, then given to it."""
         done = self.filter.step(interval, self.known, self.gates)
-        self.known = done.filtered
-        self.take(interval, self.known, done.processed)
+        self.take(interval, done.filtered, done.processed)
         self.history.append(interval, self.known, done.processed)
         return done
 
@@ -94,33 +98,27 @@ class IncrementalEstimator:
         known : where to linearise it at first
         processed : its measurements
         """
-        b, segment = self.beginning, interval.segment
-        first = not self.intervals
-        factors = priors(b.prior, self.beliefs, self.unknowns) if first else motion(interval, self.unknowns, segment)
+        self.known = known
         values = state_values(interval.index, known.state)
-        if first or segment > self.intervals[-1].segment:
-            factors += drift(self.unknowns, segment, interval.time - self._begun)
-            insert_calibration(values, known.state.calibration, self.unknowns, segment)
-            self._begun = interval.time
-        known_to_kernels: dict[tuple[int, int], list[KeyframeMeasurement]] = {}
-        for one in processed:
-            m, landmark = one.measurement, one.measurement.landmark
-            if self.filter.knows(m.sensor):
-                if one.weight > 0.0:
-                    known_to_kernels.setdefault((m.keyframe, m.segment), []).append(m)
-            elif one.weight > 0.0 or landmark is not None:  # a place that fits none of its name is one by itself
-                block = self.filter.block([m], self.unknowns)
-                factors.append(measurement_factor(block, m.segment))
-                if landmark is not None and landmark.number not in self._places:
-                    self._places.add(landmark.number)
-                    insert_places(values, block, known.state)
-                    factors.append(landmark_prior(landmark.number))
-        factors += [self._factor(own, *at) for at, own in known_to_kernels.items()]
-        self.engine.add(factors, values)
-        if any(m.landmark for m in interval.measurements):
+        if not self.intervals or interval.segment > self.intervals[-1].segment:
+            insert_calibration(values, known.state.calibration, self.unknowns, interval.segment)
+        # a place that fits none of its name is one by itself
+        admitted = [p.measurement for p in processed if p.weight > 0.0 or p.measurement.landmark is not None]
+        for m in admitted:
+            if m.landmark is not None and m.landmark.number not in self._places:
+                insert_places(values, self.filter.block([m], self.unknowns), known.state)
+        self._native.append(self._motion(interval))
+        self.engine.add([*self._native[-1], *self._factors(admitted)], values)
+        own = {m.time: m.landmark.number for m in interval.measurements if m.landmark is not None}
+        if own:
+            self._own_places |= own
             interval = replace(interval, measurements=[one.measurement for one in processed])
         self.intervals.append(interval)
-        if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
+        if self._due and interval.time - self.intervals[0].time >= self._due[0]:
+            self.update()
+            self._due.pop(0)
+            self._relinearise()
+        elif interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
             self.update()
 
     def update(self) -> None:
@@ -129,10 +127,14 @@ class IncrementalEstimator:
             return
         self.engine.update()
         self.updated = len(self.intervals) - 1
+        self._know()
+
+    def _know(self) -> None:
+        """The newest keyframe as iSAM2 has it."""
         newest = self.intervals[-1]
-        places = [place.number for place in self.known.places]
-        state, P, positions = self.engine.newest(newest.index, newest.segment, places)
-        remembered = tuple(replace(p, position=q) for p, q in zip(self.known.places, positions, strict=True))
+        places = [place for place in self.known.places if place.number in self._places]
+        state, P, positions = self.engine.newest(newest.index, newest.segment, [place.number for place in places])
+        remembered = tuple(replace(p, position=q) for p, q in zip(places, positions, strict=True))
         self.known = Gaussian.of(state, P, remembered)
 
     def latest(self) -> State:
@@ -150,9 +152,60 @@ class IncrementalEstimator:
     def solve(self) -> Estimate:
         """The smoothed trajectory with its uncertainty."""
         self.update()
-        intervals = resolved_associations(self.intervals)
-        problem, solution = segmented_problem(intervals, self.beginning, self.beliefs, self.engine.values())
-        return smoothed(GraphOptimum(intervals, self.beginning, self.beliefs, problem, solution), self.beginning)
+        return smoothed(self._optimum(), self.beginning)
+
+    def _optimum(self) -> GraphOptimum:
+        """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
+        given = self.beginning, self.beliefs
+        best = segmented_optimum(resolved_associations(self.intervals), *given, self.engine.values())
+        block = best.blocks.get(PLACE)
+        if block is None or not (out := block.time[block.believed & ~best.gates[PLACE]]).size:
+            return best
+        apart = [apart_from(interval, {t: self._own_places[t] for t in out.tolist()}) for interval in self.intervals]
+        return segmented_optimum(resolved_associations(apart), *given, self.engine.values())
+
+    def _relinearise(self) -> None:
+        """Go on from the optimum of the dive so far, with all factors linearised there, and what it lets in."""
+        best = self._optimum()
+        self.engine = Incremental(self.unknowns)
+        before, self._places = self._places | set(best.places), set()
+        gates = {sensor: iter(gate.tolist()) for sensor, gate in best.gates.items()}
+        factors: list[Factor] = []
+        for interval, native in zip(best.intervals, self._native, strict=True):
+            admitted = [m for m in interval.measurements if next(gates[m.sensor])]
+            factors += [*native, *self._factors(admitted)]
+        values = best.solution.point
+        for number in before - self._places:
+            values.erase(key(PLACE, number))
+        self.engine.add(factors, values)
+        self.engine.update()
+        self._know()
+
+    def _motion(self, interval: KeyframeInterval) -> list[Factor]:
+        """What ties a keyframe to the one before, or to what is believed at first."""
+        segment, unknowns = interval.segment, self.unknowns
+        if not self.intervals:
+            factors = priors(self.beginning.prior, self.beliefs, unknowns)
+        else:
+            factors = motion(interval, unknowns, segment)
+        if not self.intervals or segment > self.intervals[-1].segment:
+            factors += drift(unknowns, segment, interval.time - self._begun)
+            self._begun = interval.time
+        return factors
+
+    def _factors(self, measurements: Sequence[KeyframeMeasurement]) -> list[Factor]:
+        """Factors of measurements, those that the kernels know of one keyframe in one."""
+        factors: list[Factor] = []
+        together: dict[tuple[int, int], list[KeyframeMeasurement]] = {}
+        for m in measurements:
+            if self.filter.knows(m.sensor):
+                together.setdefault((m.keyframe, m.segment), []).append(m)
+                continue
+            factors.append(measurement_factor(self.filter.block([m], self.unknowns), m.segment))
+            if m.landmark is not None and m.landmark.number not in self._places:
+                self._places.add(m.landmark.number)
+                factors.append(landmark_prior(m.landmark.number))
+        return factors + [self._factor(own, *at) for at, own in together.items()]
 
     def _factor(self, measurements: Sequence[KeyframeMeasurement], keyframe: int, segment: int) -> Factor:
         """All measurements of a keyframe that the kernels know."""

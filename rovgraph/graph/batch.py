@@ -176,12 +176,6 @@ def solve(problem: Problem, values: gtsam.Values) -> Solution[gtsam.Values]:
     return minimise(problem, values)
 
 
-def solution_at(problem: Problem, values: gtsam.Values) -> Solution[gtsam.Values]:
-    """The optimum that another solver found, as a `Solution`."""
-    gates = problem.gates(values)
-    return Solution(values, gates, problem.cost(values, gates), 0, True)
-
-
 def eliminate_step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
     """The solution of a linear graph: Cholesky, and QR where rounding makes that indefinite.
 

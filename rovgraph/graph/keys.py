@@ -5,6 +5,7 @@ from rovgraph.engine.unknowns import Unknowns
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
 _LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n"}
+_NAMES = {ord(letter): variable for variable, letter in _LETTER.items()}
 _SIZE = DIMENSION | {PLACE: PLACE_DIM}
 _INDICES = 1 << 56  # of a letter
 _PLACES = ord(_LETTER[PLACE])
@@ -51,8 +52,9 @@ def key_name(key: int) -> str:
 
 def _variable(letter: int) -> str:
     """Whose letter it is."""
-    letters = _LETTER | {variable.name: variable.letter for variable in TABLE.values()}
-    return next(name for name, own in letters.items() if ord(own) == letter)
+    if letter in _NAMES:
+        return _NAMES[letter]
+    return next(variable.name for variable in TABLE.values() if ord(variable.letter) == letter)
 
 
 def calibration_key(unknowns: Unknowns, name: str, index: int) -> int:

@@ -31,7 +31,7 @@ from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, make_problem, make_values, solution_at, solve
+from rovgraph.graph.batch import Problem, make_problem, make_values, solve
 from rovgraph.graph.information import eliminate
 from rovgraph.graph.keys import key
 from rovgraph.graph.optimum import GraphOptimum
@@ -69,16 +69,26 @@ def smooth_graph(
     return GraphOptimum(recognised_dive, initial, beliefs, together, solve(together, values))
 
 
-def segmented_problem(
+def segmented_optimum(
     intervals: Sequence[KeyframeInterval],
     initial: InitialConditions,
     beliefs: Mapping[str, Belief],
     values: gtsam.Values,
-) -> tuple[Problem, Solution[gtsam.Values]]:
-    """The graph whose calibration has a value for each segment of time, and the optimum that iSAM2 has found of it."""
+) -> GraphOptimum:
+    """The optimum of the graph whose calibration has a value for each segment of time, as iSAM2's has.
+
+    Parameters
+    ----------
+    intervals, initial : the dive, each landmark given to its place
+    beliefs : of the calibration, all of which walks
+    values : iSAM2's, to begin with
+    """
     segments = np.array([interval.segment for interval in intervals])
     problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments, segments)
-    return problem, solution_at(problem, values)
+    values = gtsam.Values(values)
+    if (block := problem.blocks.get(PLACE)) is not None:
+        insert_places(values, block, problem.states(values).at(block.keyframe))
+    return GraphOptimum(list(intervals), initial, beliefs, problem, solve(problem, values))
 
 
 def recognised(
@@ -109,6 +119,16 @@ def resolved_associations(intervals: Sequence[KeyframeInterval]) -> list[Keyfram
     """A dive whose landmarks have been given to places one by one: what fits no other of its name is not believed."""
     seen = _landmarks(intervals)
     return _given(intervals, _resolved(seen, [_number(a) for a in seen]))
+
+
+def apart_from(interval: KeyframeInterval, numbers: Mapping[float, int]) -> KeyframeInterval:
+    """An interval whose landmarks of some times are each of the place of that number."""
+    found = {
+        a.time: replace(a, landmark=a.landmark._replace(number=numbers[a.time]))
+        for a in interval.measurements
+        if a.landmark is not None and a.time in numbers
+    }
+    return _given([interval], found)[0]
 
 
 def insert_places(values: gtsam.Values, block: Block, states: State) -> None:

@@ -8,7 +8,7 @@ import time as host
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
-from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
 from rovgraph.geometry import Array
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
@@ -29,6 +28,9 @@ from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.startup import Startup
 from rovgraph.log import Log, Measurement
+
+if TYPE_CHECKING:
+    from rovgraph.estimators.incremental import IncrementalEstimator
 
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
@@ -44,9 +46,9 @@ class Navigator:
     config : what is believed of vehicle and sensors
     patient : wait for the thread that smooths, so that a replay can be repeated
     reinitialise : the filter from the smoothed dive so far, now and then
-    smooth : have iSAM2 smooth the whole dive as it goes
+    smooth : have iSAM2 estimate the whole dive as it goes; the filter goes on from its newest keyframe
     clocks, faults, health : of the sources, and of the sensors
-    isam2 : the smoother, where it was asked for
+    isam2 : iSAM2, where it was asked for; it takes each keyframe that the lag has passed
     engine : None until the first seconds are over
     time : of the newest measurement, or of the last `tick` [s]
     passed : marks that the lag has passed, since they were last taken
@@ -62,7 +64,7 @@ class Navigator:
     faults: Faults = field(default_factory=Faults)
     health: Health = field(default_factory=Health)
     engine: FixedLag | None = None
-    isam2: IncrementalEstimator | None = None
+    isam2: "IncrementalEstimator | None" = None
     time: float = -np.inf
     passed: list[FilterSnapshot] = field(default_factory=list)
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -73,7 +75,8 @@ class Navigator:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
-        self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise else None
+        self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
+        self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
         self._events: list[Event] = []
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
@@ -228,6 +231,8 @@ class Navigator:
         """The first seconds are over, or an estimate goes on from its state."""
         config = beginning.config
         if self.smooth:
+            from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
+
             self.isam2 = IncrementalEstimator(beginning, UPDATE_S)
         self.engine = FixedLag(beginning, config.graph.lag_s, config.online.hold_s, self._pass, learn_noise=True)
         if state is not None:
@@ -255,9 +260,18 @@ class Navigator:
             waited = 0.0
             if self._reinitialisations is not None:
                 waited = self._reinitialisations.step(engine)
+            if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
+                self._adopt(engine, self.isam2)
             self.health.step(engine.marks)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
+
+    def _adopt(self, engine: FixedLag, isam2: "IncrementalEstimator") -> None:
+        """Have the filter go on from iSAM2's newest keyframe."""
+        newest = self.passed[-1]
+        if isam2.updated == newest.interval.index:
+            engine.adopt_passed(isam2.known, newest.gates)
+            self._adopted = isam2.updated
 
     def _pass(self, mark: FilterSnapshot) -> None:
         self.passed.append(mark)

@@ -23,6 +23,7 @@ FAMILIES: dict[str, dict[str, Any]] = {
     "thesis": {"color": "#D55E00", "marker": "o"},
     "error state": {"color": "#009E73", "marker": "^"},
     "graph": {"color": "#0072B2", "marker": "D"},
+    "isam2": {"color": "#E69F00", "marker": "P"},
 }
 OTHER: dict[str, Any] = {"color": "#CC79A7", "marker": "v"}
 INSIDE, OUTSIDE = "#0072B2", "#D55E00"

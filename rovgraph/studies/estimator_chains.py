@@ -44,7 +44,7 @@ class EstimatorSpec:
     Attributes
     ----------
     name : key of `rovgraph.studies.estimators.ESTIMATORS`
-    family : "dead reckoning", "thesis", "error state", "graph"
+    family : "dead reckoning", "thesis", "error state", "graph", "isam2"
     about : one line of what it is
     headings : "a", "b", "c", or "" for those of the configuration
     misalignment : whether the DVL's misalignment is estimated
@@ -256,3 +256,22 @@ def stepped(batch: BatchSmoother) -> ErrorStateFilter:
 def reinitialised(batch: BatchSmoother) -> ErrorStateFilter:
     """The same, going on from the smoothed dive so far now and then."""
     return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S)
+
+
+def incremental(batch: BatchSmoother) -> Any:
+    """iSAM2 over the same keyframes: an `rovgraph.estimators.incremental.IncrementalEstimator`."""
+    from rovgraph.estimators.incremental import run_isam2  # GTSAM is slow to load, and not everywhere to be had
+
+    return run_isam2(batch.intervals, batch.beginning)
+
+
+def filtered_by_isam2(estimator: Any) -> Estimate:
+    """Each keyframe when it was the newest."""
+    estimate: Estimate = estimator.filtered()
+    return estimate
+
+
+def smoothed_by_isam2(estimator: Any) -> Estimate:
+    """All keyframes from the whole dive."""
+    estimate: Estimate = estimator.solve()
+    return estimate

@@ -12,7 +12,16 @@ from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.estimators.thesis import FILTERS, Filter
-from rovgraph.studies.estimator_chains import EstimatorSpec, Stage, assembled, reinitialised, stepped
+from rovgraph.studies.estimator_chains import (
+    EstimatorSpec,
+    Stage,
+    assembled,
+    filtered_by_isam2,
+    incremental,
+    reinitialised,
+    smoothed_by_isam2,
+    stepped,
+)
 
 _REINITIALISED = "filter reinitialised from the graph of the dive so far"
 _LETTERS = {(True, True): "a", (False, True): "b", (True, False): "c"}  # magnetometer, compass
@@ -67,6 +76,8 @@ ESTIMATORS: dict[str, EstimatorSpec] = {
             ErrorStateFilter.solve,
         ),
         *_variants("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
+        *_variants("isam2-filtered", "isam2", "iSAM2, each keyframe when new", False, incremental, filtered_by_isam2),
+        *_variants("isam2-smoothed", "isam2", "iSAM2, whole dive at its end", True, incremental, smoothed_by_isam2),
         _driven("ekf", "error state", "error-state Kalman filter", False, stepped, ErrorStateFilter.solve),
         _driven("graph-smoothed", "graph", "factor graph, whole dive", True, BatchSmoother.solve),
     )

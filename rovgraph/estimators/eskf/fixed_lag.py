@@ -141,6 +141,20 @@ class FixedLag:
         self._assembler.time_offsets.assume(self.marks[-1].known.state.calibration)
         return True
 
+    def adopt_passed(self, known: Gaussian, gates: Gates) -> None:
+        """Go on from a better estimate of the keyframe that the lag has passed last, by the intervals since.
+
+        Parameters
+        ----------
+        known, gates : its estimate, and the sensors that were left out there
+        """
+        self._gates = dict(gates)
+        for k, mark in enumerate(self.marks):
+            done = self.filter.step(mark.interval, known, self._gates)
+            known = done.filtered
+            self.marks[k] = replace(mark, known=known, gates=dict(self._gates), processed=done.processed)
+        self._assembler.time_offsets.assume(known.state.calibration)
+
     def oldest(self) -> FilterSnapshot:
         """The oldest mark that the filter can go on from: the last of those that came at once."""
         ends = (a for a, b in pairwise(self.marks) if a.taken != b.taken)

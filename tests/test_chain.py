@@ -1,0 +1,230 @@
+"""The chain of keyframes and GTSAM's graph are the same problem: the same optimum, and the same certainty."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dives import altered, batch, changed, falcon, interrupted, simulated, started
+
+from rovgraph.calibration import TABLE
+from rovgraph.config import Config, beliefs
+from rovgraph.engine import gauss_newton
+from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
+from rovgraph.engine.optimum import Optimum
+from rovgraph.estimators.dead_reckoning import dead_reckon
+from rovgraph.geometry import Array, log_rotation, transpose
+from rovgraph.graph.optimum import GraphOptimum
+from rovgraph.graph.places import smooth_graph
+from rovgraph.log import Log
+from rovgraph.simulate import Style, Waves
+from rovgraph.simulate.files import write_log
+from rovgraph.state import BIAS, POSE, VELOCITY
+
+EXACT = 1e-13  # of the cost, at which both stop here
+SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0}
+WILD = Style(waves=Waves(heave=0.2, roll=0.4, pitch=0.35))
+
+
+def estimated(*names: str, **others) -> dict:
+    return {"calibration": {name: {"estimate": True} for name in names} | others}
+
+
+Case = tuple[Log, Config]
+
+
+def both_compasses() -> Case:
+    case = simulated(falcon(**estimated("dvl_yaw")), 60.0, seed=6, **SHORT)
+    return case.log, case.config
+
+
+def walking() -> Case:
+    config = falcon(**estimated("dvl_yaw", mag_offset={"estimate": True, "walk_deg": 0.1}))
+    case = simulated(config, 60.0, seed=2, **SHORT)
+    return case.log, case.config
+
+
+def scales() -> Case:
+    config = falcon(calibration={n: {"estimate": True, "sd": 0.01} for n in ("acc_scale", "gyr_scale")})
+    case = simulated(config, 50.0, seed=2, style=WILD, **SHORT)
+    return case.log, case.config
+
+
+def time_offset() -> Case:
+    others = {name: {"estimate": False} for name in TABLE}
+    config = falcon(calibration=others | {"dvl_time_offset": {"estimate": True, "sd": 0.1}})
+    case = simulated(config, 45.0, seed=2, calibration={"dvl_time_offset": np.array([0.1])}, **SHORT)
+    return case.log, started(case)
+
+
+def outage() -> Case:
+    case = simulated(falcon(), 60.0, seed=4, **SHORT)
+    return interrupted(case.log, 40.0, 1.6, "imu"), changed(case.config, imu={"max_gap_s": 5.0})
+
+
+def outliers() -> Case:
+    case = simulated(falcon(**estimated("dvl_yaw")), 60.0, seed=7, **SHORT)
+    data = case.log["dvl"].data.copy()
+    data[20::17, 0] += 1.0
+    return altered(case.log, "dvl", data), case.config
+
+
+SCENARIOS: dict[str, Callable[[], Case]] = {
+    "both compasses and misalignment": both_compasses,
+    "calibration that walks": walking,
+    "scales of the IMU": scales,
+    "time offset of the DVL": time_offset,
+    "IMU outage": outage,
+    "outliers": outliers,
+}
+
+
+@pytest.fixture(scope="module", params=SCENARIOS, ids=lambda name: name.replace(" ", "_"))
+def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
+    """A dive, solved by both until neither moves any more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gauss_newton, "RELATIVE_DECREASE", EXACT)
+        dive = batch(*SCENARIOS[request.param]())
+        b = dive.beginning
+        states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
+        both = smooth_chain(dive.intervals, b, states), smooth_graph(dive.intervals, b, states)
+    assert IS_SO[request.param](both[0]), "the scenario is not what it is called"
+    return both
+
+
+IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
+    "both compasses and misalignment": lambda best: {"mag", "dvl_heading"} <= set(best.blocks),
+    "calibration that walks": lambda best: best.chain.d > 15,
+    "scales of the IMU": lambda best: {"acc_scale", "gyr_scale"} <= set(best.unknowns.estimated),
+    "time offset of the DVL": lambda best: "dvl_time_offset" in best.unknowns.estimated,
+    "IMU outage": lambda best: any(i.motion is not None and i.motion.coasted for i in best.intervals),
+    "outliers": lambda best: 5 < int((~best.gates["dvl"]).sum()) < 20,
+}
+
+
+def sds(best: Optimum, variable: str) -> Array:
+    return np.sqrt(np.diagonal(best.covariances(variable), axis1=1, axis2=2))
+
+
+def test_both_come_to_the_same_cost(solved):
+    chain, graph = solved
+    assert isinstance(chain, ChainOptimum) and isinstance(graph, GraphOptimum)
+    assert chain.converged and graph.converged
+    assert chain.cost == pytest.approx(graph.cost, rel=1e-6)
+    for sensor, gate in graph.gates.items():
+        np.testing.assert_array_equal(chain.gates[sensor], gate)
+
+
+def test_both_come_to_the_same_states(solved):
+    chain, graph = solved
+    a, b = chain.state, graph.state
+    np.testing.assert_allclose(a.p_n, b.p_n, atol=1e-5)
+    np.testing.assert_allclose(a.v_n, b.v_n, atol=1e-5)
+    assert np.abs(log_rotation(transpose(a.R_nb) @ b.R_nb)).max() < 1e-5
+    for name in chain.unknowns.estimated:
+        sd = sds(graph, name)
+        assert (np.abs(a.calibration[name] - b.calibration[name]) < 1e-3 * sd).all(), name
+    assert (np.abs(a.bias - b.bias) < 1e-3 * sds(graph, BIAS)).all()
+
+
+def test_both_know_them_equally_well(solved):
+    chain, graph = solved
+    for variable in (POSE, VELOCITY, BIAS, *chain.unknowns.estimated):
+        np.testing.assert_allclose(sds(chain, variable), sds(graph, variable), rtol=1e-4, err_msg=variable)
+    a, b = chain.newest_covariance(), graph.newest_covariance()
+    sd = np.sqrt(np.diag(b))
+    np.testing.assert_allclose(a / np.outer(sd, sd), b / np.outer(sd, sd), atol=1e-4)
+
+
+def test_both_weigh_the_measurements_alike(solved):
+    chain, graph = solved
+    assert set(chain.weights) == set(graph.weights)
+    for sensor, weight in graph.weights.items():
+        np.testing.assert_allclose(chain.weights[sensor], weight, atol=1e-4)
+
+
+def test_both_say_the_same_of_the_calibration_as_the_dive_goes_on(solved):
+    chain, graph = solved
+    end = len(chain.intervals) - 1
+    keyframes = [end // 3, 2 * end // 3, end]
+    a, b = chain.knowledge(keyframes), graph.knowledge(keyframes)
+    assert a.keyframe.tolist() == b.keyframe.tolist() == keyframes
+    for mine, other in zip(a.covariance, b.covariance, strict=True):
+        sd = np.sqrt(np.diag(other))
+        np.testing.assert_allclose(mine / np.outer(sd, sd), other / np.outer(sd, sd), atol=1e-4)
+
+
+def test_noise_of_the_states_adds_as_much_information_to_both(solved):
+    """The draws differ: so the mean of some is compared, to what a draw of them may differ by."""
+    chain, graph = solved
+    end = [len(chain.intervals) - 1]
+    sd = np.sqrt(np.diag(graph.knowledge(end).calibration[0]))
+
+    def gained(best: Optimum) -> Array:
+        known = [P for seed in range(1, 5) for P in best.noisier(end, seed)]
+        return np.array([np.sqrt(np.diag(k.calibration[0])) / sd for k in known])
+
+    a, b = gained(chain), gained(graph)
+    allowed = 5.0 * np.sqrt((a.var(axis=0) + b.var(axis=0)) / len(a)) + 1e-3
+    assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < allowed).all()
+
+
+def test_both_move_alike_when_a_constant_is_held(solved):
+    chain, _ = solved
+    constant = [name for name, walk in chain.unknowns.walks.items() if not walk]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gauss_newton, "RELATIVE_DECREASE", EXACT)
+        (a, by_a), (b, by_b) = (best.holding(constant[:1]) for best in solved)
+    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+    np.testing.assert_allclose(a.state.p_n, b.state.p_n, atol=1e-5)
+    for variable in (POSE, VELOCITY, BIAS):
+        np.testing.assert_allclose(
+            by_a[variable], by_b[variable], atol=1e-4 * np.abs(by_b[variable]).max(), err_msg=variable
+        )
+
+
+# a machine without GTSAM
+
+WITHOUT_GTSAM = """
+import sys
+sys.modules["gtsam"] = None
+from rovgraph.cli import app
+sys.argv = ["rovgraph", *sys.argv[1:]]
+app.main()
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """A short dive, with places and without, and its configuration."""
+    folder = tmp_path_factory.mktemp("dive")
+    case = simulated(falcon(), 33.0, seed=3, path="circle", places=((0.0, 1.0),), **SHORT)
+    frame = case.dive.log_frame
+    assert frame["place_id"].notna().any()
+    write_log(frame, folder / "places.csv")
+    write_log(frame.drop(columns=[c for c in frame if c.startswith("place")]), folder / "log.csv")
+    (folder / "config.yaml").write_text(case.config.to_yaml(), encoding="utf-8")
+    return folder
+
+
+def smoothed_without_gtsam(folder: Path, log: str) -> subprocess.CompletedProcess:
+    arguments = ["smooth", folder / log, "--config", folder / "config.yaml", "--out", folder / f"out-{log}"]
+    command = [sys.executable, "-c", WITHOUT_GTSAM, *arguments, "--no-figures"]
+    return subprocess.run([str(a) for a in command], capture_output=True, text=True, timeout=300)
+
+
+def test_a_dive_without_places_is_smoothed_where_gtsam_is_missing(recorded):
+    done = smoothed_without_gtsam(recorded, "log.csv")
+    assert done.returncode == 0, done.stderr[-1000:]
+    written = {path.name for path in (recorded / "out-log.csv").iterdir()}
+    assert {"trajectory_smoothed.csv", "trajectory_filtered.csv"} <= written
+
+
+def test_a_dive_with_places_says_in_one_line_that_gtsam_is_missing(recorded):
+    done = smoothed_without_gtsam(recorded, "places.csv")
+    assert done.returncode == 2
+    said = [line for line in done.stderr.splitlines() if not line.startswith("warning:")]
+    assert len(said) == 1 and "gtsam" in said[0] and "pip install" in said[0]
+    assert not (recorded / "out-places.csv").exists()
