@@ -100,7 +100,7 @@ IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
     "scales of the IMU": lambda best: {"acc_scale", "gyr_scale"} <= set(best.unknowns.estimated),
     "time offset of the DVL": lambda best: "dvl_time_offset" in best.unknowns.estimated,
     "IMU outage": lambda best: any(i.motion is not None and i.motion.coasted for i in best.intervals),
-    "outliers": lambda best: 5 < int((~best.gates["dvl"]).sum()) < 20,
+    "outliers": lambda best: 5 < int((~best.solution.gates["dvl"]).sum()) < 20,
 }
 
 
@@ -111,10 +111,10 @@ def sds(best: Optimum, variable: str) -> Array:
 def test_both_come_to_the_same_cost(solved):
     chain, graph = solved
     assert isinstance(chain, ChainOptimum) and isinstance(graph, GraphOptimum)
-    assert chain.converged and graph.converged
-    assert chain.cost == pytest.approx(graph.cost, rel=1e-6)
-    for sensor, gate in graph.gates.items():
-        np.testing.assert_array_equal(chain.gates[sensor], gate)
+    assert chain.solution.converged and graph.solution.converged
+    assert chain.solution.cost == pytest.approx(graph.solution.cost, rel=1e-6)
+    for sensor, gate in graph.solution.gates.items():
+        np.testing.assert_array_equal(chain.solution.gates[sensor], gate)
 
 
 def test_both_come_to_the_same_states(solved):
@@ -177,7 +177,7 @@ def test_both_move_alike_when_a_constant_is_held(solved):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "RELATIVE_DECREASE", EXACT)
         (a, by_a), (b, by_b) = (best.holding(constant[:1]) for best in solved)
-    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+    assert a.solution.cost == pytest.approx(b.solution.cost, rel=1e-6)
     np.testing.assert_allclose(a.state.p_n, b.state.p_n, atol=1e-5)
     for variable in (POSE, VELOCITY, BIAS):
         np.testing.assert_allclose(

@@ -159,7 +159,7 @@ class IncrementalEstimator:
         given = self.beginning, self.beliefs
         best = segmented_optimum(resolved_associations(self.intervals), *given, self.engine.values())
         block = best.blocks.get(PLACE)
-        if block is None or not (out := block.time[block.believed & ~best.gates[PLACE]]).size:
+        if block is None or not (out := block.time[block.believed & ~best.solution.gates[PLACE]]).size:
             return best
         apart = [apart_from(interval, {t: self._own_places[t] for t in out.tolist()}) for interval in self.intervals]
         return segmented_optimum(resolved_associations(apart), *given, self.engine.values())
@@ -169,7 +169,7 @@ class IncrementalEstimator:
         best = self._optimum()
         self.engine = Incremental(self.unknowns)
         before, self._places = self._places | set(best.places), set()
-        gates = {sensor: iter(gate.tolist()) for sensor, gate in best.gates.items()}
+        gates = {sensor: iter(gate.tolist()) for sensor, gate in best.solution.gates.items()}
         factors: list[Factor] = []
         for interval, native in zip(best.intervals, self._native, strict=True):
             admitted = [m for m in interval.measurements if next(gates[m.sensor])]
