@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 
-from rovgraph.estimators.thesis import FILTERS, Asked, run_filters
+from rovgraph.estimators.thesis import FILTERS, FilterJob, run_filters
 from rovgraph.estimators.thesis.processes import length
 from rovgraph.estimators.thesis.setup import prepare
 from rovgraph.live.checkpoint import write_checkpoint
@@ -92,14 +92,14 @@ def thesis_filter(folder: Path) -> list[Pair]:
     pairs = []
     for name in ("4.3a", "4.4a", "4.5"):
         n = length(prepare(FILTERS[name], log, config).places)
-        asked = [Asked(FILTERS[name], log, config)]
+        asked = [FilterJob(FILTERS[name], log, config)]
         pairs.append(
             Pair(
                 f"filter {name}, 12 s", f"textbook Kalman filter of {n} states in NumPy",
                 lambda asked=asked: run_filters(asked), lambda n=n: textbook(n, len(log["imu"])), 5.5,
             )
         )  # fmt: skip
-    one, many = ([Asked(FILTERS["4.3a"], log, config)] * count for count in (1, 15))
+    one, many = ([FilterJob(FILTERS["4.3a"], log, config)] * count for count in (1, 15))
     side_by_side = Pair(
         "fifteen filters side by side, each", "one alone",
         lambda: run_filters(many), lambda: run_filters(one), 2.0 / 3.0, share=15,

@@ -75,7 +75,7 @@ def test_without_noise_it_is_exact_through_starts_stops_and_turns(exact):
 def test_pings_between_keyframes_count_as_those_at_keyframes(exact):
     far = started(exact, graph={"min_gap_s": 0.9})
     smoother = batch(exact.log, far)
-    pings = [a for i in smoother.intervals for a in i.attached if a.sensor == "dvl"]
+    pings = [a for i in smoother.intervals for a in i.measurements if a.sensor == "dvl"]
     assert np.mean([a.motion.dt > 0.0 for a in pings]) > 0.7
     assert position_errors(smoother.dead_reckoning().trajectory, exact).max() < 0.01
 
@@ -178,7 +178,7 @@ def test_a_gyro_at_rest_shows_its_bias_beside_the_earths_rate():
     case = simulated(falcon(**sections), 300.0, noise=False, style=style)
     smoother = batch(case.log, started(case))
     assert any("gyro bias" in line for line in smoother.beginning.assumptions)
-    assert np.abs(smoother.beginning.start.state.bias[0, 3:]).max() < 1e-6
+    assert np.abs(smoother.beginning.prior.state.bias[0, 3:]).max() < 1e-6
     track = smoother.dead_reckoning().trajectory
     assert np.rad2deg(np.abs(attitude_errors(track, case))).max() < 0.01
 

@@ -289,7 +289,7 @@ def test_a_renewed_filter_knows_the_places_as_the_graph_does(lost):
     best = graph_of(lost)
     numbers = sorted(set(best.problem.blocks["place"].place.tolist()))
     P = best.newest_covariance(numbers)
-    known = covariances(marginals(best.problem, best.solution.point, best.gates))
+    known = covariances(marginals(best.problem, best.solution.point, best.solution.gates))
     for k, number in enumerate(numbers[::-1]):
         own = P[len(P) - 2 * (k + 1) :, len(P) - 2 * (k + 1) :][:2, :2]
         np.testing.assert_allclose(own, known[key("place", number)], rtol=1e-5)
@@ -325,7 +325,7 @@ def test_information_about_the_calibration_is_the_graphs_with_places_in_it(lost)
     end = best.problem.count - 1
     seen = best.knowledge([end // 3, 2 * end // 3, end])
     names, column = best.unknowns.estimated, OTHERS
-    known = covariances(marginals(best.problem, best.solution.point, best.gates))
+    known = covariances(marginals(best.problem, best.solution.point, best.solution.gates))
     for name in names:
         P = known[calibration_key(best.unknowns, name, int(best.problem.index[-1]))]
         own = slice(column, column + len(P))
