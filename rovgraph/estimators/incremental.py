@@ -156,7 +156,7 @@ class IncrementalEstimator:
 
     def _optimum(self) -> GraphOptimum:
         """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
-        given = self.beginning, self.beliefs
+        given = self.beginning, self.beliefs, [factor for own in self._native for factor in own]
         best = segmented_optimum(resolved_associations(self.intervals), *given, self.engine.values())
         block = best.blocks.get(PLACE)
         if block is None or not (out := block.time[block.believed & ~best.gates[PLACE]]).size:
