@@ -33,7 +33,8 @@ from rovgraph.log import Measurement
 from rovgraph.state import PLACE, State
 
 UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
-RELINEARISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0)  # all factors: before, heading and compasses may be far off
+# since the start [s], all factors: in between, iSAM2 finds too late that the heading has moved, and claims too much
+RELINEARISE_AT_S = (5.0, 7.0, 10.0, 14.0, 20.0, 24.0, 28.0, 34.0, 40.0, 50.0, 60.0, 80.0)
 STIFF = 2e-4  # walk of a constant, as a part of its prior's sd per root second
 
 
@@ -156,7 +157,7 @@ class IncrementalEstimator:
 
     def _optimum(self) -> GraphOptimum:
         """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
-        given = self.beginning, self.beliefs
+        given = self.beginning, self.beliefs, [factor for own in self._native for factor in own]
         best = segmented_optimum(resolved_associations(self.intervals), *given, self.engine.values())
         block = best.blocks.get(PLACE)
         if block is None or not (out := block.time[block.believed & ~best.solution.gates[PLACE]]).size:

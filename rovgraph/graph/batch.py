@@ -137,16 +137,15 @@ def make_problem(
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],
     index: NDArray[np.int64] | None = None,
+    others: Sequence[gtsam.NonlinearFactor] | None = None,
 ) -> Problem:
-    """Assemble the graph of a dive; ``index`` as `Problem` has it, a value for each keyframe unless given."""
+    """Assemble the graph of a dive; ``index`` as `Problem` has it, a value for each keyframe unless given.
+
+    ``others`` are the factors that are no measurements, where they are at hand.
+    """
     index = np.arange(len(intervals)) if index is None else index
     wanted = unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
-    factors = priors(prior, beliefs, wanted)
-    for interval, own in zip(intervals, index.tolist(), strict=True):
-        factors += motion(interval, wanted, own)
-    begun = np.flatnonzero(np.diff(index, prepend=-1))
-    for before, after in pairwise(begun.tolist()):
-        factors += drift(wanted, int(index[after]), intervals[after].time - intervals[before].time)
+    factors = list(others) if others is not None else _others(intervals, prior, beliefs, wanted, index)
     blocks = blocks_of(intervals, instruments, config.environment.gravity_mps2, wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
@@ -154,6 +153,23 @@ def make_problem(
     for factor in factors:
         native.add(factor)
     return Problem(native, blocks, wanted, index)
+
+
+def _others(
+    intervals: Sequence[KeyframeInterval],
+    prior: StatePrior,
+    beliefs: Mapping[str, Belief],
+    wanted: Unknowns,
+    index: NDArray[np.int64],
+) -> list[gtsam.NonlinearFactor]:
+    """Priors, motions and walks."""
+    factors = priors(prior, beliefs, wanted)
+    for interval, own in zip(intervals, index.tolist(), strict=True):
+        factors += motion(interval, wanted, own)
+    begun = np.flatnonzero(np.diff(index, prepend=-1))
+    for before, after in pairwise(begun.tolist()):
+        factors += drift(wanted, int(index[after]), intervals[after].time - intervals[before].time)
+    return factors
 
 
 def make_values(problem: Problem, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:

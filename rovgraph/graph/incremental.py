@@ -35,7 +35,7 @@ def isam2_params() -> gtsam.ISAM2Params:
     """Parameters of the engine."""
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
-    params.relinearizeSkip = 1
+    params.relinearizeSkip = 10
     params.enablePartialRelinearizationCheck = True  # down the tree, as far as anything has moved
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
     thresholds = gtsam.ISAM2ThresholdMap()

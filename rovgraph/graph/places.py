@@ -73,6 +73,7 @@ def segmented_optimum(
     intervals: Sequence[KeyframeInterval],
     initial: InitialConditions,
     beliefs: Mapping[str, Belief],
+    others: Sequence[gtsam.NonlinearFactor],
     values: gtsam.Values,
 ) -> GraphOptimum:
     """The optimum of the graph whose calibration has a value for each segment of time, as iSAM2's has.
@@ -81,10 +82,11 @@ def segmented_optimum(
     ----------
     intervals, initial : the dive, each landmark given to its place
     beliefs : of the calibration, all of which walks
+    others : factors that are no measurements, of all keyframes
     values : iSAM2's, to begin with
     """
     segments = np.array([interval.segment for interval in intervals])
-    problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments, segments)
+    problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments, segments, others)
     values = gtsam.Values(values)
     if (block := problem.blocks.get(PLACE)) is not None:
         insert_places(values, block, problem.states(values).at(block.keyframe))
