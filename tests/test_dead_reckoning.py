@@ -5,6 +5,7 @@ import pytest
 from dives import (
     LIVELY,
     Simulated,
+    altered,
     as_log,
     attitude_errors,
     batch,
@@ -212,6 +213,33 @@ def test_after_a_silence_of_the_imu_it_levels_itself_at_once():
     assert tilt.max() < 15.0  # as far as it rolled and pitched meanwhile
     assert tilt[track.time > 82.0].max() < 1.5
     assert tilt[track.time > 100.0].max() < 0.6
+
+
+@pytest.mark.parametrize("grade", ["fog", "mti"])
+def test_headings_that_are_wrong_now_and_then_turn_it_little(grade):
+    """One in fifty says anything; the compass is believed to a quarter of a degree."""
+    rng = np.random.default_rng(1)
+    case = simulated(falcon(imu=GRADES[grade], heading={"sources": ["dvl"]}), 200.0, calibration=KNOWN)
+    headings = case.log["dvl_heading"].data.copy()
+    wrong = rng.uniform(size=len(headings)) < 0.02
+    headings[wrong, 0] = rng.uniform(-np.pi, np.pi, wrong.sum())
+    track = reckoned(altered(case.log, "dvl_heading", headings), started(case))
+    assert np.rad2deg(np.abs(attitude_errors(track, case)[:, 2]).max()) < 4.0
+
+
+@pytest.mark.parametrize("grade", ["fog", "mti"])
+@pytest.mark.parametrize("stated", [{"heading_deg": 40.0}, {"roll_deg": 40.0}, {"roll_deg": 120.0}])
+def test_it_recovers_from_a_start_that_is_stated_wrong(grade, stated):
+    case = simulated(falcon(imu=GRADES[grade], heading={"sources": ["dvl"]}), 120.0, 2, calibration=KNOWN)
+    config = started(case)
+    for angle, off in stated.items():
+        own = getattr(config.start, angle)
+        config = changed(config, start={angle: own + off})
+    track = reckoned(case.log, config)
+    error = np.rad2deg(np.abs(attitude_errors(track, case)))
+    assert error[0].max() > 30.0
+    assert error[track.time > 40.0, :2].max() < 1.0
+    assert error[track.time > 40.0, 2].max() < 5.0
 
 
 @pytest.mark.parametrize("sensor", ["mag", "ahrs", "dvl_heading"])

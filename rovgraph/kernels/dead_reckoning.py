@@ -28,7 +28,10 @@ from rovgraph.kernels.rotations import cross, dot, exp_rotation, multiply, rotat
 
 ANGLE, DRIFT = 1, 2  # components of a chain, after velocity or deviation
 DEVIATES_OVER = 1.0  # a turn by which a compass comes to deviate otherwise [rad]
-FULL_SD = 4.0  # of a velocity's innovation; what is larger corrects as one of that size
+SINCE, AWAY, DEVIATION = 0, 1, 2  # of a sensor: time since it was seen, that its innovations are too large, deviation
+FULL_SD = 4.0  # of an innovation; what is larger corrects as one of that size
+LOST_S = 5.0  # for so long a sensor may be wrong
+SHORT_S = 0.02  # between two velocities
 
 
 @helper
@@ -100,38 +103,65 @@ def _move(R: Array, v_n: Array, dR: Array, dv: Array, silent: bool, work: Array)
 
 
 @helper
-def _level(R: Array, v_n: Array, bias: Array, P: Array, v_b: Array, variance: float, work: Array) -> None:
-    """Velocity, tilt and the horizontal bias of the gyro corrected by the velocity ``v_b`` in body axes."""
-    measured, gain, beta = work[0, 0], work[0, 1], work[0, 2]
-    rotate(R, v_b, measured)
-    north, east = measured[0] - v_n[0], measured[1] - v_n[1]
-    full = FULL_SD * _correct(P, 0.0, variance, gain)
-    share = min(1.0, full / max(math.hypot(north, east), 1e-12))
-    north, east = share * north, share * east
-    v_n[0] += gain[0] * north
-    v_n[1] += gain[0] * east
-    beta[0], beta[1], beta[2] = gain[DRIFT] * east, -gain[DRIFT] * north, 0.0
-    rotate_back(R, beta, measured)
-    for i in range(3):
-        bias[i] -= measured[i]
-    _turn(R, gain[ANGLE] * east, -gain[ANGLE] * north, 0.0, work)
+def _count(P: Array, seen: Array, innovation: float, sd: float, by_angle: float) -> float:
+    """The share by which an innovation corrects; where it stays too large, the angle is doubted and the drift.
+
+    One that is too large shows nothing of a drift or a deviation, and may be wrong itself. If all are for `LOST_S`, the angle is:
+    by as much as changes what is measured by that, at ``by_angle`` a radian.
+    """
+    share, since = FULL_SD * sd / max(innovation, 1e-12), seen[SINCE]
+    seen[SINCE] = 0.0
+    if share >= 1.0:
+        seen[AWAY] = 0.0
+        return 1.0
+    seen[AWAY] += since
+    if seen[AWAY] > LOST_S:
+        angle = min(innovation / by_angle, 1.0)
+        P[ANGLE, ANGLE] += angle * angle
+        P[DRIFT, DRIFT] += (angle / seen[AWAY]) ** 2
+        seen[AWAY] = 0.0
+    return share
 
 
 @helper
-def _head(R: Array, v_n: Array, bias: Array, P: Array, innovation: float, variance: float, work: Array) -> float:
-    """Heading and the vertical bias of the gyro corrected by a compass; how much more it deviates than was taken."""
+def _level(
+    R: Array, v_n: Array, bias: Array, P: Array, seen: Array, v_b: Array, variance: float, gravity: float, work: Array
+) -> None:
+    """Velocity, tilt and the horizontal bias of the gyro corrected by the velocity ``v_b`` in body axes."""
+    measured, gain, beta = work[0, 0], work[0, 1], work[0, 2]
+    rotate(R, v_b, measured)
+    north, east, since = measured[0] - v_n[0], measured[1] - v_n[1], seen[SINCE]
+    sd = _correct(P, 0.0, variance, gain)
+    v_n[0] += gain[0] * north
+    v_n[1] += gain[0] * east
+    share = _count(P, seen, math.hypot(north, east), sd, gravity * max(since, SHORT_S))
+    angle, drift = share * gain[ANGLE], gain[DRIFT] if share == 1.0 else 0.0
+    beta[0], beta[1], beta[2] = drift * east, -drift * north, 0.0
+    rotate_back(R, beta, measured)
+    for i in range(3):
+        bias[i] -= measured[i]
+    _turn(R, angle * east, -angle * north, 0.0, work)
+
+
+@helper
+def _head(
+    R: Array, v_n: Array, bias: Array, P: Array, seen: Array, innovation: float, variance: float, work: Array
+) -> None:
+    """Heading, the vertical bias of the gyro and the compass's deviation corrected by a compass."""
     gain = work[0, 1]
     innovation -= 2.0 * math.pi * math.floor(innovation / (2.0 * math.pi) + 0.5)
-    _correct(P, 1.0, variance, gain)
-    deviation: float = gain[0] * innovation
-    angle, drift = gain[ANGLE] * innovation, gain[DRIFT] * innovation
+    sd = _correct(P, 1.0, variance, gain)
+    share = _count(P, seen, abs(innovation), sd, 1.0)
+    angle, drift = share * gain[ANGLE] * innovation, 0.0
+    if share == 1.0:
+        seen[DEVIATION] += gain[0] * innovation
+        drift = gain[DRIFT] * innovation
     _turn(R, 0.0, 0.0, angle, work)
     north, east = v_n[0], v_n[1]
     v_n[0] = math.cos(angle) * north - math.sin(angle) * east
     v_n[1] = math.sin(angle) * north + math.cos(angle) * east
     for i in range(3):
         bias[i] -= R[2, i] * drift
-    return deviation
 
 
 @helper
@@ -184,8 +214,13 @@ def reckon_attitude(
     gravity, fresh_s, held, deviation_var = numbers[0], numbers[1], numbers[2], numbers[3]
     w_ie_n, arm = numbers[4:7], numbers[7:10]
     R, bias, v_n, v_b = R_start.copy(), bias_start.copy(), np.zeros(3), np.zeros(3)
-    tilt, heading, deviation = P_start[0].copy(), P_start[1].copy(), 0.0
-    since_ping, since_velocity = 0.0, 0.0
+    tilt, heading, since_ping, dvl_seen, compass_seen = (
+        P_start[0].copy(),
+        P_start[1].copy(),
+        0.0,
+        np.zeros(3),
+        np.zeros(3),
+    )
     work, turn, moved = np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros(3)
     for k in range(len(dt)):
         if dt[k] > 0.0:
@@ -196,12 +231,13 @@ def reckon_attitude(
             _move(R, v_n, turn, dv[k], silent[k], work)
             _turn(R, -dt[k] * w_ie_n[0], -dt[k] * w_ie_n[1], -dt[k] * w_ie_n[2], work)
             kept = math.exp(-abs(math.atan2(turn[1, 0], turn[0, 0])) / DEVIATES_OVER)
-            deviation *= kept
+            compass_seen[DEVIATION] *= kept
             pull = 0.0 if silent[k] else gravity
             _propagate(tilt, 1.0, pull, density[k, 0] * dt[k], dt[k], density[k], work)
             _propagate(heading, kept, 0.0, (1.0 - kept * kept) * deviation_var, dt[k], density[k], work)
             since_ping += dt[k]
-            since_velocity += dt[k]
+            dvl_seen[SINCE] += dt[k]
+            compass_seen[SINCE] += dt[k]
 
         variance = dvl[k, 3]
         if variance < math.inf:
@@ -209,15 +245,14 @@ def reckon_attitude(
             for i in range(3):
                 v_b[i] += dvl[k, i]
             since_ping = 0.0
-        elif since_ping > fresh_s and since_velocity > 0.5 * fresh_s:
-            variance = held / since_velocity
+        elif since_ping > fresh_s and dvl_seen[SINCE] > 0.5 * fresh_s:
+            variance = held / dvl_seen[SINCE]
         if variance < math.inf:
-            since_velocity = 0.0
-            _level(R, v_n, bias, tilt, v_b, variance, work)
+            _level(R, v_n, bias, tilt, dvl_seen, v_b, variance, gravity, work)
         if compass[k, 1] < math.inf:
             variance = compass[k, 1] + compass[k, 2] * tilt[ANGLE, ANGLE]
-            innovation = compass[k, 0] - _angle_about_down(R, reference[k]) - deviation
-            deviation += _head(R, v_n, bias, heading, innovation, variance, work)
+            innovation = compass[k, 0] - _angle_about_down(R, reference[k]) - compass_seen[DEVIATION]
+            _head(R, v_n, bias, heading, compass_seen, innovation, variance, work)
         _copy(R, R_out[k])
         for i in range(3):
             bias_out[k, i] = bias[i]
