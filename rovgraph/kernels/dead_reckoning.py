@@ -106,8 +106,8 @@ def _move(R: Array, v_n: Array, dR: Array, dv: Array, silent: bool, work: Array)
 def _count(P: Array, seen: Array, innovation: float, sd: float, by_angle: float) -> float:
     """The share by which an innovation corrects; where it stays too large, the angle is doubted and the drift.
 
-    One that is too large shows nothing of a drift or a deviation, and may be wrong itself. If all are for `LOST_S`, the angle is:
-    by as much as changes what is measured by that, at ``by_angle`` a radian.
+    One that is too large shows nothing of a drift or a deviation, and may be wrong itself. If all are for `LOST_S`,
+    the angle is wrong: by as much as changes what is measured by that, at ``by_angle`` a radian.
     """
     share, since = FULL_SD * sd / max(innovation, 1e-12), seen[SINCE]
     seen[SINCE] = 0.0
