@@ -1,0 +1,98 @@
+"""Compiled kernels: where they are kept, and what is said where they cannot be."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+MODULE = """
+from rovgraph.kernels.compile import cache_folder, kernel
+
+@kernel("f8(f8)")
+def twice(x: float) -> float:
+    return 2.0 * x
+
+print(twice(1.5), cache_folder(__name__))
+"""
+
+
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    given = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=given, timeout=120)
+
+
+def own_kernel(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    (folder / "own_kernel.py").write_text(MODULE)
+    return run(f"import sys; sys.path.insert(0, {str(folder)!r}); import own_kernel", **environment)
+
+
+def test_a_kernel_is_compiled_once_and_said_to_be_once(tmp_path):
+    kept = tmp_path / "kept"
+    first, second = (own_kernel(tmp_path, ROVGRAPH_CACHE_DIR=str(kept)) for _ in range(2))
+    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
+    assert first.stdout == second.stdout
+    assert first.stdout.startswith(f"3.0 {kept}")
+    assert first.stderr.count("compiling rovgraph's kernels, once") == 1
+    assert second.stderr == ""
+    assert list(kept.rglob("*.nbc"))
+
+
+def test_a_folder_that_cannot_be_written_is_passed_over(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    done = own_kernel(tmp_path, ROVGRAPH_CACHE_DIR=str(tmp_path / "file" / "below"))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("3.0 ")
+    assert "below" not in done.stdout
+
+
+def test_where_no_folder_can_be_written_kernels_are_compiled_all_the_same(tmp_path):
+    code = (
+        "from rovgraph.kernels import compile as c; c._candidates = lambda: iter(()); "
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import own_kernel"
+    )
+    (tmp_path / "own_kernel.py").write_text(MODULE)
+    done = run(code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "3.0 None\n"
+    assert "set ROVGRAPH_CACHE_DIR" in done.stderr
+
+
+def test_processes_that_compile_at_once_do_not_disturb_each_other(tmp_path):
+    (tmp_path / "own_kernel.py").write_text(MODULE)
+    given = {**os.environ, "PYTHONPATH": str(ROOT), "ROVGRAPH_CACHE_DIR": str(tmp_path / "kept")}
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import own_kernel"
+    children = [
+        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=given) for _ in range(3)
+    ]
+    assert all(child.communicate(timeout=120)[0].startswith("3.0 ") for child in children)
+    assert all(child.returncode == 0 for child in children)
+
+
+def test_the_folder_changes_with_the_version_and_with_what_a_kernel_imports(monkeypatch):
+    import rovgraph
+    from rovgraph.kernels import compile as compiling
+
+    before = compiling._state_of("rovgraph.kernels.correction")
+    assert "rotations" in compiling._imported_kernels("correction")
+    compiling._state_of.cache_clear()
+    monkeypatch.setattr(rovgraph, "__version__", "another")
+    assert compiling._state_of("rovgraph.kernels.correction") != before
+    compiling._state_of.cache_clear()
+
+
+@pytest.mark.parametrize("command", [["smooth", "log.csv"], ["online", "file:log.csv"]])
+def test_without_numba_one_line_says_what_to_install(command, tmp_path):
+    (tmp_path / "log.csv").write_text("time,acc_x\n0,1\n")
+    code = (
+        f"import sys, os; os.chdir({str(tmp_path)!r}); sys.modules['numba'] = None; "
+        f"from rovgraph.cli import app; sys.argv = ['rovgraph', *{command!r}]; app.main()"
+    )
+    done = run(code)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert "pip install 'numba" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("\n") == 1
