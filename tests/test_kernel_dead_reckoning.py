@@ -29,7 +29,7 @@ def reckoned(
     dR, dv = np.concatenate([np.eye(3)[None], turned]), np.zeros((n, 3))
     dv[1:] = -DT * G * true[:-1, 2]
     tables = {
-        "silent": np.zeros(n, bool),
+        "outage": np.zeros(n, bool),
         "dvl": np.tile([0.0, 0.0, 0.0, math.inf], (n, 1)),
         "compass": np.tile([0.0, math.inf, 0.0], (n, 1)),
         "reference": np.tile(np.eye(3), (n, 1, 1)),
@@ -39,7 +39,7 @@ def reckoned(
     start = R_nb if start is None else start
     P = np.array([np.diag(sd**2) for sd in SD])
     reckon_attitude(
-        tables["silent"], dt, dR, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)), tables["dvl"], tables["compass"],
+        tables["outage"], dt, dR, dv, np.zeros((n, 3)), np.tile(DENSITY, (n, 1)), tables["dvl"], tables["compass"],
         tables["reference"], np.ascontiguousarray(start), np.zeros(3), P, numbers, R, b,
     )  # fmt: skip
     return R, b, true
@@ -151,9 +151,9 @@ def test_the_earths_rate_is_no_turn_of_the_vehicle():
     assert np.abs(log_rotation(R_nb.T @ unaware[-1])).max() > 0.02
 
 
-def test_while_the_imu_is_silent_heading_is_followed_and_tilt_is_kept():
+def test_during_an_outage_of_the_imu_heading_is_followed_and_tilt_is_kept():
     n = 20
-    R, _, _ = reckoned(np.eye(3), [0.3, -0.4, 0.2], n, silent=np.arange(n) > 0, held=math.inf)
+    R, _, _ = reckoned(np.eye(3), [0.3, -0.4, 0.2], n, outage=np.arange(n) > 0, held=math.inf)
     rpy = rpy_from_matrix(R[-1])
     assert_allclose(rpy[:2], 0.0, atol=1e-12)
     step = rpy_from_matrix(exp_rotation(DT * np.array([0.3, -0.4, 0.2])))[2]

@@ -26,8 +26,8 @@ from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
 
 KEEPS_HEADING_S = 20.0  # for so long what is fixed in the body is fixed in n
-FRESH_S = 2.0  # for so long a ping says how fast the vehicle is
-HELD_SD = 0.3  # by which it is faster or slower after that [m/s]
+PING_VALID_S = 2.0  # for so long a ping says how fast the vehicle is
+HELD_SD = 0.3  # of the velocity that is held after that [m/s]
 CURRENT_S = 30.0  # of pings that tell the current
 
 
@@ -40,7 +40,7 @@ class _Epochs:
     time : ndarray, shape (m,) [s]
     dt, dR, dv : ndarray, shape (m,), (m, 3, 3), (m, 3), motion since the epoch before
     assumed : ndarray, shape (m, 6), bias that the motion is for
-    bridged, silent : ndarray of bool, shape (m,), samples of the IMU are missing there; for longer
+    bridged, outage : ndarray of bool, shape (m,), samples of the IMU are missing; for so long that it is an outage
     keyframe : ndarray of int, shape (n,), epochs of the keyframes
     measured : epoch -> measurement
     """
@@ -51,7 +51,7 @@ class _Epochs:
     dv: Array
     assumed: Array
     bridged: NDArray[np.bool_]
-    silent: NDArray[np.bool_]
+    outage: NDArray[np.bool_]
     keyframe: NDArray[np.intp]
     measured: dict[int, KeyframeMeasurement]
 
@@ -175,9 +175,9 @@ def _attitudes(
     P[0] = np.diag([start.v_sd.max(), start.rpy_sd[:2].max(), gyr_sd]) ** 2
     P[1] = np.diag([0.0, start.rpy_sd[2], gyr_sd]) ** 2
     held = 2.0 * KEEPS_HEADING_S * HELD_SD**2
-    numbers = np.array([env.gravity_mps2, FRESH_S, held, 0.0, *_earth_rate(config), *bottom.arm])
+    numbers = np.array([env.gravity_mps2, PING_VALID_S, held, 0.0, *_earth_rate(config), *bottom.arm])
     dv = epochs.dv - epochs.dt[:, None] * (bias[:3] - epochs.assumed[:, :3])
-    motion = (epochs.silent, epochs.dt, epochs.dR, dv, epochs.assumed[:, 3:].copy(), _densities(epochs, config))
+    motion = (epochs.outage, epochs.dt, epochs.dR, dv, epochs.assumed[:, 3:].copy(), _densities(epochs, config))
     R_nb, gyr, reference = np.empty((m, 3, 3)), np.empty((m, 3)), np.zeros((m, 3, 3))
     began = start.state.R_nb[0].copy(), bias[3:].copy(), P
     arguments: Any = (*motion, dvl, turns, reference, *began, numbers, R_nb, gyr)
@@ -241,7 +241,7 @@ def _through_water(
         c_n = np.column_stack([np.interp(time[k], known, column) for column in means.T])
         before, behind = known.searchsorted(time[k], "right"), known.searchsorted(time[k], "left")
         bounds = np.concatenate([[-math.inf], known, [math.inf]])
-        lost = (before == behind) & (bounds[before + 1] - bounds[before] > FRESH_S)
+        lost = (before == behind) & (bounds[before + 1] - bounds[before] > PING_VALID_S)
     return k[lost], rotate(transpose(R_nb[k]), w_n + c_n)[lost]
 
 

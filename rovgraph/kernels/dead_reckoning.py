@@ -28,10 +28,10 @@ from rovgraph.kernels.rotations import cross, dot, exp_rotation, multiply, rotat
 
 ANGLE, DRIFT = 1, 2  # components of a chain, after velocity or deviation
 DEVIATES_OVER = 1.0  # a turn by which a compass comes to deviate otherwise [rad]
-SINCE, AWAY, DEVIATION = 0, 1, 2  # of a sensor: time since it was seen, that its innovations are too large, deviation
-FULL_SD = 4.0  # of an innovation; what is larger corrects as one of that size
-LOST_S = 5.0  # for so long a sensor may be wrong
-SHORT_S = 0.02  # between two velocities
+SINCE, CLIPPED, DEVIATION = 0, 1, 2  # of a sensor: time since its last measurement, time of clipped ones, deviation
+CLIP_SD = 4.0  # at which innovations are clipped
+INFLATE_AFTER_S = 5.0  # of innovations that are all clipped the attitude's covariance is inflated
+SHORTEST_S = 0.02  # between two velocities
 
 
 @helper
@@ -43,7 +43,9 @@ def _copy(A: Array, B_out: Array) -> None:
 
 
 @helper
-def _propagate(P: Array, kept: float, pull: float, noise: float, dt: float, density: Array, work: Array) -> None:
+def _propagate_covariance(
+    P: Array, kept: float, pull: float, noise: float, dt: float, density: Array, work: Array
+) -> None:
     """P <- F P F' + Q of a chain.
 
     Of the first component ``kept`` is left, an angle changes it by ``pull`` [1/s], ``noise`` is added to its variance.
@@ -64,7 +66,7 @@ def _propagate(P: Array, kept: float, pull: float, noise: float, dt: float, dens
 
 
 @helper
-def _correct(P: Array, with_angle: float, variance: float, gain_out: Array) -> float:
+def _kalman_gains(P: Array, with_angle: float, variance: float, gain_out: Array) -> float:
     """Gains of a chain whose first component plus ``with_angle`` times its angle is measured; the innovation's sd."""
     for i in range(3):
         gain_out[i] = P[i, 0] + with_angle * P[i, ANGLE]
@@ -79,7 +81,7 @@ def _correct(P: Array, with_angle: float, variance: float, gain_out: Array) -> f
 
 
 @helper
-def _turn(R: Array, north: float, east: float, down: float, work: Array) -> None:
+def _rotate_about_n(R: Array, north: float, east: float, down: float, work: Array) -> None:
     """R <- Exp(phi) R, phi in n."""
     phi, D, M = work[0, 0], work[1], work[2]
     phi[0], phi[1], phi[2] = north, east, down
@@ -89,10 +91,10 @@ def _turn(R: Array, north: float, east: float, down: float, work: Array) -> None
 
 
 @helper
-def _move(R: Array, v_n: Array, dR: Array, dv: Array, silent: bool, work: Array) -> None:
-    """Attitude and horizontal velocity after a motion; while the IMU is silent heading alone changes."""
-    if silent:
-        _turn(R, 0.0, 0.0, math.atan2(dR[1, 0], dR[0, 0]), work)
+def _propagate_attitude(R: Array, v_n: Array, dR: Array, dv: Array, outage: bool, work: Array) -> None:
+    """Attitude and horizontal velocity after a motion; during an outage of the IMU only heading changes."""
+    if outage:
+        _rotate_about_n(R, 0.0, 0.0, math.atan2(dR[1, 0], dR[0, 0]), work)
         return
     change, M = work[0, 0], work[1]
     rotate(R, dv, change)
@@ -103,60 +105,68 @@ def _move(R: Array, v_n: Array, dR: Array, dv: Array, silent: bool, work: Array)
 
 
 @helper
-def _count(P: Array, seen: Array, innovation: float, sd: float, by_angle: float) -> float:
-    """The share by which an innovation corrects; where it stays too large, the angle is doubted and the drift.
+def _clip(P: Array, history: Array, innovation: float, sd: float, by_angle: float) -> float:
+    """Share of an innovation that is used; inflates the covariance of the angle where it stays too large.
 
-    One that is too large shows nothing of a drift or a deviation, and may be wrong itself. If all are for `LOST_S`,
-    the angle is wrong: by as much as changes what is measured by that, at ``by_angle`` a radian.
+    A clipped innovation corrects neither drift nor deviation: it may be wrong itself. After `INFLATE_AFTER_S` of them
+    the angle is taken to be off by what explains the innovation, which changes by ``by_angle`` per radian.
     """
-    share, since = FULL_SD * sd / max(innovation, 1e-12), seen[SINCE]
-    seen[SINCE] = 0.0
+    share, since = CLIP_SD * sd / max(innovation, 1e-12), history[SINCE]
+    history[SINCE] = 0.0
     if share >= 1.0:
-        seen[AWAY] = 0.0
+        history[CLIPPED] = 0.0
         return 1.0
-    seen[AWAY] += since
-    if seen[AWAY] > LOST_S:
+    history[CLIPPED] += since
+    if history[CLIPPED] > INFLATE_AFTER_S:
         angle = min(innovation / by_angle, 1.0)
         P[ANGLE, ANGLE] += angle * angle
-        P[DRIFT, DRIFT] += (angle / seen[AWAY]) ** 2
-        seen[AWAY] = 0.0
+        P[DRIFT, DRIFT] += (angle / history[CLIPPED]) ** 2
+        history[CLIPPED] = 0.0
     return share
 
 
 @helper
-def _level(
-    R: Array, v_n: Array, bias: Array, P: Array, seen: Array, v_b: Array, variance: float, gravity: float, work: Array
+def _correct_tilt(
+    R: Array,
+    v_n: Array,
+    bias: Array,
+    P: Array,
+    history: Array,
+    v_b: Array,
+    variance: float,
+    gravity: float,
+    work: Array,
 ) -> None:
     """Velocity, tilt and the horizontal bias of the gyro corrected by the velocity ``v_b`` in body axes."""
     measured, gain, beta = work[0, 0], work[0, 1], work[0, 2]
     rotate(R, v_b, measured)
-    north, east, since = measured[0] - v_n[0], measured[1] - v_n[1], seen[SINCE]
-    sd = _correct(P, 0.0, variance, gain)
+    north, east, since = measured[0] - v_n[0], measured[1] - v_n[1], history[SINCE]
+    sd = _kalman_gains(P, 0.0, variance, gain)
     v_n[0] += gain[0] * north
     v_n[1] += gain[0] * east
-    share = _count(P, seen, math.hypot(north, east), sd, gravity * max(since, SHORT_S))
+    share = _clip(P, history, math.hypot(north, east), sd, gravity * max(since, SHORTEST_S))
     angle, drift = share * gain[ANGLE], gain[DRIFT] if share == 1.0 else 0.0
     beta[0], beta[1], beta[2] = drift * east, -drift * north, 0.0
     rotate_back(R, beta, measured)
     for i in range(3):
         bias[i] -= measured[i]
-    _turn(R, angle * east, -angle * north, 0.0, work)
+    _rotate_about_n(R, angle * east, -angle * north, 0.0, work)
 
 
 @helper
-def _head(
-    R: Array, v_n: Array, bias: Array, P: Array, seen: Array, innovation: float, variance: float, work: Array
+def _correct_heading(
+    R: Array, v_n: Array, bias: Array, P: Array, history: Array, innovation: float, variance: float, work: Array
 ) -> None:
     """Heading, the vertical bias of the gyro and the compass's deviation corrected by a compass."""
     gain = work[0, 1]
     innovation -= 2.0 * math.pi * math.floor(innovation / (2.0 * math.pi) + 0.5)
-    sd = _correct(P, 1.0, variance, gain)
-    share = _count(P, seen, abs(innovation), sd, 1.0)
+    sd = _kalman_gains(P, 1.0, variance, gain)
+    share = _clip(P, history, abs(innovation), sd, 1.0)
     angle, drift = share * gain[ANGLE] * innovation, 0.0
     if share == 1.0:
-        seen[DEVIATION] += gain[0] * innovation
+        history[DEVIATION] += gain[0] * innovation
         drift = gain[DRIFT] * innovation
-    _turn(R, 0.0, 0.0, angle, work)
+    _rotate_about_n(R, 0.0, 0.0, angle, work)
     north, east = v_n[0], v_n[1]
     v_n[0] = math.cos(angle) * north - math.sin(angle) * east
     v_n[1] = math.sin(angle) * north + math.cos(angle) * east
@@ -176,7 +186,7 @@ def _angle_about_down(R: Array, reference: Array) -> float:
     " f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1])"
 )
 def reckon_attitude(
-    silent: Array,
+    outage: Array,
     dt: Array,
     dR: Array,
     dv: Array,
@@ -196,7 +206,7 @@ def reckon_attitude(
 
     Parameters
     ----------
-    silent : shape (m,), bool, the IMU was silent since the epoch before
+    outage : shape (m,), bool, the IMU had an outage since the epoch before
     dt, dR, dv : shapes (m,), (m, 3, 3), (m, 3), motion since then [s, -, m/s]
     assumed : shape (m, 3), gyro bias that dR is for [rad/s]
     density : shape (m, 3), squared densities of the noise of specific force, of rate, and of the gyro's walk
@@ -211,16 +221,11 @@ def reckon_attitude(
         rate of the Earth in n [rad/s]; lever arm of the DVL from the IMU [m]
     R_out, bias_out : shapes (m, 3, 3), (m, 3)
     """
-    gravity, fresh_s, held, deviation_var = numbers[0], numbers[1], numbers[2], numbers[3]
+    gravity, valid_s, held, deviation_var = numbers[0], numbers[1], numbers[2], numbers[3]
     w_ie_n, arm = numbers[4:7], numbers[7:10]
     R, bias, v_n, v_b = R_start.copy(), bias_start.copy(), np.zeros(3), np.zeros(3)
-    tilt, heading, since_ping, dvl_seen, compass_seen = (
-        P_start[0].copy(),
-        P_start[1].copy(),
-        0.0,
-        np.zeros(3),
-        np.zeros(3),
-    )
+    tilt, heading, since_ping = P_start[0].copy(), P_start[1].copy(), 0.0
+    dvl_history, compass_history = np.zeros(3), np.zeros(3)
     work, turn, moved = np.zeros((3, 3, 3)), np.zeros((3, 3)), np.zeros(3)
     for k in range(len(dt)):
         if dt[k] > 0.0:
@@ -228,16 +233,16 @@ def reckon_attitude(
                 moved[i] = -dt[k] * (bias[i] - assumed[k, i])
             exp_rotation(moved, work[0])
             multiply(dR[k], work[0], turn)
-            _move(R, v_n, turn, dv[k], silent[k], work)
-            _turn(R, -dt[k] * w_ie_n[0], -dt[k] * w_ie_n[1], -dt[k] * w_ie_n[2], work)
+            _propagate_attitude(R, v_n, turn, dv[k], outage[k], work)
+            _rotate_about_n(R, -dt[k] * w_ie_n[0], -dt[k] * w_ie_n[1], -dt[k] * w_ie_n[2], work)
             kept = math.exp(-abs(math.atan2(turn[1, 0], turn[0, 0])) / DEVIATES_OVER)
-            compass_seen[DEVIATION] *= kept
-            pull = 0.0 if silent[k] else gravity
-            _propagate(tilt, 1.0, pull, density[k, 0] * dt[k], dt[k], density[k], work)
-            _propagate(heading, kept, 0.0, (1.0 - kept * kept) * deviation_var, dt[k], density[k], work)
+            compass_history[DEVIATION] *= kept
+            pull = 0.0 if outage[k] else gravity
+            _propagate_covariance(tilt, 1.0, pull, density[k, 0] * dt[k], dt[k], density[k], work)
+            _propagate_covariance(heading, kept, 0.0, (1.0 - kept * kept) * deviation_var, dt[k], density[k], work)
             since_ping += dt[k]
-            dvl_seen[SINCE] += dt[k]
-            compass_seen[SINCE] += dt[k]
+            dvl_history[SINCE] += dt[k]
+            compass_history[SINCE] += dt[k]
 
         variance = dvl[k, 3]
         if variance < math.inf:
@@ -245,14 +250,14 @@ def reckon_attitude(
             for i in range(3):
                 v_b[i] += dvl[k, i]
             since_ping = 0.0
-        elif since_ping > fresh_s and dvl_seen[SINCE] > 0.5 * fresh_s:
-            variance = held / dvl_seen[SINCE]
+        elif since_ping > valid_s and dvl_history[SINCE] > 0.5 * valid_s:
+            variance = held / dvl_history[SINCE]
         if variance < math.inf:
-            _level(R, v_n, bias, tilt, dvl_seen, v_b, variance, gravity, work)
+            _correct_tilt(R, v_n, bias, tilt, dvl_history, v_b, variance, gravity, work)
         if compass[k, 1] < math.inf:
             variance = compass[k, 1] + compass[k, 2] * tilt[ANGLE, ANGLE]
-            innovation = compass[k, 0] - _angle_about_down(R, reference[k]) - compass_seen[DEVIATION]
-            _head(R, v_n, bias, heading, compass_seen, innovation, variance, work)
+            innovation = compass[k, 0] - _angle_about_down(R, reference[k]) - compass_history[DEVIATION]
+            _correct_heading(R, v_n, bias, heading, compass_history, innovation, variance, work)
         _copy(R, R_out[k])
         for i in range(3):
             bias_out[k, i] = bias[i]
