@@ -18,8 +18,9 @@ from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
-from rovgraph.geometry import Array, cross, earth_rate_n, identity, rotate, transpose
+from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity, rotate, transpose
 from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.kernels.dead_reckoning import reckon_attitude
 from rovgraph.sensors import dvl_mounting
@@ -111,38 +112,50 @@ def dead_reckon(
     return State(R_nb[k], p_n, v_n[k], bias[k], dict(calibration))
 
 
-def _motion(interval: KeyframeInterval) -> tuple[float, Array, Array, Array]:
-    """Duration of an interval, its rotation and velocity, and the bias that they are for."""
-    motion = interval.motion
-    if motion is None:
-        return 0.0, identity(3), np.zeros(3), np.zeros(6)
-    return motion.duration, motion.dR, motion.dv, motion.bias
+def _motions(intervals: Sequence[KeyframeInterval]) -> tuple[Array, Array, Array, Array]:
+    """Duration of n intervals, their rotations and velocities, and the biases that they are for; zero where none."""
+    rows = np.zeros((len(intervals), at.NOISE))
+    for k, interval in enumerate(intervals):
+        if interval.motion is not None:
+            rows[k] = interval.motion.row[: at.NOISE]
+    tangent = rows[:, at.TANGENT : at.BIAS]
+    return rows[:, at.DURATION], exp_rotation(tangent[:, :3]), tangent[:, 6:], rows[:, at.BIAS :]
 
 
 def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | None]) -> _Epochs:
     """The epochs of all keyframes and of some sensors."""
-    rows: list[tuple[int, float, float, Array, Array, Array, KeyframeMeasurement | None]] = []
+    measured: list[KeyframeMeasurement | None] = []  # None stands for a keyframe
+    number_of: list[int] = []
     for number, interval in enumerate(intervals):
         used = [a for a in interval.measurements if a.sensor in sensors]
-        own = [(number, a.time, a.motion.dt, a.motion.dR, a.motion.dv, a.bias, a) for a in used]
         between = sum(a.keyframe != interval.index for a in used)
-        rows += [*own[:between], (number, interval.time, *_motion(interval), None), *own[between:]]
-    number_of, time, elapsed, rotations, velocities, assumed, measured = zip(*rows, strict=True)
-    is_keyframe, of = np.array([a is None for a in measured]), np.array(number_of)
-    dt, dR, dv = np.array(elapsed), np.concatenate(rotations).reshape(-1, 3, 3), np.array(velocities)
+        measured += [*used[:between], None, *used[between:]]
+        number_of += [number] * (len(used) + 1)
+    m, of = len(measured), np.array(number_of)
+    keyframe = np.flatnonzero([a is None for a in measured])
+    found = {k: a for k, a in enumerate(measured) if a is not None}
+    time, dt, dR, dv, assumed = np.empty(m), np.empty(m), np.empty((m, 3, 3)), np.empty((m, 3)), np.empty((m, 6))
+    time[keyframe] = [i.time for i in intervals]
+    dt[keyframe], dR[keyframe], dv[keyframe], assumed[keyframe] = _motions(intervals)
+    if found:
+        k, motions = np.array([*found]), [a.motion for a in found.values()]
+        time[k], dt[k] = [a.time for a in found.values()], [motion.dt for motion in motions]
+        dR[k] = np.concatenate([motion.dR for motion in motions]).reshape(-1, 3, 3)
+        dv[k] = np.concatenate([motion.dv for motion in motions]).reshape(-1, 3)
+        assumed[k] = np.concatenate([a.bias for a in found.values()]).reshape(-1, 6)
     begin, begin_R, begin_v = np.roll(dt, 1), np.roll(dR, 1, axis=0), np.roll(dv, 1, axis=0)
-    anew = np.roll(is_keyframe, 1)
+    anew = (keyframe + 1) % m
     begin[anew], begin_R[anew], begin_v[anew] = 0.0, identity(3), 0.0
     return _Epochs(
-        np.array(time),
+        time,
         dt - begin,
         transpose(begin_R) @ dR,
         rotate(transpose(begin_R), dv - begin_v),
-        np.array(assumed),
+        assumed,
         np.array([i.bridged for i in intervals])[of],
         np.array([i.motion is not None and i.motion.coasted for i in intervals])[of],
-        np.flatnonzero(is_keyframe),
-        {k: a for k, a in enumerate(measured) if a is not None},
+        keyframe,
+        found,
     )
 
 
