@@ -156,7 +156,7 @@ def test_killed_twice_and_resumed_it_goes_on_where_it_was(tmp_path):
     assert (np.diff(imu) > 0.0).all()
     track = pd.read_csv(out / "trajectory_filtered.csv")
     assert (np.diff(track["time"]) > 0.0).all()
-    assert np.diff(track["time"]).max() < 1.1, "a keyframe is missing"
+    assert np.diff(track["time"]).max() < 1.26, "a keyframe is missing"  # graph.max_gap_s and what a ping may be late
     honest(track, case)
     honest(pd.DataFrame([json.loads(line) for line in solutions.splitlines() if line.endswith(b"}")]), case)
     assert events_of(out, "resumed") >= 1
