@@ -38,6 +38,7 @@ from rovgraph.estimators.eskf.error_state import replay
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
+from rovgraph.kernels import measurement_row
 from rovgraph.kernels.correction import RETURN_SD
 from rovgraph.kernels.robust_update import MAX_REWEIGHTINGS, SETTLED, innovation_covariance, joseph, reweight
 from rovgraph.kernels.weighting import LOSSES
@@ -66,6 +67,13 @@ def case() -> Simulated:
 @pytest.fixture(scope="session")
 def estimator(case) -> RecordingFilter:
     return filtered(case.log, case.config)
+
+
+def measuring(m: KeyframeMeasurement, z: Array) -> KeyframeMeasurement:
+    """The same measurement, of other components."""
+    row = m.row.copy()
+    row[measurement_row.Z : measurement_row.Z + m.dim] = z
+    return replace(m, row=row)
 
 
 # motion
@@ -301,7 +309,7 @@ def test_a_correction_is_a_textbooks_kalman_update_moved_along_the_coordinates(e
     if where == "here":
         known = engine.predict(interval, known).predicted
     measurements: list[KeyframeMeasurement] = getattr(interval, where)
-    measurements = [replace(m, z=m.z + 10.0 * m.sd) if m is measurements[-1] else m for m in measurements]
+    measurements = [measuring(m, m.z + 10.0 * m.sd) if m is measurements[-1] else m for m in measurements]
     processed: list[ProcessedMeasurement] = []
     after = engine.correct(known, measurements, None, processed)
     (r, H), parts = engine.linearize(known, measurements), parts_of(measurements)
@@ -506,13 +514,13 @@ def left_out(estimator: RecordingFilter, off: float, since: float) -> tuple[Gaus
     [ping] = [m for m in estimator.intervals[index].here if m.sensor == "dvl"]
     r, H = engine.linearize(known, [ping])
     along = np.linalg.cholesky(H @ known.P @ H.T + np.eye(3))[:, 0]
-    aside = replace(ping, z=ping.z - engine.block([ping]).innovations(known.state)[0])
+    aside = measuring(ping, ping.z - engine.block([ping]).innovations(known.state)[0])
     r, H = engine.linearize(known, [aside])
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
     shift = np.linalg.solve(engine.block([ping]).W[0], along * off)
     processed: list[ProcessedMeasurement] = []
     gates = {} if since == 0.0 else {"dvl": ping.time - since}
-    after = engine.correct(known, [replace(aside, z=aside.z + shift)], gates, processed)
+    after = engine.correct(known, [measuring(aside, aside.z + shift)], gates, processed)
     assert np.sqrt(processed[0].nis) == pytest.approx(off)
     return known, after, processed[0].weight > 0.0, gates
 

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
 from rovgraph.calibration import TABLE
-from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_row
 from rovgraph.engine.late_stamp_window import KNOT_S, LateStampWindow
 from rovgraph.engine.measurements import (
     Block,
@@ -53,8 +53,9 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         track = track_of(motion, bias, rng) if instrument.time_offset else None
         S = scale_to_bias(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
         seen = LandmarkObservation(1.0, 7) if sensor == "place" else None
-        place = (sensor, k, k // 2, 0.2 * k, 10 + k)
-        attached.append(KeyframeMeasurement(*place, z, sd, rate, 0.01, motion, bias, track, S, seen))
+        snapshot = np.concatenate([[motion.dt], motion.dR.ravel(), motion.dv, motion.dp])
+        row = measurement_row(0.2 * k, z, sd, rate, 0.01, snapshot, bias)
+        attached.append(KeyframeMeasurement(sensor, k, k // 2, 10 + k, len(z), row, track, S, seen))
     return make_block(attached, instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 
 

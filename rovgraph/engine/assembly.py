@@ -26,9 +26,9 @@ import numpy as np
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation, measurement_row
 from rovgraph.engine.late_stamp_window import window_around
-from rovgraph.engine.motion import Motion, Snapshot
+from rovgraph.engine.motion import Motion
 from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
 from rovgraph.engine.scale import scale_to_bias, wanted
 from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
@@ -41,7 +41,7 @@ from rovgraph.sensors import SENSORS, ModelAiding
 from rovgraph.state import State
 
 SOME = 4096  # measurements of a log that are objects at one time
-_AT_KEYFRAME = Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
+_AT_KEYFRAME = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])  # a snapshot without motion
 _NO_RATE = np.zeros(3), 0.0
 
 
@@ -284,11 +284,11 @@ class Assembler:
         attached: list[KeyframeMeasurement] = []
         for m, snapshot in zip(taken, snapshots, strict=True):
             rate_b, rate_sd = self._samples.rate(samples, m.time) if m.sensor in self._turned else _NO_RATE
-            attached += self._attach(m, Snapshot.of(snapshot), rate_b, rate_sd, every)
+            attached += self._attach(m, snapshot, rate_b, rate_sd, every)
         return motion, attached
 
     def _attach(
-        self, m: StampedMeasurement, motion: Snapshot, rate_b: Array, rate_sd: float, every: Array
+        self, m: StampedMeasurement, snapshot: Array, rate_b: Array, rate_sd: float, every: Array
     ) -> list[KeyframeMeasurement]:
         """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``."""
         instrument = self.instruments[m.sensor]
@@ -305,9 +305,10 @@ class Assembler:
             if landmark is None:
                 return []
         sd = SENSORS[m.sensor].standard_deviation(m.values, instrument, self.config)
-        place = (m.sensor, self._index, self._segment, m.time, m.row)
+        row = measurement_row(m.time, z, sd, rate_b, rate_sd, snapshot, self.bias)
         scaled = self._scale_to_bias(every, self._start, m.time)
-        return [KeyframeMeasurement(*place, z, sd, rate_b, rate_sd, motion, self.bias, window, scaled, landmark)]
+        place = (m.sensor, self._index, self._segment, m.row)
+        return [KeyframeMeasurement(*place, len(z), row, window, scaled, landmark)]
 
     def _sighting(self, m: StampedMeasurement) -> LandmarkObservation | None:
         """A place that is seen; None where it has been in view just now."""

@@ -37,7 +37,7 @@ from rovgraph.engine.remembered_places import (
     with_another,
     without_oldest,
 )
-from rovgraph.engine.sensor_rows import KeyframeRows, compiled, measurement_row, sensor_table
+from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
@@ -153,7 +153,7 @@ class FilterEngine:
         """Measurements of one keyframe that the kernels know."""
         scaled = measurements[0].scale_to_bias is not None
         scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
-        rows = np.array([measurement_row(m) for m in measurements])
+        rows = np.array([m.row[: at.ROW] for m in measurements])
         which = np.array([self._index[m.sensor] for m in measurements])
         layout = self.layout
         return KeyframeRows(rows, which, self._sensors, layout.column, layout.size, scale, self._gravity)
@@ -200,7 +200,7 @@ class FilterEngine:
         H = np.vstack([own for _, own in given]) if given else np.empty((0, self.layout.size))
         scaled = measurements[0].scale_to_bias is not None
         scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
-        rows = np.array([measurement_row(m) for m in measurements])
+        rows = np.array([m.row[: at.ROW] for m in measurements])
         which = np.array([self._index[m.sensor] for m in measurements])
         x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
         since = np.array([(gates or {}).get(sensor, np.nan) for sensor in self._index])

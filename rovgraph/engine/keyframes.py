@@ -3,9 +3,12 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from rovgraph.engine.late_stamp_window import LateStampWindow
 from rovgraph.engine.motion import Motion, Snapshot
 from rovgraph.geometry import Array
+from rovgraph.kernels import measurement_row as at
 
 
 class LandmarkObservation(NamedTuple):
@@ -24,7 +27,7 @@ class LandmarkObservation(NamedTuple):
     believed: bool = True
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class KeyframeMeasurement:
     """A measurement that belongs to a keyframe.
 
@@ -32,12 +35,9 @@ class KeyframeMeasurement:
     ----------
     sensor : name of the log stream
     keyframe, segment : index of the keyframe, and the segment of time it lies in
-    time, row : of the measurement, and its line in the log
-    z : ndarray, shape (dim,)
-    sd : ndarray, shape (dim,), the instrument's, or the measurement's own
-    rate_b, rate_sd : ndarray, shape (3,), float: measured rate, bias still in it [rad/s]
-    motion : Snapshot from the keyframe to the measurement
-    bias : ndarray, shape (6,), that the motion was integrated with
+    line : in the log
+    dim : number of components
+    row : ndarray, shape (ROW,) or longer, as `rovgraph.kernels.measurement_row` lays it out: what kernels take
     window : LateStampWindow of one stamp, where stamps may be late
     scale_to_bias : ndarray, shape (6, 6), of `rovgraph.engine.scale`, where the IMU's scale may be off
     landmark : of a place, where it is one
@@ -46,17 +46,66 @@ class KeyframeMeasurement:
     sensor: str
     keyframe: int
     segment: int
-    time: float
-    row: int
-    z: Array
-    sd: Array
-    rate_b: Array
-    rate_sd: float
-    motion: Snapshot
-    bias: Array
+    line: int
+    dim: int
+    row: Array
     window: LateStampWindow | None = None
     scale_to_bias: Array | None = None
     landmark: LandmarkObservation | None = None
+
+    @property
+    def time(self) -> float:
+        """[s]"""
+        return float(self.row[at.TIME])
+
+    @property
+    def z(self) -> Array:
+        """Components, shape (dim,)."""
+        return self.row[at.Z : at.Z + self.dim]
+
+    @property
+    def sd(self) -> Array:
+        """The instrument's, or the measurement's own, shape (dim,)."""
+        begin = sd_of(self.dim)
+        return self.row[begin : begin + self.dim]
+
+    @property
+    def rate_b(self) -> Array:
+        """Measured rate, bias still in it, shape (3,) [rad/s]."""
+        return self.row[at.RATE : at.RATE + 3]
+
+    @property
+    def rate_sd(self) -> float:
+        """Its noise [rad/s]."""
+        return float(self.row[at.RATE_SD])
+
+    @property
+    def motion(self) -> Snapshot:
+        """From the keyframe to the measurement."""
+        return Snapshot.of(self.row[at.SNAPSHOT : at.ASSUMED])
+
+    @property
+    def bias(self) -> Array:
+        """That the motion was integrated with, shape (6,)."""
+        return self.row[at.ASSUMED : at.ASSUMED + 6]
+
+
+def measurement_row(
+    time: float, z: Array, sd: Array, rate_b: Array, rate_sd: float, snapshot: Array, bias: Array
+) -> Array:
+    """What a `KeyframeMeasurement` holds in its row; ``snapshot`` has shape (16,)."""
+    dim = len(z)
+    row = np.zeros(at.Z + 2 * max(dim, at.MOST))
+    row[at.TIME], row[at.RATE : at.RATE + 3], row[at.RATE_SD] = time, rate_b, rate_sd
+    row[at.SNAPSHOT : at.ASSUMED], row[at.ASSUMED : at.ASSUMED + 6] = snapshot, bias
+    begin = sd_of(dim)
+    row[at.Z : at.Z + dim], row[begin : begin + dim] = z, sd
+    return row
+
+
+def sd_of(dim: int) -> int:
+    """Where in a row the noise of ``dim`` components begins."""
+    return at.Z + max(dim, at.MOST)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from rovgraph.engine.gauss_newton import Gates
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, sd_of
 from rovgraph.engine.late_stamp_window import LateStampWindow
 from rovgraph.engine.scale import COLUMNS, SCALES, biased
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, rotate
 from rovgraph.instruments import Instrument
+from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.weighting import LOSSES, weight_many, whiten_many
 from rovgraph.sensors import innovation
 from rovgraph.state import (
@@ -46,7 +47,7 @@ class Block:
     ----------
     instrument : model, noise and loss
     keyframe, segment : ndarray of int, shape (n,)
-    time, row : ndarray, shape (n,)
+    time, line : ndarray, shape (n,), and in the log
     z : ndarray, shape (n, dim)
     W : ndarray, shape (n, dim, dim), square-root information, lower triangular
     rate_b : ndarray, shape (n, 3), measured rate, bias still in it [rad/s]
@@ -63,7 +64,7 @@ class Block:
     keyframe: Array
     segment: Array
     time: Array
-    row: Array
+    line: Array
     z: Array
     W: Array
     rate_b: Array
@@ -177,7 +178,7 @@ class Block:
         return replace(self, **arrays, motion=motion, window=window, scale_to_bias=scale_to_bias)
 
 
-_PER_MEASUREMENT = ("keyframe", "segment", "time", "row", "z", "W", "rate_b", "place", "believed")
+_PER_MEASUREMENT = ("keyframe", "segment", "time", "line", "z", "W", "rate_b", "place", "believed")
 
 
 def make_block(
@@ -188,25 +189,26 @@ def make_block(
 ) -> Block:
     """Stack measurements of one sensor; ``unknowns`` are those of the whole graph."""
 
-    def stack(name: str) -> Array:
-        return np.array([getattr(a, name) for a in attached])
-
-    W = whitening(instrument, stack("sd"), stack("rate_sd"))
-    arrays = (stack("keyframe"), stack("segment"), stack("time"), stack("row"), stack("z"), W, stack("rate_b"))
+    dim, rows = instrument.model.dim, np.array([m.row for m in attached])
+    sd = rows[:, sd_of(dim) : sd_of(dim) + dim]
+    W = whitening(instrument, sd, rows[:, at.RATE_SD])
+    where = np.array([(m.keyframe, m.segment, m.line) for m in attached]).T
+    z, rate_b = rows[:, at.Z : at.Z + dim], rows[:, at.RATE : at.RATE + 3]
+    arrays = (where[0], where[1], rows[:, at.TIME], where[2], z, W, rate_b)
     windows = [a.window for a in attached if a.window is not None]
     window = LateStampWindow.stack(windows) if windows else None
     scaled = attached[0].scale_to_bias is not None
     own = unknowns.of((*instrument.calibration, *(SCALES if scaled else ())))
     place = np.array([-1 if a.landmark is None else a.landmark.number for a in attached])
     believed = np.array([a.landmark is None or a.landmark.believed for a in attached])
-    scale_to_bias = stack("scale_to_bias") if scaled else None
-    return Block(instrument, *arrays, motions(attached), gravity, own, place, believed, window, scale_to_bias)
+    scale_to_bias = np.array([m.scale_to_bias for m in attached]) if scaled else None
+    return Block(instrument, *arrays, motions_of(rows), gravity, own, place, believed, window, scale_to_bias)
 
 
-def motions(attached: Sequence[KeyframeMeasurement]) -> Delta:
-    """From their keyframes to measurements, of one sensor or of many."""
-    dt, dR, dv, dp = (np.array([getattr(a.motion, name) for a in attached]) for name in ("dt", "dR", "dv", "dp"))
-    return Delta(dt, dR, dv, dp, np.array([a.bias for a in attached]))
+def motions_of(rows: Array) -> Delta:
+    """From their keyframes to n measurements, of rows of `rovgraph.kernels.measurement_row`, shape (n, ROW)."""
+    dR, dv, dp = rows[:, at.DR : at.DV].reshape(-1, 3, 3), rows[:, at.DV : at.DP], rows[:, at.DP : at.ASSUMED]
+    return Delta(rows[:, at.DT], dR, dv, dp, rows[:, at.ASSUMED : at.ASSUMED + 6])
 
 
 def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:

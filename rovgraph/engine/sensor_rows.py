@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.engine.measurements import loss_threshold
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
@@ -45,21 +44,6 @@ def sensor_table(instruments: Mapping[str, Instrument], given: Sequence[str]) ->
         row[at.GAIN : at.GAIN + 9] = gain.ravel()
         row[at.PARAMS : at.PARAMS + len(packed[sensor])] = packed[sensor]
     return out
-
-
-def measurement_row(m: KeyframeMeasurement) -> Array:
-    """A measurement of at most three components, shape (ROW,)."""
-    row = np.zeros(at.ROW)
-    dim = len(m.z)
-    row[at.TIME] = m.time
-    if dim <= 3:
-        row[at.Z : at.Z + dim], row[at.SD : at.SD + dim] = m.z, m.sd
-    row[at.RATE : at.RATE + 3], row[at.RATE_SD] = m.rate_b, m.rate_sd
-    row[at.DT] = m.motion.dt
-    row[at.DR : at.DR + 9] = m.motion.dR.ravel()
-    row[at.DV : at.DV + 3], row[at.DP : at.DP + 3] = m.motion.dv, m.motion.dp
-    row[at.ASSUMED : at.ASSUMED + 6] = m.bias
-    return row
 
 
 @dataclass(frozen=True)

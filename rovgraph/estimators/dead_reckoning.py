@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.measurements import motions_of
 from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
 from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity, rotate, transpose
 from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.kernels import measurement_row
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.kernels.dead_reckoning import reckon_attitude
@@ -138,11 +140,15 @@ def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | Non
     time[keyframe] = [i.time for i in intervals]
     dt[keyframe], dR[keyframe], dv[keyframe], assumed[keyframe] = _motions(intervals)
     if found:
-        k, motions = np.array([*found]), [a.motion for a in found.values()]
-        time[k], dt[k] = [a.time for a in found.values()], [motion.dt for motion in motions]
-        dR[k] = np.concatenate([motion.dR for motion in motions]).reshape(-1, 3, 3)
-        dv[k] = np.concatenate([motion.dv for motion in motions]).reshape(-1, 3)
-        assumed[k] = np.concatenate([a.bias for a in found.values()]).reshape(-1, 6)
+        k, rows = np.array([*found]), np.array([a.row[: measurement_row.Z] for a in found.values()])
+        motion = motions_of(rows)
+        time[k], dt[k], dR[k], dv[k], assumed[k] = (
+            rows[:, measurement_row.TIME],
+            motion.dt,
+            motion.dR,
+            motion.dv,
+            motion.bias,
+        )
     begin, begin_R, begin_v = np.roll(dt, 1), np.roll(dR, 1, axis=0), np.roll(dv, 1, axis=0)
     anew = (keyframe + 1) % m
     begin[anew], begin_R[anew], begin_v[anew] = 0.0, identity(3), 0.0

@@ -132,7 +132,7 @@ def residual_frame(
                 "sd": sd[:, k],
                 "normalised": normalised[:, k],
                 "weight": weights[sensor],
-                "row": block.row,
+                "row": block.line,
             }
             frames.append(pd.DataFrame(columns))
     if not frames:

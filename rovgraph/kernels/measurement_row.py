@@ -1,14 +1,14 @@
-"""How a measurement, and a sensor, are laid out in one row of numbers for the filter's kernel.
+"""How a measurement, and a sensor, are laid out in one row of numbers.
 
 =============  =====  ==========================================================================================
 measurement
 =============  =====  ==========================================================================================
 `TIME`             1  [s]
-`Z`, `SD`       3, 3  components, and their noise
 `RATE`             3  measured angular rate in b, its bias still in it [rad/s]
 `RATE_SD`          1  its noise [rad/s]
 `SNAPSHOT`        16  motion from the keyframe: time, dR by rows, dv, dp
 `ASSUMED`          6  bias that the motion was integrated with
+`Z`, `SD`       3, 3  components, and their noise; more of each where there are more, which no kernel takes
 =============  =====  ==========================================================================================
 
 =============  =====  ==========================================================================================
@@ -26,8 +26,10 @@ sensor
 =============  =====  ==========================================================================================
 """
 
-TIME, Z, SD, RATE, RATE_SD, SNAPSHOT, ASSUMED = 0, 1, 4, 7, 10, 11, 27
-ROW = ASSUMED + 6
+TIME, RATE, RATE_SD, SNAPSHOT, ASSUMED, Z = 0, 1, 4, 5, 21, 27
+MOST = 3  # components of a measurement that a kernel takes
+SD = Z + MOST
+ROW = SD + MOST
 DT, DR, DV, DP = SNAPSHOT, SNAPSHOT + 1, SNAPSHOT + 10, SNAPSHOT + 13
 
 KIND, DIM, LOSS, BEND, GATE, READMIT, SEES, SEEN_FRAME, GAIN, PARAMS = 0, 1, 2, 3, 4, 5, 6, 9, 10, 19
