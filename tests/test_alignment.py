@@ -7,6 +7,7 @@ import pytest
 from dives import RecordingFilter, attitude_errors, falcon, fed, interrupted, position_errors, simulated
 
 import rovgraph.engine.alignment as alignment
+from rovgraph.engine import filter
 from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.keyframes import KeyframeInterval
@@ -133,7 +134,8 @@ def test_after_a_silence_no_sensor_is_kept_out_for_long_and_attitude_is_as_sure_
 
 
 def test_linearised_where_it_stands_a_vague_attitude_would_be_believed_and_sensors_kept_out(monkeypatch):
-    monkeypatch.setattr(alignment, "POORLY_KNOWN_TILT", np.inf)
+    for module in (alignment, filter):
+        monkeypatch.setattr(module, "POORLY_KNOWN", np.full(2, np.inf))
     kept_out, _, heading = after_silences(range(2, 4))
     assert kept_out > 40 and np.mean(heading > 5.0) > 0.3
 

@@ -23,7 +23,7 @@ from rovgraph.simulate import Style, Waves
 from rovgraph.simulate.files import write_log
 from rovgraph.state import BIAS, POSE, VELOCITY
 
-EXACT = 1e-13  # of the cost, at which both stop here
+EXACT = 1e-10  # decrease of the cost that is left when both stop here
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0}
 WILD = Style(waves=Waves(heave=0.2, roll=0.4, pitch=0.35))
 
@@ -85,7 +85,7 @@ SCENARIOS: dict[str, Callable[[], Case]] = {
 def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
     """A dive, solved by both until neither moves any more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gauss_newton, "RELATIVE_DECREASE", EXACT)
+        patch.setattr(gauss_newton, "FINE", EXACT)
         dive = batch(*SCENARIOS[request.param]())
         b = dive.beginning
         states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
@@ -175,7 +175,7 @@ def test_both_move_alike_when_a_constant_is_held(solved):
     chain, _ = solved
     constant = [name for name, walk in chain.unknowns.walks.items() if not walk]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gauss_newton, "RELATIVE_DECREASE", EXACT)
+        patch.setattr(gauss_newton, "FINE", EXACT)
         (a, by_a), (b, by_b) = (best.holding(constant[:1]) for best in solved)
     assert a.solution.cost == pytest.approx(b.solution.cost, rel=1e-6)
     np.testing.assert_allclose(a.state.p_n, b.state.p_n, atol=1e-5)

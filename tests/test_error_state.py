@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from dives import (
     RecordingFilter,
@@ -34,7 +35,7 @@ from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import loss_and_weight, loss_threshold
 from rovgraph.engine.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
 from rovgraph.engine.transition import predict, transitions
-from rovgraph.estimators.eskf.error_state import replay
+from rovgraph.estimators.eskf.error_state import ErrorStateFilter, replay
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
@@ -298,8 +299,25 @@ def kalman(P: Array, r: Array, H: Array, parts: list[slice], losses: list[str]) 
     return K @ r, (eye - K @ H) @ P @ (eye - K @ H).T + K @ np.diag(noise) @ K.T, weights
 
 
-@pytest.mark.parametrize("loss", LOSSES)
+def test_intervals_in_a_row_come_out_as_one_by_one(case):
+    data = case.log["dvl"].data.copy()
+    data[20::17, 0] += 1.0  # some that the gate leaves out
+    dive = batch(altered(case.log, "dvl", data), case.config)
+    alone = ErrorStateFilter(dive.beginning, (10.0,))
+    for interval in dive.intervals:
+        alone.step(interval)
+    together = replay(dive.intervals, dive.beginning, (10.0,))
+    np.testing.assert_array_equal(together.known.P, alone.known.P)
+    np.testing.assert_array_equal(together.states().p_n, alone.states().p_n)
+    assert together.gates == alone.gates
+    a, b = together.solve(), alone.solve()
+    assert (a.residuals["weight"] == 0.0).any()
+    pd.testing.assert_frame_equal(a.residuals, b.residuals)
+    np.testing.assert_array_equal(a.trajectory.p_sd, b.trajectory.p_sd)
+
+
 @pytest.mark.parametrize("where", ["between", "here"])
+@pytest.mark.parametrize("loss", LOSSES)
 def test_a_correction_is_a_textbooks_kalman_update_moved_along_the_coordinates(estimator, where, loss):
     initial = estimator.beginning
     lossy = {sensor: replace(instrument, loss=loss) for sensor, instrument in initial.instruments.items()}

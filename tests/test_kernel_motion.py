@@ -14,7 +14,7 @@ import pytest
 from rovgraph.geometry import Array, exp_rotation, log_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
 from rovgraph.kernels.motion import transitions
-from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motions
+from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motion
 from rovgraph.kernels.motion_row import (
     BIAS,
     BY_BIAS,
@@ -333,11 +333,11 @@ def test_weights_whiten(case):
     before = ends(8, case.bias)
     after = predict(row, before).moved(0.01 * np.random.default_rng(5).normal(size=(1, 15)))
     r, A_i, A_j = error(row, before, after)
-    whitened = r[None].copy(), A_i[None].copy(), A_j[None].copy()
-    whiten_motions(W[None], *whitened)
-    close(whitened[0][0], W @ r)
-    close(whitened[1][0], W @ A_i)
-    close(whitened[2][0], W @ A_j)
+    whitened = r.copy(), A_i.copy(), A_j.copy()
+    whiten_motion(W, *whitened)
+    close(whitened[0], W @ r)
+    close(whitened[1], W @ A_i)
+    close(whitened[2], W @ A_j)
 
 
 def test_many_intervals_are_each_alone():

@@ -25,8 +25,9 @@ from rovgraph.geometry import (
     transpose,
 )
 from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.kernels.filtering import attitude_variances_of
 
-POORLY_KNOWN_TILT, POORLY_KNOWN_HEADING = np.deg2rad(4.0), np.deg2rad(10.0)  # sd from which a tangent does harm
+POORLY_KNOWN = np.deg2rad([4.0, 10.0]) ** 2  # variances of tilt and heading from which a tangent does harm [rad^2]
 STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
 AT_REST = 0.2  # share of gravity by which a mean specific force may differ from it and still show where down is
 
@@ -35,10 +36,8 @@ Linearize = Callable[[Gaussian, Sequence[KeyframeMeasurement]], tuple[Array, Arr
 
 def poorly_known(known: Gaussian) -> bool:
     """Whether tilt or heading is hardly known."""
-    if known.P[0, 0] + known.P[1, 1] + known.P[2, 2] < POORLY_KNOWN_TILT**2:
-        return False
-    tilt, heading = _variances(known)
-    return bool(tilt > POORLY_KNOWN_TILT**2 or heading > POORLY_KNOWN_HEADING**2)
+    tilt, heading = attitude_variances_of(known.x, known.P)
+    return bool(tilt > POORLY_KNOWN[0] or heading > POORLY_KNOWN[1])
 
 
 def aligned(known: Gaussian, interval: KeyframeInterval, linearize: Linearize, gravity: float) -> Gaussian:
@@ -51,11 +50,11 @@ def aligned(known: Gaussian, interval: KeyframeInterval, linearize: Linearize, g
     linearize : from an estimate and measurements to whitened innovations and Jacobians
     gravity : [m/s^2]
     """
-    tilt, heading = _variances(known)
-    if tilt > POORLY_KNOWN_TILT**2:
+    tilt, heading = attitude_variances_of(known.x, known.P)
+    if tilt > POORLY_KNOWN[0]:
         known = with_attitude(known, _levelled(known, interval, gravity))
     compasses = [m for m in interval.between if m.sensor in HEADING_STREAMS]
-    if compasses and heading > POORLY_KNOWN_HEADING**2:
+    if compasses and heading > POORLY_KNOWN[1]:
         known = with_attitude(known, _towards(known, compasses, linearize))
     return known
 
@@ -74,13 +73,6 @@ def with_attitude(known: Gaussian, R_nb: Array) -> Gaussian:
         x[12:15] = turn @ v_n
     x[:9] = R_nb.ravel()
     return replace(known, x=x, P=basis @ known.P @ basis.T)
-
-
-def _variances(known: Gaussian) -> tuple[float, float]:
-    """Of the tilt, the larger one, and of the heading [rad^2]."""
-    R_nb = known.state.R_nb[0]
-    north, east, down = np.diag(R_nb @ known.P[:3, :3] @ R_nb.T).tolist()
-    return max(north, east), down
 
 
 def _levelled(known: Gaussian, interval: KeyframeInterval, gravity: float) -> Array:

@@ -1,28 +1,33 @@
 """The smoother of a dive that closes no loop: a chain of keyframes with a border of constants.
 
-Each iteration linearises all motions and measurements in compiled kernels and eliminates them in the order of time
-(`rovgraph.kernels.chain`). Calibration that walks is a part of each keyframe, what is constant is the border. The
+Each iteration linearises all factors and eliminates them in the order of time, in one compiled pass
+(`rovgraph.kernels.dive`). Calibration that walks is a part of each keyframe, what is constant is the border. The
 factors are those of the graph that `rovgraph.graph` gives to GTSAM, and a test holds both optima equal.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.calibration import TABLE, Belief
-from rovgraph.engine.chain_information import MeasurementRows, MotionRows, SquareRoot, UndeterminedError, eliminate
+from rovgraph.calibration import LAYOUT, TABLE, Belief, calibration_size
+from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, UndeterminedError, square_root
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.measurements import Block, gates_of, loss_and_weight, measurement_cost
+from rovgraph.engine.measurements import Block, Seen, blocks_of, gates_of, loss_and_weight, measurement_cost
 from rovgraph.engine.scale import SCALES
+from rovgraph.engine.sensor_rows import compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
-from rovgraph.kernels.motion_residual import motion_cost, motion_errors, motion_weights, whiten_motions
+from rovgraph.kernels.dive import eliminate_dive, robust_costs, squared_lengths
+from rovgraph.kernels.measurement_row import GATE
+from rovgraph.kernels.motion_residual import motion_cost
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 MOTION = 15  # components of a keyframe before what walks
@@ -49,14 +54,14 @@ class Chain:
     Attributes
     ----------
     intervals, initial, beliefs, unknowns : the dive
-    blocks : sensor -> its measurements
+    rows : the same as arrays
     """
 
-    intervals: list[KeyframeInterval]
+    intervals: Sequence[KeyframeInterval]
     initial: InitialConditions
     beliefs: Mapping[str, Belief]
     unknowns: Unknowns
-    blocks: dict[str, Block]
+    rows: DiveRows
 
     @cached_property
     def layout(self) -> dict[str, tuple[bool, slice]]:
@@ -88,53 +93,95 @@ class Chain:
         return np.array([i.time for i in self.intervals])
 
     @cached_property
-    def motions(self) -> Array:
-        """Rows of the motions between keyframes, shape (n - 1, ROW)."""
-        return np.array([i.motion.row for i in self.intervals[1:] if i.motion is not None]).reshape(
-            len(self.intervals) - 1, -1
-        )
-
-    @cached_property
-    def motion_weights(self) -> Array:
-        """Square-root information of the motions, shape (n - 1, 15, 15)."""
-        W = np.empty((len(self.motions), MOTION, MOTION))
-        motion_weights(self.motions, W)
-        return W
-
-    @cached_property
-    def scale_to_bias(self) -> Array | None:
-        """Bias by the IMU's scales of each interval, shape (n - 1, 6, 6), or None where these are exact."""
-        if len(self.intervals) < 2 or self.intervals[1].scale_to_bias is None:
-            return None
-        return np.array([i.scale_to_bias for i in self.intervals[1:]])
-
-    @cached_property
     def walk(self) -> Array:
         """Square-root information of the walks, shape (n - 1, d - 15)."""
         rates = [np.full(TABLE[n].dim, walk) for n, walk in self.unknowns.walks.items() if walk]
         rate = np.concatenate([np.empty(0), *rates])
         return np.asarray(1.0 / (rate * np.sqrt(np.diff(self.time))[:, None]))
 
+    @cached_property
+    def blocks(self) -> dict[str, Block]:
+        """Sensor -> its measurements."""
+        return self._blocks({*self.initial.instruments})
+
+    @cached_property
+    def given(self) -> dict[str, Block]:
+        """The same of sensors whose equation no kernel knows."""
+        return self._blocks(self._unknown_to_kernels) if self._unknown_to_kernels else {}
+
+    def _blocks(self, sensors: set[str]) -> dict[str, Block]:
+        gravity = self.initial.config.environment.gravity_mps2
+        return blocks_of(self.intervals, sensors, self.initial.instruments, gravity, self.unknowns)
+
+    @cached_property
+    def _unknown_to_kernels(self) -> set[str]:
+        # of a time offset that is held here, too: its measurements have been assembled for any
+        late = {name for name, belief in self.beliefs.items() if belief.estimate}
+        return {s for s, i in self.initial.instruments.items() if not compiled(i, i.time_offset in late)}
+
+    @cached_property
+    def _sensors(self) -> Array:
+        return sensor_table(self.initial.instruments, sorted(self._unknown_to_kernels))
+
+    @cached_property
+    def _places(self) -> dict[str, NDArray[np.int64]]:
+        """Sensor that kernels know -> places of its measurements among all."""
+        names = [s for s in self.initial.instruments if s not in self._unknown_to_kernels]
+        places = {name: self.rows.of_sensor(name) for name in names}
+        return {name: found for name, found in places.items() if len(found)}
+
     # what `rovgraph.engine.gauss_newton` asks
 
-    def seen(self, state: State) -> list[tuple[str, Block, State]]:
-        """Every sensor's block, with the state of each measurement's keyframe."""
-        return [(sensor, block, state.at(block.keyframe)) for sensor, block in self.blocks.items()]
+    def seen(self, state: State, blocks: Mapping[str, Block]) -> Seen:
+        """Sensors' blocks, with the state of each measurement's keyframe."""
+        return [(sensor, block, state.at(block.keyframe)) for sensor, block in blocks.items()]
 
     def initial_gates(self) -> Gates:
-        return {sensor: block.believed.copy() for sensor, block in self.blocks.items()}
+        """As `rovgraph.engine.gauss_newton.Linearizable`."""
+        known = {sensor: np.full(len(places), True) for sensor, places in self._places.items()}
+        return {**known, **{sensor: block.believed.copy() for sensor, block in self.given.items()}}
 
     def gates(self, point: State) -> Gates:
-        return gates_of(self.seen(point))
+        """As `rovgraph.engine.gauss_newton.Linearizable`."""
+        within = self._squared_lengths(point) <= self._sensors[self.rows.which, GATE] ** 2
+        known = {sensor: within[places] for sensor, places in self._places.items()}
+        return {**known, **gates_of(self.seen(point, self.given))}
 
     def cost(self, point: State, gates: Gates) -> float:
-        shift = np.empty((0, 6)) if self.scale_to_bias is None else self._scale_shift(point)
+        """As `rovgraph.engine.gauss_newton.Linearizable`."""
+        shift = self._scale_shift(point) if len(self.rows.scales) else np.empty((0, 6))
         R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
-        total = motion_cost(self.motions, self.motion_weights, R, p, v, b, shift)
+        total = motion_cost(self.rows.motions, self.rows.weights, R, p, v, b, shift)
         total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
         for name in self._walking:
             total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
-        return total + measurement_cost(self.seen(point), gates)
+        squares = self._squared_lengths(point)
+        total += robust_costs(squares, self.rows.which, self._sensors, self._entered(gates))
+        return total + measurement_cost(self.seen(point, self.given), gates)
+
+    def _squared_lengths(self, point: State) -> Array:
+        """Of the whitened innovations of what kernels know, shape (m,)."""
+        r, out = self.rows, np.empty(len(self.rows.rows))
+        gravity = self.initial.config.environment.gravity_mps2
+        dive = r.rows, r.which, r.first, r.row_scales, self._sensors
+        squared_lengths(*dive, *self._arrays(point), gravity, out)
+        return out
+
+    def _entered(self, gates: Gates) -> NDArray[np.bool_]:
+        """Gates of what kernels know, shape (m,)."""
+        out = np.zeros(len(self.rows.rows), bool)
+        for sensor, places in self._places.items():
+            out[places] = gates[sensor]
+        return out
+
+    def _arrays(self, point: State) -> tuple[Array, Array, Array, Array, Array]:
+        """A point as `rovgraph.kernels.dive` takes it."""
+        walked = any(value.ndim > 1 for value in point.calibration.values())  # also of what is held where it has walked
+        c = np.empty((len(self.intervals) if walked else 1, calibration_size()))
+        for name, part in LAYOUT.items():
+            c[:, part] = point.calibration[name]
+        R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
+        return R, p, v, b, c
 
     def step(self, point: State, gates: Gates) -> ChainStep:
         return ChainStep(*self.eliminate(point, gates).solve())
@@ -190,24 +237,10 @@ class Chain:
         J[3:6, 3:6] = R
         return self._prior_weight @ J
 
-    def motion_residuals(self, point: State) -> tuple[Array, Array, Array]:
-        """Whitened residuals of the motions, and their derivatives by the keyframes before and after."""
-        n = len(self.motions)
-        r, A_i, A_j = np.empty((n, MOTION)), np.empty((n, MOTION, MOTION)), np.empty((n, MOTION, MOTION))
-        R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
-        b_i, b_j = b[:-1], b[1:]
-        if self.scale_to_bias is not None:
-            shift = self._scale_shift(point)
-            b_i, b_j = b_i + shift, b_j + shift
-        motion_errors(self.motions, R[:-1], p[:-1], v[:-1], b_i, R[1:], p[1:], v[1:], b_j, r, A_i, A_j)
-        whiten_motions(self.motion_weights, r, A_i, A_j)
-        return r, A_i, A_j
-
     def _scale_shift(self, point: State) -> Array:
         """Bias that errors of the IMU's scale make in each interval, shape (n - 1, 6)."""
-        assert self.scale_to_bias is not None
         k = [np.broadcast_to(np.atleast_2d(point.calibration[s]), (len(self.intervals), 3))[1:] for s in SCALES]
-        return rotate(self.scale_to_bias, np.concatenate(k, axis=1))
+        return rotate(self.rows.scales, np.concatenate(k, axis=1))
 
     def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = ()) -> SquareRoot:
         """All factors linearised at a point and eliminated; with ``stops`` the border ends with the first attitude.
@@ -216,17 +249,28 @@ class Chain:
         ------
         InputError : the data do not determine some variable, which is named
         """
-        r, A_i, A_j = self.motion_residuals(point)
-        C, targets = self._scale_columns(A_i, A_j)
-        walks = [np.diff(point.calibration[name], axis=0) * self._walk_of(name) for name in self._walking]
-        walk_r = np.concatenate([np.empty((len(r), 0)), *walks], axis=1)
-        rows, clones = (self._rows_with_clone, CLONED) if len(stops) else (self._rows, 0)
-        self._put_priors(rows, point, clones)
-        for place, (sensor, block, state) in enumerate(self.seen(point), PRIORS):
-            self._put_block(rows, place, block, state, gates[sensor])
+        given, clones = (self._rows_with_clone, CLONED) if len(stops) else (self._rows, 0)
+        self._put_priors(given, point, clones)
+        for place, (sensor, block, state) in enumerate(self.seen(point, self.given), PRIORS):
+            self._put_block(given, place, block, state, gates[sensor])
+        r, n, d, c = self.rows, len(self.intervals), self.d, self.c + clones
+        dive = r.motions, r.weights, r.scales, r.rows, r.which, r.first, r.row_scales, self._sensors
+        gravity = self.initial.config.environment.gravity_mps2
+        point_and_layout: Any = (*self._arrays(point), self._column, gravity, self.walk, self._walking_of_c)
+        rest: Any = (
+            given.values,
+            given.targets,
+            given.first,
+            self._border_rows(point, clones),
+            np.array(stops, np.int64),
+        )
+
+        def fill(conditionals: Array, border: Array, filtered: Array, left: Array) -> int:
+            out: Any = conditionals, border, filtered, left
+            return eliminate_dive(*dive, self._entered(gates), *point_and_layout, *rest, *out)
+
         try:
-            motions = MotionRows(A_i, A_j, -r, C, targets, self.walk, -walk_r)
-            return eliminate(motions, rows, self._border_rows(point, clones), stops)
+            return square_root(n, d, c, len(stops), fill)
         except UndeterminedError as error:
             raise InputError(self._indeterminate(error.keyframe, error.component)) from None
 
@@ -239,13 +283,28 @@ class Chain:
         return self._room(CLONED)
 
     def _room(self, clones: int) -> MeasurementRows:
-        """Room for the rows of priors, of the clone's tie and of all measurements, in this order."""
-        blocks, first = self.blocks.values(), np.zeros(1, np.int64)
+        """Room for the rows of priors, of the clone's tie and of what no kernel knows, in this order."""
+        blocks, first = self.given.values(), np.zeros(1, np.int64)
         walking = self.d - MOTION
         keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]
         dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
         others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
         return MeasurementRows(len(self.intervals), MOTION, keyframes, dims, max([walking, clones, *others]))
+
+    @cached_property
+    def _column(self) -> NDArray[np.int64]:
+        """Target of each component of state and calibration vector, shape (15 + C,), -1 where it is not estimated."""
+        out = np.full(MOTION + calibration_size(), -1)
+        out[:MOTION] = np.arange(MOTION)
+        for name in self.layout:
+            part = LAYOUT[name]
+            out[MOTION + part.start : MOTION + part.stop] = self.target(name)
+        return out
+
+    @cached_property
+    def _walking_of_c(self) -> NDArray[np.int64]:
+        """What of the calibration vector walks, shape (d - 15,)."""
+        return np.concatenate([_NOTHING, *(np.r_[LAYOUT[name]] for name in self._walking)])
 
     def _put_priors(self, rows: MeasurementRows, point: State, clones: int) -> None:
         """The prior of the first keyframe, that of what walks, and the tie of the first attitude's clone."""
@@ -298,17 +357,6 @@ class Chain:
     def _walk_of(self, name: str) -> Array:
         part = self.layout[name][1]
         return self.walk[:, part.start - MOTION : part.stop - MOTION]
-
-    def _scale_columns(self, A_i: Array, A_j: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Derivatives of the motions by the IMU's scales that are estimated, and their targets."""
-        names = [name for name in SCALES if name in self.layout]
-        if not names or self.scale_to_bias is None:
-            return np.empty((len(A_i), MOTION, 0)), np.empty(0, np.int64)
-        by_bias = A_i[:, :, 9:15] + A_j[:, :, 9:15]  # of both alike, which leaves the bias's walk out of it
-        by_scale = by_bias @ self.scale_to_bias
-        parts = {"acc_scale": slice(0, 3), "gyr_scale": slice(3, 6)}
-        C = np.concatenate([by_scale[:, :, parts[name]] for name in names], axis=2)
-        return np.ascontiguousarray(C), np.concatenate([self.target(name) for name in names])
 
     def _indeterminate(self, keyframe: int | None, component: int) -> str:
         """One line on a system that cannot be solved."""

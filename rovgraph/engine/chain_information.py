@@ -6,7 +6,7 @@ considered, not estimated (Schmidt), come last in it: `SquareRoot.solve` and `Sq
 many they are, or what is believed of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -234,14 +234,29 @@ def eliminate(
     UndeterminedError : the rows do not determine some component
     """
     m, n, c = motions, len(measurements.first) - 1, border_rows.shape[1] - 1
-    d = m.A_i.shape[1] + m.walk.shape[1]
+    rows = measurements.values, measurements.targets, measurements.first, border_rows, np.array(stops, dtype=np.int64)
+
+    def fill(*out: Array) -> int:
+        return chain.eliminate(m.A_i, m.A_j, m.r, m.C, m.targets, m.walk, m.walk_r, *rows, *out)
+
+    return square_root(n, m.A_i.shape[1] + m.walk.shape[1], c, len(stops), fill)
+
+
+def square_root(n: int, d: int, c: int, stops: int, fill: Callable[[Array, Array, Array, Array], int]) -> SquareRoot:
+    """What an elimination of n keyframes of d components and a border of c leaves.
+
+    Parameters
+    ----------
+    stops : number of keyframes at which to keep what is known
+    fill : writes ``conditionals_out`` to ``left_out`` and returns, as `rovgraph.kernels.chain.eliminate`
+
+    Raises
+    ------
+    UndeterminedError : the rows do not determine some component
+    """
     conditionals, border = np.empty((n, d, 2 * d + c + 1)), np.empty((c, c + 1))
-    filtered, left = np.empty((len(stops), d + c, d + c + 1)), np.empty(1)
-    failing = chain.eliminate(
-        *(m.A_i, m.A_j, m.r, m.C, m.targets, m.walk, m.walk_r),
-        *(measurements.values, measurements.targets, measurements.first, border_rows, np.array(stops, dtype=np.int64)),
-        *(conditionals, border, filtered, left),
-    )
+    filtered, left = np.empty((stops, d + c, d + c + 1)), np.empty(1)
+    failing = fill(conditionals, border, filtered, left)
     if failing >= n * d:
         raise UndeterminedError(None, failing - n * d)
     if failing >= 0:

@@ -10,10 +10,11 @@ from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.chain import COLUMNS, MOTION, Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Solution, minimise
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.measurements import Block, blocks_of, weights_of
+from rovgraph.engine.measurements import Block, weights_of
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import Array
@@ -28,7 +29,7 @@ class ChainOptimum:
     solution: Solution[State]
 
     @property
-    def intervals(self) -> list[KeyframeInterval]:
+    def intervals(self) -> Sequence[KeyframeInterval]:
         return self.chain.intervals
 
     @property
@@ -49,7 +50,7 @@ class ChainOptimum:
 
     @cached_property
     def weights(self) -> Mapping[str, Array]:
-        return weights_of(self.chain.seen(self.state), self.solution.gates)
+        return weights_of(self.chain.seen(self.state, self.blocks), self.solution.gates)
 
     @property
     def places(self) -> Mapping[int, Array]:
@@ -126,6 +127,7 @@ def smooth_chain(
     initial: InitialConditions,
     states: State,
     calibration: Mapping[str, Array] | None = None,
+    rows: DiveRows | None = None,
 ) -> ChainOptimum:
     """Solve a dive that closes no loop.
 
@@ -134,14 +136,13 @@ def smooth_chain(
     intervals, initial : the dive
     states : State of its keyframes to begin with
     calibration : to begin with, its prior means where it is None
+    rows : the dive as arrays, where they are at hand
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
-    beliefs = beliefs_of(initial.config)
-    measured = {m.sensor for interval in intervals for m in interval.measurements}
-    wanted = unknowns(beliefs, measured)
-    blocks = blocks_of(intervals, initial.instruments, initial.config.environment.gravity_mps2, wanted)
-    chain = Chain(list(intervals), initial, beliefs, wanted, blocks)
+    beliefs, rows = beliefs_of(initial.config), rows or DiveRows.of(intervals, [*initial.instruments])
+    wanted = unknowns(beliefs, [rows.sensors[k] for k in np.unique(rows.which)])
+    chain = Chain(intervals, initial, beliefs, wanted, rows)
     return ChainOptimum(chain, minimise(chain, chain.start(states, calibration)))

@@ -10,13 +10,16 @@ goes on to the next keyframe with the IMU; what was measured there corrects it.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from rovgraph.config import beliefs
-from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
+from rovgraph.engine.alignment import POORLY_KNOWN, aligned, poorly_known, with_attitude
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.error_layout import ErrorLayout
 from rovgraph.engine.filter_step import (
+    FilterRun,
     FilterStep,
     Gates,
     Gaussian,
@@ -42,6 +45,7 @@ from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.correction import correct, difference, move_estimate
+from rovgraph.kernels.filtering import filter_intervals
 from rovgraph.kernels.prediction import predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 
@@ -107,6 +111,31 @@ class FilterEngine:
             predicted = transition.predicted
         filtered = self.correct(predicted, interval.here, gates, processed)
         return FilterStep(departed, transition, filtered, processed)
+
+    def run(self, rows: DiveRows, begin: int, end: int, before: Gaussian, gates: Gates) -> FilterRun:
+        """Take intervals of a dive as `step` does, as far as kernels know how.
+
+        Parameters
+        ----------
+        rows : the dive, its sensors those of the configuration
+        begin, end : the intervals, the first beyond 0
+        before : the keyframe before them, without places
+        gates : renewed in place
+        """
+        size, C = self.layout.size, len(before.c)
+        x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
+        some = rows.between(begin, end)
+        k, m, since = end - begin, len(some.rows), self._since(gates)
+        out: Any = [np.empty(shape) for shape in ((k, 21), (k, C)) * 2]
+        out += [np.empty(shape) for shape in ((k, 6, 6), (k, 3, 3), (k, size), (m,), (m,))]
+        known: Any = x, c, P, some.motions, some.scales, some.rows, some.which, some.row_scales
+        tables: Any = self._sensors, self.layout.column, self._walk, *self.layout.coordinates
+        order: Any = np.append(0, some.taken), some.first[:k]
+        limits: Any = since, self._gravity, POORLY_KNOWN
+        taken = filter_intervals(*known, *order, *tables, *limits, *out)
+        self._renew(gates, since)
+        m = int(some.taken[taken - 1]) if taken else 0
+        return FilterRun(Gaussian(x, c, P), *(a[:taken] for a in out[:-2]), *(a[:m] for a in out[-2:]))
 
     def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:
         """The next keyframe, from the IMU alone; calibration walks."""
@@ -203,17 +232,24 @@ class FilterEngine:
         rows = np.array([m.row[: at.ROW] for m in measurements])
         which = np.array([self._index[m.sensor] for m in measurements])
         x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
-        since = np.array([(gates or {}).get(sensor, np.nan) for sensor in self._index])
+        since = self._since(gates or {})
         nis, weight = np.empty(len(rows)), np.empty(len(rows))
         places = np.zeros(len(P) - self.layout.size)
         tables = (self._sensors, self.layout.column, scale, r, H, *self.layout.coordinates)
         correct(x, c, P, rows, which, *tables, since, gates is not None, self._gravity, nis, weight, places)
         if gates is not None:
-            gates.clear()
-            gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
+            self._renew(gates, since)
         met = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
         processed += [ProcessedMeasurement(m, before.x, before.c, own, w) for m, own, w in met]
         return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places)
+
+    def _since(self, gates: Gates) -> Array:
+        """Since when each sensor is left out, nan where it is not [s]."""
+        return np.array([gates.get(sensor, np.nan) for sensor in self._index])
+
+    def _renew(self, gates: Gates, since: Array) -> None:
+        gates.clear()
+        gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
 
     def _of_block(self, known: Gaussian, m: KeyframeMeasurement) -> tuple[Array, Array]:
         """The same of a sensor whose equation the kernels do not know."""

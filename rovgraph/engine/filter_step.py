@@ -120,3 +120,31 @@ class FilterStep:
     transition: Transition | None
     filtered: Gaussian
     processed: list[ProcessedMeasurement]
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """Through k intervals in a row, with m measurements.
+
+    Attributes
+    ----------
+    known : Gaussian of the last keyframe
+    x, c : ndarray, shapes (k, 21), (k, C), the keyframes, as of `Gaussian`
+    predicted_x, predicted_c : the same, before what was measured at them
+    pose, velocity, sd : ndarray, shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
+    nis, weight : ndarray, shape (m,), of the measurements, as of `ProcessedMeasurement`
+    """
+
+    known: Gaussian
+    x: Array
+    c: Array
+    predicted_x: Array
+    predicted_c: Array
+    pose: Array
+    velocity: Array
+    sd: Array
+    nis: Array
+    weight: Array
+
+    def __len__(self) -> int:
+        return len(self.x)

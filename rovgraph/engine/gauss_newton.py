@@ -4,9 +4,14 @@ A Gauss-Newton step of a reweighted problem is a direction of descent of the rob
 falls, so the iteration cannot diverge, and doubled as long as that helps, since reweighted steps fall short where
 many measurements lie beyond their loss's bend. When it has converged, measurements beyond their gate are taken
 out, those back within it let in, and it is solved again until the gates rest.
+
+It has converged when the decrease that is left is small. Steps that converge by a factor leave a geometric series
+of decreases, so two of them say what is left. A decrease of e is a move of sqrt(2 e) sd in the direction in which
+the data know least about it.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -17,8 +22,10 @@ Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are 
 MAX_ITERATIONS = 50
 MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
-RELATIVE_DECREASE = 1e-7  # of the cost, at which the last round stops
-COARSE_DECREASE = 1e-3  # and the rounds before the gates rest
+FINE = 1e-3  # decrease of the cost that is left when the last round stops: 0.045 sd
+COARSE = 1e-2  # the same as a part of the cost, of the rounds before the gates rest
+
+LEAST_LEFT = 0.1  # of a step's decrease: after steps that were still far away the next may converge less well
 
 Point = TypeVar("Point")
 Step = TypeVar("Step")
@@ -81,29 +88,56 @@ def minimise(problem: Linearizable[Point, Step], point: Point) -> Solution[Point
     InputError : the data do not determine some variable, which is named
     """
     gates, iterations, gatings = problem.initial_gates(), 0, 0
-    tolerance = COARSE_DECREASE
+    descent, fine = _Descent(point, problem.cost(point, gates)), False
     while True:
-        point, cost, steps, converged = _descend(problem, point, gates, tolerance)
-        iterations, within = iterations + steps, problem.gates(point)
+        descent = _descend(problem, descent, gates, fine)
+        iterations, within = iterations + descent.steps, problem.gates(descent.point)
         rest = gatings >= MAX_GATINGS or all(np.array_equal(within[s], gates[s]) for s in gates)
-        if rest and tolerance == RELATIVE_DECREASE:
-            return Solution(point, gates, cost, iterations, converged)
-        tolerance = RELATIVE_DECREASE if rest else COARSE_DECREASE
-        gates, gatings = gates if rest else within, gatings + 1
+        if rest and (fine or descent.left <= FINE):
+            return Solution(descent.point, gates, descent.cost, iterations, descent.steps < MAX_ITERATIONS)
+        fine, gatings = rest, gatings + 1
+        if not rest:
+            gates = within
+            descent = _Descent(descent.point, problem.cost(descent.point, gates))
 
 
-def _descend(
-    problem: Linearizable[Point, Step], point: Point, gates: Gates, tolerance: float
-) -> tuple[Point, float, int, bool]:
-    """Gauss-Newton for fixed gates: the point, its cost, the steps taken, and whether the cost has come to rest."""
-    cost = problem.cost(point, gates)
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        trial, trial_cost = _search(problem, point, gates, cost, tolerance)
-        decrease = cost - trial_cost
-        point, cost = trial, trial_cost
-        if decrease <= tolerance * (1.0 + cost):
-            return point, cost, iteration, True
-    return point, cost, MAX_ITERATIONS, False
+@dataclass(frozen=True)
+class _Descent(Generic[Point]):
+    """Where an iteration with fixed gates stands.
+
+    Attributes
+    ----------
+    point, cost : the best so far
+    decrease : of the last step's cost; infinite before the first
+    left : what further steps may still take off the cost
+    steps : since the gates changed, or were found at rest
+    """
+
+    point: Point
+    cost: float
+    decrease: float = math.inf
+    left: float = math.inf
+    steps: int = 0
+
+
+def _descend(problem: Linearizable[Point, Step], begin: _Descent[Point], gates: Gates, fine: bool) -> _Descent[Point]:
+    """Gauss-Newton for fixed gates, until little is left or `MAX_ITERATIONS` steps are taken."""
+    now = replace(begin, steps=0)
+    for step in range(1, MAX_ITERATIONS + 1):
+        tolerance = FINE if fine else max(FINE, COARSE * now.cost)
+        point, cost = _search(problem, now.point, gates, now.cost, tolerance)
+        decrease = now.cost - cost
+        now = _Descent(point, cost, decrease, _left(decrease, now.decrease), step)
+        if now.left <= (FINE if fine else max(FINE, COARSE * cost)):
+            return now
+    return now
+
+
+def _left(decrease: float, before: float) -> float:
+    """What steps will still take off the cost, from the decreases by the last step and the one before it."""
+    if decrease >= before:
+        return math.inf if decrease > 0.0 else 0.0
+    return decrease * (1.0 if before == math.inf else max(decrease / (before - decrease), LEAST_LEFT))
 
 
 def _search(
@@ -118,7 +152,7 @@ def _search(
 
     share, best = 1.0, at(1.0)
     if best[1] < cost:
-        if cost - best[1] <= tolerance * (1.0 + cost):  # it was the last
+        if cost - best[1] <= tolerance:  # it was the last
             return best
         while (longer := at(2.0 * share))[1] < best[1]:
             share, best = 2.0 * share, longer

@@ -5,7 +5,7 @@ rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero wher
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 
@@ -290,11 +290,16 @@ def measurement_cost(seen: Seen, gates: Gates) -> float:
 
 
 def blocks_of(
-    intervals: Sequence[KeyframeInterval], instruments: Mapping[str, Instrument], gravity: float, unknowns: Unknowns
+    intervals: Sequence[KeyframeInterval],
+    sensors: Container[str],
+    instruments: Mapping[str, Instrument],
+    gravity: float,
+    unknowns: Unknowns,
 ) -> dict[str, Block]:
-    """The measurements of a dive, by sensor."""
+    """The measurements of a dive, by sensor, of some sensors."""
     measured: dict[str, list[KeyframeMeasurement]] = {}
     for interval in intervals:
         for m in interval.measurements:
-            measured.setdefault(m.sensor, []).append(m)
+            if m.sensor in sensors:
+                measured.setdefault(m.sensor, []).append(m)
     return {sensor: make_block(own, instruments[sensor], gravity, unknowns) for sensor, own in measured.items()}

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from rovgraph.engine.chain_optimum import smooth_chain
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
@@ -15,6 +16,7 @@ def optimum(
     initial: InitialConditions,
     states: State,
     calibration: Mapping[str, Array] | None = None,
+    rows: DiveRows | None = None,
 ) -> Optimum:
     """Solve a dive.
 
@@ -23,6 +25,7 @@ def optimum(
     intervals, initial : the dive
     states : State of its keyframes to begin with
     calibration : to begin with, its prior means where it is None
+    rows : the dive as arrays, where they are at hand
 
     Raises
     ------
@@ -32,4 +35,4 @@ def optimum(
         from rovgraph.graph.places import smooth_graph  # GTSAM is slow to load, and not everywhere to be had
 
         return smooth_graph(intervals, initial, states, calibration)
-    return smooth_chain(intervals, initial, states, calibration)
+    return smooth_chain(intervals, initial, states, calibration, rows)

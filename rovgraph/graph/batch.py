@@ -146,7 +146,7 @@ def make_problem(
     index = np.arange(len(intervals)) if index is None else index
     wanted = unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
     factors = list(others) if others is not None else _others(intervals, prior, beliefs, wanted, index)
-    blocks = blocks_of(intervals, instruments, config.environment.gravity_mps2, wanted)
+    blocks = blocks_of(intervals, instruments, instruments, config.environment.gravity_mps2, wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
     native = gtsam.NonlinearFactorGraph()

@@ -21,6 +21,7 @@ component of y. What a negative target stands for is ignored.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,39 @@ Index = NDArray[np.int64]
 UNDETERMINED = 1e-10  # a pivot below this part of its column is rounding
 PENDING = 48  # rows that are folded into the border at a time
 LANES = 8  # columns are worked on in multiples of it, so that loops become vector instructions
+
+
+class Room(NamedTuple):
+    """Where rows are worked on.
+
+    Attributes
+    ----------
+    V : shape (d + most, padded(d + c + 1)), rows of a keyframe and the border: what is known, then measurements
+    W : shape (2 d, padded(2 d + c + 1)), of a keyframe, the one after it and the border: what is known, then the motion
+    Y : shape (rows, padded(c + 1)), of the border: its triangle, then rows that are yet to be folded into it
+    scale : shape (d + c,), sums of squares of the columns' rows so far
+    v, w : as many elements as the largest of them has rows and columns
+    """
+
+    V: Array
+    W: Array
+    Y: Array
+    scale: Array
+    v: Array
+    w: Array
+
+
+@helper
+def make_room(d: int, c: int, most: int, border_rows: Array) -> Room:
+    """Room for keyframes of d components, each with at most so many rows of measurements; the border's priors in it."""
+    V, W = np.zeros((d + most, padded(d + c + 1))), np.zeros((2 * d, padded(2 * d + c + 1)))
+    Y = np.zeros((c + border_rows.shape[0] + PENDING + most, padded(c + 1)))
+    scale = np.zeros(d + c)
+    for i in range(border_rows.shape[0]):
+        for j in range(c):
+            scale[d + j] += border_rows[i, j] * border_rows[i, j]
+    append_rows(border_rows, 0, border_rows.shape[0], 0, c + 1, c, Y)
+    return Room(V, W, Y, scale, np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1]))
 
 
 @helper
@@ -118,11 +152,9 @@ def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
 
 
 @helper
-def load_measurements(
-    rows: Array, targets: Index, begin: int, end: int, s: int, d: int, V_out: Array, scale_out: Array
-) -> None:
-    """Rows of a keyframe's measurements, below the d rows that are known of it; ``scale_out`` adds up their squares."""
-    last = rows.shape[1] - 1
+def load_measurements(rows: Array, targets: Index, begin: int, end: int, s: int, d: int, room: Room) -> int:
+    """Rows of a keyframe's measurements into V, below the d rows that are known of it; returns the row after them."""
+    last, V_out, scale_out = rows.shape[1] - 1, room.V, room.scale
     for i in range(end - begin):
         row = begin + i
         for j in range(V_out.shape[1]):
@@ -135,6 +167,7 @@ def load_measurements(
         for j in range(scale_out.shape[0]):
             scale_out[j] += V_out[d + i, j] * V_out[d + i, j]
         V_out[d + i, scale_out.shape[0]] = rows[row, last]
+    return d + end - begin
 
 
 @helper
@@ -147,11 +180,10 @@ def load_motion(
     targets: Index,
     walk: Array,
     walk_r: Array,
-    W_out: Array,
-    scale_out: Array,
+    room: Room,
 ) -> None:
-    """Rows of the motion after keyframe k, below its own d; ``scale_out`` becomes that of the keyframe after it."""
-    s, d = A_i.shape[1], A_i.shape[1] + walk.shape[1]
+    """Rows of the motion after keyframe k into W, below its own d; the scale becomes that of the keyframe after it."""
+    s, d, W_out, scale_out = A_i.shape[1], A_i.shape[1] + walk.shape[1], room.W, room.scale
     for i in range(d, 2 * d):
         for j in range(W_out.shape[1]):
             W_out[i, j] = 0.0
@@ -199,6 +231,75 @@ def undetermined(triangle: Array, scale: Array, begin: int, end: int, shift: int
         if not pivot * pivot > UNDETERMINED * UNDETERMINED * scale[j]:
             return j + shift
     return -1
+
+
+@helper
+def absorb(
+    k: int,
+    n: int,
+    end: int,
+    last: int,
+    stops: Index,
+    stop: int,
+    room: Room,
+    filtered_out: Array,
+    left_out: Array,
+) -> tuple[int, int, int]:
+    """Make a triangle of keyframe k's rows in V, up to ``end``, and put it where its motion is added.
+
+    Parameters
+    ----------
+    last : of Y, the row after those that are in use
+    stops, stop, filtered_out, left_out : as `eliminate`, and the next of the stops
+
+    Returns
+    -------
+    last, stop : afterwards
+    failing : the first component that is not determined at a stop, or -1
+    """
+    V, W, Y, d = room.V, room.W, room.Y, room.W.shape[0] // 2
+    c, failing = room.scale.shape[0] - d, -1
+    triangularise(V, d, 0, end, room.v, room.w)
+    last = append_rows(V, d, end, d, c + 1, last, Y)
+    stops_here = stop < stops.shape[0] and stops[stop] == k
+    if last > c + PENDING or stops_here or k == n - 1:
+        left_out[0] += fold_border(Y, c, last, room.v, room.w)
+        last = c
+    if stops_here:
+        failing = max(undetermined(V, room.scale, 0, d, k * d), undetermined(Y, room.scale, d, d + c, (n - 1) * d))
+        join(V, Y, d, c, stop, filtered_out)
+        stop += 1
+    for i in range(d):
+        for j in range(d):
+            W[i, j] = V[i, j]
+            W[i, d + j] = 0.0
+        for j in range(c + 1):
+            W[i, 2 * d + j] = V[i, d + j]
+    return last, stop, failing
+
+
+@helper
+def pass_on(k: int, n: int, room: Room, conditionals_out: Array) -> int:
+    """Eliminate keyframe k from W; what is left is known of the one after it. Returns what is not determined, or -1."""
+    W, d = room.W, room.W.shape[0] // 2
+    c = room.scale.shape[0] - d
+    if k < n - 1:
+        triangularise(W, d, d, 2 * d, room.v, room.w)
+        append_rows(W, d, 2 * d, d, d + c + 1, 0, room.V)
+    # before the last keyframe, where scale is that of the next by now, a motion determines all that is a number
+    failing = undetermined(W, room.scale, 0, d, k * d)
+    for i in range(d):
+        for j in range(2 * d + c + 1):
+            conditionals_out[k, i, j] = W[i, j]
+    return failing
+
+
+@helper
+def close_border(n: int, d: int, room: Room, border_out: Array) -> int:
+    """The border's triangle, when all keyframes are eliminated; returns what is not determined, or -1."""
+    c = room.scale.shape[0] - d
+    append_rows(room.Y, 0, c, 0, c + 1, 0, border_out)
+    return undetermined(room.Y, room.scale, d, d + c, (n - 1) * d)
 
 
 @kernel(
@@ -250,47 +351,17 @@ def eliminate(
     most = 0
     for k in range(n):
         most = max(most, first[k + 1] - first[k])
-    V, W = np.zeros((d + most, padded(d + c + 1))), np.zeros((2 * d, padded(2 * d + c + 1)))
-    Y = np.zeros((c + border_rows.shape[0] + PENDING + most, padded(c + 1)))
-    scale, v, w = np.zeros(d + c), np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1])
-    left_out[0], stop = 0.0, 0
-    for i in range(border_rows.shape[0]):
-        for j in range(c):
-            scale[d + j] += border_rows[i, j] * border_rows[i, j]
-    last = append_rows(border_rows, 0, border_rows.shape[0], 0, c + 1, c, Y)
+    room, last, stop = make_room(d, c, most, border_rows), c + border_rows.shape[0], 0
+    left_out[0] = 0.0
     for k in range(n):
-        load_measurements(rows, targets, first[k], first[k + 1], s, d, V, scale)
-        end = d + first[k + 1] - first[k]
-        triangularise(V, d, 0, end, v, w)
-        last = append_rows(V, d, end, d, c + 1, last, Y)
-        stops_here = stop < stops.shape[0] and stops[stop] == k
-        if last > c + PENDING or stops_here or k == n - 1:
-            left_out[0] += fold_border(Y, c, last, v, w)
-            last = c
-        failing = -1
-        if stops_here:
-            failing = max(undetermined(V, scale, 0, d, k * d), undetermined(Y, scale, d, d + c, (n - 1) * d))
-            join(V, Y, d, c, stop, filtered_out)
-            stop += 1
-        for i in range(d):
-            for j in range(d):
-                W[i, j] = V[i, j]
-                W[i, d + j] = 0.0
-            for j in range(c + 1):
-                W[i, 2 * d + j] = V[i, d + j]
+        end = load_measurements(rows, targets, first[k], first[k + 1], s, d, room)
+        last, stop, failing = absorb(k, n, end, last, stops, stop, room, filtered_out, left_out)
         if k < n - 1:
-            load_motion(k, A_i, A_j, r, C, C_targets, walk, walk_r, W, scale)
-            triangularise(W, d, d, 2 * d, v, w)
-            append_rows(W, d, 2 * d, d, d + c + 1, 0, V)
-        # before the last keyframe, where scale is that of the next by now, a motion determines all that is a number
-        failing = max(failing, undetermined(W, scale, 0, d, k * d))
+            load_motion(k, A_i, A_j, r, C, C_targets, walk, walk_r, room)
+        failing = max(failing, pass_on(k, n, room, conditionals_out))
         if failing >= 0:
             return failing
-        for i in range(d):
-            for j in range(2 * d + c + 1):
-                conditionals_out[k, i, j] = W[i, j]
-    append_rows(Y, 0, c, 0, c + 1, 0, border_out)
-    return undetermined(Y, scale, d, d + c, (n - 1) * d)
+    return close_border(n, d, room, border_out)
 
 
 @kernel("void(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[::1], i8[::1], f8[:, ::1], i8[:, ::1])")

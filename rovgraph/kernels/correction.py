@@ -16,39 +16,24 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.change_of_basis import change_basis
-from rovgraph.kernels.compass import wrap
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.error_coordinates import ErrorLayout, local, make_scratch, retract
-from rovgraph.kernels.layout import ACC_SCALE, MOTION
+from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
+from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
+from rovgraph.kernels.linearization import linearize_measurement, make_scratch
 from rovgraph.kernels.measurement_row import (
-    ASSUMED,
     BEND,
     DIM,
-    DP,
-    DR,
-    DT,
-    DV,
-    GAIN,
     GATE,
     GIVEN,
     KIND,
     LOSS,
-    PARAMS,
-    RATE,
-    RATE_SD,
     READMIT,
-    SD,
     SEEN_FRAME,
     SEES,
     SEES_HEADING,
     SEES_VELOCITY,
     TIME,
-    Z,
 )
-from rovgraph.kernels.measurements import WORK as PREDICT_WORK
-from rovgraph.kernels.measurements import is_angular, predict
-from rovgraph.kernels.propagation import WORK as PROPAGATE_WORK
-from rovgraph.kernels.propagation import chain, propagate, propagation_jacobian
 from rovgraph.kernels.robust_update import (
     inflate,
     innovation_covariance,
@@ -57,10 +42,11 @@ from rovgraph.kernels.robust_update import (
     normalised_squared,
     reweight,
 )
-from rovgraph.kernels.weighting import loss_weight, whiten
+from rovgraph.kernels.weighting import loss_weight
 
 Index = NDArray[np.int64]
 
+NO_SCALE = np.empty((0, 0))  # of an IMU whose scale is exact
 RETURN_SD = 3.0  # a sensor that was left out for long returns with an innovation within this many sd
 
 
@@ -68,7 +54,7 @@ RETURN_SD = 3.0  # a sensor that was left out for long returns with an innovatio
 def move(x: Array, c: Array, P: Array, delta: Array, layout: ErrorLayout) -> None:
     """Move a state by ``delta`` along the error's coordinates, and its covariance's basis with it; in place."""
     size, rows = len(layout.columns), len(layout.rows)
-    scratch, basis = make_scratch(len(layout.seen), len(c)), np.zeros((size, size))
+    scratch, basis = make_coordinates_scratch(len(layout.seen), len(c)), np.zeros((size, size))
     for i in range(size):
         basis[i, i] = 1.0
     R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
@@ -99,73 +85,10 @@ def difference(
 ) -> None:
     """The error that leads from a state to another; ``basis_out``, the unit matrix before, takes errors back."""
     layout = ErrorLayout(columns, seen, seen_params, basis_rows)
-    scratch = make_scratch(len(layout.seen), len(c))
+    scratch = make_coordinates_scratch(len(layout.seen), len(c))
     other = (other_x[0:9].reshape(3, 3), other_x[9:12], other_x[12:15], other_x[15:21], other_c)
     own = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     local(own[0], own[1], own[2], own[3], c, other, layout, scratch, delta_out, basis_out)
-
-
-@helper
-def linearize_one(
-    x: Array,
-    c: Array,
-    row: Array,
-    sensor: Array,
-    scale: Array,
-    column: Index,
-    gravity: float,
-    r_out: Array,
-    H_out: Array,
-) -> None:
-    """Whitened innovation and Jacobian of one measurement.
-
-    Parameters
-    ----------
-    x : shape (21,), R_nb by rows, p_n, v_n, bias of the keyframe
-    c : calibration vector
-    row, sensor : of `rovgraph.kernels.measurement_row`
-    scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
-    column : shape (15 + C,), place of each component in the error, -1 where it is not estimated
-    r_out, H_out : shapes (dim,), (dim, n), zeros
-    """
-    kind, dim, C = int(sensor[KIND]), int(sensor[DIM]), len(c)
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21].copy()
-    scaled = len(scale) > 0
-    if scaled:
-        for i in range(6):
-            for k in range(6):
-                b[i] += scale[i, k] * c[ACC_SCALE + k]
-    z, H = np.empty(dim), np.zeros((dim, MOTION + C))
-    work = np.empty((PREDICT_WORK, 3, 3))
-    params = sensor[PARAMS:]
-    if row[DT] != 0.0:
-        there_R, there = np.empty((3, 3)), np.empty((2, 3))
-        motion_work, F = np.empty((PROPAGATE_WORK, 3, 3)), np.zeros((MOTION, MOTION))
-        dR = row[DR : DR + 9].reshape(3, 3)
-        dv, dp, assumed = row[DV : DV + 3], row[DP : DP + 3], row[ASSUMED : ASSUMED + 6]
-        propagate(R, p, v, b, row[DT], dR, dv, dp, assumed, gravity, there_R, there[0], there[1], motion_work)
-        propagation_jacobian(R, row[DT], F, motion_work)
-        predict(kind, there_R, there[0], there[1], b, c, row[RATE : RATE + 3], params, z, H, work)
-        chain(H, F)
-    else:
-        predict(kind, R, p, v, b, c, row[RATE : RATE + 3], params, z, H, work)
-    if scaled:
-        for a in range(dim):
-            for k in range(6):
-                for i in range(6):
-                    H[a, MOTION + ACC_SCALE + k] += H[a, 9 + i] * scale[i, k]
-    W = np.empty((dim, dim))
-    whiten(row[SD : SD + dim], sensor[GAIN : GAIN + 9].reshape(3, 3)[:dim, :dim], row[RATE_SD], W)
-    for a in range(dim):
-        difference = row[Z + a] - z[a]
-        z[a] = wrap(difference) if is_angular(kind) else difference
-    for a in range(dim):
-        for k in range(a + 1):
-            r_out[a] += W[a, k] * z[k]
-        for j in range(MOTION + C):
-            if column[j] >= 0:
-                for k in range(a + 1):
-                    H_out[a, column[j]] += W[a, k] * H[k, j]
 
 
 @helper
@@ -221,22 +144,104 @@ def linearize(
 
     ``weighted`` ones are multiplied by the root of the weight of their loss.
     """
-    begin = 0
+    begin, scratch = 0, make_scratch(len(c))
+    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     for j in range(len(which)):
         sensor = sensors[which[j]]
         end = begin + int(sensor[DIM])
-        own = scale[j] if len(scale) else scale[:, :, 0]
-        linearize_one(x, c, rows[j], sensor, own, column, gravity, r_out[begin:end], H_out[begin:end])
+        own, r, H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], H_out[begin:end]
+        square = linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, r, H)
         if weighted:
-            square = 0.0
-            for a in range(begin, end):
-                square += r_out[a] * r_out[a]
             root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
             for a in range(begin, end):
                 r_out[a] *= root
                 for i in range(H_out.shape[1]):
                     H_out[a, i] *= root
         begin = end
+
+
+@helper
+def correct_keyframe(
+    x: Array,
+    c: Array,
+    P: Array,
+    rows: Array,
+    which: Index,
+    sensors: Array,
+    column: Index,
+    scale: Array,
+    given_r: Array,
+    given_H: Array,
+    layout: ErrorLayout,
+    since: Array,
+    gated: bool,
+    gravity: float,
+    nis_out: Array,
+    weight_out: Array,
+    places_out: Array,
+) -> None:
+    """Correct a keyframe by m measurements, in place.
+
+    Parameters
+    ----------
+    x, c, P : state (21,), calibration vector and covariance (n, n); places that are remembered come last in P
+    rows, which : shapes (m, ROW), (m,), the measurements and the sensor that each is of
+    sensors : shape (s, PARAMS + ...), of `rovgraph.kernels.measurement_row`
+    column : shape (15 + C,), place of each component in the error, -1 where it is not estimated
+    scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
+    given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order
+    layout : of the error
+    since : shape (s,), since when each sensor is left out, nan where it is not [s]
+    gated : False lets everything in
+    gravity : [m/s^2]
+    nis_out, weight_out : shape (m,); weight 0 = left out
+    places_out : correction of the places
+    """
+    m, n = len(which), len(P)
+    first = np.zeros(m + 1, np.int64)
+    for j in range(m):
+        first[j + 1] = first[j] + int(sensors[which[j], DIM])
+    r, H = np.zeros(first[m]), np.zeros((first[m], n))
+    HP, S = np.empty((first[m], n)), np.empty((first[m], first[m]))
+    loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(c))
+    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
+    for j in range(m):
+        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
+        loss[j], bend[j] = int(sensor[LOSS]), sensor[BEND]
+        if sensor[KIND] == GIVEN:
+            for a in range(begin, end):
+                r[a] = given_r[taken]
+                for i in range(given_H.shape[1]):
+                    H[a, i] = given_H[taken, i]
+                taken += 1
+        else:
+            own = scale[j] if len(scale) else NO_SCALE
+            own_r, own_H = r[begin:end], H[begin:end]
+            linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, own_r, own_H)
+    innovation_covariance(P, H, HP, S)
+    entered = False
+    for j in range(m):
+        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
+        nis_out[j] = normalised_squared(S, r, begin, end)
+        weight_out[j] = 1.0
+        if gated and not admit(nis_out[j], rows[j, TIME], sensor, since, which[j]):
+            weight_out[j] = 0.0
+            if rows[j, TIME] - since[which[j]] > sensor[READMIT]:
+                inflate(P, r, H, begin, end, directions_seen(x, sensor, n))
+                innovation_covariance(P, H, HP, S)
+            leave_out(r, H, HP, S, begin, end)
+        else:
+            entered = True
+    if not entered:
+        return
+    root, inverse, weight, delta = np.empty(first[m]), np.empty_like(S), np.empty(m), np.empty(n)
+    reweight(r, S, first, loss, bend, root, inverse, weight)
+    joseph(P, r, H, HP, root, inverse, delta)
+    for j in range(m):
+        weight_out[j] *= weight[j]
+    move(x, c, P, delta, layout)
+    for i in range(len(places_out)):
+        places_out[i] = delta[n - len(places_out) + i]
 
 
 @kernel(
@@ -265,63 +270,7 @@ def correct(
     weight_out: Array,
     places_out: Array,
 ) -> None:
-    """Correct a keyframe by m measurements, in place.
-
-    Parameters
-    ----------
-    x, c, P : state (21,), calibration vector and covariance (n, n); places that are remembered come last in P
-    rows, which : shapes (m, ROW), (m,), the measurements and the sensor that each is of
-    sensors : shape (s, PARAMS + ...), of `rovgraph.kernels.measurement_row`
-    column : shape (15 + C,), place of each component in the error, -1 where it is not estimated
-    scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
-    given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order
-    columns, seen, seen_params, basis_rows : of `rovgraph.kernels.error_coordinates.ErrorLayout`
-    since : shape (s,), since when each sensor is left out, nan where it is not [s]
-    gated : False lets everything in
-    gravity : [m/s^2]
-    nis_out, weight_out : shape (m,); weight 0 = left out
-    places_out : correction of the places
-    """
-    m, n = len(which), len(P)
-    first = np.zeros(m + 1, np.int64)
-    for j in range(m):
-        first[j + 1] = first[j] + int(sensors[which[j], DIM])
-    r, H = np.zeros(first[m]), np.zeros((first[m], n))
-    HP, S = np.empty((first[m], n)), np.empty((first[m], first[m]))
-    loss, bend, taken = np.empty(m, np.int64), np.empty(m), 0
-    for j in range(m):
-        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
-        loss[j], bend[j] = int(sensor[LOSS]), sensor[BEND]
-        if sensor[KIND] == GIVEN:
-            for a in range(begin, end):
-                r[a] = given_r[taken]
-                for i in range(given_H.shape[1]):
-                    H[a, i] = given_H[taken, i]
-                taken += 1
-        else:
-            own = scale[j] if len(scale) else scale[:, :, 0]
-            linearize_one(x, c, rows[j], sensor, own, column, gravity, r[begin:end], H[begin:end])
-    innovation_covariance(P, H, HP, S)
-    entered = False
-    for j in range(m):
-        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
-        nis_out[j] = normalised_squared(S, r, begin, end)
-        weight_out[j] = 1.0
-        if gated and not admit(nis_out[j], rows[j, TIME], sensor, since, which[j]):
-            weight_out[j] = 0.0
-            if rows[j, TIME] - since[which[j]] > sensor[READMIT]:
-                inflate(P, r, H, begin, end, directions_seen(x, sensor, n))
-                innovation_covariance(P, H, HP, S)
-            leave_out(r, H, HP, S, begin, end)
-        else:
-            entered = True
-    if not entered:
-        return
-    root, inverse, weight, delta = np.empty(first[m]), np.empty_like(S), np.empty(m), np.empty(n)
-    reweight(r, S, first, loss, bend, root, inverse, weight)
-    joseph(P, r, H, HP, root, inverse, delta)
-    for j in range(m):
-        weight_out[j] *= weight[j]
-    move(x, c, P, delta, ErrorLayout(columns, seen, seen_params, basis_rows))
-    for i in range(len(places_out)):
-        places_out[i] = delta[n - len(places_out) + i]
+    """`correct_keyframe`, from Python; columns to basis_rows are those of its layout."""
+    layout, out = ErrorLayout(columns, seen, seen_params, basis_rows), (nis_out, weight_out, places_out)
+    tables = sensors, column, scale, given_r, given_H
+    correct_keyframe(x, c, P, rows, which, *tables, layout, since, gated, gravity, *out)

@@ -114,6 +114,24 @@ def _whitening(S: Array, W_out: Array) -> None:
 
 
 @helper
+def whiten_motion(W: Array, r: Array, A_i: Array, A_j: Array) -> None:
+    """W r, W A_i, W A_j of one interval in place, for the lower triangular W of `motion_weights`."""
+    for i in range(14, -1, -1):
+        total = 0.0
+        for k in range(i + 1):
+            total += W[i, k] * r[k]
+        r[i] = total
+        for j in range(15):
+            A_i[i, j] *= W[i, i]
+            A_j[i, j] *= W[i, i]
+        for k in range(i):
+            w = W[i, k]
+            for j in range(15):
+                A_i[i, j] += w * A_i[k, j]
+                A_j[i, j] += w * A_j[k, j]
+
+
+@helper
 def motion_covariance(row: Array, S_out: Array) -> None:
     """Covariance of the residual of one interval, shape (15, 15)."""
     if is_coasted(row):
@@ -211,22 +229,3 @@ def motion_weights(motions: Array, W_out: Array) -> None:
     for k in range(len(motions)):
         motion_covariance(motions[k], S)
         _whitening(S, W_out[k])
-
-
-@kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])")
-def whiten_motions(W: Array, r: Array, A_i: Array, A_j: Array) -> None:
-    """W r, W A_i, W A_j in place, for the lower triangular W of `motion_weights`."""
-    for n in range(len(W)):
-        for i in range(14, -1, -1):
-            total = 0.0
-            for k in range(i + 1):
-                total += W[n, i, k] * r[n, k]
-            r[n, i] = total
-            for j in range(15):
-                A_i[n, i, j] *= W[n, i, i]
-                A_j[n, i, j] *= W[n, i, i]
-            for k in range(i):
-                w = W[n, i, k]
-                for j in range(15):
-                    A_i[n, i, j] += w * A_i[n, k, j]
-                    A_j[n, i, j] += w * A_j[n, k, j]

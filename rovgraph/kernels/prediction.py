@@ -45,8 +45,8 @@ def carry(P: Array, F: Array, Q: Array) -> None:
             P[i, j] += Q[i, j]
 
 
-@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])")
-def predict_filter(
+@helper
+def predict_keyframe(
     x: Array,
     c: Array,
     P: Array,
@@ -99,3 +99,20 @@ def predict_filter(
                     for j in range(6):
                         F_out[i, own] += F[i, MOVED + j] * scale[j, k]
     carry(P, F_out, Q_out)
+
+
+@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])")
+def predict_filter(
+    x: Array,
+    c: Array,
+    P: Array,
+    motion: Array,
+    scale: Array,
+    column: NDArray[np.int64],
+    walk: Array,
+    x_out: Array,
+    F_out: Array,
+    Q_out: Array,
+) -> None:
+    """`predict_keyframe`, from Python."""
+    predict_keyframe(x, c, P, motion, scale, column, walk, x_out, F_out, Q_out)

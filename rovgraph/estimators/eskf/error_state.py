@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, Transition
 from rovgraph.engine.initial_conditions import InitialConditions
@@ -18,13 +19,14 @@ from rovgraph.engine.remembered_places import columns, common, extended
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.eskf.reinitialisation import reinitialised
 from rovgraph.estimators.estimate import Estimate
+from rovgraph.geometry import Array
 from rovgraph.log import Measurement
 from rovgraph.state import State
 
 # since the start, for `ErrorStateFilter.reinitialise_at`: while heading, mounting and compasses are known to
 # several degrees only, what was linearised once misstates what it knows by the square of that
 REINITIALISE_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
-PROGRESS_EVERY = 50  # keyframes
+PROGRESS_EVERY = 500  # keyframes
 
 
 @dataclass
@@ -57,6 +59,7 @@ class ErrorStateFilter:
         self.transitions: list[Transition] = []
         self.gates: Gates = {}
         self._due = list(self.reinitialise_at)
+        self._rows: DiveRows | None = None  # of a dive that is known as a whole
         self._smoothed: State | None = None  # of the keyframes up to the newest reinitialisation
 
     @property
@@ -98,13 +101,38 @@ class ErrorStateFilter:
             self.transitions.append(done.transition)
         self.known = done.filtered
         self.history.append(interval, self.known, done.processed)
-        if self._due and interval.time - self.intervals[0].time >= self._due[0]:
-            self._due.pop(0)
-            self.known, smoothed = reinitialised(self.engine, self.intervals, self.states())
-            self._smoothed = smoothed
-            self.history.replace_last(self.known)
+        self._reinitialise()
         self.assembler.time_offsets.assume(self.latest().calibration)
         return done
+
+    def run(self, intervals: Sequence[KeyframeInterval], progress: Callable[[float], None]) -> None:
+        """Take the intervals of a dive, before anything else; ``progress`` is told 0 to 1 now and then."""
+        self._rows = rows = DiveRows.of(intervals, [*self.beginning.instruments])
+        while (k := len(self.intervals)) < len(intervals):
+            progress(k / len(intervals))
+            end = min(k + PROGRESS_EVERY, self._due_at(rows.time, k))
+            if k > 0 and not self.known.places:
+                run = self.engine.run(rows, k, end, self.known, self.gates)
+                self.known = run.known
+                self.history.extend(intervals[k : k + len(run)], run)
+                k += len(run)
+                self._reinitialise()
+            if k < end:
+                self.step(intervals[k])
+        self._rows = None
+
+    def _due_at(self, time: Array, k: int) -> int:
+        """The number of intervals, more than k, after which the next reinitialisation is due, or all."""
+        due = int(time.searchsorted(time[0] + self._due[0])) + 1 if self._due else len(time)
+        return min(max(due, k + 1), len(time))
+
+    def _reinitialise(self) -> None:
+        """Go on from the smoothed dive so far, where that is due."""
+        if self._due and self.intervals[-1].time - self.intervals[0].time >= self._due[0]:
+            self._due.pop(0)
+            so_far = self._rows and self._rows.upto(len(self.intervals))
+            self.known, self._smoothed = reinitialised(self.engine, self.intervals, self.states(), so_far)
+            self.history.replace_last(self.known)
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""
@@ -156,8 +184,5 @@ def replay(
 ) -> ErrorStateFilter:
     """A filter that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
     estimator = ErrorStateFilter(beginning, reinitialise_at)
-    for index, interval in enumerate(intervals):
-        estimator.step(interval)
-        if index % PROGRESS_EVERY == 0:
-            progress(index / len(intervals))
+    estimator.run(intervals, progress)
     return estimator

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states, states_of
+from rovgraph.engine.filter_step import FilterRun, Gaussian, ProcessedMeasurement, stack_states, states_of
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import Estimate
@@ -50,6 +50,19 @@ class FilterHistory:
         self._rows.append(self._row(known))
         for one in processed:
             self._processed.setdefault(one.measurement.sensor, []).append(one)
+
+    def extend(self, intervals: Sequence[KeyframeInterval], run: FilterRun) -> None:
+        """Take the intervals that a filter has run through."""
+        columns = zip(run.x, run.c, run.pose, run.velocity, run.sd, strict=True)
+        met = zip(run.nis.tolist(), run.weight.tolist(), strict=True)
+        for k, (interval, row) in enumerate(zip(intervals, columns, strict=True)):
+            before, predicted = self._rows[-1][:2], (run.predicted_x[k], run.predicted_c[k])
+            self.intervals.append(interval)
+            self._rows.append(row)
+            for m in interval.measurements:
+                x, c = before if m.keyframe < interval.index else predicted
+                nis, weight = next(met)
+                self._processed.setdefault(m.sensor, []).append(ProcessedMeasurement(m, x, c, nis, weight))
 
     def replace_last(self, known: Gaussian) -> None:
         """Take another estimate of the newest keyframe."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.keyframes import KeyframeInterval
@@ -13,7 +14,9 @@ from rovgraph.estimators.optimum import optimum
 from rovgraph.state import PLACE_DIM, State
 
 
-def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], states: State) -> tuple[Gaussian, State]:
+def reinitialised(
+    engine: FilterEngine, intervals: Sequence[KeyframeInterval], states: State, rows: DiveRows | None = None
+) -> tuple[Gaussian, State]:
     """The newest keyframe, with every factor of the dive linearised at the optimum.
 
     Parameters
@@ -21,6 +24,7 @@ def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], s
     engine : the filter's
     intervals : the dive so far
     states : State of all its keyframes to begin with; its newest calibration is taken
+    rows : the dive as arrays, where they are at hand
 
     Returns
     -------
@@ -29,7 +33,7 @@ def reinitialised(engine: FilterEngine, intervals: Sequence[KeyframeInterval], s
     """
     initial, layout = engine.initial, engine.layout
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
-    best = optimum(intervals, initial, states, calibration)
+    best = optimum(intervals, initial, states, calibration, rows)
     newest = best.state.at([len(intervals) - 1])
     known = np.concatenate([np.arange(15)] + [np.r_[layout.columns[name]] for name in best.unknowns.estimated])
     places = remembered(best, initial.config.place.remembered)

@@ -1,0 +1,118 @@
+"""A dive's motions and measurements as arrays that kernels take, for smoother and filter alike."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.geometry import Array
+from rovgraph.kernels import measurement_row as measured
+from rovgraph.kernels import motion_row
+from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.motion_residual import motion_weights
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class DiveRows:
+    """n keyframes with m measurements, in the order of the intervals, which is that of their keyframes.
+
+    Attributes
+    ----------
+    motions, weights : ndarray, shapes (n - 1, ROW), (n - 1, 15, 15), of `rovgraph.kernels.motion_row`, and their
+        square-root information, lower triangular
+    scales : ndarray, shape (n - 1, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
+    rows : ndarray, shape (m, ROW), of `rovgraph.kernels.measurement_row`
+    which : ndarray of int, shape (m,), the sensor of each, of ``sensors``
+    row_scales : ndarray, shape (m, 6, 6) or (0, 6, 6), as ``scales``
+    first : ndarray of int, shape (n + 1,), the first measurement of each keyframe
+    taken : ndarray of int, shape (n,), measurements up to the end of each interval
+    time : ndarray, shape (n,), of the keyframes [s]
+    sensors : names
+    """
+
+    motions: Array
+    weights: Array
+    scales: Array
+    rows: Array
+    which: Index
+    row_scales: Array
+    first: Index
+    taken: Index
+    time: Array
+    sensors: tuple[str, ...]
+
+    @staticmethod
+    def of(intervals: Sequence[KeyframeInterval], sensors: Sequence[str]) -> "DiveRows":
+        """Of the intervals of a dive, from its first; ``sensors`` are those in use."""
+        n, index = len(intervals), {sensor: k for k, sensor in enumerate(sensors)}
+        motions = np.zeros((max(n - 1, 0), motion_row.ROW))
+        for k, interval in enumerate(intervals[1:]):
+            assert interval.motion is not None
+            motions[k] = interval.motion.row
+        scaled = n > 1 and intervals[1].scale_to_bias is not None
+        scales = np.array([i.scale_to_bias for i in intervals[1:]]) if scaled else np.zeros((0, 6, 6))
+        found = [m for interval in intervals for m in interval.measurements]
+        rows = np.zeros((len(found), measured.ROW))
+        for k, m in enumerate(found):
+            rows[k] = m.row[: measured.ROW]
+        row_scales = np.zeros((0, 6, 6))
+        if found and found[0].scale_to_bias is not None:
+            row_scales = np.array([m.scale_to_bias for m in found])
+        keyframe = np.array([m.keyframe for m in found], dtype=np.int64)
+        weights = np.empty((len(motions), MOTION, MOTION))
+        motion_weights(motions, weights)
+        return DiveRows(
+            motions,
+            weights,
+            scales,
+            rows,
+            np.array([index[m.sensor] for m in found], dtype=np.int64),
+            row_scales,
+            keyframe.searchsorted(np.arange(n + 1)),
+            np.cumsum([len(i.measurements) for i in intervals], dtype=np.int64),
+            np.array([i.time for i in intervals]),
+            tuple(sensors),
+        )
+
+    def __len__(self) -> int:
+        return len(self.taken)
+
+    def upto(self, count: int) -> "DiveRows":
+        """The first intervals."""
+        m = int(self.taken[count - 1])
+        return DiveRows(
+            self.motions[: count - 1],
+            self.weights[: count - 1],
+            self.scales[: count - 1],
+            self.rows[:m],
+            self.which[:m],
+            self.row_scales[:m],
+            np.minimum(self.first[: count + 1], m),
+            self.taken[:count],
+            self.time[:count],
+            self.sensors,
+        )
+
+    def between(self, begin: int, end: int) -> "DiveRows":
+        """Some intervals, the first beyond 0; ``taken`` and ``first`` count from their first measurement."""
+        before, after = int(self.taken[begin - 1]), int(self.taken[end - 1])
+        return DiveRows(
+            self.motions[begin - 1 : end - 1],
+            self.weights[begin - 1 : end - 1],
+            self.scales[begin - 1 : end - 1],
+            self.rows[before:after],
+            self.which[before:after],
+            self.row_scales[before:after],
+            self.first[begin : end + 1] - before,
+            self.taken[begin:end] - before,
+            self.time[begin:end],
+            self.sensors,
+        )
+
+    def of_sensor(self, sensor: str) -> Index:
+        """Places of a sensor's measurements."""
+        return np.flatnonzero(self.which == self.sensors.index(sensor)) if sensor in self.sensors else np.empty(0, int)
