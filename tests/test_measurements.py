@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
 from rovgraph.calibration import TABLE
-from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_row
+from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_rows, sd_of
 from rovgraph.engine.late_stamp_window import KNOT_S, LateStampWindow
 from rovgraph.engine.measurements import (
     Block,
@@ -29,6 +29,7 @@ from rovgraph.graph.keys import key
 from rovgraph.graph.measurement_factors import measurement_factor, measurement_keys, robust_noise
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
 
@@ -54,7 +55,9 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         S = scale_to_bias(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
         seen = LandmarkObservation(1.0, 7) if sensor == "place" else None
         snapshot = np.concatenate([[motion.dt], motion.dR.ravel(), motion.dv, motion.dp])
-        row = measurement_row(0.2 * k, z, sd, rate, 0.01, snapshot, bias)
+        row = measurement_rows(0.2 * k, snapshot[None], bias, len(z))[0]
+        row[at.RATE : at.RATE_SD], row[at.RATE_SD] = rate, 0.01
+        row[at.Z : at.Z + len(z)], row[sd_of(len(z)) : sd_of(len(z)) + len(z)] = z, sd
         attached.append(KeyframeMeasurement(sensor, k, k // 2, 10 + k, len(z), row, track, S, seen))
     return make_block(attached, instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 

@@ -26,7 +26,7 @@ from scipy.stats import chi2
 from rovgraph.check import examine
 from rovgraph.config import Config
 from rovgraph.engine.assembly import Assembler
-from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_row
+from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_rows, sd_of
 from rovgraph.engine.optimum import OTHERS
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
@@ -240,10 +240,11 @@ def test_a_false_first_sighting_spoils_none_of_those_that_follow(lost):
 def walked(offsets: Array, sd: Array, names: Array) -> list[int]:
     """Numbers of landmarks on a random walk whose steps have a standard deviation of 1 m."""
     m = len(offsets)
-    still = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])
+    still = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])[None]
     seen = []
     for k, name in enumerate(names):
-        row = measurement_row(float(k), np.zeros(2), sd, np.zeros(3), 0.0, still, np.zeros(6))
+        row = measurement_rows(float(k), still, np.zeros(6), 2)[0]
+        row[sd_of(2) : sd_of(2) + 2] = sd
         seen.append(KeyframeMeasurement("place", k, 0, k, 2, row, landmark=LandmarkObservation(name, k)))
     steps = np.minimum.outer(np.arange(m), np.arange(m)) + 1.0
     covariance = np.kron(steps, np.eye(2)) + np.diag(np.tile(sd**2, m))

@@ -26,7 +26,13 @@ import numpy as np
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation, measurement_row
+from rovgraph.engine.keyframes import (
+    KeyframeInterval,
+    KeyframeMeasurement,
+    LandmarkObservation,
+    measurement_rows,
+    sd_of,
+)
 from rovgraph.engine.late_stamp_window import window_around
 from rovgraph.engine.motion import Motion
 from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
@@ -35,14 +41,14 @@ from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_s
 from rovgraph.engine.whole_log import SHORTEST_S, WholeLog
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
+from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Log, Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.sensors import SENSORS, ModelAiding
 from rovgraph.state import State
 
 SOME = 4096  # measurements of a log that are objects at one time
-_AT_KEYFRAME = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])  # a snapshot without motion
-_NO_RATE = np.zeros(3), 0.0
+_AT_KEYFRAME = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])[None]  # a snapshot without motion
 
 
 @dataclass
@@ -83,6 +89,7 @@ class Assembler:
         self.time_offsets = assumed or TimeOffsets.of(self.config, self.instruments)
         self._scaled = wanted(beliefs(self.config))
         self._around = HALF_WINDOW_S + self.time_offsets.span
+        self._dim = max(i.model.dim for i in self.instruments.values()) if self.instruments else 0
         # the rate reaches these: by a lever arm, or by the motion of a turning body
         self._turned = {sensor for sensor, i in self.instruments.items() if i.rate_gain.any()} | {"thruster"}
 
@@ -262,7 +269,8 @@ class Assembler:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._samples.rate(samples, time)
         if ping is not None:
-            attached += self._attach(ping, _AT_KEYFRAME, rate_b, rate_sd, every)
+            row = measurement_rows(time, _AT_KEYFRAME, self.bias, self._dim)[0]
+            attached += self._attach(ping, row, (rate_b, rate_sd), every)
         scaled = self._scale_to_bias(samples, before, time) if motion is not None else None
         self._samples.forget(time, self._around)
         return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, motion, attached, scaled)
@@ -282,16 +290,20 @@ class Assembler:
         stops = np.array([m.time for m in taken])
         motion, snapshots = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
         attached: list[KeyframeMeasurement] = []
-        for m, snapshot in zip(taken, snapshots, strict=True):
-            rate_b, rate_sd = self._samples.rate(samples, m.time) if m.sensor in self._turned else _NO_RATE
-            attached += self._attach(m, snapshot, rate_b, rate_sd, every)
+        for m, row in zip(taken, measurement_rows(stops, snapshots, self.bias, self._dim), strict=True):
+            rate = self._samples.rate(samples, m.time) if m.sensor in self._turned else None
+            attached += self._attach(m, row, rate, every)
         return motion, attached
 
     def _attach(
-        self, m: StampedMeasurement, snapshot: Array, rate_b: Array, rate_sd: float, every: Array
+        self, m: StampedMeasurement, row: Array, rate: tuple[Array, float] | None, every: Array
     ) -> list[KeyframeMeasurement]:
-        """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``."""
+        """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``.
+
+        Its motion stands in ``row``; ``rate`` is what is measured there, and its noise, where it matters.
+        """
         instrument = self.instruments[m.sensor]
+        dim = instrument.model.dim
         lag = self.time_offsets.lag(m.sensor)
         window, known, landmark = None, self._samples, None
         if lag is not None:
@@ -299,16 +311,19 @@ class Assembler:
             if window is None:
                 self.left_out[m.sensor, f"calibration.{instrument.time_offset} reaches beyond the IMU's samples"] += 1
                 return []
-        z = m.values[: instrument.model.dim]
         if m.sensor == "place":
-            landmark, z = self._sighting(m), np.zeros(instrument.model.dim)
+            landmark = self._sighting(m)
             if landmark is None:
                 return []
-        sd = SENSORS[m.sensor].standard_deviation(m.values, instrument, self.config)
-        row = measurement_row(m.time, z, sd, rate_b, rate_sd, snapshot, self.bias)
+        else:
+            row[at.Z : at.Z + dim] = m.values[:dim]
+        sd = sd_of(dim)
+        row[sd : sd + dim] = SENSORS[m.sensor].standard_deviation(m.values, instrument, self.config)
+        if rate is not None:
+            row[at.RATE : at.RATE_SD], row[at.RATE_SD] = rate
         scaled = self._scale_to_bias(every, self._start, m.time)
         place = (m.sensor, self._index, self._segment, m.row)
-        return [KeyframeMeasurement(*place, len(z), row, window, scaled, landmark)]
+        return [KeyframeMeasurement(*place, dim, row, window, scaled, landmark)]
 
     def _sighting(self, m: StampedMeasurement) -> LandmarkObservation | None:
         """A place that is seen; None where it has been in view just now."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rovgraph.engine.late_stamp_window import LateStampWindow
 from rovgraph.engine.motion import Motion, Snapshot
@@ -90,17 +91,19 @@ class KeyframeMeasurement:
         return self.row[at.ASSUMED : at.ASSUMED + 6]
 
 
-def measurement_row(
-    time: float, z: Array, sd: Array, rate_b: Array, rate_sd: float, snapshot: Array, bias: Array
-) -> Array:
-    """What a `KeyframeMeasurement` holds in its row; ``snapshot`` has shape (16,)."""
-    dim = len(z)
-    row = np.zeros(at.Z + 2 * max(dim, at.MOST))
-    row[at.TIME], row[at.RATE : at.RATE + 3], row[at.RATE_SD] = time, rate_b, rate_sd
-    row[at.SNAPSHOT : at.ASSUMED], row[at.ASSUMED : at.ASSUMED + 6] = snapshot, bias
-    begin = sd_of(dim)
-    row[at.Z : at.Z + dim], row[begin : begin + dim] = z, sd
-    return row
+def measurement_rows(time: ArrayLike, snapshots: Array, bias: Array, dim: int) -> Array:
+    """Rows of n measurements whose motion is known, shape (n, ROW) or wider, and nothing else of them yet.
+
+    Parameters
+    ----------
+    time : shape (n,) [s]
+    snapshots : ndarray, shape (n, 16), motion from their keyframe
+    bias : ndarray, shape (6,), that it was integrated with
+    dim : the largest number of components that any has
+    """
+    rows = np.zeros((len(snapshots), at.Z + 2 * max(dim, at.MOST)))
+    rows[:, at.TIME], rows[:, at.SNAPSHOT : at.ASSUMED], rows[:, at.ASSUMED : at.Z] = time, snapshots, bias
+    return rows
 
 
 def sd_of(dim: int) -> int:
