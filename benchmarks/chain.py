@@ -212,7 +212,7 @@ def accuracy(n: int, position_sd: float) -> dict[str, Accuracy]:
     dive = make_dive(n, position_sd)
     x, sd = _by_gtsam(dive)
     root = eliminate(*rows(dive))
-    P, _ = root.covariances(np.zeros((0, 0)))
+    P = root.covariances(np.zeros((0, 0)))
     own = np.sqrt(np.einsum("kii->ki", P))
     out = {
         "chain": Accuracy(_largest((root.solve()[0] - x) / sd), _largest(own / sd - 1), _largest(own[-1] / sd[-1] - 1))

@@ -164,7 +164,7 @@ def test_covariances_are_blocks_of_the_inverse_information(chain):
     P, n, d = chain.covariance(), chain.n, chain.d
     root = chain.eliminate()
     P_y = root.border_covariance()
-    own, cross, following = root.consecutive_covariances(P_y)
+    own, cross, following = root.joint_covariances(P_y)
     assert_close(P_y, P[n * d :, n * d :])
     for k in range(n):
         here = slice(k * d, (k + 1) * d)
@@ -172,7 +172,7 @@ def test_covariances_are_blocks_of_the_inverse_information(chain):
         assert_close(cross[k], P[here, n * d :])
         if k + 1 < n:
             assert_close(following[k], P[here, (k + 1) * d : (k + 2) * d])
-    assert_close(root.covariances(P_y)[0], own)
+    assert_close(root.covariances(P_y), own)
 
 
 def test_the_derivative_by_the_border_is_that_of_the_optimum(chain):
@@ -185,7 +185,7 @@ def test_the_derivative_by_the_border_is_that_of_the_optimum(chain):
 def test_the_border_held_leaves_the_covariance_of_the_states_alone(chain):
     of_states = chain.dense()[0][:, : chain.n * chain.d]
     expected = np.linalg.inv(of_states.T @ of_states)
-    own, _ = chain.eliminate().covariances(np.zeros((chain.c, chain.c)))
+    own = chain.eliminate().covariances(np.zeros((chain.c, chain.c)))
     for k in range(chain.n):
         here = slice(k * chain.d, (k + 1) * chain.d)
         assert_close(own[k], expected[here, here])
@@ -204,7 +204,7 @@ def test_considered_variables_add_their_own_covariance_and_move_nothing(held):
     root = chain.eliminate()
     x, y = root.solve(held)
     P_y = root.border_covariance(believed)
-    own, cross = root.covariances(P_y)
+    own, cross, _ = root.joint_covariances(P_y)
     n, d = chain.n, chain.d
     assert_close(np.concatenate([x.ravel(), y[: chain.c - held]]), expected)
     np.testing.assert_array_equal(y[chain.c - held :], 0.0)
@@ -277,7 +277,7 @@ def test_what_a_border_tied_to_the_first_keyframe_says_is_said_of_that_keyframe(
     tied.border_rows = np.insert(tied.border_rows, [4, 4, 4], 0.0, axis=1)
     tied.sensors.append(Sensor(np.zeros(1, dtype=np.int64), np.zeros((1, 3)), J, -one, np.arange(19, 22), np.ones(1)))
     root = tied.eliminate((5,))
-    known, cross = root.filtered_covariances()[0], root.covariances(root.border_covariance())[1]
+    known, cross = root.filtered_covariances()[0], root.joint_covariances(root.border_covariance())[1]
     assert_close(known[19:, 19:], P[:3, :3])
     assert_close(known[:15, 19:], P[75:90, :3])
     assert_close(cross[3, :, 4:], P[45:60, :3])
@@ -300,7 +300,7 @@ def test_a_vague_prior_survives_precise_motions():
     mixed = np.array([[0.8, -0.6], [0.6, 0.8]])
     for part in (chain.motions.A_i, chain.motions.A_j, chain.sensors[0].J):
         part[:] = part @ mixed  # or all would be powers of one number
-    P, _ = chain.eliminate().covariances(np.zeros((0, 0)))
+    P = chain.eliminate().covariances(np.zeros((0, 0)))
     expected = prior_sd**2 + step_sd**2 * np.arange(n)
     np.testing.assert_allclose(np.sqrt(P[:, 0, 0]), np.sqrt(expected), rtol=1e-8)
     np.testing.assert_allclose(np.sqrt(P[:, 1, 1]), np.sqrt(expected), rtol=1e-8)
@@ -384,7 +384,7 @@ def test_the_benchmark_times_every_solver(benchmark):
 WITHOUT_COMPILER = """
 from test_kernel_chain import random_chain
 root = random_chain(4, 15, 2, 5).eliminate((1, 3))
-P, cross = root.covariances(root.border_covariance())
+P, cross, _ = root.joint_covariances(root.border_covariance())
 x, y = root.solve()
 print(*map(float.hex, [*x.ravel(), *y, *P.ravel(), *root.filtered_covariances().ravel()]))
 """

@@ -162,24 +162,24 @@ class SquareRoot:
             P += gain @ believed @ gain.T
         return P
 
-    def covariances(self, P_y: Array) -> tuple[Array, Array]:
-        """Marginal covariances of the keyframes, shape (n, d, d), and of them with the border, shape (n, d, c).
+    def covariances(self, P_y: Array) -> Array:
+        """Marginal covariances of the keyframes, shape (n, d, d).
 
         Parameters
         ----------
         P_y : ndarray, shape (c, c), of the border
         """
-        P, cross, _ = self._covariances(P_y, 0)
-        return P, cross
+        return self._covariances(P_y, 0, 0)[0]
 
-    def consecutive_covariances(self, P_y: Array) -> tuple[Array, Array, Array]:
-        """As `covariances`, and of keyframes with those after them, shape (n - 1, d, d)."""
-        return self._covariances(P_y, len(self.conditionals) - 1)
+    def joint_covariances(self, P_y: Array) -> tuple[Array, Array, Array]:
+        """As `covariances`, with the border, shape (n, d, c), and with keyframes after them, shape (n - 1, d, d)."""
+        n = len(self.conditionals)
+        return self._covariances(P_y, n, n - 1)
 
-    def _covariances(self, P_y: Array, count: int) -> tuple[Array, Array, Array]:
-        n, d = self.conditionals.shape[:2]
-        cross, P, following = self.x_by_y @ P_y, np.empty((n, d, d)), np.empty((count, d, d))
-        chain_posterior.covariances(self.conditionals, self.x_by_y, cross, P, following)
+    def _covariances(self, P_y: Array, crosses: int, followings: int) -> tuple[Array, Array, Array]:
+        (n, d), c = self.conditionals.shape[:2], len(self.border)
+        P, cross, following = np.empty((n, d, d)), np.empty((crosses, d, c)), np.empty((followings, d, d))
+        chain_posterior.covariances(self.conditionals, np.ascontiguousarray(P_y), P, cross, following)
         return P, cross, following
 
     def filtered_covariances(self) -> Array:

@@ -67,7 +67,7 @@ class ChainOptimum:
 
     @cached_property
     def _covariances(self) -> Array:
-        return self.information.covariances(self._border_covariance)[0]
+        return self.information.covariances(self._border_covariance)
 
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""

@@ -65,6 +65,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
             passed = _filter(batch, progress)
             estimates.append(passed.solve())
             states = None if batch.measurements else passed.states()  # where the filter went is close by
+            del passed  # of a long dive it is large
         if estimate != "filtered":
             progress("smoothing", 0.5)
             estimates.insert(0, batch.solve(states))

@@ -82,28 +82,39 @@ def invert_triangle(R: Array, inverse_out: Array) -> None:
             inverse_out[i, c] /= R[i, i]
 
 
-@kernel("void(f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1])")
-def covariances(conditionals: Array, x_by_y: Array, cross: Array, P_out: Array, next_out: Array) -> None:
+@kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1])")
+def covariances(conditionals: Array, P_y: Array, P_out: Array, cross_out: Array, next_out: Array) -> None:
     """Marginal covariances of the keyframes, backwards in time.
 
         H_k = R^-1 (I + S H_{k+1} S') R^-T,   P_k = H_k + X_k P_y X_k',   P_{k,k+1} = -R^-1 S H_{k+1} + X_k P_y X_{k+1}'
+        X_k = -R^-1 (S X_{k+1} + T)
 
     H is the covariance where the border is held and X = dx/dy, so covariances are sums of squares.
 
     Parameters
     ----------
     conditionals : shape (n, d, 2 d + c + 1), of `eliminate`
-    x_by_y : shape (n, d, c), X, of `back_substitute`
-    cross : shape (n, d, c), X P_y, the covariance of keyframes (rows) with the border
+    P_y : shape (c, c), covariance of the border
     P_out : shape (n, d, d)
+    cross_out : shape (n, d, c), of the keyframes (rows) with the border, X P_y; or (0, d, c)
     next_out : shape (n - 1, d, d), of a keyframe (rows) with that after it; or (0, d, d)
     """
-    n, d, c = x_by_y.shape
+    n, d, c = P_out.shape[0], P_out.shape[1], P_y.shape[0]
     width, factors, transposed = padded(d), np.zeros((d, 2 * d)), np.zeros((2 * d, padded(d)))
     inverse, S, H, gain = np.zeros((d, width)), np.zeros((d, width)), np.zeros((d, width)), np.zeros((d, width))
     gain_H, P = np.zeros((d, width)), np.zeros((d, width))
+    T, X, moved, cross = (
+        np.zeros((d, padded(c))),
+        np.zeros((d, padded(c))),
+        np.zeros((d, padded(c))),
+        np.zeros((d, padded(c))),
+    )
+    padded_P_y = np.zeros((c, padded(c)))
     # of this keyframe, and right of it of that after it
     X_t, by_border = np.zeros((c, 2 * width)), np.zeros((d, 2 * width))
+    for i in range(c):
+        for j in range(c):
+            padded_P_y[i, j] = P_y[i, j]
     for k in range(n - 1, -1, -1):
         invert_triangle(conditionals[k], inverse)
         if k < n - 1:
@@ -112,20 +123,30 @@ def covariances(conditionals: Array, x_by_y: Array, cross: Array, P_out: Array, 
                     S[i, j] = conditionals[k, i, d + j]
             multiply_padded(inverse, S, d, True, gain)
             multiply_padded(gain, H, d, False, gain_H)
+            multiply_padded(gain, X, d, False, moved)
+        for i in range(d):
+            for j in range(c):
+                T[i, j] = conditionals[k, i, 2 * d + j]
+        multiply_padded(inverse, T, d, True, X)
         for i in range(d):
             for j in range(d):
                 factors[i, j], factors[i, d + j] = inverse[i, j], gain_H[i, j]
                 transposed[j, i], transposed[d + j, i] = inverse[i, j], gain[i, j]
+            for j in range(c):
+                X[i, j] = -X[i, j] - moved[i, j]
+                X_t[j, width + i] = X_t[j, i]
+                X_t[j, i] = X[i, j]
         multiply_padded(factors, transposed, 2 * d, True, P)
-        for i in range(c):
-            for j in range(d):
-                X_t[i, width + j] = X_t[i, j]
-                X_t[i, j] = x_by_y[k, j, i]
-        multiply_padded(cross[k], X_t, c, False, by_border)
+        multiply_padded(X, padded_P_y, c, False, cross)
+        multiply_padded(cross, X_t, c, False, by_border)
         for i in range(d):
             for j in range(i, d):
                 H[i, j] = H[j, i] = P[i, j]
                 P_out[k, i, j] = P_out[k, j, i] = P[i, j] + by_border[i, j]
+        if k < cross_out.shape[0]:
+            for i in range(d):
+                for j in range(c):
+                    cross_out[k, i, j] = cross[i, j]
         if k < next_out.shape[0]:
             for i in range(d):
                 for j in range(d):

@@ -14,7 +14,7 @@ measurement
 =============  =====  ==========================================================================================
 sensor
 =============  =====  ==========================================================================================
-`KIND`             1  of `rovgraph.kernels.measurements`, or `GIVEN`: linearised outside the kernel
+`KIND`             1  of `rovgraph.kernels.measurements`, or `GIVEN`: linearised outside the kernels
 `DIM`              1  components
 `LOSS`, `BEND`  1, 1  of `rovgraph.kernels.weighting`, and where it begins
 `GATE`             1  normalised innovation beyond which a measurement is left out, or infinite
