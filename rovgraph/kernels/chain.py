@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.householder import padded, triangularise
 
 Index = NDArray[np.int64]
 
 UNDETERMINED = 1e-10  # a pivot below this part of its column is rounding
 PENDING = 48  # rows that are folded into the border at a time
-LANES = 8  # columns are worked on in multiples of it, so that loops become vector instructions
 
 
 class Room(NamedTuple):
@@ -67,68 +67,6 @@ def make_room(d: int, c: int, most: int, border_rows: Array) -> Room:
             scale[d + j] += border_rows[i, j] * border_rows[i, j]
     append_rows(border_rows, 0, border_rows.shape[0], 0, c + 1, c, Y)
     return Room(V, W, Y, scale, np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1]))
-
-
-@helper
-def padded(columns: int) -> int:
-    """The next multiple of `LANES`."""
-    return (columns + LANES - 1) // LANES * LANES
-
-
-@helper
-def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, w: Array) -> None:
-    """Householder reflection of the rows ``pivot`` and ``first`` to ``last`` of W that clears a column of the latter.
-
-    W has a multiple of `LANES` columns, of which those before ``column`` stay as they are. v and w are work
-    space of as many elements as W has rows and columns.
-    """
-    if pivot < 0 or first < 0 or column < 0:
-        return  # it never is; the compiler must know it to use vector instructions
-    count = last - first
-    square, other = 0.0, 0.0
-    for i in range(count):
-        v[i] = W[first + i, column]
-        W[first + i, column] = 0.0
-    for i in range(count // 2):  # two sums do not wait for each other
-        square += v[2 * i] * v[2 * i]
-        other += v[2 * i + 1] * v[2 * i + 1]
-    square += other
-    if count % 2:
-        square += v[count - 1] * v[count - 1]
-    if square == 0.0:
-        return
-    top = W[pivot, column]
-    norm = -math.copysign(math.sqrt(top * top + square), top)
-    lead = top - norm
-    gain = 1.0 / (lead * norm)  # -2 over the square of (lead, v)
-    W[pivot, column] = 0.0
-    begin = column // LANES * LANES
-    width = (W.shape[1] // LANES - column // LANES) * LANES
-    for c in range(width):
-        w[c] = lead * W[pivot, begin + c]
-    for i in range(count):
-        factor = v[i]
-        if factor == 0.0:
-            continue
-        for c in range(width):
-            w[c] += factor * W[first + i, begin + c]
-    factor = gain * lead
-    for c in range(width):
-        W[pivot, begin + c] += factor * w[c]
-    W[pivot, column] = norm
-    for i in range(count):
-        factor = gain * v[i]
-        if factor == 0.0:
-            continue
-        for c in range(width):
-            W[first + i, begin + c] += factor * w[c]
-
-
-@helper
-def triangularise(W: Array, columns: int, top: int, end: int, v: Array, w: Array) -> None:
-    """Clear the first columns of W's rows ``top`` to ``end`` below the diagonal; rows above are triangular."""
-    for j in range(columns):
-        reflect(W, j, max(j + 1, top), end, j, v, w)
 
 
 @helper

@@ -11,8 +11,8 @@ in the notation of that module. Covariances are sums of squares, as in the smoot
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.chain import padded
 from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.householder import padded
 
 
 @kernel("void(f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])")
