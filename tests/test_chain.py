@@ -96,7 +96,7 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
 
 IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
     "both compasses and misalignment": lambda best: {"mag", "dvl_heading"} <= set(best.blocks),
-    "calibration that walks": lambda best: best.chain.d > 15,
+    "calibration that walks": lambda best: best.chain.layout.d > 15,
     "scales of the IMU": lambda best: {"acc_scale", "gyr_scale"} <= set(best.unknowns.estimated),
     "time offset of the DVL": lambda best: "dvl_time_offset" in best.unknowns.estimated,
     "IMU outage": lambda best: any(i.motion is not None and i.motion.coasted for i in best.intervals),

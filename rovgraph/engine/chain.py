@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import LAYOUT, TABLE, Belief, calibration_size
 from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, UndeterminedError, square_root
+from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING, ChainLayout
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
@@ -28,15 +29,13 @@ from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian,
 from rovgraph.kernels.dive import eliminate_dive, robust_costs, squared_lengths
 from rovgraph.kernels.measurement_row import GATE
 from rovgraph.kernels.motion_residual import motion_cost
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.state import State
 
-MOTION = 15  # components of a keyframe before what walks
 CLONED = 3  # of the first keyframe, its attitude, that a border ends with where its covariance is asked for
 PRIORS = 3  # rows at the first keyframe that are no measurements: two priors, and the tie of its clone
 STIFF = 1e8  # square-root information that ties the clone to it [1/rad]
-COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
 
-_NOTHING, _ONE = np.empty(0, np.int64), np.ones(1)
+_ONE = np.ones(1)
 
 
 @dataclass(frozen=True)
@@ -64,40 +63,16 @@ class Chain:
     rows: DiveRows
 
     @cached_property
-    def layout(self) -> dict[str, tuple[bool, slice]]:
-        """Calibration variable -> whether it is in the border, and its place there or in a keyframe's block."""
-        out, d, c = {}, MOTION, 0
-        for name, walk in self.unknowns.walks.items():
-            dim = TABLE[name].dim
-            out[name] = (False, slice(d, d + dim)) if walk else (True, slice(c, c + dim))
-            d, c = (d + dim, c) if walk else (d, c + dim)
-        return out
-
-    @cached_property
-    def d(self) -> int:
-        """Components of a keyframe's block."""
-        return MOTION + sum(TABLE[name].dim for name, (border, _) in self.layout.items() if not border)
-
-    @cached_property
-    def c(self) -> int:
-        """Components of the border."""
-        return sum(TABLE[name].dim for name, (border, _) in self.layout.items() if border)
-
-    def target(self, name: str) -> NDArray[np.int64]:
-        """Targets of a calibration variable's components, as `rovgraph.kernels.chain` counts them."""
-        border, part = self.layout[name]
-        return np.arange(part.start, part.stop) + (self.d if border else 0)
-
-    @cached_property
-    def time(self) -> Array:
-        return np.array([i.time for i in self.intervals])
+    def layout(self) -> ChainLayout:
+        """Where each variable stands."""
+        return ChainLayout(self.unknowns.walks)
 
     @cached_property
     def walk(self) -> Array:
         """Square-root information of the walks, shape (n - 1, d - 15)."""
         rates = [np.full(TABLE[n].dim, walk) for n, walk in self.unknowns.walks.items() if walk]
         rate = np.concatenate([np.empty(0), *rates])
-        return np.asarray(1.0 / (rate * np.sqrt(np.diff(self.time))[:, None]))
+        return np.asarray(1.0 / (rate * np.sqrt(np.diff(self.rows.time))[:, None]))
 
     @cached_property
     def blocks(self) -> dict[str, Block]:
@@ -153,7 +128,7 @@ class Chain:
         R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
         total = motion_cost(self.rows.motions, self.rows.weights, R, p, v, b, shift)
         total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
-        for name in self._walking:
+        for name in self.layout.walking:
             total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
         squares = self._squared_lengths(point)
         total += robust_costs(squares, self.rows.which, self._sensors, self._entered(gates))
@@ -189,7 +164,7 @@ class Chain:
     def moved(self, point: State, step: ChainStep, share: float) -> State:
         x, y = share * step.x, share * step.y
         calibration = dict(point.calibration)
-        for name, (border, part) in self.layout.items():
+        for name, (border, part) in self.layout.places.items():
             calibration[name] = point.calibration[name] + (y[part] if border else x[:, part])
         return State(
             point.R_nb @ exp_rotation(x[:, :3]),
@@ -203,7 +178,7 @@ class Chain:
         """The point to begin with: calibration constant over the dive, its prior means where none is given."""
         values = {name: np.asarray(v, float).ravel() for name, v in (calibration or self.unknowns.fixed).items()}
         known = {**self.unknowns.fixed, **{name: values[name] for name in self.unknowns.estimated}}
-        for name in self._walking:
+        for name in self.layout.walking:
             known[name] = np.tile(known[name], (len(self.intervals), 1))
         return State(states.R_nb, states.p_n, states.v_n, states.bias, known)
 
@@ -253,10 +228,10 @@ class Chain:
         self._put_priors(given, point, clones)
         for place, (sensor, block, state) in enumerate(self.seen(point, self.given), PRIORS):
             self._put_block(given, place, block, state, gates[sensor])
-        r, n, d, c = self.rows, len(self.intervals), self.d, self.c + clones
+        r, n, d, c = self.rows, len(self.intervals), self.layout.d, self.layout.c + clones
         dive = r.motions, r.weights, r.scales, r.rows, r.which, r.first, r.row_scales, self._sensors
         gravity = self.initial.config.environment.gravity_mps2
-        point_and_layout: Any = (*self._arrays(point), self._column, gravity, self.walk, self._walking_of_c)
+        point_and_layout: Any = (*self._arrays(point), self.layout.column, gravity, self.walk, self.layout.walking_of_c)
         rest: Any = (
             given.values,
             given.targets,
@@ -272,7 +247,7 @@ class Chain:
         try:
             return square_root(n, d, c, len(stops), fill)
         except UndeterminedError as error:
-            raise InputError(self._indeterminate(error.keyframe, error.component)) from None
+            raise InputError(self.layout.indeterminate(error.keyframe, error.component)) from None
 
     @cached_property
     def _rows(self) -> MeasurementRows:
@@ -285,40 +260,25 @@ class Chain:
     def _room(self, clones: int) -> MeasurementRows:
         """Room for the rows of priors, of the clone's tie and of what no kernel knows, in this order."""
         blocks, first = self.given.values(), np.zeros(1, np.int64)
-        walking = self.d - MOTION
+        walking = self.layout.d - MOTION
         keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]
         dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
         others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
         return MeasurementRows(len(self.intervals), MOTION, keyframes, dims, max([walking, clones, *others]))
 
-    @cached_property
-    def _column(self) -> NDArray[np.int64]:
-        """Target of each component of state and calibration vector, shape (15 + C,), -1 where it is not estimated."""
-        out = np.full(MOTION + calibration_size(), -1)
-        out[:MOTION] = np.arange(MOTION)
-        for name in self.layout:
-            part = LAYOUT[name]
-            out[MOTION + part.start : MOTION + part.stop] = self.target(name)
-        return out
-
-    @cached_property
-    def _walking_of_c(self) -> NDArray[np.int64]:
-        """What of the calibration vector walks, shape (d - 15,)."""
-        return np.concatenate([_NOTHING, *(np.r_[LAYOUT[name]] for name in self._walking)])
-
     def _put_priors(self, rows: MeasurementRows, point: State, clones: int) -> None:
         """The prior of the first keyframe, that of what walks, and the tie of the first attitude's clone."""
         r, _ = self.prior_residuals(point)
-        rows.put(0, -r[None], self._prior_jacobian(point)[None], np.empty((1, MOTION, 0)), _NOTHING, _ONE)
-        sd = [np.full(TABLE[n].dim, self.beliefs[n].sd) for n in self._walking]
-        off = [self.beliefs[n].mean - point.calibration[n][0] for n in self._walking]
+        rows.put(0, -r[None], self._prior_jacobian(point)[None], np.empty((1, MOTION, 0)), NOTHING, _ONE)
+        sd = [np.full(TABLE[n].dim, self.beliefs[n].sd) for n in self.layout.walking]
+        off = [self.beliefs[n].mean - point.calibration[n][0] for n in self.layout.walking]
         weight = 1.0 / np.concatenate([np.empty(0), *sd])
-        own = np.concatenate([_NOTHING, *(self.target(n) for n in self._walking)])
+        own = np.concatenate([NOTHING, *(self.layout.target(n) for n in self.layout.walking)])
         values = np.concatenate([np.empty(0), *off]) * weight
         rows.put(1, values[None], np.zeros((1, len(own), MOTION)), np.diag(weight)[None], own, _ONE)
         tie = np.zeros((1, clones, MOTION))
         tie[0, :, :clones] = STIFF * np.eye(clones)
-        clone = self.d + self.c + np.arange(clones)
+        clone = self.layout.d + self.layout.c + np.arange(clones)
         rows.put(2, np.zeros((1, clones)), tie, -STIFF * np.eye(clones)[None], clone, _ONE)
 
     def _put_block(
@@ -333,42 +293,23 @@ class Chain:
                 J[..., columns] = H[variable]
         names = self._columns_of(block)
         C = np.concatenate([np.empty((*r.shape, 0)), *(H[n] for n in names)], axis=2)
-        targets = np.concatenate([_NOTHING, *(self.target(n) for n in names)])
+        targets = np.concatenate([NOTHING, *(self.layout.target(n) for n in names)])
         rows.put(place, r, J, C, targets, weight)
 
     def _columns_of(self, block: Block) -> list[str]:
         """Calibration that a sensor's measurements depend on, of what is estimated."""
-        return [name for name in block.unknowns.estimated if name in self.layout]
+        return [name for name in block.unknowns.estimated if name in self.layout.places]
 
     def _border_rows(self, point: State, clones: int) -> Array:
         """Priors of the border's constants, shape (c, c + clones + 1)."""
-        out = np.zeros((self.c, self.c + clones + 1))
-        for name, (border, part) in self.layout.items():
+        out = np.zeros((self.layout.c, self.layout.c + clones + 1))
+        for name, (border, part) in self.layout.places.items():
             if border:
                 belief = self.beliefs[name]
                 out[part, part] = np.eye(belief.variable.dim) / belief.sd
                 out[part, -1] = (belief.mean - point.calibration[name]) / belief.sd
         return out
 
-    @cached_property
-    def _walking(self) -> list[str]:
-        return [name for name, (border, _) in self.layout.items() if not border]
-
     def _walk_of(self, name: str) -> Array:
-        part = self.layout[name][1]
+        part = self.layout.places[name][1]
         return self.walk[:, part.start - MOTION : part.stop - MOTION]
-
-    def _indeterminate(self, keyframe: int | None, component: int) -> str:
-        """One line on a system that cannot be solved."""
-        if keyframe is not None and component < MOTION:
-            variable = next(v for v, columns in COLUMNS.items() if columns.start <= component < columns.stop)
-            what = f"{variable} of keyframe {keyframe}"
-        else:
-            place = (keyframe is None, component)
-            parts = self.layout.items()
-            own = (n for n, (border, p) in parts if border == place[0] and p.start <= place[1] < p.stop)
-            what = next(own, "some variable")
-        return (
-            f"the data do not determine {what}: check the log (rovgraph check), "
-            "tighten its prior sd, or hold it fixed in the configuration"
-        )

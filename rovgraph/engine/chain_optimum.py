@@ -8,8 +8,9 @@ import numpy as np
 
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs as beliefs_of
-from rovgraph.engine.chain import COLUMNS, MOTION, Chain, ChainStep
+from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
+from rovgraph.engine.chain_layout import COLUMNS, MOTION
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Solution, minimise
 from rovgraph.engine.initial_conditions import InitialConditions
@@ -73,7 +74,7 @@ class ChainOptimum:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
             return np.asarray(self._covariances[:, COLUMNS[variable], COLUMNS[variable]])
-        border, part = self.chain.layout[variable]
+        border, part = self.chain.layout.places[variable]
         if not border:
             return self._covariances[:, part, part]
         P = self._border_covariance[part, part]
@@ -81,7 +82,7 @@ class ChainOptimum:
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
-        chosen = np.concatenate([np.arange(MOTION), *(self.chain.target(n) for n in self.unknowns.estimated)])
+        chosen = np.concatenate([np.arange(MOTION), *(self.chain.layout.target(n) for n in self.unknowns.estimated)])
         return np.asarray(self.information.newest_covariance()[np.ix_(chosen, chosen)])
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
@@ -106,9 +107,9 @@ class ChainOptimum:
         begin = replace(self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}})
         solution = minimise(without, begin)
         full = self.chain.eliminate(solution.point, solution.gates)
-        given = np.concatenate([np.r_[self.chain.layout[n][1]] for n in names])
+        given = np.concatenate([np.r_[self.chain.layout.places[n][1]] for n in names])
         by_given = full.border_by(given)
-        x, parts = full.x_by_y @ by_given, self.chain.layout
+        x, parts = full.x_by_y @ by_given, self.chain.layout.places
         out = {v: x[:, columns] for v, columns in COLUMNS.items()}
         for name, (border, part) in parts.items():
             out[name] = np.broadcast_to(by_given[part], (len(x), TABLE[name].dim, len(given))) if border else x[:, part]
@@ -116,8 +117,8 @@ class ChainOptimum:
 
     def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
         P = self.chain.eliminate(point, self.solution.gates, keyframes).filtered_covariances()
-        attitude = self.chain.d + self.chain.c + np.arange(3)
-        calibration = [self.chain.target(name) for name in self.unknowns.estimated]
+        attitude = self.chain.layout.d + self.chain.layout.c + np.arange(3)
+        calibration = [self.chain.layout.target(name) for name in self.unknowns.estimated]
         chosen = np.concatenate([np.arange(9, MOTION), attitude, *calibration])
         return Knowledge(np.array(keyframes), P[:, chosen[:, None], chosen])
 
