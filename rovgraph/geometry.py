@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Coefficient = TypeVar("Coefficient", float, Array)
@@ -225,9 +224,45 @@ def log_rotation(R: ArrayLike) -> Array:
     -------
     ndarray, shape (..., 3)
     """
-    R = np.array(R, dtype=float)
-    rotvec = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec()
-    return np.asarray(rotvec.reshape(R.shape[:-1]), dtype=float)
+    q = quaternion_from_matrix(R)
+    q = np.where(q[..., 3:] < 0.0, -q, q)  # of the two that are one rotation, the shorter
+    half = np.arctan2(np.linalg.norm(q[..., :3], axis=-1), q[..., 3])[..., None]
+    return q[..., :3] * _angle_over_sine(half)
+
+
+def _angle_over_sine(half: Array) -> Array:
+    """Angle over the sine of its half, of half angles [rad]; a series where the sine vanishes."""
+    angle = 2.0 * half
+    small, square = angle <= 1e-3, angle**2
+    series = 2.0 + square / 12.0 + 7.0 * square**2 / 2880.0
+    return np.where(small, series, angle / np.sin(np.where(small, 1.0, half)))
+
+
+def quaternion_from_matrix(R: ArrayLike) -> Array:
+    """Unit quaternions x, y, z, w of rotation matrices, by their largest component (Shepperd 1978).
+
+    Parameters
+    ----------
+    R : array_like, shape (..., 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+    """
+    R = np.asarray(R, dtype=float)
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    rows = np.empty((*R.shape[:-2], 4, 4))  # 4 q q^T, of which each row is the quaternion but for its length
+    rows[..., :3, :3] = R + transpose(R)
+    rows[..., _XYZ, _XYZ] += 1.0 - trace[..., None]
+    rows[..., 3, :3] = rows[..., :3, 3] = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
+    rows[..., 3, 3] = 1.0 + trace
+    diagonal = np.concatenate([R[..., _XYZ, _XYZ], trace[..., None]], axis=-1)
+    largest = np.argmax(diagonal, axis=-1)[..., None, None]
+    q = np.take_along_axis(rows, largest, axis=-2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+_XYZ = [0, 1, 2]
 
 
 def earth_rate_n(latitude: float) -> Array:

@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.fast_csv import write_csv
-from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, rpy_jacobian, transpose
+from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
 
 POSITION = ["north", "east", "down"]
 ATTITUDE = ["roll", "pitch", "yaw"]
@@ -131,8 +130,7 @@ class Trajectory:
 
     def write_tum(self, path: Path) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes."""
-        quat = Rotation.from_matrix(self.R_nb).as_quat()
-        rows = np.column_stack([self.time, self.p_n, quat])
+        rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
         np.savetxt(path, rows, fmt=["%.4f"] + ["%.6f"] * 3 + ["%.9f"] * 4)
 
 
@@ -155,6 +153,8 @@ def _slerp(time: Array, R: Array, at: Array) -> Array:
     """
     known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
     if known.all() and len(time) > 1:
+        from scipy.spatial.transform import Rotation, Slerp  # loads half of scipy, which the smoother does not need
+
         return np.asarray(Slerp(time, Rotation.from_matrix(R))(at).as_matrix())
     filled = _slerp(time, np.where(known[:, None, None], R, np.eye(3)), at) if len(time) > 1 else R[[0] * len(at)]
     gap = np.interp(at, time, np.where(known, 0.0, 1.0))

@@ -182,7 +182,8 @@ def _robust_first(time: Array, values: Array) -> float:
     """The first of some values, by the line that half of them cannot turn; of two the first (Siegel 1982)."""
     if len(time) < 3:
         return float(values[0])
-    from scipy.stats import siegelslopes  # half a second to import, which a second process need not wait for
-
-    slope, intercept = siegelslopes(values, time)
-    return float(intercept + slope * time[0])
+    apart = np.subtract.outer(time, time)
+    rise = np.subtract.outer(values, values)
+    slopes = np.divide(rise, apart, out=np.full_like(apart, np.nan), where=apart != 0.0)  # two may share a stamp
+    slope = np.median(np.nanmedian(slopes, axis=1))
+    return float(np.median(values - slope * time) + slope * time[0])
