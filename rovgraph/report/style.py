@@ -13,6 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
@@ -35,6 +37,7 @@ PRIOR = "#ECE7DA"
 _RC: dict[str, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
+    "axes.titley": 1.0,  # where it stands anyway, but not measured again at every layout
     "axes.labelsize": 9,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
@@ -69,7 +72,14 @@ def new_figure(height: float, width: float = WIDTH) -> Figure:
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a PNG, drawn once (`Figure.savefig` lays everything out twice)."""
-    FigureCanvasAgg(figure).print_png(path, metadata={"Software": "rovgraph"})  # type: ignore[no-untyped-call]
+    for axes in figure.axes:
+        axes.spines[:].set_in_layout(False)  # nowhere beyond the ticks, and slow to measure
+    canvas = FigureCanvasAgg(figure)  # type: ignore[no-untyped-call]
+    canvas.draw()
+    opaque = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    about = PngInfo()
+    about.add_text("Software", "rovgraph")
+    Image.fromarray(opaque).save(path, dpi=(DPI, DPI), compress_level=3, pnginfo=about)
     return path
 
 
