@@ -259,7 +259,7 @@ def quaternion_from_matrix(R: ArrayLike) -> Array:
     diagonal = np.concatenate([R[..., _XYZ, _XYZ], trace[..., None]], axis=-1)
     largest = np.argmax(diagonal, axis=-1)[..., None, None]
     q = np.take_along_axis(rows, largest, axis=-2)[..., 0, :]
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
 _XYZ = [0, 1, 2]

@@ -125,13 +125,13 @@ class Trajectory:
         more : rows for the end of a file that has the same columns
         """
         frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
-        frame["time"] = frame["time"].map("{:.4f}".format)
-        write_csv(frame, path, append=more)
+        write_csv(frame, path, append=more, decimals={"time": 4})
 
     def write_tum(self, path: Path) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes."""
         rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
-        np.savetxt(path, rows, fmt=["%.4f"] + ["%.6f"] * 3 + ["%.9f"] * 4)
+        line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
+        path.write_text(line * len(rows) % tuple(rows.ravel().tolist()), encoding="utf-8", newline="")
 
 
 def _sd(covariance: Array) -> Array:

@@ -44,3 +44,13 @@ def test_rows_are_appended_without_names_and_no_rows_are_names_alone(tmp_path):
     frame = pd.DataFrame({"a": [1.0, 2.0], "b": ["x", "y"]})
     written(frame[:0], tmp_path)
     assert written(frame, tmp_path, append=True) == b"a,b\n1,x\n2,y\n"
+
+
+@pytest.mark.parametrize("name", ["ours.csv", "ours.csv.gz"])
+def test_a_column_may_have_a_fixed_number_of_decimals(name, tmp_path):
+    frame = pd.DataFrame({"time": [1.7e9 + 0.25, 2e9], "value": [0.5, np.nan]})
+    write_csv(frame, tmp_path / name, decimals={"time": 4})
+    assert (
+        pd.read_csv(tmp_path / name, dtype=str).to_csv(index=False)
+        == "time,value\n1700000000.2500,0.5\n2000000000.0000,\n"
+    )

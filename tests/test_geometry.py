@@ -12,6 +12,7 @@ from rovgraph.geometry import (
     exp_rotation,
     log_rotation,
     matrix_from_rpy,
+    quaternion_from_matrix,
     right_jacobian,
     rotate,
     rpy_from_matrix,
@@ -101,3 +102,11 @@ def test_wrapped_angles_lie_within_half_a_turn_and_point_the_same_way(angle):
     wrapped = wrap_angle(angle)
     assert -np.pi <= wrapped < np.pi
     np.testing.assert_allclose([np.sin(wrapped), np.cos(wrapped)], [np.sin(angle), np.cos(angle)], atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 2.0, 3.1])
+def test_quaternions_and_logarithms_are_those_of_scipy(size):
+    expected = Rotation.from_rotvec(size * np.random.default_rng(3).standard_normal((500, 3)))
+    R = expected.as_matrix()
+    np.testing.assert_allclose(quaternion_from_matrix(R), Rotation.from_matrix(R).as_quat(), atol=1e-14)
+    np.testing.assert_allclose(log_rotation(R), expected.as_rotvec(), rtol=1e-9, atol=1e-14)

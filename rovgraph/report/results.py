@@ -60,8 +60,8 @@ def write_results(
         estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv")
         estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}.tum")
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
-    write_csv(_residual_frame(estimates[0]), folder / "residuals.csv")
-    write_csv(_history_frame(estimates), folder / "history.csv")
+    write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
+    write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
     summary = summarise(estimates, log, config, assumptions, seconds)
     (folder / SUMMARY).write_text(
@@ -236,19 +236,18 @@ def _calibration_numbers(entry: CalibrationEstimate) -> dict[str, Any]:
     }
 
 
-def _residual_frame(estimate: Estimate) -> pd.DataFrame:
-    frame = estimate.residuals[RESIDUAL_COLUMNS]
-    return frame.assign(time=frame["time"].map("{:.4f}".format))
-
-
 def _history_frame(estimates: Sequence[Estimate]) -> pd.DataFrame:
     """Rows of history.csv: one per estimate, epoch and scalar component."""
     frames = []
     for estimate in estimates:
         for variable, history in estimate.history.items():
-            stamps = [f"{t:.4f}" for t in history.time]
             for i, label in enumerate(history_labels(variable, history)):
-                columns = {"time": stamps, "variable": label, "value": history.value[:, i], "sd": history.sd[:, i]}
+                columns = {
+                    "time": history.time,
+                    "variable": label,
+                    "value": history.value[:, i],
+                    "sd": history.sd[:, i],
+                }
                 frames.append(pd.DataFrame({"estimate": estimate.kind, **columns, "unit": history.unit}))
     if not frames:
         return pd.DataFrame(columns=pd.Index(["estimate", "time", "variable", "value", "sd", "unit"]))

@@ -74,7 +74,7 @@ def save(figure: Figure, path: Path) -> Path:
     """Write a PNG, drawn once (`Figure.savefig` lays everything out twice)."""
     for axes in figure.axes:
         axes.spines[:].set_in_layout(False)  # nowhere beyond the ticks, and slow to measure
-    canvas = FigureCanvasAgg(figure)  # type: ignore[no-untyped-call]
+    canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     opaque = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
     about = PngInfo()
