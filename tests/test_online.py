@@ -126,7 +126,7 @@ def events_of(out: Path, kind: str) -> int:
 
 
 def test_killed_twice_and_resumed_it_goes_on_where_it_was(tmp_path):
-    case = simulated(falcon(), 45.0, seed=2, dvl_rate=4.0)
+    case = simulated(falcon(), 35.0, seed=2, dvl_rate=4.0)
     lines = [(m.time, row(m)) for m in case.log.measurements()]
     out, speed, solutions = tmp_path / "out", 1.0, b""  # what passes while a process starts, passes blindly
     config = tmp_path / "config.yaml"
