@@ -1,0 +1,248 @@
+"""One dive through the command, its errors in standard deviations, and the outcome of many dives.
+
+NEES: the squared error over the variance per degree of freedom, its mean over epochs 1 s apart, from
+10 s after the start. 1 is honest.
+"""
+
+import contextlib
+import io
+import json
+import re
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from fault_campaign.earth import Array
+from fault_campaign.instruments import Hidden, log_table
+from fault_campaign.motion import Motion
+
+HONEST_NEES = 2.0
+WIDER = 1.5  # times the sd of the healthy dive
+NAMED_IN = 0.95  # of the seeds, for a fault to count as named
+SETTLED_S = 10.0
+QUANTITIES = ("position", "depth", "heading", "dvl_yaw", "dvl_scale")
+
+
+@dataclass(frozen=True)
+class Result:
+    """One dive.
+
+    Attributes
+    ----------
+    nees : estimate ("smoothed", "filtered", "online") -> quantity -> NEES per degree of freedom
+    rms, sd : estimate -> horizontal error, and the sd that is stated of it [m]
+    said : warnings and assumptions, a line each
+    refused : no estimate was made
+    """
+
+    nees: dict[str, dict[str, float]] = field(default_factory=dict)
+    rms: dict[str, float] = field(default_factory=dict)
+    sd: dict[str, float] = field(default_factory=dict)
+    said: tuple[str, ...] = ()
+    refused: bool = False
+
+
+def run_command(arguments: Sequence[str]) -> tuple[int, str]:
+    """A command of rovgraph in this process: exit code and what it wrote to standard error."""
+    from rovgraph.cli.app import main
+
+    before, errors = sys.argv, io.StringIO()
+    sys.argv = ["rovgraph", *arguments]
+    code = 0
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
+            main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except Exception as error:  # a traceback is what a user would see, and the campaign goes on
+        code = 1
+        print(f"traceback: {type(error).__name__}: {error}", file=errors)
+    finally:
+        sys.argv = before
+    return code, errors.getvalue()
+
+
+def run_dive(
+    streams: dict[str, pd.DataFrame],
+    configuration: dict[str, Any],
+    motion: Motion,
+    hidden: Hidden,
+    clock: float = 0.0,
+    online: bool = False,
+) -> Result:
+    """Estimate a dive with the command and compare it with the truth.
+
+    Parameters
+    ----------
+    streams, configuration : what the command gets
+    motion, hidden : the truth
+    clock : how late the clock is that stamps the estimates [s]
+    online : replay the log through ``rovgraph online`` too
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        log_table(streams).to_csv(folder / "log.csv", index=False, float_format="%.9g")
+        (folder / "vehicle.yaml").write_text(json.dumps(configuration), encoding="utf-8")  # JSON is YAML
+        log, out, live = (str(folder / part) for part in ("log.csv", "out", "live"))
+        config = ["--config", str(folder / "vehicle.yaml")]
+        code, errors = run_command(["smooth", log, *config, "--out", out, "--no-figures"])
+        said = [line for line in errors.replace(name, "").splitlines() if line.strip()]
+        if not (folder / "out" / "summary.json").exists():
+            return Result(said=tuple(said), refused=True)
+        summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
+        said += [*summary["assumptions"], *_warnings(summary)]
+        result = Result()
+        for kind in ("smoothed", "filtered"):
+            track = pd.read_csv(folder / "out" / f"trajectory_{kind}.csv")
+            table = pd.read_csv(folder / "out" / "calibration.csv")
+            _compare(result, kind, track, table[table["estimate"] == kind], motion, hidden, clock)
+        if online:
+            command = ["online", f"file:{log}", *config, "--out", live, "--speed", "max", "--no-refine"]
+            code, errors = run_command(command)
+            said += [f"online: {line}" for line in errors.replace(name, "").splitlines()]
+            path = folder / "live" / "trajectory_filtered.csv"
+            if code == 0 and path.exists():
+                _compare(result, "online", pd.read_csv(path), None, motion, hidden, clock)
+        return Result(result.nees, result.rms, result.sd, tuple(said))
+
+
+def _warnings(summary: dict[str, Any]) -> list[str]:
+    """Warnings and verdict, where a summary has them."""
+    found = summary.get("warnings") or []
+    return [w if isinstance(w, str) else json.dumps(w) for w in found]
+
+
+def _compare(
+    result: Result,
+    kind: str,
+    track: pd.DataFrame,
+    calibration: pd.DataFrame | None,
+    motion: Motion,
+    hidden: Hidden,
+    clock: float,
+) -> None:
+    """Add the errors of one estimate to a result; ``calibration`` are its rows of calibration.csv."""
+    times = track["time"].to_numpy()
+    wanted = np.arange(SETTLED_S, motion.duration, 1.0)
+    rows = np.unique(np.clip(np.searchsorted(times, wanted + clock), 0, len(times) - 1))
+    result.nees[kind], result.rms[kind], result.sd[kind] = nees(track.iloc[rows], motion, clock)
+    if calibration is None:
+        return
+    estimated = calibration[calibration["estimated"].astype(bool)].set_index("label")
+    for name, true, turn in (("dvl_yaw", hidden.dvl_yaw, 360.0), ("dvl_scale", hidden.dvl_scale, np.inf)):
+        if name in estimated.index:
+            error = float(estimated.loc[name, "value"]) - true
+            error -= 0.0 if np.isinf(turn) else turn * round(error / turn)
+            result.nees[kind][name] = float((error / estimated.loc[name, "sd"]) ** 2)
+
+
+def nees(track: pd.DataFrame, motion: Motion, clock: float = 0.0) -> tuple[dict[str, float], float, float]:
+    """NEES per degree of freedom of position (north and east), depth and heading; horizontal rms error and sd [m].
+
+    Parameters
+    ----------
+    track : rows of a trajectory file
+    motion, clock : the truth, and how late the track's stamps are [s]
+    """
+    t = track["time"].to_numpy() - clock
+    error = track[["north", "east", "down"]].to_numpy() - motion.local(t)
+    e, n = error[:, 1], error[:, 0]
+    nn, ee, ne = track["north_sd"] ** 2, track["east_sd"] ** 2, track["cov_north_east"]
+    horizontal = ((ee * n**2 - 2.0 * ne * n * e + nn * e**2) / (nn * ee - ne**2)).to_numpy()
+    heading = np.asarray(track["yaw"].to_numpy() - motion.heading(t))
+    heading = np.mod(heading + np.pi, 2.0 * np.pi) - np.pi
+    values = {
+        "position": _mean(horizontal) / 2.0,
+        "depth": _mean((error[:, 2] / track["down_sd"].to_numpy()) ** 2),
+        "heading": _mean((heading / track["yaw_sd"].to_numpy()) ** 2),
+    }
+    return values, float(np.sqrt(np.mean(n**2 + e**2))), float(np.sqrt(np.mean(nn + ee)))
+
+
+def _mean(values: Array) -> float:
+    return float(np.mean(values))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Many dives of one case.
+
+    Attributes
+    ----------
+    verdict : right, wide, loud, or a lie
+    nees : estimate -> quantity -> mean over the seeds
+    rms, sd : estimate -> root of the mean square over the seeds [m]
+    named : part of the seeds in which the cause was named
+    warned : part of the seeds with any warning that the healthy dive does not have
+    refused : part of the seeds that were refused
+    seeds : how many
+    """
+
+    verdict: str
+    nees: dict[str, dict[str, float]]
+    rms: dict[str, float]
+    sd: dict[str, float]
+    named: float
+    warned: float
+    refused: float
+    seeds: int
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The quantity and estimate of the largest NEES; not a number where every dive was refused."""
+        found = [(f"{q}, {kind}", v) for kind, values in self.nees.items() for q, v in values.items()]
+        return max(found, key=lambda entry: entry[1], default=("", float("nan")))
+
+
+def template(line: str) -> str:
+    """A message without its numbers."""
+    return re.sub(r"[-+]?\d[\d.,e+-]*", "#", line)
+
+
+def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) -> Outcome:
+    """The outcome of a case.
+
+    Parameters
+    ----------
+    results : one per seed
+    says : regular expression; a message that matches it names the cause
+    healthy : the same dives without the fault; what is said of them is no warning, and their sd is what is possible
+    """
+    usual = {template(line) for result in healthy for line in result.said}
+    new = [[line for line in r.said if template(line) not in usual] for r in results]
+    named = [any(re.search(says, line, re.IGNORECASE) for line in lines) if says else False for lines in new]
+    made = [r for r in results if not r.refused]
+    averages = _average([r.nees for r in made])
+    rms, sd = ({kind: _rms([getattr(r, what)[kind] for r in made]) for kind in averages} for what in ("rms", "sd"))
+    largest = max((v for values in averages.values() for v in values.values()), default=0.0)
+    refused = 1.0 - len(made) / len(results)
+    limit = {kind: WIDER * _rms([r.sd[kind] for r in healthy if not r.refused]) for kind in sd if healthy}
+    share = float(np.mean([a or r.refused for a, r in zip(named, results, strict=True)]))
+    if refused == 1.0:
+        verdict = "loud"
+    elif largest <= HONEST_NEES:
+        verdict = "wide" if any(sd[kind] > limit[kind] for kind in limit) else "right"
+    else:
+        verdict = "loud" if share >= NAMED_IN else "lie"
+    warned = float(np.mean([bool(lines) for lines in new]))
+    return Outcome(verdict, averages, rms, sd, float(np.mean(named)), warned, refused, len(results))
+
+
+def _average(every: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    kinds = {kind for nees in every for kind in nees}
+    result: dict[str, dict[str, float]] = {}
+    for kind in sorted(kinds, reverse=True):
+        rows = [nees[kind] for nees in every if kind in nees]
+        names = [q for q in QUANTITIES if any(q in row for row in rows)]
+        result[kind] = {q: float(np.mean([row[q] for row in rows if q in row])) for q in names}
+    return result
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
