@@ -18,6 +18,7 @@ from pathlib import Path
 
 from fault_campaign.campaign import Outcome, run, table
 from fault_campaign.cases import CASES, Case
+from fault_campaign.judge import HONEST_NEES, honest_nees
 
 from rovgraph.workers import cores
 
@@ -40,8 +41,8 @@ dives without the fault do not count.
 | loud | some NEES is above 2, and the cause is named in 19 of 20 dives, or the log is refused |
 | lie | some NEES is above 2, and the cause is not named |
 
-Run the campaign whenever the estimator changes. `--cases` takes some of them, `--jobs` sets the number of processes, \
-`--json` writes all figures, `--keep` goes on with a campaign that was interrupted, \
+{limit}Run the campaign whenever the estimator changes. `--cases` takes some of them, `--jobs` sets the number of \
+processes, `--json` writes all figures, `--keep` goes on with a campaign that was interrupted, \
 `--online` replays each log through `rovgraph online` as well.
 """
 
@@ -78,12 +79,20 @@ def page(cases: list[Case], outcomes: dict[str, Outcome], arguments: argparse.Na
     """docs/faults.md."""
     version = f", here at {arguments.version}" if arguments.version else ""
     online = " and `rovgraph online`" if arguments.online else ""
-    parts = [READING.format(seeds=arguments.seeds, version=version, online=online)]
+    parts = [READING.format(seeds=arguments.seeds, version=version, online=online, limit=_limit(arguments.seeds))]
     for title, healthy in (("Healthy dives", True), ("Faults", False)):
         some = [case for case in cases if case.healthy == healthy]
         if some:
             parts += [f"## {title}\n", count(some, outcomes) + "\n", table(some, outcomes) + "\n"]
     return "\n".join(parts)
+
+
+def _limit(seeds: int) -> str:
+    """What takes the place of 2 where seeds are few."""
+    limit = honest_nees(seeds)
+    if limit <= HONEST_NEES:
+        return ""
+    return f"With {seeds} seeds chance alone reaches {limit:.1f} in 1 of 100 campaigns, which takes the place of 2.\n\n"
 
 
 def count(cases: list[Case], outcomes: dict[str, Outcome]) -> str:

@@ -1,6 +1,7 @@
 """Every case over many seeds, on several cores, and the table of it."""
 
 import json
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict
@@ -28,18 +29,20 @@ def merge(base: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_case(case: Case, seed: int, online: bool = False) -> Result:
-    """One dive of one case. The same seed gives the same motion and, where the fault allows, the same noise."""
-    rng = np.random.default_rng(seed)
+    """One dive of one case. A seed gives a faulty case and its healthy one the same motion and the same noise."""
+    setting = zlib.crc32(repr(case.setting).encode())  # other settings have other draws
+    rng = np.random.default_rng([setting, seed])
     motion, vehicle = make_motion(case.scenario, rng), make_vehicle(case.grade, case.aids)
     if case.dvl_rate is not None:
         vehicle.dvl.rate = case.dvl_rate
+    vehicle.dvl.scale_sd = case.config.get("calibration", {}).get("dvl_scale", {}).get("sd", 0.0)
     config = merge(merge(configuration(vehicle), case.config), case.wrong_config)
     config["start"] |= dict(zip(("north_m", "east_m"), rng.normal(0.0, 0.1, 2).tolist(), strict=True))
     if case.on_vehicle is not None:
         case.on_vehicle(vehicle)
     streams, hidden = sample(motion, vehicle, rng)
     if case.on_log is not None:
-        case.on_log(streams, motion, np.random.default_rng([seed, 1]))
+        case.on_log(streams, motion, np.random.default_rng([setting, seed, 1]))
     return run_dive(streams, config, motion, hidden, case.clock, online)
 
 

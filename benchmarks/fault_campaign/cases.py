@@ -24,6 +24,7 @@ ACC, GYR, MAG = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("acc", "
 DVL = ("dvl_vx", "dvl_vy", "dvl_vz")
 AUDIT = "audit"  # found with another simulator and recorded dives
 AHRS_DEPTH = ("ahrs", "depth")
+WAVES = "survey, waves"
 WITH_FIXES = ("ahrs", "depth", "fix")
 
 
@@ -410,25 +411,26 @@ SOFT_IRON = np.array([[1.06, 0.03, 0.0], [0.03, 0.95, 0.02], [0.0, 0.02, 1.0]])
 SCALE = {"calibration": {"dvl_scale": {"estimate": True, "sd": 0.01}}}
 TIME_OFFSET = {"calibration": {"dvl_time_offset": {"estimate": True, "sd": 0.1}}}
 
-CLOCK = r"clock|late\b|lag|stamp|time offset|time_offset|synchron|delay"
+CLOCK = r"\bclocks?\b|\blate|\blag|stamp|time offset|time_offset|synchron|delay"
 MOUNT = r"mount|axis|axes|sign\b|turned|flipp|mirror|orientation|upside"
-DVL_WRONG = r"dvl.*(reject|inconsisten|disagree|contradict|bias|lock|gate|outlier)"
+DVL_WRONG = r"dvl.*(reject|inconsisten|disagree|contradict|bias|\block|gate|outlier)"
 FROZEN = r"frozen|froze|stuck|same value|repeat|stands still|constant"
 NOISE = r"nois|scatter|mean square|chi-square|vibrat|autocorrel|correlat"
 
 HEALTHY: tuple[Case, ...] = (
     Case("survey", "nothing"),
-    Case("survey, waves", "nothing", scenario="survey, waves"),
+    Case("survey, waves", "nothing", scenario=WAVES),
     Case("long survey", "nothing", scenario="long survey"),
     Case("dives", "nothing", scenario="dives"),
     Case("hover", "nothing", scenario="hover"),
     Case("transit", "nothing", scenario="transit"),
     Case("survey with fixes", "nothing", aids=WITH_FIXES),
+    Case("transit with fixes", "nothing", scenario="transit", aids=WITH_FIXES),
     Case("magnetometer", "nothing", aids=("mag", "depth")),
     Case("magnetometer, little turning", "nothing", scenario="transit", aids=("mag", "depth")),
     Case("two compasses", "nothing", aids=("mag", "dvl_heading", "depth"), scenario="dives"),
     Case("tactical", "nothing", grade="tactical"),
-    Case("tactical, waves", "nothing", grade="tactical", scenario="survey, waves"),
+    Case("tactical, waves", "nothing", grade="tactical", scenario=WAVES),
     Case("tactical, long transit", "nothing", grade="tactical", scenario="long transit"),
     Case("FOG", "nothing", grade="fog"),
     Case(
@@ -461,17 +463,18 @@ FAULTS: tuple[Case, ...] = (
          on_vehicle=change("dvl", mount_rpy_deg=(181.5, 1.5, -45.0))),
     Case("dvl arm", "15 cm off", r"arm", on_vehicle=change("dvl", arm=(0.35, 0.1, 0.3))),
     # clocks
-    Case("dvl 0.1 s late", "stamps", CLOCK, on_log=later("dvl", 0.1)),
-    Case("dvl 0.087 s late", "as an A50 stamped on arrival", CLOCK, on_log=later("dvl", 0.087)),
-    Case("dvl 0.3 s late", "stamps", CLOCK, on_log=later("dvl", 0.3)),
+    Case("dvl 0.1 s late", "stamps", CLOCK, scenario=WAVES, on_log=later("dvl", 0.1)),
+    Case("dvl 0.087 s late", "as an A50 stamped on arrival", CLOCK, scenario=WAVES, on_log=later("dvl", 0.087)),
+    Case("dvl 0.3 s late", "stamps", CLOCK, scenario=WAVES, on_log=later("dvl", 0.3)),
+    Case("dvl 0.1 s late, level", "the same without waves", CLOCK, on_log=later("dvl", 0.1)),
     Case("dvl 3.2 s late", "stamps", CLOCK, on_log=later("dvl", 3.2)),
     Case("dvl 0.1 s late, estimated", "and dvl_time_offset estimated", CLOCK, on_log=later("dvl", 0.1),
          config=TIME_OFFSET),
-    Case("dvl in bursts", "stamped on arrival, read once a second", CLOCK, on_log=dvl_bursts),
+    Case("dvl in bursts", "stamped on arrival, read once a second", CLOCK, scenario=WAVES, on_log=dvl_bursts),
     Case("dvl of another epoch", "Unix time beside time since boot", CLOCK, on_log=later("dvl", 1.7e9)),
-    Case("imu 50 ms late", "stamps", CLOCK, on_log=later("imu", 0.05), clock=0.05),
-    Case("imu clock jumps", "by 2 s", CLOCK + "|jump|set", on_log=jump("imu", 90.0, 2.0)),
-    Case("dvl clock jumps", "by 2 s", CLOCK + "|jump|set", on_log=jump("dvl", 90.0, 2.0)),
+    Case("imu 50 ms late", "stamps", CLOCK, scenario=WAVES, on_log=later("imu", 0.05), clock=0.05),
+    Case("imu clock jumps", "by 2 s", CLOCK + r"|jump|\bset\b", on_log=jump("imu", 90.0, 2.0)),
+    Case("dvl clock jumps", "by 2 s", CLOCK + r"|jump|\bset\b", on_log=jump("dvl", 90.0, 2.0)),
     # the IMU
     Case("imu tilted", "mounted 2, 1, 3 degrees off", MOUNT + "|tilt",
          on_vehicle=change("imu", mount_rpy_deg=(2.0, 1.0, 3.0))),
@@ -522,7 +525,7 @@ FAULTS: tuple[Case, ...] = (
     Case("dvl sound speed 3 %", "fresh water's in the sea", r"scale|sound speed", "LABUST",
          on_vehicle=change("dvl", scale=-0.03)),
     Case("dvl arm unsigned", "z typed upwards", r"arm", "LABUST, oplab_pipeline",
-         wrong_config={"dvl": {"lever_arm_m": [0.25, 0.0, -0.3]}}, scenario="survey, waves"),
+         wrong_config={"dvl": {"lever_arm_m": [0.25, 0.0, -0.3]}}, scenario=WAVES),
     # from issue trackers: IMUs and autopilots
     Case("imu forward-port-up", "not declared", MOUNT, "MAVROS, VectorNav", on_log=flu([ACC, GYR])),
     Case("gyro forward-port-up", "accelerometer converted, gyro not", MOUNT, "MAVROS", on_log=flu([GYR])),
@@ -532,7 +535,7 @@ FAULTS: tuple[Case, ...] = (
          on_log=multiply("imu", ACC, 1.0 / 9.80665)),
     Case("gyro bias 3 deg/s", "not calibrated at boot", r"gyr.*bias", "ArduSub",
          on_vehicle=change("imu", gyr_bias=np.deg2rad([1.0, -1.0, 3.0]))),
-    Case("gyro bias 1 deg/s, in waves", "no rest to see it", r"gyr.*bias", "ArduSub", scenario="survey, waves",
+    Case("gyro bias 1 deg/s, in waves", "no rest to see it", r"gyr.*bias", "ArduSub", scenario=WAVES,
          on_vehicle=change("imu", gyr_bias=np.deg2rad([0.5, -0.5, 1.0]))),
     Case("gyro warms up", "0.3 deg/s in minutes", r"gyr.*(bias|drift)", "PX4, iNav", on_log=imu_warms_up),
     Case("accelerometer bias", "0.3 m/s^2", r"acc.*bias", "PX4",
@@ -543,10 +546,11 @@ FAULTS: tuple[Case, ...] = (
          on_log=imu_doubled_stamps),
     Case("imu stamps coarse", "16 ms", r"imu.*(same time|stamp|repeat|resolution)", "ZED", on_log=imu_milliseconds),
     Case("imu stamped on arrival", "5 ms of jitter, queues of 100 ms", CLOCK + "|jitter|irregular", "Xsens drivers",
-         on_log=imu_stamped_on_arrival),
-    Case("imu stamped at the end", "of its averaging period", CLOCK, "PX4", on_log=imu_end_of_period, clock=0.005),
-    Case("imu clock 1 % fast", "against all others", CLOCK + "|rate|fast", "Xsens drivers", on_log=imu_clock_fast),
-    Case("all clocks jump", "NTP: 8 s", CLOCK + "|jump|gap|set|silent", "ROS, rtabmap", on_log=all_clocks_jump),
+         scenario=WAVES, on_log=imu_stamped_on_arrival),
+    Case("imu stamped at the end", "of its averaging period", CLOCK, "PX4", scenario=WAVES,
+         on_log=imu_end_of_period, clock=0.005),
+    Case("imu clock 1 % fast", "against all others", CLOCK + "|too fast", "Xsens drivers", on_log=imu_clock_fast),
+    Case("all clocks jump", "NTP: 8 s", CLOCK + r"|jump|gap|\bset\b|silent", "ROS, rtabmap", on_log=all_clocks_jump),
     Case("rows doubled", "two recordings merged", r"repeat|twice|same time", "rosbag users", on_log=rows_doubled),
     Case("gravity of the equator", "9.78 m/s^2", r"gravity", "iNav",
          wrong_config={"environment": {"gravity_mps2": earth.GRAVITY_EQUATOR}}),

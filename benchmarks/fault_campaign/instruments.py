@@ -52,12 +52,12 @@ def imu(motion: Motion, vehicle: Vehicle, rng: np.random.Generator) -> pd.DataFr
     return pd.DataFrame({"time": t, **columns})
 
 
-def dvl(motion: Motion, vehicle: Vehicle, C_bs: Array, rng: np.random.Generator) -> pd.DataFrame:
+def dvl(motion: Motion, vehicle: Vehicle, C_bs: Array, scale: float, rng: np.random.Generator) -> pd.DataFrame:
     """Velocity of the instrument over ground, along its own axes."""
     unit = vehicle.dvl
     t = _times(motion, unit.rate, 0.13)
     v_b = motion.v_b(t) + np.cross(motion.rate_nb_b(t), np.asarray(unit.arm))
-    values = (1.0 + unit.scale) * v_b @ C_bs + rng.normal(0.0, 1.0, (len(t), 3)) * np.asarray(unit.sd)
+    values = (1.0 + scale) * v_b @ C_bs + rng.normal(0.0, 1.0, (len(t), 3)) * np.asarray(unit.sd)
     columns = {f"dvl_v{axis}": values[:, k] for k, axis in enumerate(XYZ)}
     return pd.DataFrame({"time": t, **columns, "dvl_valid": 1.0})
 
@@ -101,8 +101,9 @@ def sample(motion: Motion, vehicle: Vehicle, rng: np.random.Generator) -> tuple[
     """All instruments of a vehicle on a motion."""
     roll, pitch, yaw = vehicle.dvl.mount_rpy_deg
     yaw += rng.normal(0.0, vehicle.dvl.yaw_sd)
+    scale = vehicle.dvl.scale + (rng.normal(0.0, vehicle.dvl.scale_sd) if vehicle.dvl.scale_sd else 0.0)
     C_dvl, C_imu = mounting((roll, pitch, yaw)), mounting(vehicle.imu.mount_rpy_deg)
-    streams = {"imu": imu(motion, vehicle, rng), "dvl": dvl(motion, vehicle, C_dvl, rng)}
+    streams = {"imu": imu(motion, vehicle, rng), "dvl": dvl(motion, vehicle, C_dvl, scale, rng)}
     if "ahrs" in vehicle.aids:
         streams["ahrs"] = compass(motion, vehicle, vehicle.ahrs, C_imu[:, 0], rng)
         streams["ahrs"].columns = pd.Index(["time", "ahrs_yaw"])
@@ -121,7 +122,7 @@ def sample(motion: Motion, vehicle: Vehicle, rng: np.random.Generator) -> tuple[
         position = at_arm(motion, t, np.asarray(vehicle.fix.arm))[:, :2]
         position = position + rng.normal(0.0, vehicle.fix.sd, (len(t), 2))
         streams["fix"] = pd.DataFrame({"time": t, "fix_north": position[:, 0], "fix_east": position[:, 1]})
-    return streams, Hidden(yaw, vehicle.dvl.scale)
+    return streams, Hidden(yaw, scale)
 
 
 def log_table(streams: Streams) -> pd.DataFrame:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import chi2
 
 from fault_campaign.earth import Array
 from fault_campaign.instruments import Hidden, log_table
@@ -87,7 +88,7 @@ def run_dive(
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        log_table(streams).to_csv(folder / "log.csv", index=False, float_format="%.9g")
+        log_table(streams).to_csv(folder / "log.csv", index=False, float_format="%.14g")
         (folder / "vehicle.yaml").write_text(json.dumps(configuration), encoding="utf-8")  # JSON is YAML
         log, out, live = (str(folder / part) for part in ("log.csv", "out", "live"))
         config = ["--config", str(folder / "vehicle.yaml")]
@@ -96,7 +97,7 @@ def run_dive(
         if not (folder / "out" / "summary.json").exists():
             return Result(said=tuple(said), refused=True)
         summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
-        said += [*summary["assumptions"], *_warnings(summary)]
+        said += [*(f"assumed: {line}" for line in summary["assumptions"]), *_warnings(summary)]
         result = Result()
         for kind in ("smoothed", "filtered"):
             track = pd.read_csv(folder / "out" / f"trajectory_{kind}.csv")
@@ -115,7 +116,7 @@ def run_dive(
 def _warnings(summary: dict[str, Any]) -> list[str]:
     """Warnings and verdict, where a summary has them."""
     found = summary.get("warnings") or []
-    return [w if isinstance(w, str) else json.dumps(w) for w in found]
+    return ["warning: " + (w if isinstance(w, str) else json.dumps(w)) for w in found]
 
 
 def _compare(
@@ -200,6 +201,14 @@ class Outcome:
         return max(found, key=lambda entry: entry[1], default=("", float("nan")))
 
 
+def honest_nees(seeds: int) -> float:
+    """What the mean NEES of an honest estimate exceeds in fewer than 1 of 100 campaigns; 2 for 20 seeds or more.
+
+    An error that is constant over a dive, as a compass's offset, is one degree of freedom a dive.
+    """
+    return max(HONEST_NEES, float(chi2.ppf(0.99, seeds)) / seeds)
+
+
 def template(line: str) -> str:
     """A message without its numbers."""
     return re.sub(r"[-+]?\d[\d.,e+-]*", "#", line)
@@ -226,11 +235,11 @@ def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) 
     share = float(np.mean([a or r.refused for a, r in zip(named, results, strict=True)]))
     if refused == 1.0:
         verdict = "loud"
-    elif largest <= HONEST_NEES:
+    elif largest <= honest_nees(len(made)):
         verdict = "wide" if any(sd[kind] > limit[kind] for kind in limit) else "right"
     else:
         verdict = "loud" if share >= NAMED_IN else "lie"
-    warned = float(np.mean([bool(lines) for lines in new]))
+    warned = float(np.mean([any(line.startswith("warning") for line in lines) for lines in new]))
     return Outcome(verdict, averages, rms, sd, float(np.mean(named)), warned, refused, len(results))
 
 

@@ -71,7 +71,7 @@ class Dvl:
     rate : pings per second
     sd : of a ping's components [m/s]
     yaw_sd : how well the mounting's yaw is known [deg]
-    scale : relative error of the velocity
+    scale, scale_sd : relative error of the velocity, and of one that is drawn in addition
     """
 
     rate: float = 5.0
@@ -80,6 +80,7 @@ class Dvl:
     arm: Triple = (0.25, 0.0, 0.3)
     yaw_sd: float = 3.0
     scale: float = 0.0
+    scale_sd: float = 0.0
 
 
 @dataclass
