@@ -16,7 +16,7 @@ from fault_campaign import earth  # noqa: E402
 from fault_campaign.campaign import keep_dive, read_dives, run, table  # noqa: E402
 from fault_campaign.cases import CASES, FAULTS, HEALTHY  # noqa: E402
 from fault_campaign.instruments import at_arm, dvl, log_table, sample  # noqa: E402
-from fault_campaign.judge import Result, honest_nees, judge, nees, run_dive  # noqa: E402
+from fault_campaign.judge import Dive, Result, honest_nees, judge, nees, run_dive  # noqa: E402
 from fault_campaign.motion import Motion, Profile, mounting, strapdown  # noqa: E402
 from fault_campaign.scenarios import SCENARIOS, make_motion  # noqa: E402
 from fault_campaign.vehicle import configuration, make_vehicle  # noqa: E402
@@ -248,7 +248,7 @@ def test_perfect_instruments_give_the_true_track():
     vehicle.ahrs.sd = vehicle.ahrs.offset_sd = vehicle.ahrs.curve_sd = vehicle.depth.sd = vehicle.dvl.yaw_sd = 0.0
     vehicle.dvl.sd = (0.0, 0.0, 0.0)
     streams, hidden = sample(motion, vehicle, np.random.default_rng(0))
-    result = run_dive(streams, config, motion, hidden)
+    result = run_dive(Dive(streams, config, motion, hidden))
     assert not result.refused, result.said
     assert result.rms["smoothed"] < 0.03
     assert result.rms["filtered"] < 0.1

@@ -8,6 +8,7 @@ motion      a smooth motion over the ellipsoid: rate, specific force, position; 
 scenarios   named motions
 vehicle     what the instruments really are, and the configuration that describes them
 instruments samples of every instrument; streams to a log
-cases       the table of faults
 judge       one dive through the command, its errors in standard deviations, the outcome
+cases       the table of faults
+campaign    every case over many seeds
 """

@@ -12,7 +12,7 @@ import numpy as np
 
 from fault_campaign.cases import CASES, HEALTHY, Case
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Outcome, Result, judge, run_dive
+from fault_campaign.judge import Dive, Outcome, Result, judge, run_dive
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
 from rovgraph.workers import starting, workers
@@ -43,7 +43,7 @@ def run_case(case: Case, seed: int, online: bool = False) -> Result:
     streams, hidden = sample(motion, vehicle, rng)
     if case.on_log is not None:
         case.on_log(streams, motion, np.random.default_rng([setting, seed, 1]))
-    return run_dive(streams, config, motion, hidden, case.clock, online)
+    return run_dive(Dive(streams, config, motion, hidden, case.clock, tuple(case.second_file)), online)
 
 
 def run(
@@ -135,9 +135,8 @@ def _nees(outcome: Outcome, kind: str) -> str:
 
 
 def _errors(outcome: Outcome) -> str:
-    if "smoothed" not in outcome.rms:
-        return "–"
-    return f"{number(outcome.rms['smoothed'])} ({number(outcome.sd['smoothed'])})"
+    kind = next((kind for kind in ("smoothed", "online") if kind in outcome.rms), None)
+    return "–" if kind is None else f"{number(outcome.rms[kind])} ({number(outcome.sd[kind])})"
 
 
 def number(value: float) -> str:

@@ -14,6 +14,7 @@ import pandas as pd
 
 from fault_campaign import earth
 from fault_campaign.instruments import Streams
+from fault_campaign.judge import Clock, on_time
 from fault_campaign.motion import Motion, mounting
 from fault_campaign.vehicle import Vehicle
 
@@ -41,8 +42,9 @@ class Case:
     on_vehicle, on_log : the fault
     config : keys of the configuration beside those that describe the vehicle
     wrong_config : keys that are wrong; the healthy case does not have them
-    clock : how late the clock is that stamps the estimate [s]
+    clock : how late the clock is that stamps the estimate, as a function of the stamp [s]
     dvl_rate : pings per second, where it is not 5
+    second_file : sensors in a file of their own, replayed by `rovgraph online` beside the other
     """
 
     name: str
@@ -56,8 +58,9 @@ class Case:
     on_log: OnLog | None = None
     config: dict[str, Any] = field(default_factory=dict)
     wrong_config: dict[str, Any] = field(default_factory=dict)
-    clock: float = 0.0
+    clock: Clock = on_time
     dvl_rate: float | None = None
+    second_file: Sequence[str] = ()
 
     @property
     def healthy(self) -> bool:
@@ -65,9 +68,10 @@ class Case:
         return self.on_vehicle is None and self.on_log is None and not self.wrong_config
 
     @property
-    def setting(self) -> tuple[str, str, tuple[str, ...], str, float | None]:
+    def setting(self) -> tuple[Any, ...]:
         """What a faulty case has in common with its healthy one."""
-        return self.scenario, self.grade, tuple(self.aids), repr(self.config), self.dvl_rate
+        common = self.scenario, self.grade, tuple(self.aids), repr(self.config), self.dvl_rate
+        return (*common, *self.second_file)
 
 
 # --- what several faults share -------------------------------------------------------------------
@@ -406,6 +410,11 @@ def change(part: str, **values: Any) -> OnVehicle:
     return fault
 
 
+def constantly(seconds: float) -> Clock:
+    """A clock that is late by as much all the time."""
+    return lambda stamps: np.full_like(stamps, seconds)
+
+
 SKEW = np.array([[1.0, 0.01, -0.01], [0.0, 1.0, 0.01], [0.0, 0.0, 1.0]])
 SOFT_IRON = np.array([[1.06, 0.03, 0.0], [0.03, 0.95, 0.02], [0.0, 0.02, 1.0]])
 SCALE = {"calibration": {"dvl_scale": {"estimate": True, "sd": 0.01}}}
@@ -441,6 +450,7 @@ HEALTHY: tuple[Case, ...] = (
         dvl_rate=1.0,
     ),
     Case("figures of eight, dvl_scale estimated", "nothing", scenario="eights", config=SCALE),
+    Case("two files, online", "nothing", second_file=("dvl",)),
     Case("dvl_time_offset estimated", "nothing", config=TIME_OFFSET),
 )
 
@@ -472,7 +482,10 @@ FAULTS: tuple[Case, ...] = (
          config=TIME_OFFSET),
     Case("dvl in bursts", "stamped on arrival, read once a second", CLOCK, scenario=WAVES, on_log=dvl_bursts),
     Case("dvl of another epoch", "Unix time beside time since boot", CLOCK, on_log=later("dvl", 1.7e9)),
-    Case("imu 50 ms late", "stamps", CLOCK, scenario=WAVES, on_log=later("imu", 0.05), clock=0.05),
+    Case("two files, online, 55 years apart", "Unix time beside time since boot", CLOCK, second_file=("dvl",),
+         on_log=later("dvl", 1.7e9)),
+    Case("two files, online, 87 ms apart", "stamps", CLOCK, second_file=("dvl",), on_log=later("dvl", 0.087)),
+    Case("imu 50 ms late", "stamps", CLOCK, scenario=WAVES, on_log=later("imu", 0.05), clock=constantly(0.05)),
     Case("imu clock jumps", "by 2 s", CLOCK + r"|jump|\bset\b", on_log=jump("imu", 90.0, 2.0)),
     Case("dvl clock jumps", "by 2 s", CLOCK + r"|jump|\bset\b", on_log=jump("dvl", 90.0, 2.0)),
     # the IMU
@@ -548,9 +561,10 @@ FAULTS: tuple[Case, ...] = (
     Case("imu stamped on arrival", "5 ms of jitter, queues of 100 ms", CLOCK + "|jitter|irregular", "Xsens drivers",
          scenario=WAVES, on_log=imu_stamped_on_arrival),
     Case("imu stamped at the end", "of its averaging period", CLOCK, "PX4", scenario=WAVES,
-         on_log=imu_end_of_period, clock=0.005),
+         on_log=imu_end_of_period, clock=constantly(0.005)),
     Case("imu clock 1 % fast", "against all others", CLOCK + "|too fast", "Xsens drivers", on_log=imu_clock_fast),
-    Case("all clocks jump", "NTP: 8 s", CLOCK + r"|jump|gap|\bset\b|silent", "ROS, rtabmap", on_log=all_clocks_jump),
+    Case("all clocks jump", "NTP: 8 s", CLOCK + r"|jump|gap|\bset\b|silent", "ROS, rtabmap", on_log=all_clocks_jump,
+         clock=lambda stamps: np.clip(stamps - 90.0, 0.0, 8.0)),
     Case("rows doubled", "two recordings merged", r"repeat|twice|same time", "rosbag users", on_log=rows_doubled),
     Case("gravity of the equator", "9.78 m/s^2", r"gravity", "iNav",
          wrong_config={"environment": {"gravity_mps2": earth.GRAVITY_EQUATOR}}),

@@ -10,8 +10,8 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,14 @@ WIDER = 1.5  # times the sd of the healthy dive
 NAMED_IN = 0.95  # of the seeds, for a fault to count as named
 SETTLED_S = 10.0
 QUANTITIES = ("position", "depth", "heading", "dvl_yaw", "dvl_scale")
+
+
+Clock = Callable[[Array], Array]
+
+
+def on_time(stamps: Array) -> Array:
+    """A clock that is not late."""
+    return np.zeros_like(stamps)
 
 
 @dataclass(frozen=True)
@@ -69,48 +77,74 @@ def run_command(arguments: Sequence[str]) -> tuple[int, str]:
     return code, errors.getvalue()
 
 
-def run_dive(
-    streams: dict[str, pd.DataFrame],
-    configuration: dict[str, Any],
-    motion: Motion,
-    hidden: Hidden,
-    clock: float = 0.0,
-    online: bool = False,
-) -> Result:
-    """Estimate a dive with the command and compare it with the truth.
+@dataclass(frozen=True)
+class Dive:
+    """What the command gets, and the truth.
 
-    Parameters
+    Attributes
     ----------
-    streams, configuration : what the command gets
+    streams, configuration : the log by sensors, and the configuration
     motion, hidden : the truth
-    clock : how late the clock is that stamps the estimates [s]
-    online : replay the log through ``rovgraph online`` too
+    clock : how late the clock is that stamps the estimates, as a function of the stamp [s]
+    second_file : sensors in a file of their own; such a dive goes through `rovgraph online` alone
     """
+
+    streams: dict[str, pd.DataFrame]
+    configuration: dict[str, Any]
+    motion: Motion
+    hidden: Hidden
+    clock: Clock = on_time
+    second_file: tuple[str, ...] = ()
+
+
+def run_dive(dive: Dive, online: bool = False) -> Result:
+    """Estimate a dive with `rovgraph smooth`, with ``online`` as a replay too, and compare it with the truth."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        log_table(streams).to_csv(folder / "log.csv", index=False, float_format="%.14g")
-        (folder / "vehicle.yaml").write_text(json.dumps(configuration), encoding="utf-8")  # JSON is YAML
-        log, out, live = (str(folder / part) for part in ("log.csv", "out", "live"))
-        config = ["--config", str(folder / "vehicle.yaml")]
-        code, errors = run_command(["smooth", log, *config, "--out", out, "--no-figures"])
-        said = [line for line in errors.replace(name, "").splitlines() if line.strip()]
-        if not (folder / "out" / "summary.json").exists():
-            return Result(said=tuple(said), refused=True)
-        summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
-        said += [*(f"assumed: {line}" for line in summary["assumptions"]), *_warnings(summary)]
-        result = Result()
-        for kind in ("smoothed", "filtered"):
-            track = pd.read_csv(folder / "out" / f"trajectory_{kind}.csv")
-            table = pd.read_csv(folder / "out" / "calibration.csv")
-            _compare(result, kind, track, table[table["estimate"] == kind], motion, hidden, clock)
-        if online:
-            command = ["online", f"file:{log}", *config, "--out", live, "--speed", "max", "--no-refine"]
-            code, errors = run_command(command)
-            said += [f"online: {line}" for line in errors.replace(name, "").splitlines()]
-            path = folder / "live" / "trajectory_filtered.csv"
-            if code == 0 and path.exists():
-                _compare(result, "online", pd.read_csv(path), None, motion, hidden, clock)
-        return Result(result.nees, result.rms, result.sd, tuple(said))
+        (folder / "vehicle.yaml").write_text(json.dumps(dive.configuration), encoding="utf-8")  # JSON is YAML
+        first = {sensor: table for sensor, table in dive.streams.items() if sensor not in dive.second_file}
+        _write(first, folder / "log.csv")
+        result = Result(refused=True) if dive.second_file else _smooth(folder, dive)
+        if dive.second_file:
+            _write({sensor: dive.streams[sensor] for sensor in dive.second_file}, folder / "second.csv")
+        if dive.second_file or (online and not result.refused):
+            result = _online(folder, dive, result)
+        return replace(result, said=tuple(line.replace(name, "") for line in result.said))
+
+
+def _write(streams: dict[str, pd.DataFrame], path: Path) -> None:
+    log_table(streams).to_csv(path, index=False, float_format="%.14g")
+
+
+def _smooth(folder: Path, dive: Dive) -> Result:
+    paths = [str(folder / part) for part in ("log.csv", "vehicle.yaml", "out")]
+    _, errors = run_command(["smooth", paths[0], "--config", paths[1], "--out", paths[2], "--no-figures"])
+    said = [line for line in errors.splitlines() if line.strip()]
+    if not (folder / "out" / "summary.json").exists():
+        return Result(said=tuple(said), refused=True)
+    summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
+    said += [*(f"assumed: {line}" for line in summary["assumptions"]), *_warnings(summary)]
+    result = Result(said=tuple(said))
+    calibration = pd.read_csv(folder / "out" / "calibration.csv")
+    for kind in ("smoothed", "filtered"):
+        track = pd.read_csv(folder / "out" / f"trajectory_{kind}.csv")
+        _compare(result, kind, track, calibration[calibration["estimate"] == kind], dive)
+    return result
+
+
+def _online(folder: Path, dive: Dive, result: Result) -> Result:
+    """A replay at full speed; what it says is added, and its estimate."""
+    files = [f"file:{folder / part}" for part in ("log.csv", "second.csv") if (folder / part).exists()]
+    options = ["--config", str(folder / "vehicle.yaml"), "--out", str(folder / "live")]
+    options += ["--speed", "max", "--no-refine", "--output", "udp://127.0.0.1:9"]  # port 9 is for what nobody reads
+    code, errors = run_command(["online", *files, *options])
+    said = (*result.said, *(f"online: {line}" for line in errors.splitlines()))
+    track = folder / "live" / "trajectory_filtered.csv"
+    if code != 0 or not track.exists():
+        return replace(result, said=said)
+    result = replace(result, said=said, refused=False)
+    _compare(result, "online", pd.read_csv(track), None, dive)
+    return result
 
 
 def _warnings(summary: dict[str, Any]) -> list[str]:
@@ -124,34 +158,35 @@ def _compare(
     kind: str,
     track: pd.DataFrame,
     calibration: pd.DataFrame | None,
-    motion: Motion,
-    hidden: Hidden,
-    clock: float,
+    dive: Dive,
 ) -> None:
     """Add the errors of one estimate to a result; ``calibration`` are its rows of calibration.csv."""
     times = track["time"].to_numpy()
-    wanted = np.arange(SETTLED_S, motion.duration, 1.0)
-    rows = np.unique(np.clip(np.searchsorted(times, wanted + clock), 0, len(times) - 1))
-    result.nees[kind], result.rms[kind], result.sd[kind] = nees(track.iloc[rows], motion, clock)
+    wanted = np.arange(SETTLED_S, dive.motion.duration, 1.0)
+    wanted += dive.clock(wanted)
+    rows = np.unique(np.clip(np.searchsorted(times, wanted), 0, len(times) - 1))
+    result.nees[kind], result.rms[kind], result.sd[kind] = nees(track.iloc[rows], dive.motion, dive.clock)
     if calibration is None:
         return
     estimated = calibration[calibration["estimated"].astype(bool)].set_index("label")
-    for name, true, turn in (("dvl_yaw", hidden.dvl_yaw, 360.0), ("dvl_scale", hidden.dvl_scale, np.inf)):
+    for name, true, turn in (("dvl_yaw", dive.hidden.dvl_yaw, 360.0), ("dvl_scale", dive.hidden.dvl_scale, np.inf)):
         if name in estimated.index:
-            error = float(estimated.loc[name, "value"]) - true
+            value, sd = estimated.loc[name, ["value", "sd"]].to_numpy(dtype=float)
+            error = value - true
             error -= 0.0 if np.isinf(turn) else turn * round(error / turn)
-            result.nees[kind][name] = float((error / estimated.loc[name, "sd"]) ** 2)
+            result.nees[kind][name] = float((error / sd) ** 2)
 
 
-def nees(track: pd.DataFrame, motion: Motion, clock: float = 0.0) -> tuple[dict[str, float], float, float]:
+def nees(track: pd.DataFrame, motion: Motion, clock: Clock = on_time) -> tuple[dict[str, float], float, float]:
     """NEES per degree of freedom of position (north and east), depth and heading; horizontal rms error and sd [m].
 
     Parameters
     ----------
     track : rows of a trajectory file
-    motion, clock : the truth, and how late the track's stamps are [s]
+    motion, clock : the truth, and how late the track's stamps are
     """
-    t = track["time"].to_numpy() - clock
+    stamps = track["time"].to_numpy()
+    t = stamps - clock(stamps)
     error = track[["north", "east", "down"]].to_numpy() - motion.local(t)
     e, n = error[:, 1], error[:, 0]
     nn, ee, ne = track["north_sd"] ** 2, track["east_sd"] ** 2, track["cov_north_east"]
