@@ -41,7 +41,13 @@ dives without the fault do not count.
 | loud | some NEES is above 2, and the cause is named in 19 of 20 dives, or the log is refused |
 | lie | some NEES is above 2, and the cause is not named |
 
-{limit}Run the campaign whenever the estimator changes. `--cases` takes some of them, `--jobs` sets the number of \
+{limit}*Reported by* says who met such a fault: `audit` is an audit of rovgraph with another simulator and recorded \
+dives, others are issue trackers of drivers, autopilots and navigation software.
+
+Some faults leave no trace in a log: a heading that is off by a constant where there are no fixes, and a depth that is \
+off by a constant. Wider priors are the only defence against those.
+
+Run the campaign whenever the estimator changes. `--cases` takes some of them, `--jobs` sets the number of \
 processes, `--json` writes all figures, `--keep` goes on with a campaign that was interrupted, \
 `--online` replays each log through `rovgraph online` as well.
 """

@@ -450,7 +450,7 @@ HEALTHY: tuple[Case, ...] = (
         dvl_rate=1.0,
     ),
     Case("figures of eight, dvl_scale estimated", "nothing", scenario="eights", config=SCALE),
-    Case("two files, online", "nothing", second_file=("dvl",)),
+    Case("two files, online", "nothing", scenario=WAVES, second_file=("dvl",)),
     Case("dvl_time_offset estimated", "nothing", config=TIME_OFFSET),
 )
 
@@ -482,9 +482,10 @@ FAULTS: tuple[Case, ...] = (
          config=TIME_OFFSET),
     Case("dvl in bursts", "stamped on arrival, read once a second", CLOCK, scenario=WAVES, on_log=dvl_bursts),
     Case("dvl of another epoch", "Unix time beside time since boot", CLOCK, on_log=later("dvl", 1.7e9)),
-    Case("two files, online, 55 years apart", "Unix time beside time since boot", CLOCK, second_file=("dvl",),
-         on_log=later("dvl", 1.7e9)),
-    Case("two files, online, 87 ms apart", "stamps", CLOCK, second_file=("dvl",), on_log=later("dvl", 0.087)),
+    Case("two files, online, 55 years apart", "Unix time beside time since boot", CLOCK, scenario=WAVES,
+         second_file=("dvl",), on_log=later("dvl", 1.7e9)),
+    Case("two files, online, 87 ms apart", "an A50 stamped on arrival", CLOCK, scenario=WAVES,
+         second_file=("dvl",), on_log=later("dvl", 0.087)),
     Case("imu 50 ms late", "stamps", CLOCK, scenario=WAVES, on_log=later("imu", 0.05), clock=constantly(0.05)),
     Case("imu clock jumps", "by 2 s", CLOCK + r"|jump|\bset\b", on_log=jump("imu", 90.0, 2.0)),
     Case("dvl clock jumps", "by 2 s", CLOCK + r"|jump|\bset\b", on_log=jump("dvl", 90.0, 2.0)),

@@ -142,9 +142,19 @@ def _online(folder: Path, dive: Dive, result: Result) -> Result:
     track = folder / "live" / "trajectory_filtered.csv"
     if code != 0 or not track.exists():
         return replace(result, said=said)
-    result = replace(result, said=said, refused=False)
-    _compare(result, "online", pd.read_csv(track), None, dive)
+    summary = json.loads((folder / "live" / "summary.json").read_text(encoding="utf-8"))
+    result = replace(result, said=(*said, *_warnings(summary)), refused=False)
+    _compare(result, "online", pd.read_csv(track), _live_calibration(summary["calibration"]), dive)
     return result
+
+
+def _live_calibration(last: dict[str, list[float]]) -> pd.DataFrame:
+    """The last solution's calibration with the columns of calibration.csv; its angles are radians."""
+    rows = []
+    for name, (value, sd) in last.items():
+        unit = 180.0 / np.pi if name == "dvl_yaw" else 1.0
+        rows.append({"label": name, "estimated": True, "value": unit * value, "sd": unit * sd})
+    return pd.DataFrame(rows, columns=["label", "estimated", "value", "sd"])
 
 
 def _warnings(summary: dict[str, Any]) -> list[str]:
@@ -157,7 +167,7 @@ def _compare(
     result: Result,
     kind: str,
     track: pd.DataFrame,
-    calibration: pd.DataFrame | None,
+    calibration: pd.DataFrame,
     dive: Dive,
 ) -> None:
     """Add the errors of one estimate to a result; ``calibration`` are its rows of calibration.csv."""
@@ -166,8 +176,6 @@ def _compare(
     wanted += dive.clock(wanted)
     rows = np.unique(np.clip(np.searchsorted(times, wanted), 0, len(times) - 1))
     result.nees[kind], result.rms[kind], result.sd[kind] = nees(track.iloc[rows], dive.motion, dive.clock)
-    if calibration is None:
-        return
     estimated = calibration[calibration["estimated"].astype(bool)].set_index("label")
     for name, true, turn in (("dvl_yaw", dive.hidden.dvl_yaw, 360.0), ("dvl_scale", dive.hidden.dvl_scale, np.inf)):
         if name in estimated.index:
