@@ -449,6 +449,7 @@ HEALTHY: tuple[Case, ...] = (
         scenario="moving start",
         dvl_rate=1.0,
     ),
+    Case("figures of eight", "nothing", scenario="eights"),
     Case("figures of eight, dvl_scale estimated", "nothing", scenario="eights", config=SCALE),
     Case("two files, online", "nothing", scenario=WAVES, second_file=("dvl",)),
     Case("dvl_time_offset estimated", "nothing", config=TIME_OFFSET),
@@ -492,7 +493,8 @@ FAULTS: tuple[Case, ...] = (
     # the IMU
     Case("imu tilted", "mounted 2, 1, 3 degrees off", MOUNT + "|tilt",
          on_vehicle=change("imu", mount_rpy_deg=(2.0, 1.0, 3.0))),
-    Case("gyro scale 0.5 %", "held", r"gyr.*scale|scale.*gyr", on_vehicle=change("imu", gyr_matrix=1.005 * np.eye(3))),
+    Case("gyro scale 0.5 %", "held", r"gyr.*scale|scale.*gyr", scenario="eights",
+         on_vehicle=change("imu", gyr_matrix=1.005 * np.eye(3))),
     Case("gyro not orthogonal", "1 %", r"orthogonal|gyr.*scale|scale.*gyr", on_vehicle=change("imu", gyr_matrix=SKEW)),
     Case("FOG without Earth rate", "earth_rotation forgotten", r"earth.?(rate|rotation)", grade="fog",
          wrong_config={"environment": {"earth_rotation": False}}),
