@@ -3,6 +3,7 @@
 import ast
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +205,14 @@ NAMED = ("warning: dvl: frozen for 60.0 s",)
 )
 def test_outcomes(results, verdict):
     assert judge(results, "frozen", dives(1.0)).verdict == verdict
+
+
+def test_what_one_command_says_is_no_excuse_for_the_other():
+    both = {"smoothed": {"position": 9.0}, "online": {"position": 9.0}}
+    size = {"smoothed": 1.0, "online": 1.0}
+    online_only = Result(both, size, size, ("online: dvl: frozen",))
+    assert judge([online_only] * 20, "frozen").verdict == "lie"
+    assert judge([replace(online_only, said=(*online_only.said, *NAMED))] * 20, "frozen").verdict == "loud"
 
 
 def test_what_is_said_of_healthy_dives_too_names_nothing():

@@ -27,6 +27,8 @@ HONEST_NEES = 2.0
 WIDER = 1.5  # times the sd of the healthy dive
 NAMED_IN = 0.95  # of the seeds, for a fault to count as named
 SETTLED_S = 10.0
+COMMANDS = {"smooth": ("smoothed", "filtered"), "online": ("online",)}  # and their estimates
+WORST_FIRST = ("lie", "loud", "wide", "right")
 QUANTITIES = ("position", "depth", "heading", "dvl_yaw", "dvl_scale")
 
 
@@ -222,7 +224,7 @@ class Outcome:
     verdict : right, wide, loud, or a lie
     nees : estimate -> quantity -> mean over the seeds
     rms, sd : estimate -> root of the mean square over the seeds [m]
-    named : part of the seeds in which the cause was named
+    named : part of the seeds in which the cause was named, by the command that names it less often
     warned : part of the seeds with any warning that the healthy dive does not have
     refused : part of the seeds that were refused
     seeds : how many
@@ -258,7 +260,7 @@ def template(line: str) -> str:
 
 
 def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) -> Outcome:
-    """The outcome of a case.
+    """The outcome of a case: the worse one of the two commands', each with its own estimates and messages.
 
     Parameters
     ----------
@@ -268,22 +270,33 @@ def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) 
     """
     usual = {template(line) for result in healthy for line in result.said}
     new = [[line for line in r.said if template(line) not in usual] for r in results]
-    named = [any(re.search(says, line, re.IGNORECASE) for line in lines) if says else False for lines in new]
-    made = [r for r in results if not r.refused]
-    averages = _average([r.nees for r in made])
-    rms, sd = ({kind: _rms([getattr(r, what)[kind] for r in made]) for kind in averages} for what in ("rms", "sd"))
-    largest = max((v for values in averages.values() for v in values.values()), default=0.0)
-    refused = 1.0 - len(made) / len(results)
-    limit = {kind: WIDER * _rms([r.sd[kind] for r in healthy if not r.refused]) for kind in sd if healthy}
-    share = float(np.mean([a or r.refused for a, r in zip(named, results, strict=True)]))
+    averages = _average([r.nees for r in results])
+    rms, sd = ({kind: _rms_of(results, what, kind) for kind in averages} for what in ("rms", "sd"))
+    wider = {kind for kind in sd if healthy and sd[kind] > WIDER * _rms_of(healthy, "sd", kind)}
+    refused = float(np.mean([r.refused for r in results]))
+    named, verdicts = [], []
     if refused == 1.0:
-        verdict = "loud"
-    elif largest <= honest_nees(len(made)):
-        verdict = "wide" if any(sd[kind] > limit[kind] for kind in limit) else "right"
-    else:
-        verdict = "loud" if share >= NAMED_IN else "lie"
+        named, verdicts = [float(np.mean(_naming(says, new)))], ["loud"]
+    for command, kinds in COMMANDS.items():
+        if not any(kind in averages for kind in kinds):
+            continue
+        lines = [[line for line in some if line.startswith("online: ") == (command == "online")] for some in new]
+        share = _naming(says, lines)
+        named.append(float(np.mean(share)))
+        largest = max(v for kind in kinds for v in averages.get(kind, {}).values())
+        if largest <= honest_nees(sum(not r.refused for r in results)):
+            verdicts.append("wide" if wider.intersection(kinds) else "right")
+        else:
+            told = np.mean([a or r.refused for a, r in zip(share, results, strict=True)])
+            verdicts.append("loud" if told >= NAMED_IN else "lie")
     warned = float(np.mean([any(line.startswith("warning") for line in lines) for lines in new]))
-    return Outcome(verdict, averages, rms, sd, float(np.mean(named)), warned, refused, len(results))
+    verdict = min(verdicts, key=WORST_FIRST.index)
+    return Outcome(verdict, averages, rms, sd, min(named), warned, refused, len(results))
+
+
+def _naming(says: str, messages: Sequence[Sequence[str]]) -> list[bool]:
+    """Whether the messages of each dive name the cause."""
+    return [bool(says) and any(re.search(says, line, re.IGNORECASE) for line in lines) for lines in messages]
 
 
 def _average(every: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
@@ -296,5 +309,7 @@ def _average(every: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str
     return result
 
 
-def _rms(values: Sequence[float]) -> float:
+def _rms_of(results: Sequence[Result], what: str, kind: str) -> float:
+    """Root of the mean square of "rms" or "sd" of one estimate over the dives that have it."""
+    values = [getattr(r, what)[kind] for r in results if kind in getattr(r, what)]
     return float(np.sqrt(np.mean(np.square(values))))
