@@ -498,6 +498,8 @@ FAULTS: tuple[Case, ...] = (
     Case("gyro not orthogonal", "1 %", r"orthogonal|gyr.*scale|scale.*gyr", on_vehicle=change("imu", gyr_matrix=SKEW)),
     Case("FOG without Earth rate", "earth_rotation forgotten", r"earth.?(rate|rotation)", grade="fog",
          wrong_config={"environment": {"earth_rotation": False}}),
+    Case("tactical without Earth rate", "earth_rotation forgotten", r"earth.?(rate|rotation)", grade="tactical",
+         wrong_config={"environment": {"earth_rotation": False}}),
     Case("vibration", "20 m/s^2 at 63 Hz, 0.2 rad/s", NOISE, on_log=imu_vibration),
     # other aids
     Case("depth stuck", "while it dives", f"depth.*({FROZEN})", scenario="dives",

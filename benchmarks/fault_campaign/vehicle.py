@@ -157,7 +157,7 @@ def configuration(vehicle: Vehicle) -> dict[str, Any]:
     """What a careful crew would write about a healthy vehicle, by rovgraph's keys."""
     imu, dvl = vehicle.imu, vehicle.dvl
     sources = [name for name in ("mag", "dvl_heading", "ahrs") if name in vehicle.aids]
-    precise = imu.gyr_noise < 1e-5  # the Earth's rate shows
+    precise = imu.gyr_noise < 1e-4  # within ten seconds the Earth turns further than the gyro's noise
 
     def compass(key: str, model: Compass) -> dict[str, Any]:
         return {
