@@ -28,7 +28,8 @@ READING = """# When the world is not as configured
 
 An independent simulator makes the dives: WGS-84, Earth rate, IMU samples averaged over their period, its own frames \
 and equations (`benchmarks/fault_campaign`). Each case breaks one thing and leaves the configuration as it is. Every \
-log goes through `rovgraph smooth`{online}, {seeds} seeds a case. NEES is the squared error over the stated variance \
+log goes through `rovgraph smooth`{online}, {seeds} seeds a case; cases named *online* go \
+through `rovgraph online` alone. NEES is the squared error over the stated variance \
 per degree of freedom, its mean over dive and seeds: 1 is honest. The columns show that of the horizontal position, \
 and the largest of depth, heading, `dvl_yaw` and `dvl_scale`. The rms error and the stated sd are of the smoothed \
 horizontal position. *Named* is the part of the dives in which a warning names the cause. The warnings of the same \
