@@ -1,0 +1,315 @@
+"""One dive through the command, its errors in standard deviations, and the outcome of many dives.
+
+NEES: the squared error over the variance per degree of freedom, its mean over epochs 1 s apart, from
+10 s after the start. 1 is honest.
+"""
+
+import contextlib
+import io
+import json
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import chi2
+
+from fault_campaign.earth import Array
+from fault_campaign.instruments import Hidden, log_table
+from fault_campaign.motion import Motion
+
+HONEST_NEES = 2.0
+WIDER = 1.5  # times the sd of the healthy dive
+NAMED_IN = 0.95  # of the seeds, for a fault to count as named
+SETTLED_S = 10.0
+COMMANDS = {"smooth": ("smoothed", "filtered"), "online": ("online",)}  # and their estimates
+WORST_FIRST = ("lie", "loud", "wide", "right")
+QUANTITIES = ("position", "depth", "heading", "dvl_yaw", "dvl_scale")
+
+
+Clock = Callable[[Array], Array]
+
+
+def on_time(stamps: Array) -> Array:
+    """A clock that is not late."""
+    return np.zeros_like(stamps)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One dive.
+
+    Attributes
+    ----------
+    nees : estimate ("smoothed", "filtered", "online") -> quantity -> NEES per degree of freedom
+    rms, sd : estimate -> horizontal error, and the sd that is stated of it [m]
+    said : warnings and assumptions, a line each
+    refused : no estimate was made
+    """
+
+    nees: dict[str, dict[str, float]] = field(default_factory=dict)
+    rms: dict[str, float] = field(default_factory=dict)
+    sd: dict[str, float] = field(default_factory=dict)
+    said: tuple[str, ...] = ()
+    refused: bool = False
+
+
+def run_command(arguments: Sequence[str]) -> tuple[int, str]:
+    """A command of rovgraph in this process: exit code and what it wrote to standard error."""
+    from rovgraph.cli.app import main
+
+    before, errors = sys.argv, io.StringIO()
+    sys.argv = ["rovgraph", *arguments]
+    code = 0
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
+            main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except Exception as error:  # a traceback is what a user would see, and the campaign goes on
+        code = 1
+        print(f"traceback: {type(error).__name__}: {error}", file=errors)
+    finally:
+        sys.argv = before
+    return code, errors.getvalue()
+
+
+@dataclass(frozen=True)
+class Dive:
+    """What the command gets, and the truth.
+
+    Attributes
+    ----------
+    streams, configuration : the log by sensors, and the configuration
+    motion, hidden : the truth
+    clock : how late the clock is that stamps the estimates, as a function of the stamp [s]
+    second_file : sensors in a file of their own; such a dive goes through `rovgraph online` alone
+    """
+
+    streams: dict[str, pd.DataFrame]
+    configuration: dict[str, Any]
+    motion: Motion
+    hidden: Hidden
+    clock: Clock = on_time
+    second_file: tuple[str, ...] = ()
+
+
+def run_dive(dive: Dive, online: bool = False) -> Result:
+    """Estimate a dive with `rovgraph smooth`, with ``online`` as a replay too, and compare it with the truth."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "vehicle.yaml").write_text(json.dumps(dive.configuration), encoding="utf-8")  # JSON is YAML
+        first = {sensor: table for sensor, table in dive.streams.items() if sensor not in dive.second_file}
+        _write(first, folder / "log.csv")
+        result = Result(refused=True) if dive.second_file else _smooth(folder, dive)
+        if dive.second_file:
+            _write({sensor: dive.streams[sensor] for sensor in dive.second_file}, folder / "second.csv")
+        if dive.second_file or (online and not result.refused):
+            result = _online(folder, dive, result)
+        return replace(result, said=tuple(line.replace(name, "") for line in result.said))
+
+
+def _write(streams: dict[str, pd.DataFrame], path: Path) -> None:
+    log_table(streams).to_csv(path, index=False, float_format="%.14g")
+
+
+def _smooth(folder: Path, dive: Dive) -> Result:
+    paths = [str(folder / part) for part in ("log.csv", "vehicle.yaml", "out")]
+    _, errors = run_command(["smooth", paths[0], "--config", paths[1], "--out", paths[2], "--no-figures"])
+    said = [line for line in errors.splitlines() if line.strip()]
+    if not (folder / "out" / "summary.json").exists():
+        return Result(said=tuple(said), refused=True)
+    summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
+    said += [*(f"assumed: {line}" for line in summary["assumptions"]), *_warnings(summary)]
+    result = Result(said=tuple(said))
+    calibration = pd.read_csv(folder / "out" / "calibration.csv")
+    for kind in ("smoothed", "filtered"):
+        track = pd.read_csv(folder / "out" / f"trajectory_{kind}.csv")
+        _compare(result, kind, track, calibration[calibration["estimate"] == kind], dive)
+    return result
+
+
+def _online(folder: Path, dive: Dive, result: Result) -> Result:
+    """A replay at full speed; what it says is added, and its estimate."""
+    files = [f"file:{folder / part}" for part in ("log.csv", "second.csv") if (folder / part).exists()]
+    options = ["--config", str(folder / "vehicle.yaml"), "--out", str(folder / "live")]
+    options += ["--speed", "max", "--no-refine", "--output", "udp://127.0.0.1:9"]  # port 9 is for what nobody reads
+    code, errors = run_command(["online", *files, *options])
+    said = (*result.said, *(f"online: {line}" for line in errors.splitlines()))
+    track = folder / "live" / "trajectory_filtered.csv"
+    if code != 0 or not track.exists():
+        return replace(result, said=said)
+    summary = json.loads((folder / "live" / "summary.json").read_text(encoding="utf-8"))
+    result = replace(result, said=(*said, *_warnings(summary)), refused=False)
+    _compare(result, "online", pd.read_csv(track), _live_calibration(summary["calibration"]), dive)
+    return result
+
+
+def _live_calibration(last: dict[str, list[float]]) -> pd.DataFrame:
+    """The last solution's calibration with the columns of calibration.csv; its angles are radians."""
+    rows = []
+    for name, (value, sd) in last.items():
+        unit = 180.0 / np.pi if name == "dvl_yaw" else 1.0
+        rows.append({"label": name, "estimated": True, "value": unit * value, "sd": unit * sd})
+    return pd.DataFrame(rows, columns=["label", "estimated", "value", "sd"])
+
+
+def _warnings(summary: dict[str, Any]) -> list[str]:
+    """Warnings and verdict, where a summary has them."""
+    found = summary.get("warnings") or []
+    return ["warning: " + (w if isinstance(w, str) else json.dumps(w)) for w in found]
+
+
+def _compare(
+    result: Result,
+    kind: str,
+    track: pd.DataFrame,
+    calibration: pd.DataFrame,
+    dive: Dive,
+) -> None:
+    """Add the errors of one estimate to a result; ``calibration`` are its rows of calibration.csv."""
+    times = track["time"].to_numpy()
+    wanted = np.arange(SETTLED_S, dive.motion.duration, 1.0)
+    wanted += dive.clock(wanted)
+    rows = np.unique(np.clip(np.searchsorted(times, wanted), 0, len(times) - 1))
+    result.nees[kind], result.rms[kind], result.sd[kind] = nees(track.iloc[rows], dive.motion, dive.clock)
+    estimated = calibration[calibration["estimated"].astype(bool)].set_index("label")
+    for name, true, turn in (("dvl_yaw", dive.hidden.dvl_yaw, 360.0), ("dvl_scale", dive.hidden.dvl_scale, np.inf)):
+        if name in estimated.index:
+            value, sd = estimated.loc[name, ["value", "sd"]].to_numpy(dtype=float)
+            error = value - true
+            error -= 0.0 if np.isinf(turn) else turn * round(error / turn)
+            result.nees[kind][name] = float((error / sd) ** 2)
+
+
+def nees(track: pd.DataFrame, motion: Motion, clock: Clock = on_time) -> tuple[dict[str, float], float, float]:
+    """NEES per degree of freedom of position (north and east), depth and heading; horizontal rms error and sd [m].
+
+    Parameters
+    ----------
+    track : rows of a trajectory file
+    motion, clock : the truth, and how late the track's stamps are
+    """
+    stamps = track["time"].to_numpy()
+    t = stamps - clock(stamps)
+    error = track[["north", "east", "down"]].to_numpy() - motion.local(t)
+    e, n = error[:, 1], error[:, 0]
+    nn, ee, ne = track["north_sd"] ** 2, track["east_sd"] ** 2, track["cov_north_east"]
+    horizontal = ((ee * n**2 - 2.0 * ne * n * e + nn * e**2) / (nn * ee - ne**2)).to_numpy()
+    heading = np.asarray(track["yaw"].to_numpy() - motion.heading(t))
+    heading = np.mod(heading + np.pi, 2.0 * np.pi) - np.pi
+    values = {
+        "position": _mean(horizontal) / 2.0,
+        "depth": _mean((error[:, 2] / track["down_sd"].to_numpy()) ** 2),
+        "heading": _mean((heading / track["yaw_sd"].to_numpy()) ** 2),
+    }
+    return values, float(np.sqrt(np.mean(n**2 + e**2))), float(np.sqrt(np.mean(nn + ee)))
+
+
+def _mean(values: Array) -> float:
+    return float(np.mean(values))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Many dives of one case.
+
+    Attributes
+    ----------
+    verdict : right, wide, loud, or a lie
+    nees : estimate -> quantity -> mean over the seeds
+    rms, sd : estimate -> root of the mean square over the seeds [m]
+    named : part of the seeds in which the cause was named, by the command that names it less often
+    warned : part of the seeds with any warning that the healthy dive does not have
+    refused : part of the seeds that were refused
+    seeds : how many
+    """
+
+    verdict: str
+    nees: dict[str, dict[str, float]]
+    rms: dict[str, float]
+    sd: dict[str, float]
+    named: float
+    warned: float
+    refused: float
+    seeds: int
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The quantity and estimate of the largest NEES; not a number where every dive was refused."""
+        found = [(f"{q}, {kind}", v) for kind, values in self.nees.items() for q, v in values.items()]
+        return max(found, key=lambda entry: entry[1], default=("", float("nan")))
+
+
+def honest_nees(seeds: int) -> float:
+    """What the mean NEES of an honest estimate exceeds in fewer than 1 of 100 campaigns; 2 for 20 seeds or more.
+
+    An error that is constant over a dive, as a compass's offset, is one degree of freedom a dive.
+    """
+    return max(HONEST_NEES, float(chi2.ppf(0.99, seeds)) / seeds)
+
+
+def template(line: str) -> str:
+    """A message without its numbers."""
+    return re.sub(r"[-+]?\d[\d.,e+-]*", "#", line)
+
+
+def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) -> Outcome:
+    """The outcome of a case: the worse one of the two commands', each with its own estimates and messages.
+
+    Parameters
+    ----------
+    results : one per seed
+    says : regular expression; a message that matches it names the cause
+    healthy : the same dives without the fault; what is said of them is no warning, and their sd is what is possible
+    """
+    usual = {template(line) for result in healthy for line in result.said}
+    new = [[line for line in r.said if template(line) not in usual] for r in results]
+    averages = _average([r.nees for r in results])
+    rms, sd = ({kind: _rms_of(results, what, kind) for kind in averages} for what in ("rms", "sd"))
+    wider = {kind for kind in sd if healthy and sd[kind] > WIDER * _rms_of(healthy, "sd", kind)}
+    refused = float(np.mean([r.refused for r in results]))
+    named, verdicts = [], []
+    if refused == 1.0:
+        named, verdicts = [float(np.mean(_naming(says, new)))], ["loud"]
+    for command, kinds in COMMANDS.items():
+        if not any(kind in averages for kind in kinds):
+            continue
+        lines = [[line for line in some if line.startswith("online: ") == (command == "online")] for some in new]
+        share = _naming(says, lines)
+        named.append(float(np.mean(share)))
+        largest = max(v for kind in kinds for v in averages.get(kind, {}).values())
+        if largest <= honest_nees(sum(not r.refused for r in results)):
+            verdicts.append("wide" if wider.intersection(kinds) else "right")
+        else:
+            told = np.mean([a or r.refused for a, r in zip(share, results, strict=True)])
+            verdicts.append("loud" if told >= NAMED_IN else "lie")
+    warned = float(np.mean([any(line.startswith("warning") for line in lines) for lines in new]))
+    verdict = min(verdicts, key=WORST_FIRST.index)
+    return Outcome(verdict, averages, rms, sd, min(named), warned, refused, len(results))
+
+
+def _naming(says: str, messages: Sequence[Sequence[str]]) -> list[bool]:
+    """Whether the messages of each dive name the cause."""
+    return [bool(says) and any(re.search(says, line, re.IGNORECASE) for line in lines) for lines in messages]
+
+
+def _average(every: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    kinds = {kind for nees in every for kind in nees}
+    result: dict[str, dict[str, float]] = {}
+    for kind in sorted(kinds, reverse=True):
+        rows = [nees[kind] for nees in every if kind in nees]
+        names = [q for q in QUANTITIES if any(q in row for row in rows)]
+        result[kind] = {q: float(np.mean([row[q] for row in rows if q in row])) for q in names}
+    return result
+
+
+def _rms_of(results: Sequence[Result], what: str, kind: str) -> float:
+    """Root of the mean square of "rms" or "sd" of one estimate over the dives that have it."""
+    values = [getattr(r, what)[kind] for r in results if kind in getattr(r, what)]
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,117 @@
+"""Does rovgraph say so when the world is not as configured? A campaign of faults.
+
+    python benchmarks/faults.py                                    all cases, 20 seeds
+    python benchmarks/faults.py --cases "dvl bias" "dvl frozen" --seeds 3
+    python benchmarks/faults.py --list
+    python benchmarks/faults.py --markdown docs/faults.md --json faults.json
+
+Dives of an independent simulator (`fault_campaign`) go through `rovgraph smooth`, with `--online` through
+`rovgraph online` too. Exit code 1 if a case is a lie, or a healthy case is not right.
+"""
+
+import argparse
+import json
+import sys
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+from fault_campaign.campaign import Outcome, run, table
+from fault_campaign.cases import CASES, Case
+from fault_campaign.judge import HONEST_NEES, honest_nees
+
+from rovgraph.workers import cores
+
+READING = """# When the world is not as configured
+
+`python benchmarks/faults.py --seeds {seeds} --markdown docs/faults.md` makes this page{version}.
+
+An independent simulator makes the dives: WGS-84, Earth rate, IMU samples averaged over their period, its own frames \
+and equations (`benchmarks/fault_campaign`). Each case breaks one thing and leaves the configuration as it is. Every \
+log goes through `rovgraph smooth`{online}, {seeds} seeds a case; cases named *online* go \
+through `rovgraph online` alone. NEES is the squared error over the stated variance \
+per degree of freedom, its mean over dive and seeds: 1 is honest. The columns show that of the horizontal position, \
+and the largest of depth, heading, `dvl_yaw` and `dvl_scale`. The rms error and the stated sd are of the smoothed \
+horizontal position. *Named* is the part of the dives in which a warning names the cause. The warnings of the same \
+dives without the fault do not count.
+
+| outcome | |
+|---|---|
+| right | every NEES is at most 2, and the sd is at most 1.5 times that of the healthy dive |
+| wide | every NEES is at most 2, and the sd is larger |
+| loud | some NEES is above 2, and the cause is named in 19 of 20 dives, or the log is refused |
+| lie | some NEES is above 2, and the cause is not named |
+
+{limit}*Reported by* says who met such a fault: `audit` is an audit of rovgraph with another simulator and recorded \
+dives, others are issue trackers of drivers, autopilots and navigation software.
+
+Some faults leave no trace in a log: a heading that is off by a constant where there are no fixes, and a depth that is \
+off by a constant. Wider priors are the only defence against those.
+
+Run the campaign whenever the estimator changes. `--cases` takes some of them, `--jobs` sets the number of \
+processes, `--json` writes all figures, `--keep` goes on with a campaign that was interrupted, \
+`--online` replays each log through `rovgraph online` as well.
+"""
+
+
+def main() -> int:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--cases", nargs="+", metavar="CASE", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--jobs", type=int, default=cores())
+    parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
+    parser.add_argument("--keep", type=Path, help="keep every dive in this file, and run only those that it lacks")
+    parser.add_argument("--json", type=Path, help="write all figures")
+    parser.add_argument("--markdown", type=Path, help="write the page docs/faults.md")
+    parser.add_argument("--version", help="what was measured, for the page")
+    parser.add_argument("--list", action="store_true", help="list the cases")
+    arguments = parser.parse_args()
+    cases = [CASES[name] for name in arguments.cases]
+    if arguments.list:
+        print("\n".join(f"{case.name}: {case.breaks}" for case in cases))
+        return 0
+    outcomes = run(cases, arguments.seeds, arguments.jobs, arguments.online, _progress, arguments.keep)
+    print(table(cases, outcomes))
+    print(count(cases, outcomes))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps({n: asdict(o) for n, o in outcomes.items()}, indent=1), encoding="utf-8")
+    if arguments.markdown is not None:
+        arguments.markdown.write_text(page(cases, outcomes, arguments), encoding="utf-8")
+    good = {True: {"right"}, False: {"right", "wide", "loud"}}
+    return int(any(outcomes[case.name].verdict not in good[case.healthy] for case in cases))
+
+
+def page(cases: list[Case], outcomes: dict[str, Outcome], arguments: argparse.Namespace) -> str:
+    """docs/faults.md."""
+    version = f", here at {arguments.version}" if arguments.version else ""
+    online = " and `rovgraph online`" if arguments.online else ""
+    parts = [READING.format(seeds=arguments.seeds, version=version, online=online, limit=_limit(arguments.seeds))]
+    for title, healthy in (("Healthy dives", True), ("Faults", False)):
+        some = [case for case in cases if case.healthy == healthy]
+        if some:
+            parts += [f"## {title}\n", count(some, outcomes) + "\n", table(some, outcomes) + "\n"]
+    return "\n".join(parts)
+
+
+def _limit(seeds: int) -> str:
+    """What takes the place of 2 where seeds are few."""
+    limit = honest_nees(seeds)
+    if limit <= HONEST_NEES:
+        return ""
+    return f"With {seeds} seeds chance alone reaches {limit:.1f} in 1 of 100 campaigns, which takes the place of 2.\n\n"
+
+
+def count(cases: list[Case], outcomes: dict[str, Outcome]) -> str:
+    """How many of each outcome."""
+    verdicts = Counter(outcomes[case.name].verdict for case in cases)
+    return ", ".join(f"{verdicts[verdict]} {verdict}" for verdict in ("right", "wide", "loud", "lie")) + "."
+
+
+def _progress(done: float) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{done:.0%}", end="" if done < 1.0 else "\n", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
