@@ -60,7 +60,6 @@ def smooth(
     began = time.perf_counter()
     dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
     check.warn(dive_log, settings)
-    dive_log = check.without_frozen_pings(dive_log)
     seconds = {"reading": time.perf_counter() - began}
     with progress_bar() as progress:
         dive = smooth_dive(dive_log, settings, estimate.value, progress)

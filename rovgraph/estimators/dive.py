@@ -11,6 +11,7 @@ from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.log import Log
+from rovgraph.log.frozen import FrozenStretch, without_frozen
 
 Progress = Callable[[str, float], None]
 
@@ -28,11 +29,13 @@ class Dive:
     estimates : "smoothed" and "filtered" as asked for, and "dead_reckoning"
     beginning : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
+    frozen : times in which a sensor repeated itself; left out, too
     """
 
     estimates: list[Estimate]
     beginning: InitialConditions
     left_out: dict[tuple[str, str], int]
+    frozen: list[FrozenStretch]
 
     @property
     def assumptions(self) -> list[str]:
@@ -54,6 +57,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     ------
     InputError : the log lacks what is needed, or does not determine some variable
     """
+    log, frozen = without_frozen(log, config)
     beginning = initialise(log, config)
     batch = assemble(log, beginning)
     if config.graph.solver == "isam2":
@@ -68,7 +72,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
         if estimate != "filtered":
             progress("smoothing", 0.5)
             estimates.insert(0, batch.solve(states))
-    return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
+    return Dive([*estimates, batch.dead_reckoning()], beginning, _left_out(batch, frozen), frozen)
 
 
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
@@ -76,6 +80,15 @@ def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
     batch = BatchSmoother(beginning)
     batch.take(log)
     return batch
+
+
+def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch]) -> dict[tuple[str, str], int]:
+    """What never reached the graph, and why."""
+    counts = dict(batch.assembler.left_out)
+    for stretch in frozen:
+        why = (stretch.sensor, "frozen")
+        counts[why] = counts.get(why, 0) + stretch.count
+    return counts
 
 
 def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
