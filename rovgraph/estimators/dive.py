@@ -6,10 +6,11 @@ from functools import partial
 
 from rovgraph.config import Config
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.estimators.alarms import Alarm, Evidence, Verdict, find_alarms, verdict_of
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.smoother import BatchSmoother, smoothed
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
 
@@ -30,12 +31,24 @@ class Dive:
     beginning : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
     frozen : times in which a sensor repeated itself; left out, too
+    alarms : what the estimates say against themselves, the worst first
     """
 
     estimates: list[Estimate]
     beginning: InitialConditions
     left_out: dict[tuple[str, str], int]
     frozen: list[FrozenStretch]
+    alarms: list[Alarm]
+
+    @property
+    def verdict(self) -> Verdict:
+        """trusted, doubtful or wrong."""
+        return verdict_of(self.alarms)
+
+    @property
+    def warnings(self) -> list[str]:
+        """The alarms, a line each with cause and remedy."""
+        return [alarm.text for alarm in self.alarms]
 
     @property
     def assumptions(self) -> list[str]:
@@ -61,18 +74,21 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     beginning = initialise(log, config)
     batch = assemble(log, beginning)
     if config.graph.solver == "isam2":
-        both = _isam2(batch, progress)
+        both, best = _isam2(batch, progress), None
         estimates = [one for one in both if estimate in ("both", one.kind)]
     else:
-        estimates, states = [], None
+        estimates, states, best = [], None, None
         if estimate != "smoothed":
             passed = _filter(batch, progress)
             estimates.append(passed.solve())
             states = None if batch.measurements else passed.states()  # where the filter went is close by
         if estimate != "filtered":
             progress("smoothing", 0.5)
-            estimates.insert(0, batch.solve(states))
-    return Dive([*estimates, batch.dead_reckoning()], beginning, _left_out(batch, frozen), frozen)
+            best = batch.optimum(states)
+            estimates.insert(0, smoothed(best, beginning))
+    intervals = batch.intervals if best is None else best.intervals
+    alarms = find_alarms(Evidence(beginning, estimates, intervals, best, frozen))
+    return Dive([*estimates, batch.dead_reckoning()], beginning, _left_out(batch, frozen), frozen, alarms)
 
 
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:

@@ -1,0 +1,46 @@
+"""Alarms of an estimate on its own evidence, and the verdict for the whole dive.
+
+`STATISTICS` is the table: each function takes the `Evidence` of a dive and yields numbers that healthy dives keep
+small, with their limits (docs/alarms.md). What is beyond its limit is an `Alarm`; the worst of them is the verdict.
+"""
+
+from collections.abc import Callable, Iterator
+
+from rovgraph.estimators.alarms import constants, motion, residuals, sensors
+from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic, Verdict, alarm_of, verdict_of
+from rovgraph.estimators.alarms.evidence import Evidence
+
+__all__ = ["Alarm", "Evidence", "Severity", "Statistic", "Verdict", "find_alarms", "statistics", "verdict_of"]
+
+STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
+    constants.held,
+    constants.moved,
+    sensors.frozen,
+    residuals.rejected,
+    residuals.too_large,
+    residuals.too_small,
+    residuals.lasting,
+    motion.imu,
+    motion.estimates,
+    constants.halves,
+)
+
+
+def statistics(evidence: Evidence) -> list[Statistic]:
+    """Every number of a dive, within its limits or not."""
+    return [one for function in STATISTICS for one in function(evidence)]
+
+
+def find_alarms(evidence: Evidence) -> list[Alarm]:
+    """What is beyond its limits, the worst of each kind and sensor, what is wrong before what is doubtful."""
+    worst: dict[tuple[str, str], Alarm] = {}
+    for alarm in filter(None, map(alarm_of, statistics(evidence))):
+        known = worst.get((alarm.kind, alarm.sensor))
+        if known is None or _badness(alarm) > _badness(known):
+            worst[alarm.kind, alarm.sensor] = alarm
+    found = [*worst.values(), *sensors.contradictions(list(worst.values()), evidence)]
+    return sorted(found, key=lambda alarm: alarm.severity != "wrong")
+
+
+def _badness(alarm: Alarm) -> tuple[bool, float]:
+    return alarm.severity == "wrong", alarm.figure / alarm.limit
