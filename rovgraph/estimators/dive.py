@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 from rovgraph.config import Config
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.estimators.alarms import Alarm, Evidence, Verdict, find_alarms, verdict_of
+from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
@@ -31,14 +31,19 @@ class Dive:
     beginning : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
     frozen : times in which a sensor repeated itself; left out, too
-    alarms : what the estimates say against themselves, the worst first
+    statistics : numbers that healthy dives keep small
     """
 
     estimates: list[Estimate]
     beginning: InitialConditions
     left_out: dict[tuple[str, str], int]
     frozen: list[FrozenStretch]
-    alarms: list[Alarm]
+    statistics: list[Statistic]
+
+    @cached_property
+    def alarms(self) -> list[Alarm]:
+        """What the estimates say against themselves, the worst first."""
+        return find_alarms(self.statistics, float(self.estimates[0].trajectory.time[0]))
 
     @property
     def verdict(self) -> Verdict:
@@ -87,8 +92,8 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
             best = batch.optimum(states)
             estimates.insert(0, smoothed(best, beginning))
     intervals = batch.intervals if best is None else best.intervals
-    alarms = find_alarms(Evidence(beginning, estimates, intervals, best, frozen))
-    return Dive([*estimates, batch.dead_reckoning()], beginning, _left_out(batch, frozen), frozen, alarms)
+    numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen))
+    return Dive([*estimates, batch.dead_reckoning()], beginning, _left_out(batch, frozen), frozen, numbers)
 
 
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:

@@ -17,6 +17,7 @@ from rovgraph.log.streams import Log, Stream
 
 MIN_REPEATS = 5  # measurements, times as many as the sensor usually repeats
 MIN_SECONDS = 3.0
+NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
 ALIVE = 1e-6  # spread of an IMU's signals that are more than rounding [m/s^2, rad/s]
 ABRUPT_SPEED = 0.1  # of the pings just before or after zeros [m/s]
 AROUND = 3  # that many pings
@@ -28,6 +29,7 @@ TURNED = np.deg2rad(17.0)  # by the gyro, while a heading stands still,
 TURN_DRIFT = 0.03  # and more than its bias may feign [rad/s]
 DIVED = 0.5  # by the DVL, while a depth stands still [m],
 SLOPE = 0.1  # and more than this part of the way, which a tilted mounting feigns
+DIVE_SECONDS = 20.0  # over which it is looked for
 LEVEL_SECONDS = 2.0  # over which the specific force shows the vertical
 LONGEST_STEP = 1.0  # between pings over which a velocity is integrated [s]
 
@@ -125,13 +127,19 @@ def _held(log: Log, sensor: str) -> Iterator[FrozenStretch]:
 
 
 def _held_depth(log: Log, config: Config) -> Iterator[FrozenStretch]:
-    """A depth that stands still while the DVL, levelled by the specific force, shows a descent or climb."""
-    if not {"depth", "dvl", "imu"} <= log.sensors:
+    """A depth that stands still though it never does, or while the DVL, levelled, shows a descent or climb."""
+    if not {"depth", "imu"} <= log.sensors:
         return
-    stream, pings = log["depth"], _valid(log["dvl"])
+    stream = log["depth"]
     long = _long(stream, stream.data[:, :1])
-    if not long or len(pings) < 2:
+    if not long:
         return
+    if _shows_noise(stream.data[:, :1], long):
+        yield from _held(log, "depth")
+        return
+    if "dvl" not in log or len(log["dvl"]) < 2:
+        return
+    pings = _valid(log["dvl"])
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     downwards = np.sum(v_b * _down(log["imu"], config, pings.time), axis=1)
     step = np.minimum(np.diff(pings.time), LONGEST_STEP)
@@ -146,9 +154,23 @@ def _held_depth(log: Log, config: Config) -> Iterator[FrozenStretch]:
         during = slice(*np.searchsorted(pings.time, [first, last]))
         if during.stop - during.start < 2:
             continue
-        dived = float(np.ptp(down[during]))
-        if dived > max(least, SLOPE * float(np.ptp(way[during]))):
+        dived = _most_dived(pings.time[during], down[during], way[during])
+        if dived > least:
             yield FrozenStretch("depth", first, last, b - a + 1, False, f"the DVL moves up or down by {dived:.1f} m")
+
+
+def _shows_noise(values: Array, long: list[tuple[int, int]]) -> bool:
+    """Whether values hardly ever repeat outside some runs."""
+    counts = np.diff(equal_runs(values), axis=1)[:, 0] + 1
+    others = counts[~np.isin(counts, [b - a + 1 for a, b in long])]
+    return len(others) > 0 and float(others.mean()) < NEVER_REPEATS
+
+
+def _most_dived(time: Array, down: Array, way: Array) -> float:
+    """The largest descent or climb within a time that is more than a tilted mounting would feign [m]."""
+    parts = np.split(np.arange(len(time)), np.flatnonzero(np.diff((time - time[0]) // DIVE_SECONDS)) + 1)
+    dived = [float(np.ptp(down[part])) for part in parts]
+    return max(d if d > SLOPE * float(np.ptp(way[part])) else 0.0 for d, part in zip(dived, parts, strict=True))
 
 
 def _down(imu: Stream, config: Config, time: Array) -> Array:

@@ -15,7 +15,9 @@ from rovgraph.estimators.alarms.evidence import Evidence
 MOVED, FAR_MOVED = 5.0, 10.0  # sds
 NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
 HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
-SHOWN = 0.3  # of the default prior sd: what is less certain when it is released follows noise (errors in variables)
+# errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
+SHOWN = 0.3
+MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
 DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
 RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_time_offset", "gyr_scale")
@@ -31,7 +33,7 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
         if not c.estimated or c.sd > NARROWED * c.prior_sd:
             continue
         off = (c.value - c.prior_mean) / np.sqrt(c.prior_sd**2 - c.sd**2)
-        shown, unit = (np.rad2deg(1.0), " deg") if c.unit == "rad" else (1.0, f" {c.unit}" if c.unit else "")
+        shown, unit = _shown(c.unit)
         name = next((n for n in TABLE if c.label in TABLE[n].labels), c.label)
         yield _moved(
             evidence,
@@ -53,8 +55,8 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
             evidence,
             "imu",
             float(np.abs(off[worst])),
-            f"{history.labels[worst]} began at {history.value[0, worst]:.3g} {history.unit}, {abs(off[worst]):.0f} sd from "
-            "what was believed",
+            f"{history.labels[worst]} began at {history.value[0, worst]:.3g} {history.unit}, "
+            f"{abs(off[worst]):.0f} sd from what was believed",
             f"check imu.mount_rpy_deg and the units of the IMU, or raise {key}",
         )
 
@@ -67,13 +69,13 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
     """Constants that are held, released one by one: the score test of `rovgraph.engine.released`."""
     if not isinstance(evidence.optimum, ChainOptimum):
         return
-    for r in release(evidence.optimum, RELEASED):
+    v, v_sd = evidence.main.trajectory.v_n, evidence.main.trajectory.v_sd
+    moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
+    for r in release(evidence.optimum, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]
         if r.sd > SHOWN * variable.sd:
             continue
-        shown, unit = (
-            (np.rad2deg(1.0), " deg") if variable.angular else (1.0, f" {variable.unit}" if variable.unit else "")
-        )
+        shown, unit = _shown(variable.unit)
         mean = evidence.optimum.beliefs[r.name].mean[variable.labels.index(r.label)]
         yield Statistic(
             "held",
@@ -122,6 +124,11 @@ def halves(evidence: Evidence) -> Iterator[Statistic]:
             )
 
 
+def _shown(unit: str) -> tuple[float, str]:
+    """Factor and unit that a person reads."""
+    return (float(np.rad2deg(1.0)), " deg") if unit == "rad" else (1.0, "" if unit in ("", "1") else f" {unit}")
+
+
 def _sensor_of(name: str) -> str:
     """The stream that a calibration variable is about."""
     sensors = TABLE[name].sensors if name in TABLE else ()
@@ -150,7 +157,7 @@ def _remedy_of_held(r: Released) -> str:
             "the DVL's stamps are late (early if negative): estimate it, calibration.dvl_time_offset: {estimate: true}"
         )
     if r.name == "gyr_scale":
-        return "estimate it, calibration.gyr_scale: {estimate: true}, or calibrate the gyro"
+        return "estimate calibration.gyr_scale, or calibrate the gyro"
     if r.name in ("dvl_roll", "dvl_pitch"):
         return f"DVL and IMU are tilted to each other: check imu.mount_rpy_deg, or estimate calibration.{r.name}"
-    return f"estimate it, calibration.{r.name}: {{estimate: true}}"
+    return f"estimate calibration.{r.name}"

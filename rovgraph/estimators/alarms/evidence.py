@@ -26,7 +26,6 @@ class SensorResiduals:
     sensor, components : its name, and those of its k components
     time : ndarray, shape (n,) [s]
     normalised : ndarray, shape (n, k), innovations in units of their sd
-    innovation : ndarray, shape (n, k) [of the measurement]
     weight : ndarray, shape (n,), 0 where it was rejected
     """
 
@@ -34,7 +33,6 @@ class SensorResiduals:
     components: tuple[str, ...]
     time: Array
     normalised: Array
-    innovation: Array
     weight: Array
 
 
@@ -86,22 +84,25 @@ class Evidence:
         return time - self.start
 
     def span(self, begin: float, end: float) -> str:
-        """A time as a person looks for it, in seconds since the dive began."""
-        return f"{self.since(begin):.0f} to {self.since(end):.0f} s"
+        """A time as a person looks for it."""
+        return span(begin, end, self.start)
+
+
+def span(begin: float, end: float, start: float) -> str:
+    """A time in seconds since the dive began, as "60 to 120 s"."""
+    return f"{begin - start:.0f} to {end - start:.0f} s"
 
 
 def residuals_by_sensor(frame: pd.DataFrame) -> dict[str, SensorResiduals]:
     """Rows of `RESIDUAL_COLUMNS`, one per component, as one entry per sensor."""
     out, sensor, component = {}, frame["sensor"].to_numpy(), frame["component"].to_numpy()
-    columns = {name: frame[name].to_numpy(float) for name in ("time", "normalised", "innovation", "weight")}
+    columns = {name: frame[name].to_numpy(float) for name in ("time", "normalised", "weight")}
     for name in pd.unique(frame["sensor"]).tolist():
         own = np.flatnonzero(sensor == name)
         labels = tuple(pd.unique(component[own]).tolist())
         first = [own[component[own] == label] for label in labels]
-        stacked = {c: np.column_stack([columns[c][index] for index in first]) for c in ("normalised", "innovation")}
-        out[name] = SensorResiduals(
-            name, labels, columns["time"][first[0]], **stacked, weight=columns["weight"][first[0]]
-        )
+        normalised = np.column_stack([columns["normalised"][index] for index in first])
+        out[name] = SensorResiduals(name, labels, columns["time"][first[0]], normalised, columns["weight"][first[0]])
     return out
 
 

@@ -13,8 +13,9 @@ from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whit
 CHANCE = 1e-6  # that a figure of a healthy dive is beyond its limit
 IMU_S = 20.0  # over which errors of the IMU last that are no noise
 IMU, IMU_BADLY = 3.0, 50.0  # variance of means over that time, 1 for noise
-PARTS = (("rotation", slice(0, 3), "gyr"), ("velocity", slice(6, 9), "acc"))  # of a motion's residual
-JUMP, LARGE_JUMP = 40.0, 400.0  # squared, in joint sds
+# of a motion's residual: what people call it, columns, and the signal behind it
+PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slice(6, 9), "acc"))
+JUMP, LARGE_JUMP = 40.0, 100.0  # squared, in joint sds
 SETTLED_S = 10.0  # from which on the filter is asked
 COARSE = 300  # epochs at which both are compared
 
@@ -48,9 +49,9 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
                 ratio,
                 max(IMU, by_chance),
                 max(IMU_BADLY, by_chance),
-                f"the {part} about {axis} contradicts the other sensors: means over {IMU_S:g} s vary by {ratio:.0f} times "
-                f"what its noise allows, most at {evidence.since(begin):.0f} s",
-                f"check imu.mount_rpy_deg and the compasses, estimate calibration.{key}_scale, or raise imu.noise.{key}",
+                f"{part} {axis} contradicts the other sensors: means over {IMU_S:g} s vary by {ratio:.0f} times what "
+                f"its noise allows, most at {evidence.since(begin):.0f} s",
+                f"check imu.mount_rpy_deg and the compasses, estimate calibration.{key}_scale or raise imu.noise.{key}",
             )
 
 
@@ -102,7 +103,7 @@ def estimates(evidence: Evidence) -> Iterator[Statistic]:
             float(square[k]),
             JUMP,
             LARGE_JUMP,
-            f"smoothed and filtered {what} differ by {size[k]:.2g} {unit}, {np.sqrt(square[k]):.0f} of their joint sds, "
+            f"smoothed and filtered {what} differ by {size[k]:.2g} {unit}, {np.sqrt(square[k]):.0f} joint sds, "
             f"at {evidence.since(float(s.time[at[k]])):.0f} s",
             "something that was believed then was given up later: look at the residuals before that time",
         )

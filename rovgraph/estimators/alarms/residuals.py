@@ -21,7 +21,7 @@ TOO_LARGE, FAR_TOO_LARGE = 2.0, 6.0  # mean square of the dive
 IN_A_MINUTE = 1.5  # times as much
 TOO_SMALL = 0.3
 LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
-LASTING, BADLY_LASTING = 2.0, 30.0  # variance of the means over that time, 1 for noise
+LASTING, BADLY_LASTING = 4.0, 100.0  # variance of the means over that time, 1 for noise
 OF_ONE = 8.0  # a single mean may be that much more
 SD_KEY = {
     "dvl": "dvl.velocity_sd_mps",
@@ -62,8 +62,8 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
             MOSTLY_REJECTED,
             f"up to {share[worst]:.0%} of a minute's measurements contradict the others and were left out, "
             f"{evidence.span(begin_s, end_s)}",
-            f"look at its residuals there; if it is the instrument, take that time out of the log, "
-            f"if it is everywhere, check its mounting, its signs and its clock (rovgraph check) and {sd_key(r.sensor)}",
+            f"take that time out of the log if it is the instrument; if it is everywhere, check its mounting, signs "
+            f"and clock (rovgraph check), and {sd_key(r.sensor)}",
         )
 
 
@@ -141,8 +141,8 @@ def lasting(evidence: Evidence) -> Iterator[Statistic]:
             ratio,
             max(LASTING, by_chance),
             max(BADLY_LASTING, by_chance),
-            f"residuals of {r.components[component]} last: means over {seconds:g} s vary by {ratio:.0f} times what noise "
-            f"would, most at {evidence.since(begin):.0f} s",
+            f"residuals of {r.components[component]} last: means over {seconds:g} s vary by {ratio:.0f} times what "
+            f"noise would, most at {evidence.since(begin):.0f} s",
             _remedy_of_lasting(r.sensor),
         )
 

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
-from rovgraph.estimators.alarms.alarm import Alarm, Statistic
-from rovgraph.estimators.alarms.evidence import Evidence
+from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic
+from rovgraph.estimators.alarms.evidence import Evidence, span
 
 FROZEN_S = 3.0  # in all [s]
 MEASURE_THE_SAME = (
@@ -37,10 +37,11 @@ def frozen(evidence: Evidence) -> Iterator[Statistic]:
         )
 
 
-def contradictions(alarms: Sequence[Alarm], evidence: Evidence) -> Iterator[Alarm]:
+def contradictions(alarms: Sequence[Alarm], start: float) -> Iterator[Alarm]:
     """Pairs of sensors that measure the same and both disagree with the estimate at the same time.
 
-    The estimate lies between two sensors that contradict each other, so the residuals of both are odd.
+    The estimate lies between two sensors that contradict each other, so the residuals of both are odd. ``start`` is
+    when the dive began [s].
     """
     odd: dict[str, list[Alarm]] = {}
     for alarm in alarms:
@@ -53,10 +54,10 @@ def contradictions(alarms: Sequence[Alarm], evidence: Evidence) -> Iterator[Alar
                 continue
             a, b = max(both, key=lambda pair: min(pair[0].figure / pair[0].limit, pair[1].figure / pair[1].limit))
             begin, end = max(a.begin, b.begin), min(a.end, b.end)
-            severity = "wrong" if a.severity == b.severity == "wrong" else "doubtful"
+            severity: Severity = "wrong" if a.severity == b.severity == "wrong" else "doubtful"
             figure = min(a.figure / a.limit, b.figure / b.limit)
             text = (
-                f"{one} and {other}: they contradict each other in {what}, {evidence.span(begin, end)}; find out which "
+                f"{one} and {other}: they contradict each other in {what}, {span(begin, end, start)}; find out which "
                 f"one is off by leaving one of them out of the log"
             )
             yield Alarm("contradiction", f"{one}, {other}", begin, end, figure, 1.0, severity, text)
