@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-
 NOT_TRUSTED = 3  # exit code of --strict
 VERDICT_STYLE = {"trusted": "green", "doubtful": "bold yellow", "wrong": "bold red"}
 
