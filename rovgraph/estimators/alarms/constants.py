@@ -19,6 +19,7 @@ HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
 SHOWN = 0.3
 MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
 DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
+MATTERS = 0.2  # of the prior sd: a smaller difference of halves
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
 RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_time_offset", "gyr_scale")
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
@@ -106,9 +107,11 @@ def halves(evidence: Evidence) -> Iterator[Statistic]:
         k = int(np.searchsorted(history.time, middle))
         for label, value, sd in zip(history.labels, history.value[k], history.sd[k], strict=True):
             last = final.get(label)
-            if last is None or not last.estimated:
+            if last is None or not last.estimated or abs(value - last.value) < MATTERS * last.prior_sd:
                 continue
-            spread = np.sqrt(max(sd**2 - last.sd**2, 0.0) + (SHARE_OF_SD * sd) ** 2)
+            # the smoother may be less certain, where it considers what the filter estimates
+            known_later = -(last.sd**2) if last.sd < sd else last.sd**2
+            spread = np.sqrt(sd**2 + known_later + (SHARE_OF_SD * sd) ** 2)
             off = abs(float(value) - last.value) / float(spread)
             yield Statistic(
                 "halves",
