@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rovgraph.check import dvl_frozen_intervals, examine, warn
+from rovgraph.check import examine, warn
 from rovgraph.check.outlook import keyframes
 from rovgraph.check.times import timing
 from rovgraph.check.values import UPRIGHT
@@ -15,6 +15,7 @@ from rovgraph.config import Config, load_config, mount_matrix
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import wrap_angle
 from rovgraph.log import STREAMS, Log, Stream, read_log
+from rovgraph.log.frozen import frozen_stretches
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 FLIPPED = {"dvl": {"mount_rpy_deg": [180, 0, 0]}}
@@ -325,7 +326,7 @@ def test_a_heading_that_stands_still_in_a_turn_is_named(sound):
     def hold(data, time):
         data[(time > 50) & (time < 70), 0] = 1.0
 
-    assert "while the gyro turns by" in messages(changed(sound, "dvl_heading", hold), sensor="dvl_heading")
+    assert "although the gyro turns by" in messages(changed(sound, "dvl_heading", hold), sensor="dvl_heading")
 
 
 def zeroed(log: Log, first: float, last: float) -> Log:
@@ -333,6 +334,10 @@ def zeroed(log: Log, first: float, last: float) -> Log:
         data[(time >= first) & (time <= last), :3] = 0.0
 
     return changed(log, "dvl", stop)
+
+
+def dvl_frozen_intervals(log: Log) -> list[tuple[float, float]]:
+    return [(s.first, s.last) for s in frozen_stretches(log, Config()) if s.zero]
 
 
 def test_zeros_that_begin_at_speed_are_a_frozen_dvl(sound):

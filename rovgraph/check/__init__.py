@@ -11,17 +11,17 @@ from collections.abc import Callable, Iterator
 from rovgraph.check.agreement import headings, vertical
 from rovgraph.check.findings import Finding, Report, Timing
 from rovgraph.check.fixes import track
-from rovgraph.check.frozen_dvl import dvl_frozen_intervals, standstill, without_frozen_pings
+from rovgraph.check.frozen_sensors import standstill
 from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
 from rovgraph.check.times import overlap, presence, regularity, timing
-from rovgraph.check.values import angles, frozen, gravity, own, turn_rates
+from rovgraph.check.values import angles, frozen_imu, gravity, own, turn_rates
 from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.log import Log
 from rovgraph.sensors import Level
 
-__all__ = ["Finding", "Level", "Report", "Timing", "dvl_frozen_intervals", "examine", "warn", "without_frozen_pings"]
+__all__ = ["Finding", "Level", "Report", "Timing", "examine", "warn"]
 
 Check = Callable[[Log, Config], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (
@@ -34,7 +34,7 @@ CHECKS: tuple[Check, ...] = (
     headings,
     own,
     standstill,
-    frozen,
+    frozen_imu,
     vertical,
     track,
     places,

@@ -4,9 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import Finding, frozen_runs, integral, since, told
+from rovgraph.check.findings import Finding, frozen_runs, since
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log
 from rovgraph.sensors import SENSORS, Level
 
@@ -14,6 +13,7 @@ GRAVITY_RANGE = (9.3, 10.3)  # plausible mean specific force [m/s2]
 GRAVITY_ANGLE = np.deg2rad(25.0)  # of mean specific force from upwards
 FAST_TURN = 3.0  # no vehicle of this kind turns faster for long [rad/s]
 FAST_SPIKE = 10.0  # nor for a moment [rad/s]
+FROZEN_SECONDS = 1.0  # a noisy signal never repeats for so long
 # specific force along this IMU axis, at rest -> mounting that turns it upwards
 UPRIGHT = {
     "+x": (0, 90, 0),
@@ -96,21 +96,13 @@ def own(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding(sensor, level, text)
 
 
-def frozen(log: Log, config: Config) -> Iterator[Finding]:
-    """Sensors that repeat one value although the vehicle moves; zeros of the DVL have their own check."""
-    seconds = {"acc": 1.0, "gyr": 1.0, "mag": 3.0, "dvl": 5.0}  # a noisy sensor never repeats for so long
-    parts = {"acc": ("imu", 0), "gyr": ("imu", 3), "mag": ("mag", 0), "dvl": ("dvl", 0)}
-    for name, (sensor, first) in parts.items():
-        if sensor not in log:
-            continue
-        values = told(log[sensor])[:, first : first + 3]
-        zero_or_empty = ~np.any(values, axis=1) | np.isnan(values).any(axis=1)
-        allowed = [zero_or_empty[a] for a, _ in frozen_runs(values)] if name == "dvl" else []
-        stretches = [r for i, r in enumerate(frozen_runs(values)) if not (allowed and allowed[i])]
-        yield from _longest(log, sensor, name, [r for r in stretches if r[1] - r[0] >= 9], seconds[name])
-    for sensor in ("ahrs", "dvl_heading"):
-        if sensor in log and "imu" in log:
-            yield from _frozen_heading(log, config, sensor)
+def frozen_imu(log: Log, config: Config) -> Iterator[Finding]:
+    """An accelerometer or gyro that repeats one value; other sensors are looked at together with the motion."""
+    if "imu" not in log:
+        return
+    for name, first in (("acc", 0), ("gyr", 3)):
+        stretches = frozen_runs(log["imu"].data[:, first : first + 3])
+        yield from _longest(log, "imu", name, [r for r in stretches if r[1] - r[0] >= 9], FROZEN_SECONDS)
 
 
 def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]], seconds: float) -> Iterator[Finding]:
@@ -124,21 +116,3 @@ def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]],
             f"{name} repeats one value exactly for {duration:.1f} s from {since(log, start)} on "
             f"({len(long)} such times); a sensor that noise never moves is not measuring",
         )
-
-
-def _frozen_heading(log: Log, config: Config, sensor: str) -> Iterator[Finding]:
-    """A heading that stands still while the gyro turns."""
-    imu, stream = log["imu"], log[sensor]
-    rate = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])[:, 2]
-    turned: Array = np.interp(stream.time, imu.time, integral(imu, rate - np.median(rate)))
-    for a, b in frozen_runs(stream.data[:, :1]):
-        duration = stream.time[b] - stream.time[a]
-        turn = float(np.ptp(turned[a : b + 1]))
-        if duration > 3.0 and turn > max(0.3, 0.03 * duration):
-            yield Finding(
-                sensor,
-                "warning",
-                f"heading stands still for {duration:.1f} s from {since(log, stream.time[a])} on "
-                f"while the gyro turns by {np.rad2deg(turn):.0f} deg",
-            )
-            return

@@ -1,6 +1,6 @@
 """The console script: registers the commands and turns bad input into one line.
 
-Exit codes: 0 done, 2 bad input, 130 interrupted (typer's).
+Exit codes: 0 done, 2 bad input, 3 done but not trusted (smooth --strict), 130 interrupted (typer's).
 """
 
 import errno

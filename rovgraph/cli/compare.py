@@ -114,5 +114,5 @@ def _recorded(log: Path, reference: Path, settings: "Config | None") -> tuple[li
     settings = settings or Config()
     recorded = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
     check.warn(recorded, settings)
-    case = Case(check.without_frozen_pings(recorded), settings, read_reference(reference))
+    case = Case(recorded, settings, read_reference(reference))
     return [Recorded(log.name, case)], {"log": str(log), "reference": str(reference)}, log.name

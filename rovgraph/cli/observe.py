@@ -41,7 +41,7 @@ def observe(
     dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
     check.warn(dive_log, settings)
     with progress_bar() as progress:
-        seen = library(check.without_frozen_pings(dive_log), settings, also, progress)
+        seen = library(dive_log, settings, also, progress)
     with results_folder(out, force) as folder:
         draw_observability(folder, seen)
         write_observability(folder, seen, settings, {"log": str(log), "estimate": also})

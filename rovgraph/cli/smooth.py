@@ -6,6 +6,9 @@ from typing import Annotated
 
 import typer
 
+NOT_TRUSTED = 3  # exit code of --strict
+VERDICT_STYLE = {"trusted": "green", "doubtful": "bold yellow", "wrong": "bold red"}
+
 
 class Engine(StrEnum):
     """What estimates."""
@@ -32,6 +35,7 @@ def smooth(
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
+    strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
 ) -> None:
     """Estimate the track of a dive and everything that was calibrated on the way.
 
@@ -60,7 +64,6 @@ def smooth(
     began = time.perf_counter()
     dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
     check.warn(dive_log, settings)
-    dive_log = check.without_frozen_pings(dive_log)
     seconds = {"reading": time.perf_counter() - began}
     with progress_bar() as progress:
         dive = smooth_dive(dive_log, settings, estimate.value, progress)
@@ -72,10 +75,16 @@ def smooth(
 
             draw_figures(folder, dive.estimates, dive_log, dive.beginning.config)
         seconds["total"] = time.perf_counter() - began
-        summary = write_results(folder, dive.estimates, dive_log, dive.beginning.config, assumptions, seconds)
+        config_used = dive.beginning.config
+        summary = write_results(folder, dive.estimates, dive_log, config_used, assumptions, seconds, dive.alarms)
     console = Console()
+    console.print(f"verdict: {dive.verdict}", style=VERDICT_STYLE[dive.verdict], highlight=False)
+    for alarm in dive.alarms:
+        console.print(f"{alarm.severity}: {alarm.text}", highlight=False, markup=False, soft_wrap=True)
     console.print(summary_table(dive.estimates, summary))
     console.print(calibration_table(dive.estimates))
     for line in assumptions:
         console.print(f"assumed: {line}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
+    if strict and dive.verdict != "trusted":
+        raise typer.Exit(NOT_TRUSTED)

@@ -2,15 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 from rovgraph.config import Config
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.estimators.smoother import BatchSmoother, smoothed
 from rovgraph.log import Log
+from rovgraph.log.frozen import FrozenStretch, without_frozen
 
 Progress = Callable[[str, float], None]
 
@@ -28,11 +30,30 @@ class Dive:
     estimates : "smoothed" and "filtered" as asked for, and "dead_reckoning"
     beginning : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
+    frozen : times in which a sensor repeated itself; left out, too
+    statistics : numbers that healthy dives keep small
     """
 
     estimates: list[Estimate]
     beginning: InitialConditions
     left_out: dict[tuple[str, str], int]
+    frozen: list[FrozenStretch]
+    statistics: list[Statistic]
+
+    @cached_property
+    def alarms(self) -> list[Alarm]:
+        """What the estimates say against themselves, the worst first."""
+        return find_alarms(self.statistics, float(self.estimates[0].trajectory.time[0]))
+
+    @property
+    def verdict(self) -> Verdict:
+        """trusted, doubtful or wrong."""
+        return verdict_of(self.alarms)
+
+    @property
+    def warnings(self) -> list[str]:
+        """The alarms, a line each with cause and remedy."""
+        return [alarm.text for alarm in self.alarms]
 
     @property
     def assumptions(self) -> list[str]:
@@ -54,13 +75,14 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     ------
     InputError : the log lacks what is needed, or does not determine some variable
     """
+    log, frozen = without_frozen(log, config)
     beginning = initialise(log, config)
     batch = assemble(log, beginning)
     if config.graph.solver == "isam2":
-        both = _isam2(batch, progress)
+        both, best = _isam2(batch, progress), None
         estimates = [one for one in both if estimate in ("both", one.kind)]
     else:
-        estimates, states = [], None
+        estimates, states, best = [], None, None
         if estimate != "smoothed":
             passed = _filter(batch, progress)
             estimates.append(passed.solve())
@@ -68,8 +90,11 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
             del passed  # of a long dive it is large
         if estimate != "filtered":
             progress("smoothing", 0.5)
-            estimates.insert(0, batch.solve(states))
-    return Dive([*estimates, batch.dead_reckoning()], beginning, dict(batch.assembler.left_out))
+            best = batch.optimum(states)
+            estimates.insert(0, smoothed(best, beginning))
+    intervals = batch.intervals if best is None else best.intervals
+    numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen))
+    return Dive([*estimates, batch.dead_reckoning()], beginning, _left_out(batch, frozen), frozen, numbers)
 
 
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
@@ -77,6 +102,15 @@ def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
     batch = BatchSmoother(beginning)
     batch.take(log)
     return batch
+
+
+def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch]) -> dict[tuple[str, str], int]:
+    """What never reached the graph, and why."""
+    counts = dict(batch.assembler.left_out)
+    for stretch in frozen:
+        why = (stretch.sensor, "frozen")
+        counts[why] = counts.get(why, 0) + stretch.count
+    return counts
 
 
 def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config
+from rovgraph.estimators.alarms.alarm import Alarm, verdict_of
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
@@ -40,6 +41,7 @@ def write_results(
     config: Config,
     assumptions: list[str],
     seconds: dict[str, float],
+    alarms: Sequence[Alarm] = (),
 ) -> dict[str, Any]:
     """Write every file of a results folder but the figures.
 
@@ -50,6 +52,7 @@ def write_results(
     log, config : what they were made from
     assumptions : what was taken for granted, a sentence each
     seconds : stage of the work -> wall time [s]
+    alarms : what the estimates say against themselves
 
     Returns
     -------
@@ -63,7 +66,7 @@ def write_results(
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
     write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
-    summary = summarise(estimates, log, config, assumptions, seconds)
+    summary = summarise(estimates, log, config, assumptions, seconds, alarms)
     (folder / SUMMARY).write_text(
         json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
@@ -71,7 +74,12 @@ def write_results(
 
 
 def summarise(
-    estimates: Sequence[Estimate], log: Log, config: Config, assumptions: list[str], seconds: Mapping[str, float]
+    estimates: Sequence[Estimate],
+    log: Log,
+    config: Config,
+    assumptions: list[str],
+    seconds: Mapping[str, float],
+    alarms: Sequence[Alarm] = (),
 ) -> dict[str, Any]:
     """What summary.json holds: plain values, units in the key names, null for unknown."""
     estimates = main_first(estimates)
@@ -80,6 +88,8 @@ def summarise(
         **STAMP,
         "name": config.name,
         "log": log.source,
+        "verdict": verdict_of(alarms),
+        "alarms": [_alarm_numbers(alarm, main.trajectory.time[0]) for alarm in alarms],
         "start_time_s": main.trajectory.time[0],
         "main_estimate": main.kind,
         **_trajectory_numbers(main.trajectory),
@@ -221,6 +231,20 @@ def _end_ellipse(track: Trajectory) -> tuple[float, float, float]:
         return float("nan"), float("nan"), float("nan")
     major, minor, bearing = ellipse_axes(track.cov_p[-1:])
     return float(major[0]), float(minor[0]), float(np.rad2deg(bearing[0])) % 180.0
+
+
+def _alarm_numbers(alarm: Alarm, start: float) -> dict[str, Any]:
+    """An alarm as summary.json holds it; times are seconds since the dive began."""
+    return {
+        "kind": alarm.kind,
+        "sensor": alarm.sensor,
+        "severity": alarm.severity,
+        "from_s": alarm.begin - start,
+        "to_s": alarm.end - start,
+        "figure": alarm.figure,
+        "limit": alarm.limit,
+        "text": alarm.text,
+    }
 
 
 def _calibration_numbers(entry: CalibrationEstimate) -> dict[str, Any]:

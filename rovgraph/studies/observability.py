@@ -24,6 +24,7 @@ from rovgraph.estimators.observability import (
 )
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.log.frozen import without_frozen
 
 Progress = Callable[[str, float], None]
 TIMES = 30  # at which the sd is told
@@ -119,6 +120,7 @@ def observe(
     InputError : an unknown variable, one whose sensor is not in use, none at all; too short a log
     """
     config = estimating(config, also)
+    log, _ = without_frozen(log, config)
     dive = solved(log, config, progress)
     missing = set(also) - set(dive.unknowns.estimated)
     if missing:

@@ -1,12 +1,13 @@
 """What a study runs its estimators on: a recorded dive, or one that is simulated where it is needed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.log import Log, log_from_frame
+from rovgraph.log.frozen import without_frozen
 from rovgraph.simulate import Choices, simulated
 from rovgraph.trajectory import Trajectory
 
@@ -53,8 +54,8 @@ class Recorded:
     case: Case
 
     def load(self) -> Case:
-        """The case as it was given."""
-        return self.case
+        """The case as it was given, without frozen measurements."""
+        return replace(self.case, log=without_frozen(self.case.log, self.case.config)[0])
 
 
 @dataclass(frozen=True)

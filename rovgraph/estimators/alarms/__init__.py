@@ -1,0 +1,53 @@
+"""Alarms of an estimate on its own evidence, and the verdict for the whole dive.
+
+`STATISTICS` is the table: each function takes the `Evidence` of a dive and yields numbers that healthy dives keep
+small, with their limits (docs/alarms.md). What is beyond its limit is an `Alarm`; the worst of them is the verdict.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+from rovgraph.estimators.alarms import constants, motion, residuals, sensors
+from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic, Verdict, alarm_of, verdict_of
+from rovgraph.estimators.alarms.dvl_cause import dvl_cause
+from rovgraph.estimators.alarms.evidence import Evidence
+
+__all__ = ["Alarm", "Evidence", "Severity", "Statistic", "Verdict", "find_alarms", "statistics", "verdict_of"]
+
+STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
+    dvl_cause,
+    constants.held,
+    constants.moved,
+    sensors.frozen,
+    residuals.rejected,
+    residuals.too_large,
+    residuals.too_small,
+    residuals.lasting,
+    motion.imu,
+    motion.estimates,
+    constants.halves,
+)
+
+
+def statistics(evidence: Evidence) -> list[Statistic]:
+    """Every number of a dive, within its limits or not."""
+    return [one for function in STATISTICS for one in function(evidence)]
+
+
+def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
+    """What is beyond its limits, the worst of each kind and sensor, causes before what comes of them.
+
+    Parameters
+    ----------
+    numbers : of `statistics`
+    start : when the dive began [s]
+    """
+    worst: dict[tuple[str, str], Alarm] = {}
+    for alarm in filter(None, map(alarm_of, numbers)):
+        known = worst.get((alarm.kind, alarm.sensor))
+        if known is None or _badness(alarm) > _badness(known):
+            worst[alarm.kind, alarm.sensor] = alarm
+    return [*worst.values(), *sensors.contradictions(list(worst.values()), start)]
+
+
+def _badness(alarm: Alarm) -> tuple[bool, float]:
+    return alarm.severity == "wrong", alarm.figure / alarm.limit

@@ -1,0 +1,166 @@
+"""Alarms on constants: estimated ones that went far from what was believed, and held ones that want to move."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rovgraph.calibration import TABLE
+from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.released import Released, release
+from rovgraph.estimators.alarms.alarm import Statistic
+from rovgraph.estimators.alarms.evidence import Evidence
+
+# Of the 25 components of a dive one is beyond 3 sds in every fifteenth healthy dive, beyond 5 in one of 70000;
+# what is not linear in them makes up for the difference.
+MOVED, FAR_MOVED = 5.0, 10.0  # sds
+NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
+HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
+# errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
+SHOWN = 0.3
+MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
+DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
+MATTERS = 0.2  # of the prior sd: a smaller difference of halves
+SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
+RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_time_offset", "gyr_scale")
+BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
+
+
+def moved(evidence: Evidence) -> Iterator[Statistic]:
+    """Calibration variables and first biases against their priors.
+
+    What data move of a healthy variable has the variance prior_sd^2 - sd^2.
+    """
+    for c in evidence.main.calibration:
+        if not c.estimated or c.sd > NARROWED * c.prior_sd:
+            continue
+        off = (c.value - c.prior_mean) / np.sqrt(c.prior_sd**2 - c.sd**2)
+        shown, unit = _shown(c.unit)
+        name = next((n for n in TABLE if c.label in TABLE[n].labels), c.label)
+        yield _moved(
+            evidence,
+            _sensor_of(name),
+            abs(float(off)),
+            f"{c.label} came out at {shown * c.value:.3g}{unit}, {abs(off):.0f} sd from the "
+            f"{shown * c.prior_mean:.3g} ± {shown * c.prior_sd:.2g}{unit} that was believed",
+            f"check {_key_of(name)}; if it is as it is, state its mean or a larger sd in calibration.{name}",
+        )
+    prior = evidence.beginning.prior
+    for name, part, key in BIASES:
+        history = evidence.main.history.get(name)
+        if history is None or evidence.main.kind != "smoothed":
+            continue
+        mean, sd = prior.state.bias[0][part], prior.bias_sd[part]
+        off = (history.value[0] - mean) / np.sqrt(np.maximum(sd**2 - history.sd[0] ** 2, (1.0 - NARROWED**2) * sd**2))
+        worst = int(np.argmax(np.abs(off)))
+        yield _moved(
+            evidence,
+            "imu",
+            float(np.abs(off[worst])),
+            f"{history.labels[worst]} began at {history.value[0, worst]:.3g} {history.unit}, "
+            f"{abs(off[worst]):.0f} sd from what was believed",
+            f"check imu.mount_rpy_deg and the units of the IMU, or raise {key}",
+        )
+
+
+def _moved(evidence: Evidence, sensor: str, figure: float, cause: str, remedy: str) -> Statistic:
+    return Statistic("moved", sensor, evidence.start, evidence.end, figure, MOVED, FAR_MOVED, cause, remedy)
+
+
+def held(evidence: Evidence) -> Iterator[Statistic]:
+    """Constants that are held, released one by one: the score test of `rovgraph.engine.released`."""
+    if not isinstance(evidence.optimum, ChainOptimum):
+        return
+    v, v_sd = evidence.main.trajectory.v_n, evidence.main.trajectory.v_sd
+    moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
+    for r in release(evidence.optimum, [name for name in RELEASED if moving or not name.startswith("dvl")]):
+        variable = TABLE[r.name]
+        if r.sd > SHOWN * variable.sd:
+            continue
+        shown, unit = _shown(variable.unit)
+        mean = evidence.optimum.beliefs[r.name].mean[variable.labels.index(r.label)]
+        yield Statistic(
+            "held",
+            _sensor_of(r.name),
+            evidence.start,
+            evidence.end,
+            r.significance,
+            HELD,
+            HELD_FAR_OFF,
+            f"{r.label} is held at {shown * mean:.4g}{unit}, where the measurements have it "
+            f"{shown * r.step:+.2g} ± {shown * r.sd:.1g}{unit} from that",
+            _remedy_of_held(r),
+        )
+
+
+def halves(evidence: Evidence) -> Iterator[Statistic]:
+    """The calibration of the first half of the dive against that of the whole, which is as much as against the second.
+
+    The filter's estimate at half the dive differs from that of all data by a variance of P(half) - P(all).
+    """
+    filtered, final = evidence.estimate("filtered"), {c.label: c for c in evidence.main.calibration}
+    if filtered is None or evidence.main.kind != "smoothed":
+        return
+    middle = 0.5 * (evidence.start + evidence.end)
+    for name, history in filtered.history.items():
+        if name not in TABLE or TABLE[name].walk or len(history.time) < 3:
+            continue
+        k = int(np.searchsorted(history.time, middle))
+        for label, value, sd in zip(history.labels, history.value[k], history.sd[k], strict=True):
+            last = final.get(label)
+            if last is None or not last.estimated or abs(value - last.value) < MATTERS * last.prior_sd:
+                continue
+            # the smoother may be less certain, where it considers what the filter estimates
+            known_later = -(last.sd**2) if last.sd < sd else last.sd**2
+            spread = np.sqrt(sd**2 + known_later + (SHARE_OF_SD * sd) ** 2)
+            off = abs(float(value) - last.value) / float(spread)
+            yield Statistic(
+                "halves",
+                _sensor_of(name),
+                evidence.start,
+                evidence.end,
+                off,
+                DISAGREE,
+                DISAGREE_BADLY,
+                f"{label} of the first half of the dive and of the second differ by {off:.0f} sd",
+                f"it changes during the dive, or something else acts as it does: check {_key_of(name)}, "
+                f"or let it walk (calibration.{name})",
+            )
+
+
+def _shown(unit: str) -> tuple[float, str]:
+    """Factor and unit that a person reads."""
+    return (float(np.rad2deg(1.0)), " deg") if unit == "rad" else (1.0, "" if unit in ("", "1") else f" {unit}")
+
+
+def _sensor_of(name: str) -> str:
+    """The stream that a calibration variable is about."""
+    sensors = TABLE[name].sensors if name in TABLE else ()
+    return sensors[0] if sensors else "imu"
+
+
+def _key_of(name: str) -> str:
+    """What to look at in the configuration where a calibration variable is far off."""
+    if name in ("dvl_roll", "dvl_pitch", "dvl_yaw"):
+        return "dvl.mount_rpy_deg and the signs of the DVL's axes"
+    if name == "dvl_lever_arm":
+        return "dvl.lever_arm_m and imu.lever_arm_m"
+    if name == "dvl_time_offset":
+        return "the DVL's clock"
+    if name.endswith("_offset") and name != "depth_offset":
+        return "environment.declination_deg and the compass's mounting"
+    if name in ("hard_iron", "soft_iron", "field_scale", "field_dip", "mag_deviation"):
+        return "the magnetometer's calibration (rovgraph calibrate magnetometer)"
+    return f"calibration.{name}"
+
+
+def _remedy_of_held(r: Released) -> str:
+    """What to do about a constant that is not what it is held at."""
+    if r.name == "dvl_time_offset":
+        return (
+            "the DVL's stamps are late (early if negative): estimate it, calibration.dvl_time_offset: {estimate: true}"
+        )
+    if r.name == "gyr_scale":
+        return "estimate calibration.gyr_scale, or calibrate the gyro"
+    if r.name in ("dvl_roll", "dvl_pitch"):
+        return f"DVL and IMU are tilted to each other: check imu.mount_rpy_deg, or estimate calibration.{r.name}"
+    return f"estimate calibration.{r.name}"

@@ -1,0 +1,137 @@
+"""Why a DVL contradicts the IMU: axes that are swapped or turned round, or a clock that is off.
+
+Over a few seconds the IMU knows how the velocity changes. In body axes, with l the lever arm and T the time between
+two pings,
+
+    v_b(t) - R_b(t)b(t-T) v_b(t-T) = R_b(t)n (integral of R_nb f_b + g),  v_b = R_bs H z - w x l
+
+holds for the right signed permutation H of the DVL's axes and the right shift of its stamps. Only turns between the
+pings and the vertical enter, so it does not matter how wrong the heading is.
+"""
+
+from collections.abc import Iterator
+from itertools import permutations, product
+
+import numpy as np
+
+from rovgraph.config import mount_matrix
+from rovgraph.engine.measurements import Block
+from rovgraph.engine.optimum import Optimum
+from rovgraph.estimators.alarms.alarm import Statistic
+from rovgraph.estimators.alarms.evidence import Evidence
+from rovgraph.geometry import Array, cross, rotate, rpy_from_matrix, transpose
+from rovgraph.sensors.dvl import DvlVelocity
+
+SUSPICIOUS = 0.1  # share of rejected pings from which on it is worth a look
+OVER_S = 3.0  # T
+SHIFTS_S = np.arange(-2.0, 2.01, 0.05)
+CLIPPED = 3.0  # times the median error, beyond which an error counts no more
+BETTER = 1.15  # times smaller an error than as configured
+ENOUGH = 50  # pings
+AXES = ("dvl_vx", "dvl_vy", "dvl_vz")
+
+
+def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
+    """The axes or the clock that would make the DVL agree with the IMU, where many pings were rejected."""
+    best, seen = evidence.optimum, evidence.residuals.get("dvl")
+    if best is None or seen is None or np.mean(seen.weight <= 0.0) < SUSPICIOUS:
+        return
+    compared = _Compared.of(best, best.blocks["dvl"])
+    if compared is None:
+        return
+    R_bs = mount_matrix(evidence.beginning.config.dvl.mount_rpy_deg)
+    as_configured = compared.error(np.eye(3), R_bs, 0.0)
+    turned = {H: compared.error(np.array(H), R_bs, 0.0) for H in _signed_permutations()}
+    shifted = {float(s): compared.error(np.eye(3), R_bs, float(s)) for s in SHIFTS_S}
+    H, shift = min(turned, key=lambda H: turned[H]), min(shifted, key=lambda s: shifted[s])
+    if turned[H] < shifted[shift]:
+        cause, remedy = _said_of_axes(np.array(H), R_bs)
+        figure, kind = as_configured / turned[H], "axes"
+    else:
+        late = "late" if shift > 0 else "early"
+        cause = f"its stamps are about {abs(shift):.2g} s {late} against the IMU's"
+        entry = f"{{estimate: true, mean: {shift:.2g}, sd: 0.1}}"
+        remedy = f"mend the clock, or state calibration.dvl_time_offset: {entry}"
+        figure, kind = as_configured / shifted[shift], "clock"
+    text = f"{cause}: so it agrees {figure:.1f} times better with the IMU"
+    yield Statistic(kind, "dvl", evidence.start, evidence.end, figure, BETTER, BETTER, text, remedy)
+
+
+class _Compared:
+    """Pings a few seconds apart, and how the IMU says that the velocity changed between them.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,), of the pings [s]
+    z, swing_b : ndarray, shape (n, 3), what they measured, averaged, and the velocity of the lever arm [m/s]
+    before : ndarray of int, shape (m,), for each of the last m pings the one some seconds before
+    turn : ndarray, shape (m, 3, 3), from body axes then to those now
+    change_b : ndarray, shape (m, 3), of the velocity, by the IMU, in the body axes now [m/s]
+    """
+
+    def __init__(self, time: Array, z: Array, swing_b: Array, pairs: tuple[Array, Array], turn: Array, change_b: Array):
+        self.time, self.z, self.swing_b, self.turn, self.change_b = time, z, swing_b, turn, change_b
+        self.before, self.now = pairs
+
+    @staticmethod
+    def of(best: Optimum, block: Block) -> "_Compared | None":
+        intervals, state = best.intervals, best.state
+        model = block.instrument.model
+        if not isinstance(model, DvlVelocity) or len(block) < ENOUGH or len(intervals) < 3:
+            return None
+        motions = [i.motion for i in intervals[1:]]
+        dv = np.array([np.zeros(3) if m is None else m.dv for m in motions])
+        seconds = np.array([0.0 if m is None else m.duration for m in motions])
+        gravity = np.array([0.0, 0.0, block.gravity])
+        force_n = rotate(state.R_nb[:-1], dv - state.bias[:-1, :3] * seconds[:, None])
+        velocity_n = np.vstack([np.zeros(3), np.cumsum(force_n + gravity * seconds[:, None], axis=0)])
+        broken = np.append(0, np.cumsum([i.bridged for i in intervals[1:]]))
+        k = block.keyframe.astype(np.int64)
+        now = np.arange(len(block))
+        before = np.searchsorted(block.time, block.time - OVER_S)
+        apart = block.time - block.time[before]
+        chosen = (apart > 0.5 * OVER_S) & (apart < 1.5 * OVER_S) & (broken[k] == broken[k[before]])
+        now, before = now[chosen], before[chosen]
+        if len(now) < ENOUGH:
+            return None
+        R_bn = transpose(state.R_nb[k[now]])
+        rate_b = block.rate_b - state.bias[k, 3:]
+        swing_b = cross(rate_b, np.broadcast_to(model.lever_arm_b, rate_b.shape))
+        change_b = rotate(R_bn, velocity_n[k[now]] - velocity_n[k[before]])
+        return _Compared(block.time, _averaged(block.z), swing_b, (before, now), R_bn @ state.R_nb[k[before]], change_b)
+
+    def error(self, H: Array, R_bs: Array, shift: float) -> float:
+        """Mean square of the differences, for axes H and stamps that are late by ``shift`` [m^2/s^2]."""
+        z = self.z if shift == 0.0 else _at(self.time + shift, self.time, self.z)
+        v_b = rotate(R_bs @ H, z) - self.swing_b
+        off = np.sum((v_b[self.now] - rotate(self.turn, v_b[self.before]) - self.change_b) ** 2, axis=1)
+        return float(np.minimum(off, CLIPPED**2 * max(float(np.median(off)), 1e-12)).mean())
+
+
+def _averaged(z: Array) -> Array:
+    """Means of five pings around each: a shift interpolates, which would lower the noise of single pings, too."""
+    padded = np.pad(z, ((2, 2), (0, 0)), mode="edge")
+    return np.asarray(sum(padded[k : k + len(z)] for k in range(5)) / 5.0)
+
+
+def _at(when: Array, time: Array, values: Array) -> Array:
+    return np.column_stack([np.interp(when, time, column) for column in values.T])
+
+
+def _signed_permutations() -> list[tuple[tuple[float, ...], ...]]:
+    """The 48 ways to name three axes and their senses, that of the configuration among them."""
+    out = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        H = np.zeros((3, 3))
+        H[range(3), order] = signs
+        out.append(tuple(map(tuple, H.tolist())))
+    return out
+
+
+def _said_of_axes(H: Array, R_bs: Array) -> tuple[str, str]:
+    """What a signed permutation means, and what to do about it."""
+    named = ["-" * int(row.min() < 0.0) + AXES[int(np.abs(row).argmax())] for row in H]
+    if np.linalg.det(H) > 0.0:
+        rpy = [round(float(a), 1) + 0.0 for a in np.rad2deg(rpy_from_matrix((R_bs @ H)[None])[0])]
+        return "it is mounted in another way", f"state dvl.mount_rpy_deg: {rpy}"
+    return f"its axes are left-handed, {', '.join(named)} are right", "change those signs in the log, no mounting can"

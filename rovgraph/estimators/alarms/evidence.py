@@ -1,0 +1,111 @@
+"""What alarms look at: the estimates of a dive, its optimum, and the residuals of every sensor as arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.optimum import Optimum
+from rovgraph.estimators.estimate import Estimate
+from rovgraph.geometry import Array
+from rovgraph.log.frozen import FrozenStretch
+
+MINUTE = 60.0  # [s]
+
+
+@dataclass(frozen=True)
+class SensorResiduals:
+    """The residuals of n measurements of one sensor.
+
+    Attributes
+    ----------
+    sensor, components : its name, and those of its k components
+    time : ndarray, shape (n,) [s]
+    normalised : ndarray, shape (n, k), innovations in units of their sd
+    weight : ndarray, shape (n,), 0 where it was rejected
+    """
+
+    sensor: str
+    components: tuple[str, ...]
+    time: Array
+    normalised: Array
+    weight: Array
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A dive that was estimated.
+
+    Attributes
+    ----------
+    beginning : configuration, instruments and prior
+    estimates : smoothed, filtered or both
+    intervals : of the estimates' keyframes
+    optimum : of the smoothed estimate, where a batch solver found it
+    frozen : what was left out since a sensor repeated itself
+    """
+
+    beginning: InitialConditions
+    estimates: Sequence[Estimate]
+    intervals: Sequence[KeyframeInterval]
+    optimum: Optimum | None
+    frozen: Sequence[FrozenStretch]
+
+    def estimate(self, kind: str) -> Estimate | None:
+        """The estimate of a kind, if it was made."""
+        return next((e for e in self.estimates if e.kind == kind), None)
+
+    @cached_property
+    def main(self) -> Estimate:
+        """The smoothed estimate, or else the filtered one."""
+        return self.estimate("smoothed") or self.estimates[0]
+
+    @property
+    def start(self) -> float:
+        """Time of the first keyframe [s]."""
+        return float(self.main.trajectory.time[0])
+
+    @property
+    def end(self) -> float:
+        """Time of the last keyframe [s]."""
+        return float(self.main.trajectory.time[-1])
+
+    @cached_property
+    def residuals(self) -> dict[str, SensorResiduals]:
+        """Of the main estimate, by sensor."""
+        return residuals_by_sensor(self.main.residuals)
+
+    def since(self, time: float) -> float:
+        """Seconds since the dive began."""
+        return time - self.start
+
+    def span(self, begin: float, end: float) -> str:
+        """A time as a person looks for it."""
+        return span(begin, end, self.start)
+
+
+def span(begin: float, end: float, start: float) -> str:
+    """A time in seconds since the dive began, as "60 to 120 s"."""
+    return f"{begin - start:.0f} to {end - start:.0f} s"
+
+
+def residuals_by_sensor(frame: pd.DataFrame) -> dict[str, SensorResiduals]:
+    """Rows of `RESIDUAL_COLUMNS`, one per component, as one entry per sensor."""
+    out, sensor, component = {}, frame["sensor"].to_numpy(), frame["component"].to_numpy()
+    columns = {name: frame[name].to_numpy(float) for name in ("time", "normalised", "weight")}
+    for name in pd.unique(frame["sensor"]).tolist():
+        own = np.flatnonzero(sensor == name)
+        labels = tuple(pd.unique(component[own]).tolist())
+        first = [own[component[own] == label] for label in labels]
+        normalised = np.column_stack([columns["normalised"][index] for index in first])
+        out[name] = SensorResiduals(name, labels, columns["time"][first[0]], normalised, columns["weight"][first[0]])
+    return out
+
+
+def windows(time: Array, start: float, seconds: float) -> Array:
+    """Number of the window of a length that each time lies in, from 0, shape (n,) of int."""
+    return np.maximum((time - start) // seconds, 0).astype(np.int64)

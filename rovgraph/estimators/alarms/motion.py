@@ -1,0 +1,109 @@
+"""Alarms on the motion: the IMU against everything else, and the smoothed track against the filtered one."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.special import chdtri
+
+from rovgraph.estimators.alarms.alarm import Statistic
+from rovgraph.estimators.alarms.evidence import Evidence, windows
+from rovgraph.geometry import Array, wrap_angle
+from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motions
+
+CHANCE = 1e-6  # that a figure of a healthy dive is beyond its limit
+IMU_S = 20.0  # over which errors of the IMU last that are no noise
+IMU, IMU_BADLY = 3.0, 50.0  # variance of means over that time, 1 for noise
+# of a motion's residual: what people call it, columns, and the signal behind it
+PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slice(6, 9), "acc"))
+JUMP, LARGE_JUMP = 40.0, 100.0  # squared, in joint sds
+SETTLED_S = 10.0  # from which on the filter is asked
+COARSE = 300  # epochs at which both are compared
+
+
+def imu(evidence: Evidence) -> Iterator[Statistic]:
+    """Residuals of the IMU's factors: the mean of each axis over a time, squared, against that of noise.
+
+    What is left between two keyframes is next to nothing, since the keyframes follow the IMU. What lasts is not.
+    """
+    if evidence.optimum is None or len(evidence.intervals) < 3:
+        return
+    r = _motion_residuals(evidence)
+    kept = ~np.array([i.bridged for i in evidence.intervals[1:]])
+    time = np.array([i.time for i in evidence.intervals[1:]])[kept]
+    window = windows(time, evidence.start, IMU_S)
+    count = np.bincount(window) if len(window) else np.zeros(1)
+    full = count >= max(3.0, 0.3 * np.median(count))
+    if not full.any():
+        return
+    for part, columns, key in PARTS:
+        for axis, values in zip("xyz", r[kept, columns].T, strict=True):
+            square = (np.bincount(window, values) ** 2 / np.maximum(count, 1))[full]
+            n, ratio = len(square), float(square.mean())
+            by_chance = float(chdtri(n, CHANCE)) / n
+            begin = evidence.start + float(np.flatnonzero(full)[int(np.argmax(square))]) * IMU_S
+            yield Statistic(
+                "imu",
+                "imu",
+                begin,
+                min(begin + IMU_S, evidence.end),
+                ratio,
+                max(IMU, by_chance),
+                max(IMU_BADLY, by_chance),
+                f"{part} {axis} contradicts the other sensors: means over {IMU_S:g} s vary by {ratio:.0f} times what "
+                f"its noise allows, most at {evidence.since(begin):.0f} s",
+                f"check imu.mount_rpy_deg and the compasses, estimate calibration.{key}_scale or raise imu.noise.{key}",
+            )
+
+
+def _motion_residuals(evidence: Evidence) -> Array:
+    """Whitened residuals of the n - 1 motions between the smoothed keyframes, shape (n - 1, 15)."""
+    assert evidence.optimum is not None
+    state = evidence.optimum.state
+    rows = np.array([i.motion.row for i in evidence.intervals[1:] if i.motion is not None])
+    n = len(rows)
+    r, A, W = np.empty((n, 15)), np.empty((2, n, 15, 15)), np.empty((n, 15, 15))
+    R, p, v, b = (np.ascontiguousarray(a) for a in (state.R_nb, state.p_n, state.v_n, state.bias))
+    motion_weights(rows, W)
+    motion_errors(rows, R[:-1], p[:-1], v[:-1], b[:-1], R[1:], p[1:], v[1:], b[1:], r, A[0], A[1])
+    whiten_motions(W, r, A[0], A[1])
+    return r
+
+
+def estimates(evidence: Evidence) -> Iterator[Statistic]:
+    """Smoothed against filtered position, depth and heading, in joint sds.
+
+    Squared, the difference of a healthy pair is below a chi-square variable: its variance is P_f - P_s, and P_f + P_s
+    is what it is compared with.
+    """
+    smoothed, filtered = evidence.estimate("smoothed"), evidence.estimate("filtered")
+    if smoothed is None or filtered is None or len(smoothed.trajectory) != len(filtered.trajectory):
+        return
+    s, f = smoothed.trajectory, filtered.trajectory
+    at = np.flatnonzero(s.time >= evidence.start + SETTLED_S)
+    at = at[:: max(len(at) // COARSE, 1)]
+    if not len(at):
+        return
+    d, P = (f.p_n - s.p_n)[at], (f.cov_p + s.cov_p)[at]
+    turned = wrap_angle(f.take(at).rpy[:, 2] - s.take(at).rpy[:, 2])
+    heading = turned**2 / (f.cov_theta[at, 2, 2] + s.cov_theta[at, 2, 2])
+    level = np.einsum("ni,nij,nj->n", d[:, :2], np.linalg.inv(P[:, :2, :2]), d[:, :2])
+    depth = d[:, 2] ** 2 / P[:, 2, 2]
+    apart = {
+        "position": (level, np.linalg.norm(d[:, :2], axis=1), "m"),
+        "depth": (depth, np.abs(d[:, 2]), "m"),
+        "heading": (heading, np.rad2deg(np.abs(turned)), "deg"),
+    }
+    for what, (square, size, unit) in apart.items():
+        k = int(np.argmax(square))
+        yield Statistic(
+            "estimates",
+            "dive",
+            float(s.time[at[k]]),
+            float(s.time[at[k]]),
+            float(square[k]),
+            JUMP,
+            LARGE_JUMP,
+            f"smoothed and filtered {what} differ by {size[k]:.2g} {unit}, {np.sqrt(square[k]):.0f} joint sds, "
+            f"at {evidence.since(float(s.time[at[k]])):.0f} s",
+            "something that was believed then was given up later: look at the residuals before that time",
+        )

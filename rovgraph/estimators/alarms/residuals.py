@@ -1,0 +1,181 @@
+"""Alarms on the measurements' residuals: rejected, too large, too small, and lasting in one direction.
+
+Residuals of a smoother vary less than the noise, since each measurement has pulled the estimate towards itself:
+their covariance is I - H P H' in units of the noise. So the limits upwards are those of independent noise. Downwards
+only the filter's normalised innovations squared (NIS) can tell, whose expectation is the measurement's dimension.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.special import bdtrc, chdtri
+
+from rovgraph.estimators.alarms.alarm import Statistic
+from rovgraph.estimators.alarms.evidence import MINUTE, Evidence, SensorResiduals, windows
+
+CHANCE = 1e-6  # that a figure of a healthy sensor is beyond its limit
+ENOUGH = 20  # measurements
+REJECTED, MOSTLY_REJECTED = 0.05, 0.5  # share in a minute
+USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
+TOO_LARGE, FAR_TOO_LARGE = 2.0, 6.0  # mean square of the dive
+IN_A_MINUTE = 1.5  # times as much
+TOO_SMALL = 0.3
+LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
+LASTING, BADLY_LASTING = 4.0, 100.0  # variance of the means over that time, 1 for noise
+OF_ONE = 8.0  # a single mean may be that much more
+SD_KEY = {
+    "dvl": "dvl.velocity_sd_mps",
+    "dvl_water": "dvl.water_velocity_sd_mps",
+    "mag": "heading.mag_sd_deg",
+    "dvl_heading": "heading.dvl_sd_deg",
+    "ahrs": "heading.ahrs_sd_deg",
+    "depth": "depth.sd_m",
+    "fix": "fix.sd_m",
+    "place": "place.sd_m",
+    "thruster": "vehicle.acceleration_sd_mps2",
+}
+
+
+def sd_key(sensor: str) -> str:
+    """The configuration's key of a sensor's noise."""
+    return SD_KEY.get(sensor, f"the noise of {sensor}")
+
+
+def rejected(evidence: Evidence) -> Iterator[Statistic]:
+    """The largest share of a sensor's measurements that was left out in a minute."""
+    for r in evidence.residuals.values():
+        window = windows(r.time, evidence.start, MINUTE)
+        out, count = np.bincount(window, r.weight <= 0.0), np.bincount(window)
+        by_chance = bdtrc(np.maximum(out - 1, 0), np.maximum(count, 1), USUAL_SHARE) > CHANCE
+        share = np.where((count < ENOUGH) | by_chance, 0.0, out / np.maximum(count, 1))
+        worst = int(np.argmax(share))
+        bad = np.flatnonzero(share > REJECTED)
+        begin, end = (bad[0], bad[-1]) if len(bad) else (worst, worst)
+        begin_s, end_s = evidence.start + begin * MINUTE, min(evidence.start + (end + 1) * MINUTE, evidence.end)
+        yield Statistic(
+            "rejected",
+            r.sensor,
+            begin_s,
+            end_s,
+            float(share[worst]),
+            REJECTED,
+            MOSTLY_REJECTED,
+            f"up to {share[worst]:.0%} of a minute's measurements contradict the others and were left out, "
+            f"{evidence.span(begin_s, end_s)}",
+            f"take that time out of the log if it is the instrument; if it is everywhere, check its mounting, signs "
+            f"and clock (rovgraph check), and {sd_key(r.sensor)}",
+        )
+
+
+def too_large(evidence: Evidence) -> Iterator[Statistic]:
+    """Mean square of a sensor's normalised residuals, in the whole dive and in its worst minute."""
+    if evidence.main.kind == "filtered":  # its innovations hold its own error, too
+        return
+    for r in evidence.residuals.values():
+        used = r.weight > 0.0
+        square = np.mean(r.normalised[used] ** 2, axis=1)
+        if len(square) < ENOUGH:
+            continue
+        window = windows(r.time[used], evidence.start, MINUTE)
+        count = np.bincount(window)
+        means = np.where(count >= ENOUGH, np.bincount(window, square) / np.maximum(count, 1), 0.0)
+        worst = int(np.argmax(means))
+        begin = evidence.start + worst * MINUTE
+        end, dim = min(begin + MINUTE, evidence.end), r.normalised.shape[1]
+        yield _too_large(evidence, r.sensor, evidence.start, evidence.end, float(square.mean()), len(square) * dim, 1.0)
+        yield _too_large(evidence, r.sensor, begin, end, float(means[worst]), int(count[worst]) * dim, IN_A_MINUTE)
+
+
+def _too_large(
+    evidence: Evidence, sensor: str, begin: float, end: float, square: float, count: int, factor: float
+) -> Statistic:
+    """A mean square of ``count`` numbers against its limits, and the quantile of as many independent ones."""
+    by_chance = float(chdtri(max(count, 1), CHANCE)) / max(count, 1)
+    return Statistic(
+        "too large",
+        sensor,
+        begin,
+        end,
+        square,
+        max(factor * TOO_LARGE, by_chance),
+        max(factor * FAR_TOO_LARGE, by_chance),
+        f"its residuals are {np.sqrt(square):.1f} times as large as its stated noise, {evidence.span(begin, end)}",
+        f"find what disturbs it there, or raise {sd_key(sensor)}",
+    )
+
+
+def too_small(evidence: Evidence) -> Iterator[Statistic]:
+    """Mean of the filter's normalised innovations squared, per dimension, that is far below 1."""
+    filtered = evidence.estimate("filtered")
+    for sensor, nis in ({} if filtered is None else filtered.summary.get("nis", {})).items():
+        if nis["mean"] is None or nis["count"] < ENOUGH:
+            continue
+        mean = nis["mean"] / nis["dim"]
+        yield Statistic(
+            "too small",
+            sensor,
+            evidence.start,
+            evidence.end,
+            1.0 / max(mean, 1e-9),
+            1.0 / TOO_SMALL,
+            np.inf,
+            f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so more is known than is said",
+            f"lower {sd_key(sensor)}",
+        )
+
+
+def lasting(evidence: Evidence) -> Iterator[Statistic]:
+    """Residuals that keep their sign for seconds: the variance of means over a time, which is 1 for white noise."""
+    if evidence.main.kind == "filtered":  # its innovations wander while it settles
+        return
+    for r in evidence.residuals.values():
+        worst = _most_lasting(r, evidence.start)
+        if worst is None:
+            continue
+        seconds, component, ratio, by_chance, begin = worst
+        yield Statistic(
+            "lasting",
+            r.sensor,
+            begin,
+            min(begin + seconds, evidence.end),
+            ratio,
+            max(LASTING, by_chance),
+            max(BADLY_LASTING, by_chance),
+            f"residuals of {r.components[component]} last: means over {seconds:g} s vary by {ratio:.0f} times what "
+            f"noise would, most at {evidence.since(begin):.0f} s",
+            _remedy_of_lasting(r.sensor),
+        )
+
+
+def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, float, float] | None:
+    """Window [s], component, variance ratio, its quantile for noise and where it is largest [s], of the worst one."""
+    out: list[tuple[float, int, float, float, float]] = []
+    used = r.weight > 0.0
+    for seconds in LASTING_S:
+        window = windows(r.time[used], start, seconds)
+        count = np.bincount(window) if len(window) else np.zeros(1)
+        usual = np.median(count[count > 0]) if count.any() else 0.0
+        full = count >= max(3.0, 0.3 * usual)
+        for component in range(r.normalised.shape[1]) if full.any() else ():
+            sums = np.bincount(window, r.normalised[used, component])
+            square = (sums**2 / np.maximum(count, 1))[full]
+            k = int(np.argmax(square))
+            begin = start + float(np.flatnonzero(full)[k]) * seconds
+            # all windows together, and the largest of them
+            n = len(square)
+            out.append((seconds, component, float(square.mean()), float(chdtri(n, CHANCE)) / n, begin))
+            out.append((seconds, component, float(square[k]) / OF_ONE, float(chdtri(1, CHANCE / n)) / OF_ONE, begin))
+    return max(out, key=lambda one: one[2] / max(LASTING, one[3]), default=None)
+
+
+def _remedy_of_lasting(sensor: str) -> str:
+    """What lets a sensor's errors last, and what to do."""
+    if sensor in ("mag", "dvl_heading", "ahrs"):
+        return f"iron near the vehicle or a bad calibration (rovgraph calibrate magnetometer); raise {sd_key(sensor)}"
+    if sensor == "fix":
+        return "the fixes are off together for that time: take them out, or raise fix.sd_m"
+    if sensor == "depth":
+        return "the depth contradicts the DVL's vertical velocity: check depth, dvl.mount_rpy_deg and imu.mount_rpy_deg"
+    if sensor.startswith("dvl"):
+        return f"check dvl.mount_rpy_deg, dvl.lever_arm_m and its clock (rovgraph check), or raise {sd_key(sensor)}"
+    return f"look for what disturbs it, or raise {sd_key(sensor)}"

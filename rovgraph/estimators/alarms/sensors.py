@@ -1,0 +1,63 @@
+"""Alarms on the sensors themselves: those that froze, and pairs that contradict each other."""
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic
+from rovgraph.estimators.alarms.evidence import Evidence, span
+
+FROZEN_S = 3.0  # in all [s]
+MEASURE_THE_SAME = (
+    ("heading", ("mag", "dvl_heading", "ahrs")),
+    ("vertical motion", ("dvl", "depth")),
+    ("horizontal motion", ("dvl", "fix", "place", "dvl_water", "thruster")),
+)
+OF_RESIDUALS = ("rejected", "too large", "lasting")
+
+
+def frozen(evidence: Evidence) -> Iterator[Statistic]:
+    """How long a sensor repeated itself; those measurements were left out."""
+    by_sensor: dict[str, list[tuple[float, float]]] = {}
+    for stretch in evidence.frozen:
+        by_sensor.setdefault(stretch.sensor, []).append((stretch.first, stretch.last))
+    for sensor, times in by_sensor.items():
+        seconds = sum(last - first for first, last in times)
+        first, last = times[0][0], times[-1][1]
+        often = "" if len(times) == 1 else f" in {len(times)} stretches"
+        yield Statistic(
+            "frozen",
+            sensor,
+            first,
+            last,
+            seconds,
+            FROZEN_S,
+            float("inf"),
+            f"repeats its values for {seconds:.0f} s{often}, {evidence.span(first, last)}; they were left out",
+            "look at the instrument and its driver; the track is less certain there, as its sd says",
+        )
+
+
+def contradictions(alarms: Sequence[Alarm], start: float) -> Iterator[Alarm]:
+    """Pairs of sensors that measure the same and both disagree with the estimate at the same time.
+
+    The estimate lies between two sensors that contradict each other, so the residuals of both are odd. ``start`` is
+    when the dive began [s].
+    """
+    odd: dict[str, list[Alarm]] = {}
+    for alarm in alarms:
+        if alarm.kind in OF_RESIDUALS:
+            odd.setdefault(alarm.sensor, []).append(alarm)
+    for what, names in MEASURE_THE_SAME:
+        for one, other in combinations([name for name in names if name in odd], 2):
+            both = [(a, b) for a in odd[one] for b in odd[other] if a.begin <= b.end and b.begin <= a.end]
+            if not both:
+                continue
+            a, b = max(both, key=lambda pair: min(pair[0].figure / pair[0].limit, pair[1].figure / pair[1].limit))
+            begin, end = max(a.begin, b.begin), min(a.end, b.end)
+            severity: Severity = "wrong" if a.severity == b.severity == "wrong" else "doubtful"
+            figure = min(a.figure / a.limit, b.figure / b.limit)
+            text = (
+                f"{one} and {other}: they contradict each other in {what}, {span(begin, end, start)}; find out which "
+                f"one is off by leaving one of them out of the log"
+            )
+            yield Alarm("contradiction", f"{one}, {other}", begin, end, figure, 1.0, severity, text)

@@ -1,0 +1,189 @@
+"""A dive that is not what the configuration says is not trusted, and the line names the instrument and a remedy.
+
+python tests/test_alarms.py 1 6 [PATH] prints what is said of every broken dive of the seeds from 1 to 5.
+"""
+
+import json
+import sys
+import time
+
+import numpy as np
+import pytest
+from broken import BROKEN
+from dives import LIVELY, Simulated, falcon, position_errors, simulated
+
+from rovgraph.cli.app import main
+from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.released import release
+from rovgraph.estimators.alarms import Evidence, Statistic, find_alarms, statistics, verdict_of
+from rovgraph.estimators.alarms.alarm import alarm_of
+from rovgraph.estimators.dive import Dive, smooth
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import BatchSmoother, smoothed
+
+SECONDS = 200.0
+
+# what breaks -> the verdict, the kind of the alarm that names it, and words of its line
+SAID = {
+    "DVL y sign flipped": ("wrong", "axes", "dvl: its axes are left-handed, dvl_vx, -dvl_vy, dvl_vz are right"),
+    "IMU mounted 2, 1, 3 degrees off": ("wrong", "held", "check imu.mount_rpy_deg"),
+    "DVL biased by 0.3 m/s for 20 s": ("wrong", "rejected", "take that time out of the log"),
+    "DVL frozen for a minute": ("doubtful", "frozen", "dvl: repeats its values for 60 s"),
+    "depth stuck": ("doubtful", "frozen", "depth: repeats its values for 140 s"),
+    "DVL 0.3 s late": ("wrong", "clock", "s late against the IMU's"),
+    "DVL noise three times as stated": ("doubtful", "too large", "raise dvl.velocity_sd_mps"),
+    "fixes 8 m off for a minute": ("doubtful", "lasting", "fix: residuals of north last"),
+    "gyro scale 0.5 %": ("doubtful", "held", "estimate calibration.gyr_scale"),
+}
+
+
+def broken(name: str, seed: int, path: str = "falcon") -> tuple[Simulated, Dive]:
+    case = simulated(falcon(), SECONDS, seed, path, **BROKEN[name].truth)
+    return case, smooth(BROKEN[name].breaks(case.log), case.config)
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_is_broken_is_named_with_a_remedy(name):
+    verdict, kind, words = SAID[name]
+    _, dive = broken(name, 1)
+    assert dive.verdict == verdict
+    lines = [alarm.text for alarm in dive.alarms if alarm.kind == kind]
+    assert any(words in line for line in lines), dive.warnings
+    assert all("\n" not in line for line in dive.warnings)
+
+
+def test_a_healthy_dive_is_trusted():
+    case = simulated(falcon(), SECONDS, 1, fix_interval=2.0)
+    dive = smooth(case.log, case.config)
+    assert (dive.verdict, dive.warnings) == ("trusted", [])
+    assert {s.kind for s in dive.statistics} >= {
+        "held",
+        "moved",
+        "rejected",
+        "too large",
+        "lasting",
+        "imu",
+        "estimates",
+    }
+
+
+def test_a_dvl_whose_z_axis_points_the_other_way_gets_its_mounting():
+    case = simulated(falcon(), SECONDS, 1)
+    config = falcon(dvl={"mount_rpy_deg": [0.0, 0.0, case.config.dvl.mount_rpy_deg[2]]})
+    dive = smooth(case.log, config)
+    assert dive.verdict == "wrong"
+    true = list(case.config.dvl.mount_rpy_deg)
+    assert any(f"state dvl.mount_rpy_deg: {true}" in line for line in dive.warnings), dive.warnings
+
+
+@pytest.mark.parametrize(("name", "off"), [("dvl_scale", 0.02), ("dvl_pitch", 0.03), ("gyr_scale", 0.005)])
+def test_a_constant_that_is_held_wrongly_is_found_with_its_value(name, off):
+    case = simulated(falcon(), SECONDS, 2, calibration={name: off * np.ones(3 if name == "gyr_scale" else 1)})
+    batch = BatchSmoother(initialise(case.log, case.config))
+    batch.take(case.log)
+    best = batch.optimum()
+    assert isinstance(best, ChainOptimum)
+    found = release(best, [name])
+    mean = case.config.dvl.mount_rpy_deg[1] if name == "dvl_pitch" else 0.0
+    assert all(abs(r.step - (off - np.deg2rad(mean))) < 4.0 * r.sd + 0.15 * off for r in found)
+    assert max(r.significance for r in found) > 5.0
+
+
+def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_released():
+    steps = []
+    for seed in range(1, 5):
+        case = simulated(falcon(), 120.0, seed)
+        batch = BatchSmoother(initialise(case.log, case.config))
+        batch.take(case.log)
+        found = release(batch.optimum(), ["dvl_roll", "dvl_pitch", "dvl_scale", "dvl_time_offset", "gyr_scale"])
+        steps += [r.step / r.sd for r in found]
+    assert len(steps) == 28
+    assert 0.5 < float(np.std(steps)) < 1.6
+    assert np.abs(steps).max() < 4.5
+
+
+def test_alarms_of_a_filter_alone_need_no_smoother():
+    case = simulated(falcon(), 100.0, 1)
+    assert smooth(case.log, case.config, "filtered").verdict == "trusted"
+    late = smooth(BROKEN["DVL 0.3 s late"].breaks(case.log), case.config, "filtered")
+    assert any(line.startswith("dvl: up to") for line in late.warnings)
+
+
+def test_alarms_are_cheap():
+    case = simulated(falcon(), SECONDS, 1)
+    beginning = initialise(case.log, case.config)
+    batch = BatchSmoother(beginning)
+    batch.take(case.log)
+    best = batch.optimum()
+    evidence = Evidence(beginning, [smoothed(best, beginning)], best.intervals, best, [])
+    statistics(evidence)
+    began = time.process_time()
+    statistics(evidence)
+    spent = time.process_time() - began
+    began = time.process_time()
+    best.chain.eliminate(best.state, best.solution.gates)
+    assert spent < 8.0 * (time.process_time() - began)
+
+
+def statistic(figure: float, kind: str = "rejected", sensor: str = "dvl") -> Statistic:
+    return Statistic(kind, sensor, 10.0, 70.0, figure, 1.0, 5.0, "something is so", "do something")
+
+
+def test_the_worst_alarm_is_the_verdict():
+    assert [alarm_of(statistic(f)) is None for f in (0.5, 1.0, 1.1)] == [True, True, False]
+    alarms = find_alarms([statistic(0.5), statistic(2.0), statistic(3.0), statistic(2.0, sensor="mag")], 0.0)
+    assert [(a.sensor, a.figure) for a in alarms] == [("dvl", 3.0), ("mag", 2.0)]
+    assert verdict_of(alarms) == "doubtful"
+    assert verdict_of(find_alarms([statistic(6.0), statistic(2.0, sensor="mag")], 0.0)) == "wrong"
+    assert verdict_of([]) == "trusted"
+    assert alarms[0].text == "dvl: something is so; do something"
+
+
+def test_two_sensors_that_measure_the_same_and_are_both_odd_contradict_each_other():
+    numbers = [statistic(2.0, "lasting", "dvl"), statistic(3.0, "lasting", "depth"), statistic(2.0, "lasting", "mag")]
+    (pair,) = [alarm for alarm in find_alarms(numbers, 0.0) if alarm.kind == "contradiction"]
+    assert pair.sensor == "depth, dvl" or pair.sensor == "dvl, depth"
+    assert "10 to 70 s" in pair.text
+
+
+@pytest.fixture(scope="module")
+def flipped(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("flipped")
+    frame = simulated(falcon(), 100.0, 1, style=LIVELY).dive.log_frame
+    frame["dvl_vy"] *= -1.0
+    frame.to_csv(folder / "log.csv", index=False)
+    (folder / "config.yaml").write_text(falcon().to_yaml(), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(("options", "code"), [([], 0), (["--strict"], 3)])
+def test_smooth_says_its_verdict_first_and_strict_returns_it(flipped, monkeypatch, capsys, options, code):
+    out = flipped / f"results{code}"
+    given = ["smooth", flipped / "log.csv", "--config", flipped / "config.yaml", "--no-figures", "--out", out]
+    monkeypatch.setattr(sys, "argv", ["rovgraph", *map(str, given), *options])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert (end.value.code or 0) == code
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "verdict: wrong"
+    assert lines[1].startswith("wrong: dvl: its axes are left-handed")
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["verdict"] == "wrong"
+    assert summary["alarms"][0]["kind"] == "axes"
+    assert set(summary["alarms"][0]) == {"kind", "sensor", "severity", "from_s", "to_s", "figure", "limit", "text"}
+
+
+if __name__ == "__main__":
+    paths = sys.argv[3:] or ["falcon"]
+    for name in BROKEN:
+        verdicts, named = [], 0
+        for seed in range(int(sys.argv[1]), int(sys.argv[2])):
+            for path in paths:
+                case, dive = broken(name, seed, path)
+                track = dive.estimates[0].trajectory
+                off = position_errors(track, case) / np.linalg.norm(track.p_sd, axis=1)
+                named += any(SAID[name][2] in a.text for a in dive.alarms if a.kind == SAID[name][1])
+                verdicts.append(dive.verdict)
+                print(f"  {path} {seed}: {dive.verdict}, {off.max():.1f} sd; {(dive.warnings or ['-'])[0]}")
+        counts = ", ".join(f"{verdicts.count(v)} {v}" for v in ("trusted", "doubtful", "wrong"))
+        print(f"{name}: {counts}; named in {named} of {len(verdicts)}", flush=True)
