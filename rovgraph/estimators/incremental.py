@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rovgraph.calibration import Belief
+from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
@@ -26,14 +26,17 @@ from rovgraph.estimators.optimum import optimum
 from rovgraph.estimators.smoother import newest_calibration, smoothed
 from rovgraph.graph.incremental import Incremental
 from rovgraph.graph.places import apart_from, associated_optimum, resolved_associations
+from rovgraph.kernels.layout import MOTION
 from rovgraph.log import Measurement
 from rovgraph.state import PLACE, State
 
 UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
-CHECK_S = 1.0  # of the dive, between looks for what is linearised too far from the estimate
-TOLERANCE = 2e-3  # how far that may be, in each component [rad, 1]
-SHARE = 0.1  # and as a part of its sd
-RELINEARISATIONS = 3  # at a time
+CHECK_S = 1.0  # of the dive, at least, between looks for what is linearised too far from the estimate
+CHECK_SHARE = 0.03  # and as a part of the dive so far
+ANGLE_TOLERANCE = 0.01  # how far that may be [rad]
+TOLERANCE = 0.02  # of what is no angle [1, m...]
+SHARE = 0.2  # or as a part of its sd
+RELINEARISATIONS = 2  # at a time
 STIFF = 2e-4  # walk of a constant, as a part of its prior's sd per root second
 
 
@@ -63,7 +66,10 @@ class IncrementalEstimator:
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0])
         self.intervals: list[KeyframeInterval] = []
         self._own_places: dict[float, int] = {}  # time of a landmark -> number of the place that it is by itself
-        self._checked = -np.inf
+        names = self.filter.unknowns.estimated
+        tolerance = [np.full(v.dim, ANGLE_TOLERANCE if v.angular else TOLERANCE) for v in (TABLE[n] for n in names)]
+        self._tolerance = np.concatenate([np.empty(0), *tolerance])
+        self._due = -np.inf  # when to look for what is linearised too far from the estimate [s]
         self.relinearised = []
 
     @property
@@ -103,7 +109,8 @@ class IncrementalEstimator:
             self._own_places |= own
             interval = replace(interval, measurements=[one.measurement for one in processed])
         self.intervals.append(interval)
-        self.engine.add(interval, known, [p.measurement for p in processed if p.weight > 0.0])
+        let_in = [p.measurement for p in processed if p.weight > 0.0 or p.measurement.landmark is not None]
+        self.engine.add(interval, known, let_in)
         if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
             self.update()
 
@@ -113,16 +120,17 @@ class IncrementalEstimator:
             return
         self.engine.update()
         self._know()
-        if self.intervals[-1].time - self._checked >= CHECK_S:
-            self._checked = self.intervals[-1].time
+        now = self.intervals[-1].time
+        if now >= self._due:
+            self._due = now + max(CHECK_S, CHECK_SHARE * (now - self.intervals[0].time))
             self._relinearise()
 
     def _relinearise(self) -> None:
         """Move the point to the estimate as far back as it is off."""
         for _ in range(RELINEARISATIONS):
             sd = np.sqrt(np.diagonal(self.known.P)[: self.filter.layout.size])
-            turn = max(TOLERANCE, SHARE * float(sd[:3].max()))
-            off = self.engine.off(turn, np.maximum(TOLERANCE, SHARE * sd[15:]))
+            turn = max(ANGLE_TOLERANCE, SHARE * float(sd[:3].max()))
+            off = self.engine.off(turn, np.maximum(self._tolerance, SHARE * sd[MOTION:]))
             if off is None:
                 return
             self.engine.relinearize(off)

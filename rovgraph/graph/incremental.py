@@ -16,7 +16,6 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.calibration import LAYOUT, Belief
 from rovgraph.engine.filter import ORIGIN, FilterEngine
@@ -32,7 +31,7 @@ from rovgraph.graph.linear_intervals import IntervalTerms, LinearInterval, Linea
 from rovgraph.kernels.layout import MOTION
 from rovgraph.state import PLACE, PLACE_DIM, POSE
 
-WILDFIRE = 1e-4  # change of an estimate below which it is not propagated [rad, m, m/s...]
+WILDFIRE = 1e-3  # change of an estimate below which it is not propagated [rad, m, m/s...]
 
 _unit = cache(gtsam.noiseModel.Unit.Create)
 
@@ -91,14 +90,12 @@ class Incremental:
         known : where to linearise it at first
         let_in : of its measurements, those that count
         """
-        term = IntervalTerms(self._filter, interval)
         if interval.segment == len(self._c):
             self._c.append(known.c)
             self._begun.append(interval.index)
-        self._terms.append(term)
+        self._terms.append(IntervalTerms(self._filter, interval, let_in))
         self._x.append(known.x)
-        chosen = {id(m) for m in let_in}
-        self._push(interval.index, np.array([id(m) in chosen for m in term.measurements], bool))
+        self._push(interval.index)
 
     def update(self) -> None:
         """Take what has been added.
@@ -134,12 +131,17 @@ class Incremental:
         """
         k, s = self.updated, self._terms[self.updated].interval.segment
         keys = [key(POSE, k), key(CALIBRATION, s), *(key(PLACE, number) for number in places)]
-        P = self._engine.jointMarginalCovariance(keys).fullMatrix()
-        root = self._engine.jointBayesNet(*keys[:2]).optimize()  # which needs no estimate of the others
+        if places:
+            P = self._engine.jointMarginalCovariance(keys).fullMatrix()
+            delta = np.concatenate([self._engine.calculateEstimateVector(one) for one in keys])
+        else:  # the root of the tree tells, and nothing below it has to be asked
+            P, delta = _solve(self._engine.jointBayesNet(*keys), keys)
         c = self._c[s].copy()
-        c[self._parts] += root.at(keys[1])
-        positions = [self._places[n] + self._engine.calculateEstimateVector(key(PLACE, n)) for n in places]
-        return moved(self._x[k][None], root.at(keys[0])[None])[0], c, P, positions
+        own = MOTION + len(self._parts)
+        c[self._parts] += delta[MOTION:own]
+        of_places = delta[own:].reshape(-1, PLACE_DIM)
+        positions = [self._places[n] + by for n, by in zip(places, of_places, strict=True)]
+        return moved(self._x[k][None], delta[None, :MOTION])[0], c, P, positions
 
     def estimate(self) -> tuple[Array, Array]:
         """All keyframes that iSAM2 has, and the calibration at each: shapes (n, 21), (n, C)."""
@@ -170,7 +172,7 @@ class Incremental:
         return None
 
     def relinearize(self, segment: int) -> None:
-        """Move the point to the estimate from a segment on, with what lies within its gate there."""
+        """Move the point to the estimate from a segment on."""
         first, (x, c) = self._begun[segment], self.estimate()
         self._x[first:] = list(x[first:])
         self._c[segment:] = [c[begun] for begun in self._begun[segment:]]
@@ -199,13 +201,13 @@ class Incremental:
         self._removed: list[int] = []
         self._order: gtsam.KeyGroupMap | None = None
 
-    def _push(self, first: int, admitted: NDArray[np.bool_] | None = None) -> None:
-        """Have the factors from a keyframe on wait for the next update; ``admitted`` as of `Linearization`."""
+    def _push(self, first: int) -> None:
+        """Have the factors from a keyframe on wait for the next update."""
         terms, segments = self._terms[first:], [term.interval.segment for term in self._terms[first:]]
         x, c = np.array(self._x[max(first - 1, 0) :]), np.array([self._c[s] for s in segments])
         if first == 0:
             x = np.concatenate([x[:1], x])
-        for k, (term, rows) in enumerate(zip(terms, self._linearization.linearize(terms, x, c, admitted), strict=True)):
+        for k, (term, rows) in enumerate(zip(terms, self._linearization.linearize(terms, x, c), strict=True)):
             index, s = term.interval.index, segments[k]
             factors = [_interval_factor(index, s, rows), *self._landmarks(term, x[k : k + 2], c[k])]
             if self._begun[s] == index:
@@ -234,9 +236,8 @@ class Incremental:
     def _landmarks(self, term: IntervalTerms, x: Array, c: Array) -> list[gtsam.JacobianFactor]:
         """Factors of the places that are seen in an interval, and priors of those that are new; ``x`` of its ends."""
         factors = []
-        for m in term.interval.measurements:
-            if m.landmark is None:
-                continue
+        for m in term.landmarks:
+            assert m.landmark is not None
             number, here = m.landmark.number, m.keyframe == term.interval.index
             block, state = self._filter.block([m]), Gaussian(x[int(here)], c, np.empty((0, 0))).state
             name = key(PLACE, number)
@@ -260,6 +261,16 @@ def _interval_factor(index: int, segment: int, rows: LinearInterval) -> gtsam.Ja
     if index == 0:
         return gtsam.JacobianFactor(*own, rows.r, unit)
     return gtsam.JacobianFactor(key(POSE, index - 1), rows.A_i, *own, rows.r, unit)
+
+
+def _solve(net: gtsam.GaussianBayesNet, keys: Sequence[int]) -> tuple[Array, Array]:
+    """Covariance and mean of the variables of a small Bayes net, in the order of ``keys``."""
+    R, d = net.matrix()
+    root = np.linalg.inv(R)
+    if net.at(0).firstFrontalKey() != keys[0]:
+        root = np.roll(root, net.at(0).rows(), axis=0)
+        raise AssertionError
+    return root @ root.T, root @ d
 
 
 def moved(x: Array, delta: Array) -> Array:

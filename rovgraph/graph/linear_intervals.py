@@ -6,26 +6,24 @@ With the errors e_i, e_j of the keyframes before and after an interval and e_c o
     A_i e_i + A_j e_j + C e_c = r + white noise
 
 in one row for each component of its motion, or of the prior, and of the measurements since the keyframe before.
-Their equations are the compiled ones. Losses and gates weight the rows.
+Their equations are the compiled ones, and losses weight the rows.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import states_of
 from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
-from rovgraph.engine.measurements import loss_weight
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.geometry import Array, log_rotation, right_jacobian
-from rovgraph.instruments import Instrument
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motions
 
+_LET_IN = np.ones(1, bool)
 _SCALE = slice(ACC_SCALE, ACC_SCALE + 6)  # of the calibration vector
 
 
@@ -39,69 +37,59 @@ class LinearInterval:
     r: Array
 
 
-class MeasurementGroup:
+class KeyframeTerms:
     """Measurements that belong to one keyframe, without those of places.
 
     Parameters
     ----------
     filter : knows their equations
     measurements : at least one
-
-    Attributes
-    ----------
-    measurements : in the order of the rows
-    dims : ndarray of int, components of each
     """
 
     def __init__(self, filter: FilterEngine, measurements: Sequence[KeyframeMeasurement]) -> None:
         known = [m for m in measurements if filter.knows(m.sensor)]
-        given = [m for m in measurements if not filter.knows(m.sensor)]
-        self.measurements = [*known, *given]
-        self.dims = np.array([len(m.z) for m in self.measurements])
         self._rows = filter.rows(known) if known else None
-        self._blocks = [filter.block([m]) for m in given]
+        self._blocks = [filter.block([m]) for m in measurements if not filter.knows(m.sensor)]
         self._matrix = filter.layout.matrix
 
     def linearize(self, x: Array, c: Array) -> tuple[Array, Array]:
-        """Whitened innovations, shape (m,), and Jacobians, shape (m, size), at a state as of `Gaussian`."""
+        """Weighted innovations, shape (m,), and Jacobians, shape (m, size), at a state as of `Gaussian`."""
         if self._rows is not None and not self._blocks:
-            return self._rows.linearize(x, c)
-        r, H = [], []
-        if self._rows is not None:
-            own_r, own_H = self._rows.linearize(x, c)
-            r, H = [own_r], [own_H]
+            return self._rows.linearize(x, c, weighted=True)
+        linear = [] if self._rows is None else [self._rows.linearize(x, c, weighted=True)]
         state = states_of(x[None], c)
         for block in self._blocks:
-            own, jacobians = block.linearize(state)
-            r.append(own[0])
-            H.append(self._matrix(jacobians)[0])
-        return np.concatenate(r), np.vstack(H)
+            r, H = block.weighted(state, _LET_IN)
+            linear.append((r[0], self._matrix(H)[0]))
+        return np.concatenate([r for r, _ in linear]), np.vstack([H for _, H in linear])
 
 
 class IntervalTerms:
-    """An interval with what was measured in it, to be linearised at any point.
+    """An interval with what was let in of its measurements, to be linearised at any point.
 
     Parameters
     ----------
     filter : knows the equations
     interval : the interval
+    let_in : its measurements that count
 
     Attributes
     ----------
     interval : the interval
-    groups : (whether it belongs to the keyframe that ends the interval, measurements)
+    landmarks : those of places
+    before, here : at the keyframe before, and at the one that ends the interval, where there are any
     """
 
-    def __init__(self, filter: FilterEngine, interval: KeyframeInterval) -> None:
+    def __init__(
+        self, filter: FilterEngine, interval: KeyframeInterval, let_in: Sequence[KeyframeMeasurement]
+    ) -> None:
         self.interval = interval
-        parts = (False, interval.between), (True, interval.here)
-        kept = [(here, [m for m in own if m.landmark is None]) for here, own in parts]
-        self.groups = [(here, MeasurementGroup(filter, own)) for here, own in kept if own]
-
-    @property
-    def measurements(self) -> list[KeyframeMeasurement]:
-        """In the order of the rows."""
-        return [m for _, group in self.groups for m in group.measurements]
+        self.landmarks = [m for m in let_in if m.landmark is not None]
+        others = [m for m in let_in if m.landmark is None]
+        before = [m for m in others if m.keyframe < interval.index]
+        here = [m for m in others if m.keyframe == interval.index]
+        self.before = KeyframeTerms(filter, before) if before else None
+        self.here = KeyframeTerms(filter, here) if here else None
 
 
 class Linearization:
@@ -109,20 +97,17 @@ class Linearization:
 
     Parameters
     ----------
-    filter : knows the measurements' equations, and the layout of the error
+    filter : knows the layout of the error
     prior : of the first keyframe
     """
 
     def __init__(self, filter: FilterEngine, prior: StatePrior) -> None:
         self._prior = prior
         self._prior_weight = np.linalg.inv(np.linalg.cholesky(prior.covariance()))
-        self._instruments: Mapping[str, Instrument] = filter.initial.instruments
-        self.size = filter.layout.size
+        self._size = filter.layout.size
         self._scales = [(name, filter.layout.columns[name]) for name in SCALES if name in filter.layout.columns]
 
-    def linearize(
-        self, terms: Sequence[IntervalTerms], x: Array, c: Array, admitted: NDArray[np.bool_] | None = None
-    ) -> list[LinearInterval]:
+    def linearize(self, terms: Sequence[IntervalTerms], x: Array, c: Array) -> list[LinearInterval]:
         """Rows of n intervals that follow each other.
 
         Parameters
@@ -130,60 +115,26 @@ class Linearization:
         terms : the intervals
         x : ndarray, shape (n + 1, 21), of the keyframe before the first (any before the dive), and of each
         c : ndarray, shape (n, C), calibration vectors
-        admitted : of all measurements in the order of the rows; None = those within their gate
         """
-        r, A_i, A_j, C = self._motions(terms, x, c)
-        own_r, own_H, counts = self._measured(terms, x, c, admitted)
-        out, at = [], 0
-        for k, term in enumerate(terms):
-            m = MOTION + sum(counts[at_group] for at_group in range(at, at + len(term.groups)))
-            one = LinearInterval(np.zeros((m, MOTION)), np.zeros((m, MOTION)), np.zeros((m, C.shape[2])), np.empty(m))
-            one.A_i[:MOTION], one.A_j[:MOTION], one.C[:MOTION], one.r[:MOTION] = A_i[k], A_j[k], C[k], r[k]
-            row = MOTION
-            for here, _ in term.groups:
-                rows = slice(row, row + counts[at])
-                (one.A_j if here else one.A_i)[rows] = own_H[at][:, :MOTION]
-                one.C[rows], one.r[rows] = own_H[at][:, MOTION:], own_r[at]
-                row, at = rows.stop, at + 1
-            out.append(one)
+        nothing = np.empty(0), np.empty((0, self._size))
+        out = []
+        for k, (term, r, A_i, A_j, C) in enumerate(zip(terms, *self._motions(terms, x, c), strict=True)):
+            r_i, H_i = nothing if term.before is None else term.before.linearize(x[k], c[k])
+            r_j, H_j = nothing if term.here is None else term.here.linearize(x[k + 1], c[k])
+            here = MOTION + len(r_i)
+            J = np.zeros((here + len(r_j), MOTION + self._size))
+            J[:MOTION, :MOTION], J[:MOTION, MOTION : 2 * MOTION], J[:MOTION, 2 * MOTION :] = A_i, A_j, C
+            J[MOTION:here, :MOTION], J[MOTION:here, 2 * MOTION :] = H_i[:, :MOTION], H_i[:, MOTION:]
+            J[here:, MOTION:] = H_j
+            blocks = J[:, :MOTION], J[:, MOTION : 2 * MOTION], J[:, 2 * MOTION :]
+            out.append(LinearInterval(*blocks, np.concatenate([r, r_i, r_j])))
         return out
-
-    def _measured(
-        self, terms: Sequence[IntervalTerms], x: Array, c: Array, admitted: NDArray[np.bool_] | None
-    ) -> tuple[list[Array], list[Array], list[int]]:
-        """Innovations and Jacobians of each group of measurements, weighted, and how many rows they are."""
-        groups = [group for term in terms for _, group in term.groups]
-        if not groups:
-            return [], [], []
-        linear = [
-            group.linearize(x[k + here], c[k]) for k, term in enumerate(terms) for here, group in term.groups
-        ]
-        r = np.concatenate([own for own, _ in linear])
-        dims = np.concatenate([group.dims for group in groups])
-        d2 = np.add.reduceat(r * r, np.cumsum(dims) - dims)
-        root = np.repeat(np.sqrt(self._weights([m for group in groups for m in group.measurements], d2, admitted)), dims)
-        counts = [len(own) for own, _ in linear]
-        roots = np.split(root, np.cumsum(counts)[:-1])
-        pairs = list(zip(linear, roots, strict=True))
-        return [own * w for (own, _), w in pairs], [H * w[:, None] for (_, H), w in pairs], counts
-
-    def _weights(
-        self, measurements: Sequence[KeyframeMeasurement], d2: Array, admitted: NDArray[np.bool_] | None
-    ) -> Array:
-        """Weights of measurements by their losses, 0 where they are not let in."""
-        weight, sensors = np.empty(len(d2)), np.array([m.sensor for m in measurements])
-        for sensor in dict.fromkeys(m.sensor for m in measurements):
-            instrument, own = self._instruments[sensor], sensors == sensor
-            weight[own] = loss_weight(d2[own], instrument.loss, instrument.model.dim)
-            if admitted is None:
-                weight[own] *= d2[own] <= (instrument.gate_sd or np.inf) ** 2
-        return weight if admitted is None else weight * admitted
 
     def _motions(self, terms: Sequence[IntervalTerms], x: Array, c: Array) -> tuple[Array, Array, Array, Array]:
         """Rows of the motions, or at the first keyframe of its prior: r, A_i, A_j, C."""
         n, first = len(terms), int(terms[0].interval.motion is None)
         r, A_i, A_j = np.zeros((n, MOTION)), np.zeros((n, MOTION, MOTION)), np.zeros((n, MOTION, MOTION))
-        C = np.zeros((n, MOTION, self.size - MOTION))
+        C = np.zeros((n, MOTION, self._size - MOTION))
         if first:
             r[0], A_j[0] = self._of_prior(x[1])
         intervals = [term.interval for term in terms[first:]]
