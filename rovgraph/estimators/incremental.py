@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rovgraph.calibration import TABLE, Belief
+from rovgraph.calibration import LAYOUT, TABLE, Belief
 from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
@@ -31,6 +31,8 @@ from rovgraph.log import Measurement
 from rovgraph.state import PLACE, State
 
 UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
+# since the start, when the dive so far is solved with all measurements: a gate may have been wrong before [s]
+OPTIMUM_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0)
 CHECK_S = 1.0  # of the dive, at least, between looks for what is linearised too far from the estimate
 CHECK_SHARE = 0.03  # and as a part of the dive so far
 ANGLE_TOLERANCE = 0.01  # how far that may be [rad]
@@ -69,6 +71,7 @@ class IncrementalEstimator:
         names = self.filter.unknowns.estimated
         tolerance = [np.full(v.dim, ANGLE_TOLERANCE if v.angular else TOLERANCE) for v in (TABLE[n] for n in names)]
         self._tolerance = np.concatenate([np.empty(0), *tolerance])
+        self._optima = list(OPTIMUM_AT_S)
         self._due = -np.inf  # when to look for what is linearised too far from the estimate [s]
         self.relinearised = []
 
@@ -121,8 +124,12 @@ class IncrementalEstimator:
         self.engine.update()
         self._know()
         now = self.intervals[-1].time
-        if now >= self._due:
-            self._due = now + max(CHECK_S, CHECK_SHARE * (now - self.intervals[0].time))
+        since = now - self.intervals[0].time
+        if self._optima and since >= self._optima[0]:
+            self._optima.pop(0)
+            self._restart()
+        elif now >= self._due:
+            self._due = now + max(CHECK_S, CHECK_SHARE * since)
             self._relinearise()
 
     def _relinearise(self) -> None:
@@ -137,10 +144,21 @@ class IncrementalEstimator:
             self.relinearised.append((self.intervals[-1].time - self.intervals[0].time, len(self.engine) - self.engine._begun[off]))
             self._know()
 
+    def _restart(self) -> None:
+        """Go on from the optimum of the dive so far, with what it lets in."""
+        best = self._optimum()
+        n, state = len(self.intervals), best.state
+        calibration = {name: np.broadcast_to(value, (n, value.shape[-1])) for name, value in state.calibration.items()}
+        x = np.concatenate([state.R_nb.reshape(n, 9), state.p_n, state.v_n, state.bias], axis=1)
+        c = np.concatenate([calibration[name] for name in LAYOUT], axis=1)
+        self.engine.restart(best.intervals, best.solution.gates, x, c)
+        self._know()
+
     def _know(self) -> None:
         """The newest keyframe as iSAM2 has it."""
-        x, c, P, positions = self.engine.newest([place.number for place in self.known.places])
-        remembered = (replace(p, position=q) for p, q in zip(self.known.places, positions, strict=True))
+        places = [place for place in self.known.places if self.engine.knows(place.number)]
+        x, c, P, positions = self.engine.newest([place.number for place in places])
+        remembered = (replace(p, position=q) for p, q in zip(places, positions, strict=True))
         self.known = Gaussian(x, c, P, tuple(remembered))
 
     def latest(self) -> State:

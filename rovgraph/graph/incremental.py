@@ -20,6 +20,7 @@ import numpy as np
 from rovgraph.calibration import LAYOUT, Belief
 from rovgraph.engine.filter import ORIGIN, FilterEngine
 from rovgraph.engine.filter_step import Gaussian
+from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.errors import InputError
@@ -152,9 +153,9 @@ class Incremental:
         x = moved(np.array(self._x[:n]), delta[len(delta) - n * MOTION :].reshape(n, MOTION))
         return x, c[[term.interval.segment for term in self._terms[:n]]]
 
-    def places(self) -> dict[int, Array]:
-        """Positions of the places by their numbers, shape (2,)."""
-        return {n: p + self._engine.calculateEstimateVector(key(PLACE, n)) for n, p in self._places.items()}
+    def knows(self, place: int) -> bool:
+        """Whether a place of that number is part of the graph."""
+        return place in self._places
 
     def off(self, turn: float, calibration: Array) -> int | None:
         """The first segment that is linearised too far from the estimate, or None.
@@ -176,13 +177,34 @@ class Incremental:
         first, (x, c) = self._begun[segment], self.estimate()
         self._x[first:] = list(x[first:])
         self._c[segment:] = [c[begun] for begun in self._begun[segment:]]
-        if segment == 0:
-            self._restart()
-        else:
+        if segment > 0:
             self._removed = [slot for own in self._slots[first:] for slot in own]
+        else:
+            self._restart()
+        self._replace(segment)
+
+    def restart(self, intervals: Sequence[KeyframeInterval], let_in: Gates, x: Array, c: Array) -> None:
+        """Go on from another point, and with other measurements.
+
+        Parameters
+        ----------
+        intervals : those that have been added, landmarks perhaps given to other places
+        let_in : which of their measurements count, as an optimum has it
+        x, c : ndarray, shapes (n, 21), (n, C), of their keyframes
+        """
+        chosen = {sensor: iter(own.tolist()) for sensor, own in let_in.items()}
+        kept = ([m for m in interval.measurements if next(chosen[m.sensor])] for interval in intervals)
+        self._terms = [IntervalTerms(self._filter, *one) for one in zip(intervals, kept, strict=True)]
+        self._x, self._c, self._places = list(x), [c[begun] for begun in self._begun], {}
+        self._restart()
+        self._replace(0)
+
+    def _replace(self, segment: int) -> None:
+        """Have iSAM2 take the factors from a segment on, of which it has none, in the order of time."""
+        first = self._begun[segment]
         del self._slots[first:]
         self._push(first)
-        self._order = gtsam.KeyGroupMap()  # in the order of time, so that the newest keyframe is in the root
+        self._order = gtsam.KeyGroupMap()  # so that the newest keyframe is in the root
         for s, begun, end in self._spans(segment):
             for k in range(begun, end):
                 self._order.insert2(key(POSE, k), k - first + s - segment)
