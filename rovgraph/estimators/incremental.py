@@ -3,8 +3,13 @@
 Each interval is predicted with the IMU from the graph's own newest keyframe, and measurements are gated by their
 innovations against the graph's own joint covariance there (`FilterEngine.step`, from what iSAM2 knows); what was let
 in becomes a factor, and after the update the newest keyframe is the filtered estimate. In the end all keyframes
-are smoothed. A constant that all keyframes share would make every update touch the whole tree, so each constant of
-the calibration is a row of nearly equal ones, one for each segment of time.
+are smoothed: the smoother's Gauss-Newton goes on from iSAM2's estimate until it rests.
+
+Factors that were linearised at different headings and mountings claim to know what nothing has shown (Huang,
+Mourikis and Roumeliotis 2010). So from time to time iSAM2's estimate is compared with the point of linearisation.
+Where attitude or calibration are off by a part of their sd, all is relinearised from there on. A constant that all
+keyframes share would make every update touch the whole tree, so each constant of the calibration is a row of nearly
+equal ones, one for each segment of time.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,14 +36,15 @@ from rovgraph.log import Measurement
 from rovgraph.state import PLACE, State
 
 UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
-# since the start, when the dive so far is solved with all measurements: a gate may have been wrong before [s]
+# since the start, when the dive so far is solved with all its measurements: a gate may have been wrong before [s]
 OPTIMUM_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0)
 CHECK_S = 1.0  # of the dive, at least, between looks for what is linearised too far from the estimate
 CHECK_SHARE = 0.03  # and as a part of the dive so far
 ANGLE_TOLERANCE = 0.01  # how far that may be [rad]
-TOLERANCE = 0.02  # of what is no angle [1, m...]
-SHARE = 0.2  # or as a part of its sd
+TOLERANCE = 0.02  # of what is no angle [1, m, s...]
+SHARE = 0.2  # or as a part of its sd: less than that is not worth it while little is known
 RELINEARISATIONS = 2  # at a time
+MOST = 1000  # newest keyframes that are relinearised, which bounds what an update takes
 STIFF = 2e-4  # walk of a constant, as a part of its prior's sd per root second
 
 
@@ -73,7 +79,6 @@ class IncrementalEstimator:
         self._tolerance = np.concatenate([np.empty(0), *tolerance])
         self._optima = list(OPTIMUM_AT_S)
         self._due = -np.inf  # when to look for what is linearised too far from the estimate [s]
-        self.relinearised = []
 
     @property
     def updated(self) -> int:
@@ -137,11 +142,10 @@ class IncrementalEstimator:
         for _ in range(RELINEARISATIONS):
             sd = np.sqrt(np.diagonal(self.known.P)[: self.filter.layout.size])
             turn = max(ANGLE_TOLERANCE, SHARE * float(sd[:3].max()))
-            off = self.engine.off(turn, np.maximum(self._tolerance, SHARE * sd[MOTION:]))
+            off = self.engine.off(turn, np.maximum(self._tolerance, SHARE * sd[MOTION:]), MOST)
             if off is None:
                 return
             self.engine.relinearize(off)
-            self.relinearised.append((self.intervals[-1].time - self.intervals[0].time, len(self.engine) - self.engine._begun[off]))
             self._know()
 
     def _restart(self) -> None:

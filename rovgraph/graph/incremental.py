@@ -77,9 +77,14 @@ class Incremental:
         self._begun: list[int] = []  # first keyframe of each segment
         self._slots: list[list[int]] = []  # of each interval's factors in iSAM2
         self.updated = -1
-        self._restart()
+        self._engine = gtsam.ISAM2(isam2_params())
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # what waits for the next update
+        self._owners: list[int] = []  # interval of each factor that waits
+        self._removed: list[int] = []
+        self._order: gtsam.KeyGroupMap | None = None
 
     def __len__(self) -> int:
+        """Count of intervals, with those that wait."""
         return len(self._terms)
 
     def add(self, interval: KeyframeInterval, known: Gaussian, let_in: Sequence[KeyframeMeasurement]) -> None:
@@ -132,11 +137,9 @@ class Incremental:
         """
         k, s = self.updated, self._terms[self.updated].interval.segment
         keys = [key(POSE, k), key(CALIBRATION, s), *(key(PLACE, number) for number in places)]
-        if places:
-            P = self._engine.jointMarginalCovariance(keys).fullMatrix()
-            delta = np.concatenate([self._engine.calculateEstimateVector(one) for one in keys])
-        else:  # the root of the tree tells, and nothing below it has to be asked
-            P, delta = _solve(self._engine.jointBayesNet(*keys), keys)
+        R, d = self._engine.jointBayesNet(keys).matrix()  # of the root, in the order of the keys
+        root = np.linalg.inv(R)
+        P, delta = root @ root.T, root @ d
         c = self._c[s].copy()
         own = MOTION + len(self._parts)
         c[self._parts] += delta[MOTION:own]
@@ -157,15 +160,18 @@ class Incremental:
         """Whether a place of that number is part of the graph."""
         return place in self._places
 
-    def off(self, turn: float, calibration: Array) -> int | None:
+    def off(self, turn: float, calibration: Array, within: int) -> int | None:
         """The first segment that is linearised too far from the estimate, or None.
 
         Parameters
         ----------
         turn : of the attitude with which it begins [rad]
         calibration : ndarray, shape (nc,), of its calibration
+        within : so many newest keyframes are looked at
         """
         for s, begun in enumerate(self._begun):
+            if begun <= self.updated - within:
+                continue
             by = self._engine.calculateEstimateVector(key(CALIBRATION, s))
             turned = self._engine.calculateEstimateVector(key(POSE, begun))[:3]
             if (np.abs(by) > calibration).any() or (np.abs(turned) > turn).any():
@@ -204,11 +210,11 @@ class Incremental:
         first = self._begun[segment]
         del self._slots[first:]
         self._push(first)
-        self._order = gtsam.KeyGroupMap()  # so that the newest keyframe is in the root
+        order = self._order = gtsam.KeyGroupMap()  # so that the newest keyframe is in the root
         for s, begun, end in self._spans(segment):
             for k in range(begun, end):
-                self._order.insert2(key(POSE, k), k - first + s - segment)
-            self._order.insert2(key(CALIBRATION, s), end - first + s - segment)
+                order.insert2(key(POSE, k), k - first + s - segment)
+            order.insert2(key(CALIBRATION, s), end - first + s - segment)
         self.update()
 
     def _spans(self, segment: int) -> list[tuple[int, int, int]]:
@@ -217,11 +223,9 @@ class Incremental:
         return [(segment + k, *ends) for k, ends in enumerate(pairwise(begun))]
 
     def _restart(self) -> None:
+        """An empty tree."""
         self._engine = gtsam.ISAM2(isam2_params())
-        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._owners: list[int] = []  # of what waits
-        self._removed: list[int] = []
-        self._order: gtsam.KeyGroupMap | None = None
+        self._graph, self._values, self._owners = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
 
     def _push(self, first: int) -> None:
         """Have the factors from a keyframe on wait for the next update."""
@@ -253,7 +257,9 @@ class Incremental:
         duration = time - self._terms[self._begun[s - 1]].interval.time
         weight = 1.0 / (self._walk * np.sqrt(duration))
         off = weight * (self._c[s - 1][self._parts] - here)
-        return gtsam.JacobianFactor(key(CALIBRATION, s - 1), -np.diag(weight), own, np.diag(weight), off, _unit(len(here)))
+        return gtsam.JacobianFactor(
+            key(CALIBRATION, s - 1), -np.diag(weight), own, np.diag(weight), off, _unit(len(here))
+        )
 
     def _landmarks(self, term: IntervalTerms, x: Array, c: Array) -> list[gtsam.JacobianFactor]:
         """Factors of the places that are seen in an interval, and priors of those that are new; ``x`` of its ends."""
@@ -271,10 +277,11 @@ class Incremental:
                 factors.append(gtsam.JacobianFactor(name, prior, -prior @ self._places[number], _unit(PLACE_DIM)))
             r, jacobians = block.linearize(state.seeing(self._places[number]))
             H = self._filter.layout.matrix(jacobians)[0]
-            weight = loss_and_weight(r, block.instrument.loss)[1][0]
-            root = np.sqrt(weight)
+            root = np.sqrt(loss_and_weight(r, block.instrument.loss)[1][0])
             states = key(POSE, m.keyframe), root * H[:, :MOTION], key(CALIBRATION, m.segment), root * H[:, MOTION:]
-            factors.append(gtsam.JacobianFactor(*states, name, root * jacobians[PLACE][0], root * r[0], _unit(len(r[0]))))
+            factors.append(
+                gtsam.JacobianFactor(*states, name, root * jacobians[PLACE][0], root * r[0], _unit(len(r[0])))
+            )
         return factors
 
 
@@ -283,16 +290,6 @@ def _interval_factor(index: int, segment: int, rows: LinearInterval) -> gtsam.Ja
     if index == 0:
         return gtsam.JacobianFactor(*own, rows.r, unit)
     return gtsam.JacobianFactor(key(POSE, index - 1), rows.A_i, *own, rows.r, unit)
-
-
-def _solve(net: gtsam.GaussianBayesNet, keys: Sequence[int]) -> tuple[Array, Array]:
-    """Covariance and mean of the variables of a small Bayes net, in the order of ``keys``."""
-    R, d = net.matrix()
-    root = np.linalg.inv(R)
-    if net.at(0).firstFrontalKey() != keys[0]:
-        root = np.roll(root, net.at(0).rows(), axis=0)
-        raise AssertionError
-    return root @ root.T, root @ d
 
 
 def moved(x: Array, delta: Array) -> Array:

@@ -80,9 +80,7 @@ class IntervalTerms:
     before, here : at the keyframe before, and at the one that ends the interval, where there are any
     """
 
-    def __init__(
-        self, filter: FilterEngine, interval: KeyframeInterval, let_in: Sequence[KeyframeMeasurement]
-    ) -> None:
+    def __init__(self, filter: FilterEngine, interval: KeyframeInterval, let_in: Sequence[KeyframeMeasurement]) -> None:
         self.interval = interval
         self.landmarks = [m for m in let_in if m.landmark is not None]
         others = [m for m in let_in if m.landmark is None]

@@ -23,7 +23,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from rovgraph.calibration import Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
