@@ -42,7 +42,6 @@ def isam2_params() -> gtsam.ISAM2Params:
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.enableRelinearization = False
-    params.findUnusedFactorSlots = True
     params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(WILDFIRE))
     return params
 
