@@ -2,7 +2,6 @@
 
 python benchmarks/online.py engine fixed-lag --seconds 3600
 python benchmarks/online.py engine isam2 --seconds 3600
-python benchmarks/online.py callbacks --seconds 600
 python benchmarks/online.py agreement
 python benchmarks/online.py shuffled
 python benchmarks/online.py log LOG --config CONFIG --reference REFERENCE --after 600
@@ -18,9 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.config import load_config
-from rovgraph.estimators.dive import assemble, smooth
-from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
-from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.dive import smooth
 from rovgraph.evaluate import evaluate, read_reference
 from rovgraph.geometry import log_rotation, transpose
 from rovgraph.live.clocks import Clocks
@@ -120,24 +117,6 @@ def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
     print(f"memory: {memory[1]:.0f} MB at half, {memory[3]:.0f} MB at the end, {memory[3] / memory[1] - 1:+.1%}")
 
 
-def callbacks(seconds: float, seed: int) -> None:
-    """iSAM2 over the first minutes, and the same graph whose callbacks each get a copy of all values."""
-    dive, config = simulated("lawnmower", seed, falcon(), Choices(duration=seconds))
-    log = log_from_frame(dive.log_frame)
-    beginning = initialise(log, config)
-    intervals = assemble(log, beginning).intervals
-    for kept, period in ((True, UPDATE_S), (False, UPDATE_S), (False, 0.0)):
-        isam2 = IncrementalEstimator(beginning, period)
-        if not kept:
-            del isam2.engine._theta  # without a reference to it the bindings copy it for each callback
-        began = time.process_time()
-        for interval in intervals:
-            isam2.step(interval)
-        values = "kept" if kept else "copied for each callback"
-        often = f"once in {period:g} s" if period else "for each keyframe"
-        print(f"values {values}, updates {often}: {time.process_time() - began:.1f} s of CPU", flush=True)
-
-
 def agreement() -> None:
     """iSAM2's last trajectory against the batch smoother's, on the dive that ships."""
     config = load_config(SHIPPED / "config.yaml")
@@ -186,7 +165,7 @@ def recorded(path: Path, config_path: Path, reference: Path, after: float) -> No
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["engine", "callbacks", "agreement", "shuffled", "log"])
+    parser.add_argument("what", choices=["engine", "agreement", "shuffled", "log"])
     parser.add_argument("which", nargs="?", default="fixed-lag", help="fixed-lag or isam2; or a log")
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--rate", type=float, default=RATE_HZ, help="solutions a second of the dive")
@@ -197,8 +176,6 @@ def main() -> None:
     given = parser.parse_args()
     if given.what == "engine":
         engine(given.which, given.seconds, given.seed, given.rate)
-    elif given.what == "callbacks":
-        callbacks(given.seconds, given.seed)
     elif given.what == "agreement":
         agreement()
     elif given.what == "shuffled":

@@ -19,7 +19,7 @@ from dives import (
 from live import message
 
 from rovgraph.engine.chain_optimum import smooth_chain
-from rovgraph.engine.unknowns import Unknowns
+from rovgraph.engine.filter_step import calibration_vector, states_of
 from rovgraph.errors import InputError
 from rovgraph.estimators import incremental as incremental_module
 from rovgraph.estimators.dive import smooth
@@ -27,18 +27,23 @@ from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFi
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import smoothed as smoothed_results
 from rovgraph.geometry import Array, log_rotation, transpose
-from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.keys import key
+from rovgraph.graph.factors import motion
+from rovgraph.graph.keys import CALIBRATION, key
+from rovgraph.graph.linear_intervals import IntervalTerms, Linearization
 from rovgraph.graph.measurement_factors import measurement_factor
+from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.kernels.layout import MOTION
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
-from rovgraph.state import POSE
+from rovgraph.state import BIAS, POSE, VELOCITY
 from rovgraph.studies.estimator_chains import outcomes
 from rovgraph.studies.estimators import select
 
 DEG = np.deg2rad(1.0)
+UNIT = gtsam.noiseModel.Unit.Create(6)
 
 
 @pytest.fixture(scope="session")
@@ -163,52 +168,14 @@ def test_an_open_gate_lets_everything_in(case):
     assert min(weights.values()) > 0.0
 
 
-def test_a_variable_that_nothing_determines_is_named_in_one_line():
-    engine = Incremental(Unknowns({}, {}))
-    factor = gtsam.BetweenFactorPose3(key(POSE, 0), key(POSE, 1), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6))
-    values = gtsam.Values()
-    values.insert(key(POSE, 0), gtsam.Pose3())
-    values.insert(key(POSE, 1), gtsam.Pose3())
+def test_a_variable_that_nothing_determines_is_named_in_one_line(filtered):
+    engine = IncrementalEstimator(filtered.beginning).engine
+    between = gtsam.JacobianFactor(key(POSE, 0), np.eye(6), key(POSE, 1), -np.eye(6), np.zeros(6), UNIT)
+    engine._graph.push_back(gtsam.LinearContainerFactor(between))
+    for index in range(2):
+        engine._values.insert(key(POSE, index), np.zeros(6))
     with pytest.raises(InputError, match=r"^the data do not determine pose of keyframe [01]: [^\n]*$"):
-        engine.add([factor], values)
         engine.update()
-
-
-# the cost of a callback
-
-
-def test_the_engine_keeps_the_linearisation_point_alive():
-    engine = Incremental(Unknowns({}, {}))
-    values = gtsam.Values()
-    values.insert(key(POSE, 0), gtsam.Pose3())
-    prior = gtsam.PriorFactorPose3(key(POSE, 0), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6))
-    engine.add([prior], values)
-    engine.update()
-    assert engine._theta is engine._engine.getLinearizationPoint()
-    assert engine._theta.size() == 1
-
-
-@pytest.mark.parametrize("kept", [True, False])
-def test_a_callback_gets_the_linearisation_point_itself_while_the_engine_keeps_it(kept):
-    """And else a copy of all values, each time, whose cost grows with the dive."""
-    engine, given = Incremental(Unknowns({}, {})), []
-
-    def error(_, values, H):
-        given.append(values)
-        if H is not None:
-            H[0] = np.eye(6)
-        return np.asarray(gtsam.Pose3.Logmap(values.atPose3(name)))
-
-    theta = engine._theta if kept else None
-    if not kept:
-        engine.copy_values()
-    name, noise = key(POSE, 0), gtsam.noiseModel.Unit.Create(6)
-    values = gtsam.Values()
-    values.insert(name, gtsam.Pose3())
-    engine.add([gtsam.PriorFactorPose3(name, gtsam.Pose3(), noise), gtsam.CustomFactor(noise, [name], error)], values)
-    engine.update()
-    engine.update()
-    assert given and all((values is theta) == kept for values in given)
 
 
 # filtered and smoothed from one pass
@@ -271,20 +238,59 @@ def test_isam2_keeps_gross_outliers_out_by_its_own_innovations(case, whole):
     assert np.linalg.norm(a.p_n - b.p_n, axis=1).max() < 0.1
 
 
-def test_the_factor_of_a_keyframe_is_that_of_its_measurements_one_by_one(whole, case):
-    """The kernels' rows, weighted by their losses, and GTSAM's robust factors of the blocks."""
+def test_the_rows_of_an_interval_are_gtsams_factors_of_it(whole):
+    """The motion's, and the robust ones of its measurements, at two keyframes that are somewhat off."""
+    engine, unknowns = whole.filter, whole.filter.unknowns
     interval = next(i for i in whole.intervals[50:] if i.here and len(i.between) > 1)
-    values = whole.engine.values()
-    for measurements in (interval.here, interval.between):
-        apart_, together = gtsam.GaussianFactorGraph(), gtsam.GaussianFactorGraph()
-        for m in measurements:
-            block = whole.filter.block([m], whole.unknowns)
-            apart_.push_back(measurement_factor(block, m.segment).linearize(values))
-        (factor,) = whole._factors(measurements)
-        together.push_back(factor.linearize(values))
-        order = gtsam.Ordering.ColamdGaussianFactorGraph(together)
-        for mine, other in zip(together.hessian(order), apart_.hessian(order), strict=True):
-            np.testing.assert_allclose(mine / np.abs(other).max(), other / np.abs(other).max(), atol=1e-9)
+    states = whole.history.states.at([interval.index - 1, interval.index])
+    x = np.concatenate([states.R_nb.reshape(2, 9), states.p_n + 0.01, states.v_n - 0.02, states.bias], axis=1)
+    c = calibration_vector({name: value[-1] for name, value in states.calibration.items()})
+    (rows,) = Linearization(engine, whole.beginning.prior).linearize(
+        [IntervalTerms(engine, interval, interval.measurements)], x, c[None]
+    )
+    values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    for k in range(2):
+        insert_state(values, interval.index - 1 + k, states_of(x[k : k + 1], c))
+    insert_calibration(values, states_of(x[:1], c).calibration, unknowns)
+    for factor in motion(interval, unknowns, 0):
+        graph.add(factor)
+    for m in interval.measurements:
+        graph.add(measurement_factor(engine.block([m]), 0))
+    order = gtsam.Ordering()
+    for k in (interval.index - 1, interval.index):
+        for variable in (POSE, VELOCITY, BIAS):
+            order.push_back(key(variable, k))
+    touched = {name for m in interval.measurements for name in engine.block([m]).unknowns.estimated}
+    names = [name for name in unknowns.estimated if name in touched]
+    for name in names:
+        order.push_back(key(name))
+    used = np.concatenate([np.r_[engine.layout.columns[name]] for name in names]) - MOTION
+    J = np.hstack([rows.A_i, rows.A_j, rows.C[:, used]])
+    assert not np.delete(rows.C, used, axis=1).any()
+    for mine, other in zip((J.T @ J, J.T @ rows.r), graph.linearize(values).hessian(order), strict=True):
+        np.testing.assert_allclose(mine / np.abs(other).max(), other / np.abs(other).max(), atol=1e-8)
+
+
+def test_what_isam2_tells_of_its_newest_keyframe_is_its_joint_marginal(whole):
+    """The root of the tree has it, also after iSAM2 has been put up anew."""
+    engine, last = whole.engine, whole.intervals[-1]
+    keys = [key(POSE, last.index), key(CALIBRATION, last.segment)]
+    x, _, P, _ = engine.newest()
+    np.testing.assert_allclose(P, engine._engine.jointMarginalCovariance(keys).fullMatrix(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(x, engine.estimate()[0][-1], atol=1e-3)
+
+
+def test_isam2_claims_no_more_of_the_heading_than_the_dive_so_far_shows(case, whole):
+    """Against the chain, linearised at its optimum."""
+    ratio, dive = [], batch(case.log, case.config)
+    heading = whole.filtered().trajectory.rpy_sd[:, 2]
+    for seconds in range(6, 40, 2):
+        end = int(np.searchsorted([i.time for i in dive.intervals], dive.intervals[0].time + seconds))
+        best = smooth_chain(dive.intervals[: end + 1], dive.beginning, whole.history.states.at(np.arange(end + 1)))
+        so_far = smoothed_results(best, dive.beginning).trajectory.rpy_sd[-1, 2]
+        ratio.append(heading[end] / so_far)
+    assert min(ratio) > 0.8
+    assert np.mean(ratio) > 0.95
 
 
 def test_smooth_writes_both_estimates_of_one_pass(case):

@@ -21,14 +21,12 @@ from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, Seen, blocks_of, gates_of, loss_and_weight, measurement_cost
-from rovgraph.engine.scale import SCALES
 from rovgraph.engine.sensor_rows import compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
 from rovgraph.kernels.dive import eliminate_dive, robust_costs, squared_lengths
 from rovgraph.kernels.measurement_row import GATE
-from rovgraph.kernels.motion_residual import motion_cost
 from rovgraph.state import State
 
 CLONED = 3  # of the first keyframe, its attitude, that a border ends with where its covariance is asked for
@@ -124,9 +122,8 @@ class Chain:
 
     def cost(self, point: State, gates: Gates) -> float:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
-        shift = self._scale_shift(point) if len(self.rows.scales) else np.empty((0, 6))
-        R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
-        total = motion_cost(self.rows.motions, self.rows.weights, R, p, v, b, shift)
+        motions = self.rows.motion_residuals(point)
+        total = 0.5 * float(np.vdot(motions, motions))
         total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
         for name in self.layout.walking:
             total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
@@ -211,11 +208,6 @@ class Chain:
         J[:3, :3] = np.linalg.inv(right_jacobian(log_rotation(R)))
         J[3:6, 3:6] = R
         return self._prior_weight @ J
-
-    def _scale_shift(self, point: State) -> Array:
-        """Bias that errors of the IMU's scale make in each interval, shape (n - 1, 6)."""
-        k = [np.broadcast_to(np.atleast_2d(point.calibration[s]), (len(self.intervals), 3))[1:] for s in SCALES]
-        return rotate(self.rows.scales, np.concatenate(k, axis=1))
 
     def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = ()) -> SquareRoot:
         """All factors linearised at a point and eliminated; with ``stops`` the border ends with the first attitude.

@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.geometry import Array
+from rovgraph.engine.scale import SCALES
+from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import measurement_row as measured
 from rovgraph.kernels import motion_row
 from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.motion_residual import motion_weights
+from rovgraph.kernels.motion_residual import motion_residuals, motion_weights
+from rovgraph.state import State
 
 Index = NDArray[np.int64]
 
@@ -112,6 +114,16 @@ class DiveRows:
             self.time[begin:end],
             self.sensors,
         )
+
+    def motion_residuals(self, state: State) -> Array:
+        """Whitened residuals of the motions, shape (n - 1, 15), at a state of all keyframes."""
+        shift, r = np.empty((0, 6)), np.empty((len(self.motions), MOTION))
+        if len(self.scales):
+            k = [np.broadcast_to(np.atleast_2d(state.calibration[s]), (len(self), 3))[1:] for s in SCALES]
+            shift = rotate(self.scales, np.concatenate(k, axis=1))
+        R, p, v, b = (np.ascontiguousarray(a) for a in (state.R_nb, state.p_n, state.v_n, state.bias))
+        motion_residuals(self.motions, self.weights, R, p, v, b, shift, r)
+        return r
 
     def of_sensor(self, sensor: str) -> Index:
         """Places of a sensor's measurements."""

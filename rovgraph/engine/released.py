@@ -7,7 +7,7 @@ of many sds says that the constant is not what it is held at, and the step says 
 itself: two that move the same measurements would hide each other.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -49,14 +49,14 @@ class Released:
 
 
 @dataclass(frozen=True)
-class _ScaledChain(Chain):
-    """A chain whose IMU may be off in scale, reckoned from the motions alone."""
+class _ReleasedChain(Chain):
+    """A chain with the measurements of sensors whose stamps may be late, which no kernel knows."""
 
-    mean_signal_to_bias: Array
+    timed: Mapping[str, Block]
 
     @cached_property
-    def scale_to_bias(self) -> Array:
-        return self.mean_signal_to_bias
+    def given(self) -> dict[str, Block]:
+        return {sensor: self.timed.get(sensor, block) for sensor, block in super().given.items()}
 
 
 @dataclass(frozen=True)
@@ -85,30 +85,27 @@ def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None
     for name in held:
         own = beliefs[name]
         beliefs[name] = replace(own, estimate=True, sd=WIDE * own.variable.sd, walk=0.0)
-    wide = unknowns(beliefs, chain.blocks)
-    blocks = {}
+    wide, timed, rows = unknowns(beliefs, chain.blocks), {}, chain.rows
     for sensor, block in chain.blocks.items():
-        own_names = [*block.instrument.calibration, *(SCALES if block.scale_to_bias is not None else ())]
         offset = block.instrument.time_offset
-        blocks[sensor] = replace(block, unknowns=wide.of(own_names))
-        if offset in held and block.window is None and len(block) > 2:
-            wider = replace(block, unknowns=wide.of([*own_names, offset]))
+        if offset in held and block.window is None:
+            scales = SCALES if block.scale_to_bias is not None else ()
+            wider = replace(block, unknowns=wide.of([*block.instrument.calibration, *scales]))
             shared = {f.name: getattr(wider, f.name) for f in fields(Block)}
-            blocks[sensor] = _TimedBlock(**shared, slope=_slope(block, state.at(block.keyframe)))
-    parts = {f.name: getattr(chain, f.name) for f in fields(Chain)}
-    parts |= {"beliefs": beliefs, "unknowns": wide, "blocks": blocks}
-    S = chain.scale_to_bias
-    released = _ScaledChain(**parts, mean_signal_to_bias=_mean_signal_to_bias(best) if S is None else S)
+            timed[sensor] = _TimedBlock(**shared, slope=_slope(block, state.at(block.keyframe)))
+    if not len(rows.scales):
+        rows = replace(rows, scales=_mean_signal_to_bias(best))  # reckoned from the motions alone
+    released = _ReleasedChain(chain.intervals, chain.initial, beliefs, wide, rows, timed)
     root = released.eliminate(state, best.solution.gates if gates is None else gates)
     R, z = root.border[:, :-1], root.border[:, -1]
     information, score = R.T @ R, R.T @ z
-    kept = [released.layout[name] for name in best.unknowns.estimated]
+    kept = [released.layout.places[name] for name in best.unknowns.estimated]
     always = np.concatenate([np.empty(0, np.int64), *(np.r_[part] for border, part in kept if border)])
     out = []
     for name in held:
-        if name not in released.layout:
+        if name not in released.layout.places:
             continue
-        for label, component in zip(beliefs[name].variable.labels, np.r_[released.layout[name][1]], strict=True):
+        for label, component in zip(beliefs[name].variable.labels, np.r_[released.layout.places[name][1]], strict=True):
             chosen = np.append(always, component)
             P = np.linalg.inv(information[np.ix_(chosen, chosen)])
             out.append(Released(name, label, float(P[-1] @ score[chosen]), float(np.sqrt(P[-1, -1]))))
@@ -117,13 +114,15 @@ def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None
 
 def _slope(block: Block, state: State) -> Array:
     """Change of the predicted measurements with time, shape (n, dim) [unit/s]."""
+    if len(block) < 2:
+        return np.zeros_like(block.z)
     step = np.maximum(np.gradient(block.time), 1e-6)[:, None]
     return np.asarray(np.gradient(block.predicted(state), axis=0) / step)
 
 
 def _mean_signal_to_bias(best: ChainOptimum) -> Array:
     """As `rovgraph.engine.scale.scale_to_bias`, from the preintegrated motions, shape (n - 1, 6, 6)."""
-    rows, bias = best.chain.motions, best.state.bias[:-1]
+    rows, bias = best.chain.rows.motions, best.state.bias[:-1]
     R_bs = mount_matrix(best.chain.initial.config.imu.mount_rpy_deg)
     seconds = np.maximum(rows[:, at.DURATION], 1e-6)[:, None]
     rate_b = rows[:, at.TANGENT : at.TANGENT + 3] / seconds + rows[:, at.BIAS + 3 : at.BIAS + 6] - bias[:, 3:]

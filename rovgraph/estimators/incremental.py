@@ -2,39 +2,49 @@
 
 Each interval is predicted with the IMU from the graph's own newest keyframe, and measurements are gated by their
 innovations against the graph's own joint covariance there (`FilterEngine.step`, from what iSAM2 knows); what was let
-in becomes factors, and after the update the newest keyframe is the filtered estimate. In the end all keyframes
-are smoothed. A constant that all keyframes share would make every update touch the whole tree, so each constant of
-the calibration is a row of nearly equal ones, one for each segment of time.
+in becomes a factor, and after the update the newest keyframe is the filtered estimate. In the end all keyframes
+are smoothed: the smoother's Gauss-Newton goes on from iSAM2's estimate until it rests.
+
+Factors that were linearised at different headings and mountings claim to know what nothing has shown (Huang,
+Mourikis and Roumeliotis 2010). So from time to time iSAM2's estimate is compared with the point of linearisation.
+Where attitude or calibration are off by a part of their sd, all is relinearised from there on. A constant that all
+keyframes share would make every update touch the whole tree, so each constant of the calibration is a row of nearly
+equal ones, one for each segment of time.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from rovgraph.calibration import Belief
+import numpy as np
+
+from rovgraph.calibration import LAYOUT, TABLE, Belief
 from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement
+from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, states_of
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
-from rovgraph.engine.scale import SCALES
-from rovgraph.engine.unknowns import unknowns
+from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.smoother import smoothed
-from rovgraph.graph.factors import Factor, drift, landmark_prior, motion, priors
+from rovgraph.estimators.optimum import optimum
+from rovgraph.estimators.smoother import newest_calibration, smoothed
 from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.keys import key
-from rovgraph.graph.measurement_factors import keyframe_factor, measurement_factor
-from rovgraph.graph.optimum import GraphOptimum
-from rovgraph.graph.places import apart_from, insert_places, resolved_associations, segmented_optimum
-from rovgraph.graph.values import insert_calibration, state_values
+from rovgraph.graph.places import apart_from, associated_optimum, resolved_associations
+from rovgraph.kernels.layout import MOTION
 from rovgraph.log import Measurement
 from rovgraph.state import PLACE, State
 
 UPDATE_S = 1.0  # of the dive, between updates of iSAM2, where it need not tell of every keyframe
-# since the start [s], all factors: in between, iSAM2 finds too late that the heading has moved, and claims too much
-RELINEARISE_AT_S = (5.0, 7.0, 10.0, 14.0, 20.0, 24.0, 28.0, 34.0, 40.0, 50.0, 60.0, 80.0)
+# since the start, when the dive so far is solved with all its measurements: a gate may have been wrong before [s]
+OPTIMUM_AT_S = (5.0, 10.0, 20.0, 40.0, 80.0)
+CHECK_S = 1.0  # of the dive, at least, between looks for what is linearised too far from the estimate
+CHECK_SHARE = 0.03  # and as a part of the dive so far
+ANGLE_TOLERANCE = 0.01  # how far that may be [rad]
+TOLERANCE = 0.02  # of what is no angle [1, m, s...]
+SHARE = 0.2  # or as a part of its sd: less than that is not worth it while little is known
+RELINEARISATIONS = 2  # at a time
+MOST = 1000  # newest keyframes that are relinearised, which bounds what an update takes
 STIFF = 2e-4  # walk of a constant, as a part of its prior's sd per root second
 
 
@@ -46,10 +56,9 @@ class IncrementalEstimator:
     ----------
     beginning : of `rovgraph.estimators.initialise.initialise`
     update_s : of the dive, between updates of iSAM2; in between, the filter goes on from it [s]
-    intervals : the dive, as far as it has been taken
+    intervals : the dive, as far as it has been taken, landmarks given to their places
     known : Gaussian of the newest keyframe
     history : the filtered estimate of every keyframe
-    updated : newest keyframe that iSAM2 has, -1 = none
     """
 
     beginning: InitialConditions
@@ -61,17 +70,20 @@ class IncrementalEstimator:
         self.known = self.filter.start()
         self.history = FilterHistory(self.filter)
         self.gates: Gates = {}
-        self.beliefs = {name: _stiff(belief) for name, belief in beliefs(b.config).items()}
-        self.unknowns = unknowns(self.beliefs, b.instruments)
-        self.engine = Incremental(self.unknowns)
+        self.engine = Incremental(self.filter, {name: _stiff(belief) for name, belief in beliefs(b.config).items()})
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0])
         self.intervals: list[KeyframeInterval] = []
-        self._places: set[int] = set()  # that iSAM2 knows
         self._own_places: dict[float, int] = {}  # time of a landmark -> number of the place that it is by itself
-        self._native: list[list[Factor]] = []  # of each keyframe, those that are no measurements
-        self._due = list(RELINEARISE_AT_S)
-        self._begun = 0.0  # when the newest segment began [s]
-        self.updated = -1
+        names = self.filter.unknowns.estimated
+        tolerance = [np.full(v.dim, ANGLE_TOLERANCE if v.angular else TOLERANCE) for v in (TABLE[n] for n in names)]
+        self._tolerance = np.concatenate([np.empty(0), *tolerance])
+        self._optima = list(OPTIMUM_AT_S)
+        self._due = -np.inf  # when to look for what is linearised too far from the estimate [s]
+
+    @property
+    def updated(self) -> int:
+        """Newest keyframe that iSAM2 has, -1 = none."""
+        return self.engine.updated
 
     def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
@@ -100,26 +112,14 @@ class IncrementalEstimator:
         processed : its measurements
         """
         self.known = known
-        values = state_values(interval.index, known.state)
-        if not self.intervals or interval.segment > self.intervals[-1].segment:
-            insert_calibration(values, known.state.calibration, self.unknowns, interval.segment)
-        # a place that fits none of its name is one by itself
-        admitted = [p.measurement for p in processed if p.weight > 0.0 or p.measurement.landmark is not None]
-        for m in admitted:
-            if m.landmark is not None and m.landmark.number not in self._places:
-                insert_places(values, self.filter.block([m], self.unknowns), known.state)
-        self._native.append(self._motion(interval))
-        self.engine.add([*self._native[-1], *self._factors(admitted)], values)
         own = {m.time: m.landmark.number for m in interval.measurements if m.landmark is not None}
-        if own:
+        if own:  # a place that fits none of its name is one by itself
             self._own_places |= own
             interval = replace(interval, measurements=[one.measurement for one in processed])
         self.intervals.append(interval)
-        if self._due and interval.time - self.intervals[0].time >= self._due[0]:
-            self.update()
-            self._due.pop(0)
-            self._relinearise()
-        elif interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
+        let_in = [p.measurement for p in processed if p.weight > 0.0 or p.measurement.landmark is not None]
+        self.engine.add(interval, known, let_in)
+        if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
             self.update()
 
     def update(self) -> None:
@@ -127,24 +127,51 @@ class IncrementalEstimator:
         if self.updated == len(self.intervals) - 1:
             return
         self.engine.update()
-        self.updated = len(self.intervals) - 1
+        self._know()
+        now = self.intervals[-1].time
+        since = now - self.intervals[0].time
+        if self._optima and since >= self._optima[0]:
+            self._optima.pop(0)
+            self._restart()
+        elif now >= self._due:
+            self._due = now + max(CHECK_S, CHECK_SHARE * since)
+            self._relinearise()
+
+    def _relinearise(self) -> None:
+        """Move the point to the estimate as far back as it is off."""
+        for _ in range(RELINEARISATIONS):
+            sd = np.sqrt(np.diagonal(self.known.P)[: self.filter.layout.size])
+            turn = max(ANGLE_TOLERANCE, SHARE * float(sd[:3].max()))
+            off = self.engine.off(turn, np.maximum(self._tolerance, SHARE * sd[MOTION:]), MOST)
+            if off is None:
+                return
+            self.engine.relinearize(off)
+            self._know()
+
+    def _restart(self) -> None:
+        """Go on from the optimum of the dive so far, with what it lets in."""
+        best = self._optimum()
+        n, state = len(self.intervals), best.state
+        calibration = {name: np.broadcast_to(value, (n, value.shape[-1])) for name, value in state.calibration.items()}
+        x = np.concatenate([state.R_nb.reshape(n, 9), state.p_n, state.v_n, state.bias], axis=1)
+        c = np.concatenate([calibration[name] for name in LAYOUT], axis=1)
+        self.engine.restart(best.intervals, best.solution.gates, x, c)
         self._know()
 
     def _know(self) -> None:
         """The newest keyframe as iSAM2 has it."""
-        newest = self.intervals[-1]
-        places = [place for place in self.known.places if place.number in self._places]
-        state, P, positions = self.engine.newest(newest.index, newest.segment, [place.number for place in places])
-        remembered = tuple(replace(p, position=q) for p, q in zip(places, positions, strict=True))
-        self.known = Gaussian.of(state, P, remembered)
+        places = [place for place in self.known.places if self.engine.knows(place.number)]
+        x, c, P, positions = self.engine.newest([place.number for place in places])
+        remembered = (replace(p, position=q) for p, q in zip(places, positions, strict=True))
+        self.known = Gaussian(x, c, P, tuple(remembered))
 
     def latest(self) -> State:
         """The newest keyframe's state, at the IMU, calibration included."""
         return self.known.state
 
-    def states(self) -> list[State]:
-        """Of each keyframe that iSAM2 has taken, from all data so far."""
-        return [self.engine.state(i.index, i.segment) for i in self.intervals[: self.updated + 1]]
+    def states(self) -> State:
+        """Of each keyframe that iSAM2 has taken, from all data so far; calibration has shape (n, dim)."""
+        return states_of(*self.engine.estimate())
 
     def filtered(self) -> Estimate:
         """What was known of each keyframe when it was the newest."""
@@ -155,68 +182,18 @@ class IncrementalEstimator:
         self.update()
         return smoothed(self._optimum(), self.beginning)
 
-    def _optimum(self) -> GraphOptimum:
+    def _optimum(self) -> Optimum:
         """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
-        given = self.beginning, self.beliefs, [factor for own in self._native for factor in own]
-        best = segmented_optimum(resolved_associations(self.intervals), *given, self.engine.values())
-        block = best.blocks.get(PLACE)
-        if block is None or not (out := block.time[block.believed & ~best.solution.gates[PLACE]]).size:
+        states = self.states()
+        given = self.beginning, states, newest_calibration(states.calibration)
+        if not self._own_places:
+            return optimum(self.intervals, *given)
+        best = associated_optimum(resolved_associations(self.intervals), *given)
+        block = best.blocks[PLACE]
+        if not (out := block.time[block.believed & ~best.solution.gates[PLACE]]).size:
             return best
         apart = [apart_from(interval, {t: self._own_places[t] for t in out.tolist()}) for interval in self.intervals]
-        return segmented_optimum(resolved_associations(apart), *given, self.engine.values())
-
-    def _relinearise(self) -> None:
-        """Go on from the optimum of the dive so far, with all factors linearised there, and what it lets in."""
-        best = self._optimum()
-        self.engine = Incremental(self.unknowns)
-        before, self._places = self._places | set(best.places), set()
-        gates = {sensor: iter(gate.tolist()) for sensor, gate in best.solution.gates.items()}
-        factors: list[Factor] = []
-        for interval, native in zip(best.intervals, self._native, strict=True):
-            admitted = [m for m in interval.measurements if next(gates[m.sensor])]
-            factors += [*native, *self._factors(admitted)]
-        values = best.solution.point
-        for number in before - self._places:
-            values.erase(key(PLACE, number))
-        self.engine.add(factors, values)
-        self.engine.update()
-        self._know()
-
-    def _motion(self, interval: KeyframeInterval) -> list[Factor]:
-        """What ties a keyframe to the one before, or to what is believed at first."""
-        segment, unknowns = interval.segment, self.unknowns
-        if not self.intervals:
-            factors = priors(self.beginning.prior, self.beliefs, unknowns)
-        else:
-            factors = motion(interval, unknowns, segment)
-        if not self.intervals or segment > self.intervals[-1].segment:
-            factors += drift(unknowns, segment, interval.time - self._begun)
-            self._begun = interval.time
-        return factors
-
-    def _factors(self, measurements: Sequence[KeyframeMeasurement]) -> list[Factor]:
-        """Factors of measurements, those that the kernels know of one keyframe in one."""
-        factors: list[Factor] = []
-        together: dict[tuple[int, int], list[KeyframeMeasurement]] = {}
-        for m in measurements:
-            if self.filter.knows(m.sensor):
-                together.setdefault((m.keyframe, m.segment), []).append(m)
-                continue
-            factors.append(measurement_factor(self.filter.block([m], self.unknowns), m.segment))
-            if m.landmark is not None and m.landmark.number not in self._places:
-                self._places.add(m.landmark.number)
-                factors.append(landmark_prior(m.landmark.number))
-        return factors + [self._factor(own, *at) for at, own in together.items()]
-
-    def _factor(self, measurements: Sequence[KeyframeMeasurement], keyframe: int, segment: int) -> Factor:
-        """All measurements of a keyframe that the kernels know."""
-        filter, unknowns = self.filter, self.unknowns
-        instruments = [self.beginning.instruments[m.sensor] for m in measurements]
-        touched = {name for instrument in instruments for name in instrument.calibration}
-        if measurements[0].scale_to_bias is not None:
-            touched.update(SCALES)
-        names = [name for name in unknowns.estimated if name in touched]
-        return keyframe_factor(filter.rows(measurements), filter.layout, unknowns, names, keyframe, segment)
+        return associated_optimum(resolved_associations(apart), *given)
 
     def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
         for interval in intervals:

@@ -136,16 +136,11 @@ def make_problem(
     config: Config,
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],
-    index: NDArray[np.int64] | None = None,
-    others: Sequence[gtsam.NonlinearFactor] | None = None,
 ) -> Problem:
-    """Assemble the graph of a dive; ``index`` as `Problem` has it, a value for each keyframe unless given.
-
-    ``others`` are the factors that are no measurements, where they are at hand.
-    """
-    index = np.arange(len(intervals)) if index is None else index
+    """Assemble the graph of a dive; calibration that walks has a value at each keyframe."""
+    index = np.arange(len(intervals))
     wanted = unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
-    factors = list(others) if others is not None else _others(intervals, prior, beliefs, wanted, index)
+    factors = _others(intervals, prior, beliefs, wanted, index)
     blocks = blocks_of(intervals, instruments, instruments, config.environment.gravity_mps2, wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]

@@ -4,7 +4,8 @@ from rovgraph.calibration import TABLE
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
-_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n"}
+CALIBRATION = "calibration"  # all of it in a segment of time, as iSAM2 has it
+_LETTER = {POSE: "x", VELOCITY: "v", BIAS: "b", PLACE: "n", CALIBRATION: "C"}
 _NAMES = {ord(letter): variable for variable, letter in _LETTER.items()}
 _SIZE = DIMENSION | {PLACE: PLACE_DIM}
 _INDICES = 1 << 56  # of a letter

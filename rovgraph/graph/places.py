@@ -23,7 +23,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from rovgraph.calibration import Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
@@ -69,25 +68,22 @@ def smooth_graph(
     return GraphOptimum(recognised_dive, initial, beliefs, together, solve(together, values))
 
 
-def segmented_optimum(
+def associated_optimum(
     intervals: Sequence[KeyframeInterval],
     initial: InitialConditions,
-    beliefs: Mapping[str, Belief],
-    others: Sequence[gtsam.NonlinearFactor],
-    values: gtsam.Values,
+    states: State,
+    calibration: Mapping[str, Array] | None = None,
 ) -> GraphOptimum:
-    """The optimum of the graph whose calibration has a value for each segment of time, as iSAM2's has.
+    """Solve a dive whose landmarks have been given to their places.
 
     Parameters
     ----------
-    intervals, initial : the dive, each landmark given to its place
-    beliefs : of the calibration, all of which walks
-    others : factors that are no measurements, of all keyframes
-    values : iSAM2's, to begin with
+    intervals, initial : the dive
+    states, calibration : of the keyframes to begin with, as `make_values` takes them
     """
-    segments = np.array([interval.segment for interval in intervals])
-    problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments, segments, others)
-    values = gtsam.Values(values)
+    beliefs = beliefs_of(initial.config)
+    problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments)
+    values = make_values(problem, states, calibration)
     if (block := problem.blocks.get(PLACE)) is not None:
         insert_places(values, block, problem.states(values).at(block.keyframe))
     return GraphOptimum(list(intervals), initial, beliefs, problem, solve(problem, values))

@@ -142,19 +142,21 @@ def motion_covariance(row: Array, S_out: Array) -> None:
             S_out[i, j] = row[COVARIANCE + 15 * i + j]
 
 
-@kernel("f8(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
-def motion_cost(motions: Array, W: Array, R: Array, p: Array, v: Array, bias: Array, shift: Array) -> float:
-    """Half the sum of squares of the whitened residuals between n keyframes in a row.
+@kernel("void(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+def motion_residuals(
+    motions: Array, W: Array, R: Array, p: Array, v: Array, bias: Array, shift: Array, r_out: Array
+) -> None:
+    """Whitened residuals between n keyframes in a row, without derivatives.
 
     Parameters
     ----------
     motions, W : ndarray, shapes (n - 1, ROW), (n - 1, 15, 15), the latter of `motion_weights`
     R, p, v, bias : ndarray, shapes (n, 3, 3), (n, 3), (n, 3), (n, 6)
     shift : ndarray, shape (n - 1, 6), bias that errors of the IMU's scale make in each interval, or (0, 6)
+    r_out : ndarray, shape (n - 1, 15)
     """
     R_end, p_end, v_end, apart, seen = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
     r, b_i, b_j, Jr, A = np.empty(15), np.empty(6), np.empty(6), np.empty((3, 3)), np.empty((2, 15, 15))
-    cost = 0.0
     for k in range(len(motions)):
         for i in range(6):
             own = shift[k, i] if len(shift) else 0.0
@@ -178,8 +180,7 @@ def motion_cost(motions: Array, W: Array, R: Array, p: Array, v: Array, bias: Ar
             total = 0.0
             for j in range(i + 1):
                 total += W[k, i, j] * r[j]
-            cost += 0.5 * total * total
-    return cost
+            r_out[k, i] = total
 
 
 @kernel(

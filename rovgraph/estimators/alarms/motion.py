@@ -5,10 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import chdtri
 
+from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence, windows
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motions
 
 CHANCE = 1e-6  # that a figure of a healthy dive is beyond its limit
 IMU_S = 20.0  # over which errors of the IMU last that are no noise
@@ -58,15 +59,9 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
 def _motion_residuals(evidence: Evidence) -> Array:
     """Whitened residuals of the n - 1 motions between the smoothed keyframes, shape (n - 1, 15)."""
     assert evidence.optimum is not None
-    state = evidence.optimum.state
-    rows = np.array([i.motion.row for i in evidence.intervals[1:] if i.motion is not None])
-    n = len(rows)
-    r, A, W = np.empty((n, 15)), np.empty((2, n, 15, 15)), np.empty((n, 15, 15))
-    R, p, v, b = (np.ascontiguousarray(a) for a in (state.R_nb, state.p_n, state.v_n, state.bias))
-    motion_weights(rows, W)
-    motion_errors(rows, R[:-1], p[:-1], v[:-1], b[:-1], R[1:], p[1:], v[1:], b[1:], r, A[0], A[1])
-    whiten_motions(W, r, A[0], A[1])
-    return r
+    best = evidence.optimum
+    rows = best.chain.rows if isinstance(best, ChainOptimum) else DiveRows.of(best.intervals, [*best.blocks])
+    return rows.motion_residuals(best.state)
 
 
 def estimates(evidence: Evidence) -> Iterator[Statistic]:
