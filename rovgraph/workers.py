@@ -1,7 +1,6 @@
 """Work spread over the machine's cores, in processes that end when they are no longer wanted."""
 
 import contextlib
-import gc
 import multiprocessing
 import multiprocessing.process
 import os
@@ -10,21 +9,13 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rovgraph.errors import InputError
+from rovgraph.process import ONE_THREAD, be_frugal
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-# a pool of libraries' threads in every process would fight over the same cores
-_ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
-)
-
-
-GARBAGE = 100_000  # objects made and not freed before the collector looks; Python's own is 700
-
 
 def cores() -> int:
     """Cores that this process may use."""
@@ -59,21 +50,8 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
 @contextlib.contextmanager
 def starting() -> Iterator[None]:
     """Around what starts processes: they inherit one thread for each library, and no interrupts."""
-    with _environment(_ONE_THREAD), _interrupts_held_back():
+    with _environment(ONE_THREAD), _interrupts_held_back():
         yield
-
-
-def companion(target: Callable[..., None], *args: Any) -> multiprocessing.process.BaseProcess:
-    """A process that works beside this one and ends with it; ``target`` and ``args`` as for `workers`."""
-    process = multiprocessing.get_context("spawn").Process(target=_accompany, args=(target, *args), daemon=True)
-    with starting():
-        process.start()
-    return process
-
-
-def _accompany(target: Callable[..., None], *args: Any) -> None:
-    _prepare()
-    target(*args)
 
 
 def in_workers(
@@ -101,11 +79,8 @@ def in_workers(
 
 
 def _prepare() -> None:
-    """In a worker: leave interrupts to the parent, and end when the parent has ended, however it did.
-
-    The collector of cycles would look at a million objects of a dive again and again, and hardly find any.
-    """
-    gc.set_threshold(GARBAGE)
+    """In a worker: leave interrupts to the parent, and end when the parent has ended, however it did."""
+    be_frugal()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
 

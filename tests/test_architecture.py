@@ -15,7 +15,7 @@ PACKAGE = ROOT / "rovgraph"
 
 # Bottom first. Members of one layer are independent: they may not import each other.
 LAYERS = (
-    {"errors"},
+    {"errors", "process"},
     {"geometry", "workers", "fast_csv"},
     {"kernels"},
     {"state", "calibration", "thesis"},
