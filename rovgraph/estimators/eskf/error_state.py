@@ -21,7 +21,7 @@ from rovgraph.estimators.eskf.reinitialisation import reinitialised
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
 from rovgraph.log import Measurement
-from rovgraph.state import State
+from rovgraph.state import PLACE, State
 
 # since the start, for `ErrorStateFilter.reinitialise_at`: while heading, mounting and compasses are known to
 # several degrees only, what was linearised once misstates what it knows by the square of that
@@ -107,11 +107,14 @@ class ErrorStateFilter:
 
     def run(self, intervals: Sequence[KeyframeInterval], progress: Callable[[float], None]) -> None:
         """Take the intervals of a dive, before anything else; ``progress`` is told 0 to 1 now and then."""
-        self._rows = rows = DiveRows.of(intervals, [*self.beginning.instruments])
+        sensors = [*self.beginning.instruments]
+        self._rows = rows = DiveRows.of(intervals, sensors)
+        compiled = all(self.engine.knows(sensor) or sensor == PLACE for sensor in sensors)
         while (k := len(self.intervals)) < len(intervals):
             progress(k / len(intervals))
             end = min(k + PROGRESS_EVERY, self._due_at(rows.time, k))
-            if k > 0 and not self.known.places:
+            # of a filter that is not reinitialised, the smoother needs every step
+            if k > 0 and compiled and self.reinitialise_at and not self.known.places:
                 run = self.engine.run(rows, k, end, self.known, self.gates)
                 self.known = run.known
                 self.history.extend(intervals[k : k + len(run)], run)
