@@ -267,10 +267,10 @@ _XYZ = [0, 1, 2]
 
 def earth_rate_n(latitude: float) -> Array:
     """Angular rate of the Earth in n [rad/s], shape (3,); latitude in radians."""
-    return _EARTH_RATE * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
+    return EARTH_RATE * np.array([np.cos(latitude), 0.0, -np.sin(latitude)])
 
 
-_EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
+EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
 
 
 def transpose(R: Array) -> Array:

@@ -17,6 +17,7 @@ from rovgraph.process import ONE_THREAD, be_frugal
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -53,7 +53,7 @@ class Environment(Section):
     dip_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
         None, description="dip of the field, down positive; null = from the log, against gravity"
     )
-    earth_rotation: bool = Field(False, description="model the Earth's rotation (worth it for a FOG)")
+    earth_rotation: bool = Field(False, description="model the Earth's rotation, which good gyros feel")
 
 
 class ImuNoise(Section):

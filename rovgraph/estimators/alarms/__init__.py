@@ -17,6 +17,7 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     dvl_cause,
     constants.held,
     constants.moved,
+    constants.earth_rate,
     sensors.frozen,
     residuals.rejected,
     residuals.too_large,

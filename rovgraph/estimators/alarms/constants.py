@@ -9,6 +9,7 @@ from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import Released, release
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
+from rovgraph.geometry import EARTH_RATE
 
 # Of the 25 components of a dive one is beyond 3 sds in every fifteenth healthy dive, beyond 5 in one of 70000;
 # what is not linear in them makes up for the difference.
@@ -18,7 +19,9 @@ HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
 # errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
 SHOWN = 0.3
 MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
+FEIGNED = {"dvl_scale": 1.5e-3, "gyr_scale": 5e-4}  # by errors in variables, however long the dive is
 DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
+FEELS_THE_EARTH = 10.0  # sds
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
 RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_time_offset", "gyr_scale")
@@ -83,13 +86,36 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             _sensor_of(r.name),
             evidence.start,
             evidence.end,
-            r.significance,
+            abs(r.step) / float(np.hypot(r.sd, FEIGNED.get(r.name, 0.0))),
             HELD,
             HELD_FAR_OFF,
             f"{r.label} is held at {shown * mean:.4g}{unit}, where the measurements have it "
             f"{shown * r.step:+.2g} ± {shown * r.sd:.1g}{unit} from that",
             _remedy_of_held(r),
         )
+
+
+def earth_rate(evidence: Evidence) -> Iterator[Statistic]:
+    """The Earth's rate, where it is not modelled, against what the estimate claims to know of the gyro's bias.
+
+    It is a bias that turns with the vehicle. A gyro whose bias is known ten times better than that feels it.
+    """
+    history = evidence.main.history.get("gyr_bias")
+    if history is None or evidence.beginning.config.environment.earth_rotation:
+        return
+    sd = float(history.sd.min())
+    yield Statistic(
+        "earth rate",
+        "imu",
+        evidence.start,
+        evidence.end,
+        EARTH_RATE / sd,
+        FEELS_THE_EARTH,
+        np.inf,
+        f"the Earth's rotation is not modelled, and the estimate claims the gyro's bias to {np.rad2deg(sd) * 3600:.2g} "
+        "deg/h, where the Earth turns 15 deg/h",
+        "state environment.latitude_deg and environment.earth_rotation: true",
+    )
 
 
 def halves(evidence: Evidence) -> Iterator[Statistic]:
