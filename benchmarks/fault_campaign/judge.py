@@ -125,7 +125,7 @@ def _smooth(folder: Path, dive: Dive) -> Result:
     if not (folder / "out" / "summary.json").exists():
         return Result(said=tuple(said), refused=True)
     summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
-    said += [*(f"assumed: {line}" for line in summary["assumptions"]), *_warnings(summary)]
+    said += [*(f"assumed: {line}" for line in summary["assumptions"]), *_alarms(summary)]
     result = Result(said=tuple(said))
     calibration = pd.read_csv(folder / "out" / "calibration.csv")
     for kind in ("smoothed", "filtered"):
@@ -145,7 +145,7 @@ def _online(folder: Path, dive: Dive, result: Result) -> Result:
     if code != 0 or not track.exists():
         return replace(result, said=said)
     summary = json.loads((folder / "live" / "summary.json").read_text(encoding="utf-8"))
-    result = replace(result, said=(*said, *_warnings(summary)), refused=False)
+    result = replace(result, said=said, refused=False)
     _compare(result, "online", pd.read_csv(track), _live_calibration(summary["calibration"]), dive)
     return result
 
@@ -159,10 +159,9 @@ def _live_calibration(last: dict[str, list[float]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["label", "estimated", "value", "sd"])
 
 
-def _warnings(summary: dict[str, Any]) -> list[str]:
-    """Warnings and verdict, where a summary has them."""
-    found = summary.get("warnings") or []
-    return ["warning: " + (w if isinstance(w, str) else json.dumps(w)) for w in found]
+def _alarms(summary: dict[str, Any]) -> list[str]:
+    """The alarms of a summary."""
+    return [f"alarm: {alarm['text']}" for alarm in summary["alarms"]]
 
 
 def _compare(
