@@ -196,6 +196,18 @@ def reweight(
 
 
 @helper
+def correction(r: Array, HP: Array, root: Array, inverse: Array, delta_out: Array) -> None:
+    """The correction by itself: d = P H' W^1/2 (W^1/2 S W^1/2 + I)^-1 W^1/2 r."""
+    delta_out[:] = 0.0
+    for a in range(len(r)):
+        share = 0.0
+        for b in range(len(r)):
+            share += inverse[a, b] * root[b] * r[b]
+        for i in range(len(delta_out)):
+            delta_out[i] += HP[a, i] * root[a] * share
+
+
+@helper
 def joseph(P: Array, r: Array, H: Array, HP: Array, root: Array, inverse: Array, delta_out: Array) -> None:
     """The correction, and P after it in place; HP and H become W^1/2 times what they were."""
     m, n = HP.shape
