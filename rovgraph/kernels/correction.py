@@ -5,8 +5,9 @@
     dx, P                                             `rovgraph.kernels.robust_update`
     x <- x + dx, P <- B P B'                          `rovgraph.kernels.error_coordinates`
 
-A sensor that was left out for longer than its `READMIT` returns within `RETURN_SD`, and meanwhile inflates the
-covariance of what it sees.
+A sensor that was left out for longer than `DISTRUSTED_S` returns only within `RETURN_SD` of what the filter, whose
+uncertainty grows without it, holds possible. Left out for longer than its `READMIT`, it is believed to see something
+that no model knows, and inflates the covariance of what it sees.
 """
 
 import math
@@ -19,7 +20,7 @@ from rovgraph.kernels.change_of_basis import change_basis
 from rovgraph.kernels.compile import helper, kernel
 from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
-from rovgraph.kernels.layout import VELOCITY
+from rovgraph.kernels.layout import TRANSLATION, VELOCITY
 from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
 from rovgraph.kernels.measurement_row import (
     BEND,
@@ -52,6 +53,7 @@ NO_SCALE = np.empty((0, 0))  # of an IMU whose scale is exact
 WIDE = 30.0  # sd of a prediction, in those of its measurement, from which it is corrected by iterations
 MAX_RELINEARIZATIONS = 5
 STANDS = 0.1  # a correction within as many sd needs no other point to linearise at
+DISTRUSTED_S = 2.0  # of being left out after which a sensor may be wrong for longer than single measurements [s]
 RETURN_SD = 3.0  # a sensor that was left out for long returns with an innovation within this many sd
 
 
@@ -143,31 +145,47 @@ def coordinates_of_velocity(x: Array, P: Array, layout: ErrorLayout) -> ErrorLay
 
 
 @helper
-def directions_seen(x: Array, sensor: Array, n: int) -> Array:
-    """Directions of the error that a sensor sees, shape (n, s): velocity in n, or turn or shift along n's axes."""
+def directions_seen(x: Array, sensor: Array, n: int, elapsed: float) -> tuple[Array, Array]:
+    """Directions of the error in which something unknown has moved a state by one in what a sensor sees.
+
+    Parameters
+    ----------
+    x, sensor : state (21,) and row of the sensor
+    n : length of the error
+    elapsed : time within which it happened [s]
+
+    Returns
+    -------
+    seen : shape (n, s), velocity in n, or turn or shift along n's axes; a velocity with the way since, half of the
+        time in the mean
+    spread : shape (n, s), sd of that way, since a knock may have come at any time: elapsed / sqrt(12)
+    """
     count = 0
     for k in range(3):
         count += sensor[SEES + k] != 0.0
-    seen, j = np.zeros((n, count)), 0
+    seen, spread, j = np.zeros((n, count)), np.zeros((n, count)), 0
     frame = int(sensor[SEEN_FRAME])
     for k in range(3):
         if sensor[SEES + k] == 0.0:
             continue
         if frame == SEES_VELOCITY:
-            seen[6 + k, j] = 1.0
-        else:
-            begin = 0 if frame == SEES_HEADING else 3
+            seen[VELOCITY + k, j] = 1.0
             for i in range(3):
-                seen[begin + i, j] = x[3 * k + i]  # column k of R_bn
+                seen[TRANSLATION + i, j] = 0.5 * elapsed * x[3 * k + i]  # column k of R_bn
+                spread[TRANSLATION + i, j] = elapsed / math.sqrt(12.0) * x[3 * k + i]
+        else:
+            begin = 0 if frame == SEES_HEADING else TRANSLATION
+            for i in range(3):
+                seen[begin + i, j] = x[3 * k + i]
         j += 1
-    return seen
+    return seen, spread
 
 
 @helper
 def admit(nis: float, time: float, sensor: Array, since: Array, index: int) -> bool:
     """Whether a measurement lies within its gate; keeps in ``since`` since when its sensor is left out."""
     gate = sensor[GATE]
-    if not math.isnan(since[index]) and time - since[index] > sensor[READMIT]:
+    if time - since[index] > min(DISTRUSTED_S, sensor[READMIT]):  # never where that is nan
         gate = RETURN_SD
     if nis > gate * gate:
         if math.isnan(since[index]):
@@ -363,8 +381,10 @@ def correct_keyframe(
         weight_out[j] = 1.0
         if gated and not admit(nis_out[j], rows[j, TIME], sensor, since, which[j]):
             weight_out[j] = 0.0
-            if rows[j, TIME] - since[which[j]] > sensor[READMIT]:
-                inflate(P, r, H, begin, end, directions_seen(x, sensor, n))
+            elapsed = rows[j, TIME] - since[which[j]]
+            if elapsed > sensor[READMIT]:
+                seen, spread = directions_seen(x, sensor, n, elapsed)
+                inflate(P, r, H, begin, end, seen, spread)
                 innovation_covariance(P, H, HP, S)
             leave_out(r, H, HP, S, begin, end)
         else:
