@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dives import Simulated, beginning, falcon, interrupted, renewed, simulated, true_at
+from dives import Simulated, altered, beginning, falcon, interrupted, renewed, simulated, true_at
 
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
@@ -51,6 +51,15 @@ def test_a_dvl_that_is_back_after_a_long_silence_is_taken_at_once_and_moves_noth
     step = np.diff(track.p_n - true_at(case, track.time).p_n, axis=0)[:, :2, None]
     jump = (step.transpose(0, 2, 1) @ np.linalg.solve(track.cov_p[:-1, :2, :2], step))[:, 0, 0]
     assert jump[10:].max() < 9.0
+
+
+@pytest.mark.parametrize("wrong", ["one point", "swapped"])
+def test_fixes_that_are_wrong_for_minutes_do_not_draw_the_filter(wrong):
+    case = simulated(falcon(), 200.0, seed=4, dvl_rate=4.0, fix_interval=2.0)
+    data, late = case.log["fix"].data.copy(), case.log["fix"].time > SILENT_FROM
+    data[late, :2] = data[late, 1::-1] if wrong == "swapped" else data[late.argmax() - 1, :2]
+    estimator = renewed(altered(case.log, "fix", data), case.config)
+    assert horizontal_nees(estimator, case)[10:].max() < 9.0 / 2.0
 
 
 @pytest.mark.parametrize("seed", [1, 2])
