@@ -560,18 +560,25 @@ def test_a_sensor_that_was_left_out_for_long_returns_within_three_sd(estimator):
     assert let_in and not gates
 
 
-def test_a_sensor_that_was_left_out_for_long_inflates_what_it_sees_and_nothing_else(estimator):
-    """As something that no model knows would have to have moved the velocity, for the ping to be as it is."""
+def test_a_sensor_that_was_left_out_for_long_inflates_what_it_sees_and_what_follows_from_it(estimator):
+    """As a knock at any time since would have to have moved velocity and position, for the ping to be as it is.
+
+    Moments of the way t v, t even between 0 and T: T/2 v in the mean, T^2/3 v^2.
+    """
     engine, long = estimator.engine, 1.01 * estimator.beginning.instruments["dvl"].readmit_s
     known, after, let_in, gates = left_out(estimator, 50.0, long)
     assert not let_in and list(gates) == ["dvl"]
     np.testing.assert_array_equal(after.x, known.x)
     own = engine.layout.columns[VELOCITY]
-    grown = after.P - known.P
-    assert grown[own, own][0, 0] > 0.0
-    np.testing.assert_allclose(grown[own, own], grown[own, own][0, 0] * np.eye(3), atol=1e-12)
-    grown[own, own] = 0.0
-    np.testing.assert_array_equal(grown, 0.0)
+    grown, R_nb = after.P - known.P, known.state.R_nb[0]
+    square = grown[own, own][0, 0]
+    assert square > 0.0
+    expected = np.zeros_like(grown)
+    expected[own, own] = square * np.eye(3)
+    expected[own, 3:6] = 0.5 * long * square * R_nb
+    expected[3:6, own] = expected[own, 3:6].T
+    expected[3:6, 3:6] = long**2 / 3.0 * square * np.eye(3)
+    np.testing.assert_allclose(grown, expected, atol=1e-12)
 
 
 def test_a_dvl_that_vanishes_and_returns_leaves_an_honest_track():

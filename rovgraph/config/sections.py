@@ -144,7 +144,7 @@ class Fix(Section):
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the antenna or transponder in body axes")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is left out")
-    readmit_s: Readmission = 60.0
+    readmit_s: Readmission = 300.0
 
 
 class Place(Section):

@@ -109,11 +109,12 @@ def leave_out(r: Array, H: Array, HP: Array, S: Array, begin: int, end: int) -> 
 
 
 @helper
-def inflate(P: Array, r: Array, H: Array, begin: int, end: int, seen: Array) -> None:
+def inflate(P: Array, r: Array, H: Array, begin: int, end: int, seen: Array, spread: Array) -> None:
     """Let something that no model knows have moved what a sensor sees, by as much as its measurement shows.
 
-    As a knock does to the velocity: P += |x|^2 seen seen', x the least squares solution of H seen x = r. The
-    directions ``seen``, shape (n, s), are those of the error that the sensor sees; H P and S are out of date after it.
+    As a knock does to velocity and position: P += |x|^2 (seen seen' + spread spread'), x the least squares solution
+    of H seen x = r. The directions ``seen``, shape (n, s), are those of the error that the sensor sees, with what has
+    followed from it; ``spread``, shape (n, s), is how far that is uncertain. H P and S are out of date after it.
     """
     n, s = seen.shape
     A, x = np.zeros((s, s)), np.zeros(s)
@@ -142,7 +143,7 @@ def inflate(P: Array, r: Array, H: Array, begin: int, end: int, seen: Array) -> 
     for i in range(n):
         for k in range(n):
             for j in range(s):
-                P[i, k] += square * seen[i, j] * seen[k, j]
+                P[i, k] += square * (seen[i, j] * seen[k, j] + spread[i, j] * spread[k, j])
 
 
 @helper
@@ -193,6 +194,18 @@ def reweight(
     for a in range(m):
         inverse_out[a, a] = 1.0
         solve_cholesky(L, inverse_out[a])  # symmetric: a row is a column
+
+
+@helper
+def correction(r: Array, HP: Array, root: Array, inverse: Array, delta_out: Array) -> None:
+    """The correction by itself: d = P H' W^1/2 (W^1/2 S W^1/2 + I)^-1 W^1/2 r."""
+    delta_out[:] = 0.0
+    for a in range(len(r)):
+        share = 0.0
+        for b in range(len(r)):
+            share += inverse[a, b] * root[b] * r[b]
+        for i in range(len(delta_out)):
+            delta_out[i] += HP[a, i] * root[a] * share
 
 
 @helper
