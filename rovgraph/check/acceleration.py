@@ -15,7 +15,7 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.inertial import InertialMotion, in_gap, point_acceleration, without_level
+from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate
 from rovgraph.log import Stream
@@ -25,13 +25,16 @@ LARGEST_LAG = 300.0  # that is searched for [s]
 OVERLAP = 0.6  # of the dive, that a shift leaves
 LONGEST_PING_GAP = 2.5  # periods that are interpolated
 ENOUGH = 150  # even times
+ENOUGH_PINGS = 30
 SPIKE = 6.0  # times the usual distance from the median of five pings
 LEAST_SPIKE = 0.1  # [m/s]
 CLIPPED = 4.0  # times the median difference, which counts no more
 PARTS = 10  # of the dive, each left out once to see how much a fit depends on it
 ITERATIONS = 4
-# priors of what `refine` fits beside the lag: rotation [rad], scale, lever arm [m]
-PRIOR_SD = np.array([np.inf, 0.3, 0.3, 0.3, 0.05, 0.1, 0.1, 0.1])
+LARGEST_STEP = 1.0  # that a fit leads away from where it began [s]
+ALWAYS = (-np.inf, np.inf)
+# priors of what `refine` fits: lag [s], rotation [rad], scale, lever arm [m], the accelerometer's bias [m/s^2]
+PRIOR_SD = np.array([10.0, 0.3, 0.3, 0.3, 0.05, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
 
 
 def signed_permutations() -> Array:
@@ -77,6 +80,7 @@ class Fit:
     turn_sd : ndarray, shape (3,), of the mounting about the body's axes [rad]
     likeness : as in `Search`
     error : mean squared difference [m^2/s^4]
+    count : of independent differences
     """
 
     lag: float
@@ -85,6 +89,24 @@ class Fit:
     turn_sd: Array
     likeness: float
     error: float
+    count: float
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """Where a least-squares fit stands."""
+
+    lag: float
+    R_bs: Array
+    scale: float
+    arm_b: Array
+    bias_b: Array
+
+    def moved(self, step: Array) -> "_Guess":
+        """After a step (11,) in the order of `PRIOR_SD`."""
+        R_bs = exp_rotation(step[1:4]) @ self.R_bs
+        scale = self.scale * (1.0 + float(step[4]))
+        return _Guess(self.lag + float(step[0]), R_bs, scale, self.arm_b + step[5:8], self.bias_b + step[8:])
 
 
 class Comparison:
@@ -102,8 +124,14 @@ class Comparison:
         self.pings = without_spikes(pings)
         self.period = float(np.median(np.diff(self.pings.time)))
         self.half = max(1, round(max(0.5 * WINDOW, self.period) / motion.step))
-        arm_b = np.array(config.dvl.lever_arm_m) - np.array(config.imu.lever_arm_m)
-        self.acceleration_b = self._averaged(point_acceleration(motion, arm_b))
+        self.apart = max(1, round(WINDOW / self.period))
+        self.arm_b = np.array(config.dvl.lever_arm_m) - np.array(config.imu.lever_arm_m)
+        self.acceleration_b = self._averaged(point_acceleration(motion, self.arm_b))
+        self.force_g = rotate(motion.R_gb, motion.acceleration_b)
+        self.smooth_rate_b = _boxed(motion.rate_b, 2)
+        self.way_g = np.vstack([np.zeros(3), np.cumsum(self.force_g * motion.step, axis=0)])
+        middle = 0.5 * (self.force_g[1:] + self.force_g[:-1])
+        self.slope_g = np.vstack([self.force_g[:1], middle, self.force_g[-1:]])
         self.rate_b = self._averaged(motion.rate_b)
         self.known = _all_within(motion.known, self.half)
 
@@ -112,7 +140,7 @@ class Comparison:
         """Between two pings that are interpolated [s]."""
         return max(LONGEST_PING_GAP * self.period, 1.0)
 
-    def search(self, largest: float = LARGEST_LAG, during: tuple[float, float] = (-np.inf, np.inf)) -> Search:
+    def search(self, largest: float = LARGEST_LAG, during: tuple[float, float] = ALWAYS) -> Search:
         """Every orientation at every lag, by the IMU's samples between two times."""
         time, step = self.motion.time, self.motion.step
         known = self.known & (time >= during[0]) & (time <= during[1])
@@ -145,52 +173,123 @@ class Comparison:
         error = np.where(enough, (total - 2.0 * mixed) / count, np.inf)
         return Search(lags, error, np.where(enough, 2.0 * mixed / total, -1.0))
 
-    def refine(
-        self, lag: float, H: Array, during: tuple[float, float] = (-np.inf, np.inf), largest: float = 1.0
-    ) -> Fit | None:
-        """Least squares from a lag and an orientation; None if it leads away or there is too little."""
-        time, step = self.motion.time, self.motion.step
-        inside = self.known & (time >= during[0]) & (time <= during[1])
-        R_bs, scale, arm_b, begin = self.R_bs @ H, 1.0, np.zeros(3), lag
-        measured = self.acceleration_b
+    def refine(self, lag: float, H: Array, during: tuple[float, float] = ALWAYS, held: bool = False) -> Fit | None:
+        """Least squares from a lag and an orientation; None if it leads away or there is too little.
+
+        Parameters
+        ----------
+        lag, H : where to begin
+        during : first and last stamp of the pings that count
+        held : fit everything but the lag
+        """
+        guess = _Guess(lag, self.R_bs @ H, 1.0, np.zeros(3), np.zeros(3))
+        prior_sd = np.where(np.arange(len(PRIOR_SD)) == 0, 1e-9 if held else PRIOR_SD[0], PRIOR_SD)
         for _ in range(ITERATIONS):
-            y, seen = self._velocity(lag)
-            z = scale * rotate(R_bs, y)
-            predicted, usable = self._acceleration(z, seen)
-            usable &= inside
-            if np.count_nonzero(usable) < ENOUGH:
+            left, J, measured, usable = self._differences(guess, during)
+            if np.count_nonzero(usable) < ENOUGH_PINGS:
                 return None
-            jerk = np.gradient(predicted, step, axis=0)
-            turned = [self._acceleration(cross(np.broadcast_to(axis, z.shape), z), seen)[0] for axis in np.eye(3)]
-            swing = [self._swing(axis) for axis in np.eye(3)]
-            J = np.stack([jerk, *turned, predicted, *swing], axis=2)
-            left = measured - without_level(self.motion, np.where(seen[:, None], predicted, 0.0))
-            left = left - rotate(J[:, :, 5:], arm_b)
             size = _square(left)
             usable &= size < CLIPPED**2 * float(np.median(size[usable]))
-            step_, sd = self._solved(J[usable], left[usable], arm_b)
-            lag += float(step_[0])
-            R_bs = exp_rotation(step_[1:4]) @ R_bs
-            scale, arm_b = scale * (1.0 + float(step_[4])), arm_b + step_[5:]
-            if abs(lag - begin) > largest:
+            step, sd = self._solved(J[usable], left[usable], guess, prior_sd)
+            guess = guess.moved(step)
+            if abs(guess.lag - lag) > LARGEST_STEP:
                 return None
-        error = float(_square(left[usable]).mean())
-        total = float((_square(measured[usable]) + _square(predicted[usable])).mean())
-        return Fit(lag, float(sd[0]), R_bs, sd[1:4], 1.0 - error / total, error)
+        left, measured = left[usable], measured[usable]
+        error = float(_square(left).mean())
+        total = float((_square(measured) + _square(measured - left)).mean())
+        return Fit(guess.lag, float(sd[0]), guess.R_bs, sd[1:4], 1.0 - error / total, error, len(left) / self.apart)
 
-    def _solved(self, J: Array, left: Array, arm_b: Array) -> tuple[Array, Array]:
-        """Step and standard deviations (8,), these by leaving out one part after the other."""
-        variance = float(np.mean(left**2)) * 2 * self.half  # differences within a window are one
+    def _differences(
+        self, guess: "_Guess", during: tuple[float, float]
+    ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Changes of velocity over a window, IMU less DVL, by m pairs of pings.
+
+        In the gyro's axes, with l the DVL's arm from the IMU: change of R_gb (R_bs y - w x l) = integral of R_gb a_b.
+        Between pings nothing is interpolated but the IMU.
+
+        Returns
+        -------
+        left : ndarray, shape (m, 3), the differences per second [m/s^2]
+        J : ndarray, shape (m, 3, 11), what they fall by per unit of what `PRIOR_SD` lists
+        measured : ndarray, shape (m, 3), by the IMU [m/s^2]
+        usable : ndarray of bool, shape (m,)
+        """
+        stamps = self.pings.time
+        i = np.arange(len(stamps) - self.apart)
+        j = i + self.apart
+        seconds = (stamps[j] - stamps[i])[:, None]
+        z = guess.scale * rotate(guess.R_bs, self.pings.data[:, :3])
+        arms = np.broadcast_to(self.arm_b + guess.arm_b, z.shape)
+
+        def change(v_g: Array) -> Array:
+            return np.asarray((v_g[j] - v_g[i]) / seconds)
+
+        def difference(lag: float) -> tuple[Array, Array]:
+            when = stamps - lag
+            R_gb, rate_b, way_g = self._inertial(when)
+            measured, predicted = change(way_g), change(rotate(R_gb, z - cross(rate_b, arms)))
+            return measured - predicted + self._slow(0.5 * (when[i] + when[j]), predicted), measured
+
+        when = stamps - guess.lag
+        R_gb, rate_b, _ = self._inertial(when)
+        axes = [np.broadcast_to(axis, z.shape) for axis in np.eye(3)]
+        turned = [change(rotate(R_gb, cross(axis, z))) for axis in axes]
+        swing = [-change(rotate(R_gb, cross(rate_b, axis))) for axis in axes]
+        biased = 0.5 * (R_gb[i] + R_gb[j])
+        biased = biased - self._slow(0.5 * (when[i] + when[j]), biased.reshape(-1, 9)).reshape(-1, 3, 3)
+        h = self.motion.step
+        later = (difference(guess.lag - h)[0] - difference(guess.lag + h)[0]) / (2.0 * h)
+        J = np.stack([later, *turned, change(rotate(R_gb, z)), *swing], axis=2)
+        left, measured = difference(guess.lag)
+        left = left - rotate(biased, guess.bias_b)
+        known = self._known(when)
+        usable = known[i] & known[j] & (stamps[i] >= during[0]) & (stamps[j] <= during[1])
+        usable &= seconds[:, 0] < self.apart * self.period + self.longest
+        return left, np.concatenate([J, biased], axis=2), measured, usable
+
+    def _solved(self, J: Array, left: Array, guess: "_Guess", prior_sd: Array) -> tuple[Array, Array]:
+        """Step and standard deviations (11,), these by leaving out one part after the other."""
+        variance = float(np.mean(left**2)) * self.apart  # differences overlap
         parts = np.array_split(np.arange(len(left)), PARTS)
-        H = np.array([np.einsum("nik,nil->kl", J[p], J[p]) for p in parts]) / variance
+        H = np.array([np.einsum("nik,nil->kl", J[p], J[p], optimize=True) for p in parts]) / variance
         g = np.array([np.einsum("nik,ni->k", J[p], left[p]) for p in parts]) / variance
-        prior = np.diag(1.0 / PRIOR_SD**2) + 1e-9 * np.eye(8)
-        towards = np.concatenate([np.zeros(5), -arm_b / PRIOR_SD[5:] ** 2])
-        step = np.linalg.solve(H.sum(axis=0) + prior, g.sum(axis=0) + towards)
-        information = H.sum(axis=0) - H + prior
-        without = np.linalg.solve(information, (g.sum(axis=0) - g + towards)[..., None])[..., 0]
+        so_far = np.concatenate([np.zeros(5), guess.arm_b, guess.bias_b])
+        towards = -so_far / prior_sd**2
+        information = H.sum(axis=0) + np.diag(1.0 / prior_sd**2)
+        step = np.linalg.solve(information, g.sum(axis=0) + towards)
+        without = np.linalg.solve(information - H, (g.sum(axis=0) - g + towards)[..., None])[..., 0]
         spread = np.sqrt((PARTS - 1) * np.var(without, axis=0))
-        return step, np.maximum(spread, np.sqrt(np.diag(np.linalg.inv(H.sum(axis=0) + prior))))
+        return step, np.maximum(spread, np.sqrt(np.diag(np.linalg.inv(information))))
+
+    def _inertial(self, when: Array) -> tuple[Array, Array, Array]:
+        """Attitude, rate and the integral of the acceleration along the gyro's axes, at some times."""
+        motion = self.motion
+        k = self._nearest(when)
+        rate_b = np.column_stack([np.interp(when, motion.time, column) for column in self.smooth_rate_b.T])
+        R_gb = motion.R_gb[k] @ exp_rotation((when - motion.time[k])[:, None] * motion.rate_b[k])
+        edge = (when - motion.time[0]) / motion.step + 0.5
+        left = np.floor(edge).astype(np.int64).clip(0, len(motion.time) - 1)
+        part = (edge - left)[:, None]
+        begin, end, mean = self.slope_g[left], self.slope_g[left + 1], self.force_g[left]
+        # a parabola over the step with these ends, bent so that its mean is that of the samples
+        bend = 6.0 * (mean - 0.5 * (begin + end))
+        way = begin * part + 0.5 * (end - begin) * part**2 + bend * (0.5 * part**2 - part**3 / 3.0)
+        return R_gb, rate_b, self.way_g[left] + motion.step * way
+
+    def _known(self, when: Array) -> NDArray[np.bool_]:
+        inside = (when >= self.motion.time[0]) & (when <= self.motion.time[-1])
+        return inside & self.known[self._nearest(when)]
+
+    def _nearest(self, when: Array) -> NDArray[np.int64]:
+        k = np.rint((when - self.motion.time[0]) / self.motion.step).astype(np.int64)
+        return k.clip(0, len(self.motion.time) - 1)
+
+    def _slow(self, when: Array, change_g: Array) -> Array:
+        """What `inertial_motion` takes of accelerations (n, k) for gravity."""
+        motion = self.motion
+        even = np.column_stack([np.interp(motion.time, when, column) for column in change_g.T])
+        slow = smoothed(even, motion.known, LEVEL_SECONDS, motion.step)
+        return np.column_stack([np.interp(when, motion.time, column) for column in slow.T])
 
     def _velocity(self, lag: float) -> tuple[Array, NDArray[np.bool_]]:
         """Velocity along the instrument's axes at the even times, by stamps that are late; and where it is known."""
@@ -205,21 +304,8 @@ class Comparison:
         change[h:-h] = (y[2 * h :] - y[: -2 * h]) / (2 * h * self.motion.step)
         return change, self._averaged(y), _all_within(seen, h)
 
-    def _acceleration(self, z: Array, seen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-        change, mean, seen = self._changes(z, seen)
-        return change + cross(self.rate_b, mean), seen
-
-    def _swing(self, arm_b: Array) -> Array:
-        """Acceleration of a point at an arm because the vehicle turns."""
-        swing = cross(self.rate_b, np.broadcast_to(arm_b, self.rate_b.shape))
-        return np.asarray(np.gradient(swing, self.motion.step, axis=0) + cross(self.rate_b, swing))
-
     def _averaged(self, values: Array) -> Array:
-        """Means over the window around each time; shape of values (n, 3)."""
-        h = self.half
-        padded = np.pad(values, ((h, h), (0, 0)), mode="edge")
-        sums = np.vstack([np.zeros(3), np.cumsum(0.5 * (padded[1:] + padded[:-1]), axis=0)])
-        return np.asarray((sums[2 * h :] - sums[: -2 * h]) / (2 * h))
+        return _boxed(values, self.half)
 
 
 class _Correlator:
@@ -236,6 +322,13 @@ class _Correlator:
 
 def _square(v: Array) -> Array:
     return np.asarray(np.einsum("ij,ij->i", v, v))
+
+
+def _boxed(values: Array, half: int) -> Array:
+    """Means of (n, 3) from half a window before to half a window after."""
+    padded = np.pad(values, ((half, half), (0, 0)), mode="edge")
+    sums = np.vstack([np.zeros(3), np.cumsum(0.5 * (padded[1:] + padded[:-1]), axis=0)])
+    return np.asarray((sums[2 * half :] - sums[: -2 * half]) / (2 * half))
 
 
 def _all_within(flags: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:

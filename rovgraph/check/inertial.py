@@ -140,12 +140,6 @@ def smoothed(values: Array, known: NDArray[np.bool_], seconds: float, step: floa
     return np.asarray(sums[:, :-1] / np.maximum(sums[:, -1:], 1.0))
 
 
-def without_level(motion: InertialMotion, acceleration_b: Array) -> Array:
-    """An acceleration (n, 3) less the slow part that `inertial_motion` takes for gravity."""
-    slow_g = smoothed(rotate(motion.R_gb, acceleration_b), motion.known, LEVEL_SECONDS, motion.step)
-    return np.asarray(acceleration_b - rotate(transpose(motion.R_gb), slow_g))
-
-
 def point_acceleration(motion: InertialMotion, arm_b: Array) -> Array:
     """Acceleration of a point at an arm (3,) from the IMU, shape (n, 3): f + w' x l + w x (w x l) [m/s^2]."""
     arms = np.broadcast_to(arm_b, motion.rate_b.shape)
