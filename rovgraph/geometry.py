@@ -7,6 +7,8 @@ that any leading axes broadcast.
 from functools import cache
 from typing import TypeVar
 
+from itertools import permutations, product
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -271,6 +273,14 @@ def earth_rate_n(latitude: float) -> Array:
 
 
 _EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
+
+
+def signed_permutations() -> Array:
+    """The 48 ways to name three axes and their senses, the identity first; shape (48, 3, 3)."""
+    out = np.zeros((48, 3, 3))
+    for H, (order, signs) in zip(out, product(permutations(range(3)), product((1.0, -1.0), repeat=3)), strict=True):
+        H[range(3), order] = signs
+    return out
 
 
 def transpose(R: Array) -> Array:

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 
 from rovgraph.check.agreement import headings, vertical
+from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
 from rovgraph.check.fixes import track
 from rovgraph.check.frozen_sensors import standstill
@@ -35,6 +36,7 @@ CHECKS: tuple[Check, ...] = (
     own,
     standstill,
     frozen_imu,
+    dvl_and_imu,
     vertical,
     track,
     places,

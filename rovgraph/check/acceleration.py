@@ -10,14 +10,13 @@ every tau. `refine` then fits tau together with what else may be a little wrong:
 """
 
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array, cross, exp_rotation, rotate
+from rovgraph.geometry import Array, cross, exp_rotation, rotate, signed_permutations
 from rovgraph.log import Stream
 
 WINDOW = 1.0  # over which velocities change, at least two pings [s]
@@ -31,18 +30,11 @@ LEAST_SPIKE = 0.1  # [m/s]
 CLIPPED = 4.0  # times the median difference, which counts no more
 PARTS = 10  # of the dive, each left out once to see how much a fit depends on it
 ITERATIONS = 4
+SETTLED = 2e-3  # step that ends it [s, rad]
 LARGEST_STEP = 1.0  # that a fit leads away from where it began [s]
 ALWAYS = (-np.inf, np.inf)
 # priors of what `refine` fits: lag [s], rotation [rad], scale, lever arm [m], the accelerometer's bias [m/s^2]
 PRIOR_SD = np.array([10.0, 0.3, 0.3, 0.3, 0.05, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
-
-
-def signed_permutations() -> Array:
-    """The 48 ways to name three axes and their senses, the identity first; shape (48, 3, 3)."""
-    out = np.zeros((48, 3, 3))
-    for H, (order, signs) in zip(out, product(permutations(range(3)), product((1.0, -1.0), repeat=3)), strict=True):
-        H[range(3), order] = signs
-    return out
 
 
 ORIENTATIONS = signed_permutations()
@@ -194,6 +186,8 @@ class Comparison:
             guess = guess.moved(step)
             if abs(guess.lag - lag) > LARGEST_STEP:
                 return None
+            if abs(step[0]) < SETTLED and np.abs(step[1:4]).max() < SETTLED:
+                break
         left, measured = left[usable], measured[usable]
         error = float(_square(left).mean())
         total = float((_square(measured) + _square(measured - left)).mean())

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding, integral
+from rovgraph.check.findings import Finding, integral, valid_pings
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log, Stream
@@ -261,7 +261,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     """The DVL's velocity downwards against the change of depth: sign and clock."""
     if not {"dvl", "depth", "imu"} <= log.sensors or len(log["depth"]) < MIN_WINDOWS:
         return
-    pings = _valid_pings(log["dvl"])
+    pings = valid_pings(log["dvl"])
     if len(pings) < MIN_WINDOWS:
         return
     down = _downwards(log["imu"], config, pings.time)
@@ -307,11 +307,6 @@ def _flip(config: Config) -> str:
     roll, pitch, yaw = config.dvl.mount_rpy_deg
     turned, points = (180, "up") if abs(roll) < 90 else (0, "down")
     return f"does the DVL's z axis point {points}? Then dvl.mount_rpy_deg is [{turned}, {pitch:g}, {yaw:g}]"
-
-
-def _valid_pings(stream: Stream) -> Stream:
-    valid = stream["dvl_valid"] == 1.0
-    return Stream(stream.sensor, stream.columns, stream.time[valid], stream.data[valid], stream.row[valid])
 
 
 def _downwards(imu: Stream, config: Config, time: Array, span: float = 2.0) -> Array:

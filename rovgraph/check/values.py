@@ -37,8 +37,7 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("imu", level, f"mean specific force is {size:.4g} m/s2, expected about 9.8; {_acc_unit(size)}")
     if size < 1e-6:
         return
-    f_b = mount_matrix(config.imu.mount_rpy_deg) @ f_s
-    angle = float(np.arccos(np.clip(-f_b[2] / size, -1.0, 1.0)))
+    angle = tilt(log, config)
     k = int(np.argmax(np.abs(f_s)))
     axis = ("-" if f_s[k] < 0 else "+") + "xyz"[k]
     if angle > GRAVITY_ANGLE:
@@ -50,6 +49,13 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
         )
     elif low <= size <= high:
         yield Finding("imu", "ok", f"mean specific force {size:.2f} m/s2, {np.rad2deg(angle):.1f} deg from upwards")
+
+
+def tilt(log: Log, config: Config) -> float:
+    """Angle of the mean specific force from upwards [rad]."""
+    f_s = log["imu"].data[:, :3].mean(axis=0)
+    f_b = mount_matrix(config.imu.mount_rpy_deg) @ f_s
+    return float(np.arccos(np.clip(-f_b[2] / max(float(np.linalg.norm(f_s)), 1e-9), -1.0, 1.0)))
 
 
 def _acc_unit(size: float) -> str:
