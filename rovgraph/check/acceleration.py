@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.check.correlation import Correlator
 from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, signed_permutations
@@ -25,6 +26,7 @@ OVERLAP = 0.6  # of the dive, that a shift leaves
 LONGEST_PING_GAP = 2.5  # periods that are interpolated
 ENOUGH = 150  # even times
 ENOUGH_PINGS = 30
+BURST = 5  # pings that a serial buffer may hold back
 SPIKE = 6.0  # times the usual distance from the median of five pings
 LEAST_SPIKE = 0.1  # [m/s]
 CLIPPED = 4.0  # times the median difference, which counts no more
@@ -114,7 +116,7 @@ class Comparison:
     def __init__(self, motion: InertialMotion, pings: Stream, config: Config):
         self.motion, self.R_bs = motion, mount_matrix(config.dvl.mount_rpy_deg)
         self.pings = without_spikes(pings)
-        self.period = float(np.median(np.diff(self.pings.time)))
+        self.period = _period(self.pings.time)
         self.half = max(1, round(max(0.5 * WINDOW, self.period) / motion.step))
         self.apart = max(1, round(WINDOW / self.period))
         self.arm_b = np.array(config.dvl.lever_arm_m) - np.array(config.imu.lever_arm_m)
@@ -142,7 +144,7 @@ class Comparison:
         dy, mean, seen = self._changes(y, seen)
         a, w = (np.where(known[:, None], rotate(self.R_bs.T, v), 0.0) for v in (self.acceleration_b, self.rate_b))
         dy, mean = (np.where(seen[:, None], v, 0.0) for v in (dy, mean))
-        correlate = _Correlator(len(time), reach)
+        correlate = Correlator(len(time), reach)
         pairs = np.triu_indices(3)
         count = np.maximum(correlate(known[:, None] * 1.0, seen[:, None] * 1.0)[0, 0], 1.0)
         own = correlate(_square(a)[:, None], seen[:, None] * 1.0)[0, 0]
@@ -174,6 +176,8 @@ class Comparison:
         during : first and last stamp of the pings that count
         held : fit everything but the lag
         """
+        if len(self.pings) < self.apart + ENOUGH_PINGS:
+            return None
         guess = _Guess(lag, self.R_bs @ H, 1.0, np.zeros(3), np.zeros(3))
         prior_sd = np.where(np.arange(len(PRIOR_SD)) == 0, 1e-9 if held else PRIOR_SD[0], PRIOR_SD)
         for _ in range(ITERATIONS):
@@ -302,16 +306,10 @@ class Comparison:
         return _boxed(values, self.half)
 
 
-class _Correlator:
-    """Cross-correlations of columns: sum over t of a_i(t) b_j(t + lag), shape (columns of a, of b, lags)."""
-
-    def __init__(self, n: int, reach: int):
-        self.reach, self.size = reach, 1 << (n + reach).bit_length()
-
-    def __call__(self, a: Array, b: Array) -> Array:
-        A, B = (np.fft.rfft(v, self.size, axis=0).T for v in (a, b))
-        sums = np.fft.irfft(A.conj()[:, None] * B, self.size, axis=-1)
-        return np.concatenate([sums[..., -self.reach :], sums[..., : self.reach + 1]], axis=-1)
+def _period(time: Array) -> float:
+    """Time between pings [s], the usual one; of pings that come in bursts their mean."""
+    stride = min(BURST, len(time) - 1)
+    return float(np.median(time[stride:] - time[:-stride])) / stride
 
 
 def _square(v: Array) -> Array:

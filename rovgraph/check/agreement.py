@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.check.correlation import Correlator
 from rovgraph.check.findings import Finding, integral, valid_pings
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
@@ -20,8 +21,13 @@ ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
 MIN_WINDOWS = 15
 FOLLOWS = 0.7  # correlation of sensors that see the same motion
+CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
 LAG_WARNING = 0.3  # [s]
 LARGEST_LAG = 3.0  # that is searched for [s]
+NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
+FARTHEST_LAG = 300.0  # that is searched for coarsely [s]
+FAR_BETTER = 4.0  # times smaller a part that two signals do not share
+EVIDENCE = 12.0  # in chi-square, that a lag is no chance
 SURE = 3.0  # standard deviations of a lag that is no chance
 PARTS = 10  # of the log, each left out once to see how much a lag depends on it
 OVERLAP = 5  # windows that begin within one
@@ -79,15 +85,18 @@ class Lag:
     ----------
     seconds : NaN if they do not follow each other
     sd : NaN if it is not known
+    evidence : how much better they agree than unshifted, in chi-square
     """
 
     seconds: float
     sd: float
+    evidence: float = 0.0
 
     @property
     def significant(self) -> bool:
         """Whether it is more than noise makes of clocks that agree."""
-        return bool(abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd)
+        beyond = abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd
+        return bool(beyond and self.evidence > EVIDENCE)
 
 
 def fit(a: Signal, b: Signal, window: float) -> Fit:
@@ -103,6 +112,34 @@ def fit(a: Signal, b: Signal, window: float) -> Fit:
         return Fit(np.nan, 0.0, 0.0, 0.0, len(x))
     correlation = float(np.corrcoef(x, y)[0, 1])
     return Fit(correlation * float(y.std() / x.std()), correlation, float(x.std()), float(y.std()), len(x))
+
+
+def coarse_lag(a: Signal, b: Signal, window: float) -> float:
+    """How much later b shows the same motion than a, to a step, where that is beyond what `lag` searches; else 0 [s].
+
+    Legs of a dive are alike, so a shifted one has to agree far better than the one that is not shifted.
+    """
+    step = 0.5
+    first, last = max(a.time[0], b.time[0]), min(a.time[-1], b.time[-1])
+    times = np.arange(first, last, step)
+    apart = max(1, round(window / step))
+    if len(times) < 4 * MIN_WINDOWS * apart:
+        return 0.0
+    values = [signal.at(times, window) for signal in (a, b)]
+    changes = [value[apart:] - value[:-apart] for value in values]
+    known = [np.isfinite(change) for change in changes]
+    x, y = (np.where(k, change - np.nanmean(change), 0.0) for k, change in zip(known, changes, strict=True))
+    reach = int(min(FARTHEST_LAG / step, 0.4 * len(x)))
+    correlate = Correlator(len(x), reach)
+    left, right = (np.column_stack([k * 1.0, v, v * v]) for k, v in zip(known, (x, y), strict=True))
+    both = correlate(left, right)
+    sums = np.array([both[0, 0], both[1, 0], both[0, 1], both[2, 0], both[0, 2], both[1, 1]]).T
+    lags = step * np.arange(-reach, reach + 1)
+    correlation = np.where(sums[:, 0] > 0.5 * len(x), _correlation(sums), 0.0)
+    near = np.abs(lags) <= LARGEST_LAG
+    best = int(np.argmax(correlation))
+    far_better = 1.0 - correlation[near].max() ** 2 > FAR_BETTER * (1.0 - correlation[best] ** 2)
+    return float(lags[best]) if correlation[best] > FOLLOWS and far_better else 0.0
 
 
 def lag(a: Signal, b: Signal, window: float) -> Lag:
@@ -124,12 +161,17 @@ def lag(a: Signal, b: Signal, window: float) -> Lag:
         value = signal.at(times - late, window)
         return value[OVERLAP:] - value[:-OVERLAP]
 
+    centre = coarse_lag(a, b, window)
+    b = Signal(b.time - centre, b.value)
     part, y = np.arange(count) * PARTS // count, changes(b, 0.0)
     sums = np.array([_moments(changes(a, float(x)), y, part) for x in lags])
     every = sums.sum(axis=-1)
-    seconds = _peak(lags, _correlation(every))
+    correlation = _correlation(every)
+    seconds = _peak(lags, correlation)
     without = np.array([_peak(lags, _correlation(every - sums[..., k])) for k in range(PARTS)])
-    return Lag(seconds, float(np.sqrt((PARTS - 1) * np.var(without))))
+    unshifted = correlation[len(lags) // 2] if centre == 0.0 else 0.0
+    better = np.log((1.0 - unshifted**2) / max(1.0 - float(correlation.max()) ** 2, 1e-9))
+    return Lag(centre + seconds, float(np.sqrt((PARTS - 1) * np.var(without))), float(better * count / OVERLAP))
 
 
 def _moments(x: Array, y: Array, part: NDArray[np.int64]) -> Array:
@@ -166,8 +208,13 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
             continue
         heading = _heading(log, config, sensor)
         period = float(np.median(np.diff(heading.time)))
-        f = fit(gyro, heading, max(2.0, 3.0 * period))
-        yield _turning(log, sensor, f)
+        window = max(2.0, 3.0 * period)
+        f = fit(gyro, heading, window)
+        if abs(f.correlation) < FOLLOWS:
+            shifted = Signal(heading.time - coarse_lag(gyro, heading, window), heading.value)
+            f = fit(gyro, shifted, window)
+        noise = _change_noise(heading, window)
+        yield _turning(log, sensor, f, noise)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             # short windows: in long ones a compass's deviation looks like a lag
             found = lag(gyro, heading, max(1.0, 1.5 * period))
@@ -203,7 +250,15 @@ def _beyond_circle(values: Array) -> bool:
     return bool(np.abs(values).max() > 2.0 * np.pi + 0.01)
 
 
-def _turning(log: Log, sensor: str, f: Fit) -> Finding:
+def _change_noise(heading: Signal, window: float) -> float:
+    """Noise of a heading's changes, by the second differences at even times, which turns hardly reach [rad]."""
+    values = heading.at(np.arange(heading.time[0], heading.time[-1], window), window)
+    second = np.abs(np.diff(values, 2))
+    second = second[np.isfinite(second)]
+    return float(np.median(second)) / 0.6745 / np.sqrt(3.0) if len(second) else 0.0
+
+
+def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
     """What a comparison of a heading with the gyro means."""
     name, beyond = NAMES[sensor], sensor != "mag" and _beyond_circle(log[sensor].data[:, 0])
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b) < ENOUGH_TURNING:
@@ -212,6 +267,8 @@ def _turning(log: Log, sensor: str, f: Fit) -> Finding:
             return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; in degrees? {_say_degrees(sensor)}")
         return Finding(sensor, "ok", f"too little turning to compare {name} with the gyro")
     numbers = f"slope {f.slope:.3g}, correlation {f.correlation:.2f} over {f.windows} windows"
+    if abs(f.correlation) < FOLLOWS and f.sd_a < NOISE_MARGIN * noise:
+        return Finding(sensor, "ok", f"too little turning for its noise to compare {name} with the gyro ({numbers})")
     if abs(f.correlation) < FOLLOWS:
         hint = "hard iron, or a wrong mounting?" if sensor == "mag" else "wrong unit, mounting or clock?"
         return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); {hint}")
@@ -288,10 +345,11 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             "or does depth count upwards?",
         )
     else:
-        level: Level = "ok" if 0.7 < f.slope < 1.4 else "warning"
+        low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
+        level: Level = "ok" if low < f.slope < high else "warning"
         yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
     behind = lag(dvl, depth, window)  # the integral is the less noisy one
-    yield from _clock("dvl", "vertical velocity", "the change of depth", Lag(-behind.seconds, behind.sd))
+    yield from _clock("dvl", "vertical velocity", "the change of depth", Lag(-behind.seconds, behind.sd, behind.evidence))
 
 
 def _depth_noise(depth: Signal, config: Config, window: float) -> float:

@@ -24,7 +24,7 @@ SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 LAG_WARNING = 0.05  # [s]
 SURE = 5.0  # standard deviations of a lag
 EVIDENCE = 30.0  # in chi-square that a lag explains
-TURNED = np.deg2rad(10.0)  # a mounting that is no small error
+TURNED = np.deg2rad(20.0)  # a mounting that is no small error
 JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
 LARGEST_JUMP = 120.0  # [s]
 PIECE = 30.0  # shortest part of a dive that shows a lag [s]
@@ -91,6 +91,7 @@ def _mounting(config: Config, k: int, fit: Fit, better: str) -> Finding:
                        f"but for turns of ({angles}) deg about the body's axes, sd ({sds}) deg")  # fmt: skip
     if turned and np.linalg.det(fit.R_bs) > 0.0:
         cause, remedy = axes_remedy(np.eye(3), fit.R_bs)
+        better = "by its acceleration" if k == 0 else better
     else:
         cause, remedy = axes_remedy(ORIENTATIONS[k], R_bs)
     return Finding("dvl", "warning", f"{cause}, {better} (likeness {fit.likeness:.2f}); {remedy}")
