@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from rovgraph.check.agreement import headings, vertical
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
-from rovgraph.check.fixes import track
+from rovgraph.check.fixes import repeated, track
 from rovgraph.check.frozen_sensors import standstill
 from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
@@ -38,6 +38,7 @@ CHECKS: tuple[Check, ...] = (
     frozen_imu,
     dvl_and_imu,
     vertical,
+    repeated,
     track,
     places,
     plan,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from rovgraph.check.correlation import Correlator
 from rovgraph.check.findings import Finding, integral, valid_pings
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array, rotate
+from rovgraph.check.inertial import inertial_motion
+from rovgraph.geometry import Array, cross, rotate
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import Level
 
@@ -231,11 +232,22 @@ def _heading(log: Log, config: Config, sensor: str) -> Signal:
     """A heading without jumps, of whatever circle its numbers suggest."""
     stream = log[sensor]
     if sensor == "mag":
-        field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
-        values = np.arctan2(-field_b[:, 1], field_b[:, 0])
+        values = _magnetic_heading(log, config)
     else:
         values = stream.data[:, 0]
     return Signal(stream.time, np.unwrap(values, period=_circle(values)))
+
+
+def _magnetic_heading(log: Log, config: Config) -> Array:
+    """Heading of the field's horizontal part, shape (n,) [rad]."""
+    stream, motion = log["mag"], inertial_motion(log, config)
+    field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
+    if motion is None:
+        return np.arctan2(-field_b[:, 1], field_b[:, 0])
+    down_b = np.column_stack([np.interp(stream.time, motion.time, column) for column in motion.down_b.T])
+    starboard_b = cross(down_b, np.broadcast_to(np.eye(3)[0], down_b.shape))
+    forward_b = cross(starboard_b, down_b)
+    return np.arctan2(-np.sum(starboard_b * field_b, axis=1), np.sum(forward_b * field_b, axis=1))
 
 
 def _circle(values: Array) -> float:
