@@ -28,7 +28,8 @@ LARGEST_LAG = 3.0  # that is searched for [s]
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
 FARTHEST_LAG = 300.0  # that is searched for coarsely [s]
 FAR_BETTER = 4.0  # times smaller a part that two signals do not share
-EVIDENCE = 12.0  # in chi-square, that a lag is no chance
+EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
+WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
 SURE = 3.0  # standard deviations of a lag that is no chance
 PARTS = 10  # of the log, each left out once to see how much a lag depends on it
 OVERLAP = 5  # windows that begin within one
@@ -93,11 +94,10 @@ class Lag:
     sd: float
     evidence: float = 0.0
 
-    @property
-    def significant(self) -> bool:
-        """Whether it is more than noise makes of clocks that agree."""
+    def significant(self, evidence: float) -> bool:
+        """Whether it is more than noise makes of clocks that agree, and explains so much."""
         beyond = abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd
-        return bool(beyond and self.evidence > EVIDENCE)
+        return bool(beyond and self.evidence > evidence)
 
 
 def fit(a: Signal, b: Signal, window: float) -> Fit:
@@ -219,7 +219,7 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             # short windows: in long ones a compass's deviation looks like a lag
             found = lag(gyro, heading, max(1.0, 1.5 * period))
-            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", found)
+            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", found, EVIDENCE)
 
 
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
@@ -314,13 +314,13 @@ def _say_degrees(sensor: str) -> str:
     return f"Say units: {{{sensor}: deg}}"
 
 
-def _clock(sensor: str, what: str, against: str, found: Lag) -> Iterator[Finding]:
+def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float) -> Iterator[Finding]:
     """A lag, if there is one."""
     if np.isnan(found.seconds):
         return
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
-    if found.significant:
+    if found.significant(evidence):
         yield Finding(sensor, "warning", f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?")
     else:
         yield Finding(sensor, "ok", f"{what} comes {later}{sd}")
@@ -360,8 +360,9 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
         level: Level = "ok" if low < f.slope < high else "warning"
         yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
-    behind = lag(dvl, depth, window)  # the integral is the less noisy one
-    yield from _clock("dvl", "vertical velocity", "the change of depth", Lag(-behind.seconds, behind.sd, behind.evidence))
+    found = lag(dvl, depth, window)  # the integral is the less noisy one
+    behind = Lag(-found.seconds, found.sd, found.evidence)
+    yield from _clock("dvl", "vertical velocity", "the change of depth", behind, WAVE_EVIDENCE)
 
 
 def _depth_noise(depth: Signal, config: Config, window: float) -> float:

@@ -95,8 +95,10 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
     way, mirrored = (plane.way(turn * (v_b[:, 0] + sign * 1j * v_b[:, 1])) for sign in (1.0, -1.0))
     lag, lag_sd, lag_evidence = plane.lag(way)
     late = bool(abs(lag) > max(LAG_WARNING, SURE * lag_sd) and lag_evidence > EVIDENCE)
-    shift = lag if late else 0.0
-    as_is, unlike, swapped = plane.fit(way, shift), plane.fit(mirrored, shift), plane.fit(way.conj(), shift)
+    as_is, unlike, swapped = (plane.fit(one, 0.0) for one in (way, mirrored, way.conj()))
+    late &= plane.fit(way, lag).error < min(unlike.error, swapped.error)
+    if late:
+        as_is, unlike, swapped = (plane.fit(one, lag) for one in (way, mirrored, way.conj()))
     if _better(swapped, as_is) and swapped.error <= 1.05 * unlike.error:
         angle = round(np.rad2deg(np.angle(swapped.c)))
         yield Finding("fix", "warning", f"north and east are swapped or mirrored: fixes fit the DVL's track so, turned by "
@@ -124,7 +126,7 @@ def _turned(config: Config, as_is: _Line, unlike: _Line) -> Finding:
     wrong = abs(angle) > MISALIGNED + SURE * as_is.sd or (
         not 0.8 < scale < 1.25 and abs(np.log(scale)) > SURE * as_is.sd + 0.2
     )
-    tail = "; check dvl.mount_rpy_deg and the compass offset" if wrong else ""
+    tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""
     if wrong and unlike.likeness > as_is.likeness - 0.05:
         tail += f". As well it may be mirrored: {_other_way_up(config)}"
     text = f"fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
