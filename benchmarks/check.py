@@ -81,7 +81,9 @@ def _healthy(seeds: int) -> None:
     for name, lines in dives:
         for line in lines:
             print(f"{name}: {line.sensor}: {line.text}", flush=True)
-    print(f"{sum(bool(lines) for _, lines in dives)} of {len(dives)} healthy dives with a warning")
+    lock = "bottom lock"  # the simulator's tank does lose it
+    wrong = sum(any(not line.text.startswith(lock) for line in lines) for _, lines in dives)
+    print(f"{wrong} of {len(dives)} healthy dives with a false warning")
 
 
 if __name__ == "__main__":

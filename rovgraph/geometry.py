@@ -5,9 +5,8 @@ that any leading axes broadcast.
 """
 
 from functools import cache
-from typing import TypeVar
-
 from itertools import permutations, product
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

@@ -145,11 +145,12 @@ class Comparison:
         a, w = (np.where(known[:, None], rotate(self.R_bs.T, v), 0.0) for v in (self.acceleration_b, self.rate_b))
         dy, mean = (np.where(seen[:, None], v, 0.0) for v in (dy, mean))
         correlate = Correlator(len(time), reach)
+        inertial, pinged = (flags[:, None].astype(float) for flags in (known, seen))
         pairs = np.triu_indices(3)
-        count = np.maximum(correlate(known[:, None] * 1.0, seen[:, None] * 1.0)[0, 0], 1.0)
-        own = correlate(_square(a)[:, None], seen[:, None] * 1.0)[0, 0]
+        count = np.maximum(correlate(inertial, pinged)[0, 0], 1.0)
+        own = correlate(_square(a)[:, None], pinged)[0, 0]
         speed = correlate(_square(w)[:, None], _square(mean)[:, None])[0, 0]
-        speed += correlate(known[:, None] * 1.0, _square(dy)[:, None])[0, 0]
+        speed += correlate(inertial, _square(dy)[:, None])[0, 0]
         swing = correlate(w, cross(mean, dy))
         both = correlate(a, dy) + correlate(cross(a, w), mean)
         twice = np.where(pairs[0] == pairs[1], 1.0, 2.0)
@@ -159,10 +160,12 @@ class Comparison:
         moment = moment * twice[:, None] * twice
         shape = (len(ORIENTATIONS), -1)
         of_dvl = speed - moment.reshape(shape) @ outer.reshape(36, -1)
-        of_dvl += 2.0 * (np.linalg.det(ORIENTATIONS)[:, None, None] * ORIENTATIONS).reshape(shape) @ swing.reshape(9, -1)
+        of_dvl += (
+            2.0 * (np.linalg.det(ORIENTATIONS)[:, None, None] * ORIENTATIONS).reshape(shape) @ swing.reshape(9, -1)
+        )
         mixed = ORIENTATIONS.reshape(shape) @ both.reshape(9, -1)
         total = np.maximum(own + of_dvl, 1e-12)
-        lags = step * np.arange(-reach, reach + 1)
+        lags = np.arange(-reach, reach + 1, dtype=float) * step
         enough = count >= max(ENOUGH, OVERLAP * np.count_nonzero(known & seen))
         error = np.where(enough, (total - 2.0 * mixed) / count, np.inf)
         return Search(lags, error, np.where(enough, 2.0 * mixed / total, -1.0))
@@ -276,11 +279,11 @@ class Comparison:
 
     def _known(self, when: Array) -> NDArray[np.bool_]:
         inside = (when >= self.motion.time[0]) & (when <= self.motion.time[-1])
-        return inside & self.known[self._nearest(when)]
+        return np.asarray(inside & self.known[self._nearest(when)])
 
     def _nearest(self, when: Array) -> NDArray[np.int64]:
         k = np.rint((when - self.motion.time[0]) / self.motion.step).astype(np.int64)
-        return k.clip(0, len(self.motion.time) - 1)
+        return np.asarray(k.clip(0, len(self.motion.time) - 1))
 
     def _slow(self, when: Array, change_g: Array) -> Array:
         """What `inertial_motion` takes of accelerations (n, k) for gravity."""
@@ -338,4 +341,4 @@ def without_spikes(pings: Stream) -> Stream:
     padded = np.pad(pings.data[:, :3], ((2, 2), (0, 0)), mode="edge")
     off = np.abs(pings.data[:, :3] - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1))
     limit = np.maximum(LEAST_SPIKE, SPIKE * np.median(off, axis=0))
-    return pings.take((off <= limit).all(axis=1))
+    return pings.take(np.asarray((off <= limit).all(axis=1)))

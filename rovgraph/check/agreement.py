@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from rovgraph.check.correlation import Correlator
 from rovgraph.check.findings import Finding, integral, valid_pings
-from rovgraph.config import Config, mount_matrix
 from rovgraph.check.inertial import inertial_motion
+from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, rotate
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import Level
@@ -231,10 +231,7 @@ def _gyro_yaw(imu: Stream, config: Config) -> Signal:
 def _heading(log: Log, config: Config, sensor: str) -> Signal:
     """A heading without jumps, of whatever circle its numbers suggest."""
     stream = log[sensor]
-    if sensor == "mag":
-        values = _magnetic_heading(log, config)
-    else:
-        values = stream.data[:, 0]
+    values = _magnetic_heading(log, config) if sensor == "mag" else stream.data[:, 0]
     return Signal(stream.time, np.unwrap(values, period=_circle(values)))
 
 
@@ -243,11 +240,11 @@ def _magnetic_heading(log: Log, config: Config) -> Array:
     stream, motion = log["mag"], inertial_motion(log, config)
     field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
     if motion is None:
-        return np.arctan2(-field_b[:, 1], field_b[:, 0])
+        return np.asarray(np.arctan2(-field_b[:, 1], field_b[:, 0]))
     down_b = np.column_stack([np.interp(stream.time, motion.time, column) for column in motion.down_b.T])
     starboard_b = cross(down_b, np.broadcast_to(np.eye(3)[0], down_b.shape))
     forward_b = cross(starboard_b, down_b)
-    return np.arctan2(-np.sum(starboard_b * field_b, axis=1), np.sum(forward_b * field_b, axis=1))
+    return np.asarray(np.arctan2(-np.sum(starboard_b * field_b, axis=1), np.sum(forward_b * field_b, axis=1)))
 
 
 def _circle(values: Array) -> float:

@@ -55,8 +55,8 @@ def repeated(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding(
             "fix",
             "warning",
-            f"{counts[longest]} fixes repeat {where}, for {last - first:.0f} s from {since(log, first)} on, while the DVL "
-            f"moves by {way:.0f} m: a receiver repeats its last fix; leave these rows out",
+            f"{counts[longest]} fixes repeat {where}, for {last - first:.0f} s from {since(log, first)} on, "
+            f"while the DVL moves by {way:.0f} m: a receiver repeats its last fix; leave these rows out",
         )
 
 
@@ -101,8 +101,12 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
         as_is, unlike, swapped = (plane.fit(one, lag) for one in (way, mirrored, way.conj()))
     if _better(swapped, as_is) and swapped.error <= 1.05 * unlike.error:
         angle = round(np.rad2deg(np.angle(swapped.c)))
-        yield Finding("fix", "warning", f"north and east are swapped or mirrored: fixes fit the DVL's track so, turned by "
-                      f"{angle:+d} deg (likeness {swapped.likeness:.2f} against {as_is.likeness:.2f})")  # fmt: skip
+        yield Finding(
+            "fix",
+            "warning",
+            "north and east are swapped or mirrored: so the fixes fit the DVL's track, turned by "
+            f"{angle:+d} deg (likeness {swapped.likeness:.2f} against {as_is.likeness:.2f})",
+        )
     elif _better(unlike, as_is) and unlike.likeness > 0.6:
         yield Finding("dvl", "warning", _mirrored_text(config, as_is.likeness, unlike.likeness))
     elif as_is.likeness < 0.6:
@@ -112,8 +116,9 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
     else:
         yield _turned(config, as_is, unlike)
         if late:
-            yield Finding("fix", "warning", f"its fixes come {abs(lag):.1f} s {'late' if lag > 0 else 'early'} against the "
-                          f"DVL's track (sd {lag_sd:.1f} s): correct their stamps in the file")  # fmt: skip
+            sense = "late" if lag > 0.0 else "early"
+            text = f"fixes come {abs(lag):.1f} s {sense} against the DVL's track (sd {lag_sd:.1f} s)"
+            yield Finding("fix", "warning", f"{text}: correct their stamps in the file")
 
 
 def _better(one: _Line, other: _Line) -> bool:
@@ -189,7 +194,7 @@ class _Plane:
     def noise(self) -> float:
         """Of a fix in both components together, by differences from its neighbours' mean [m]."""
         second = np.abs(self.fixes[2:] - 2.0 * self.fixes[1:-1] + self.fixes[:-2])
-        return max(float(np.median(second)) / np.sqrt(6.0) / 0.8326, 1e-3)  # of a Rayleigh variable
+        return float(max(np.median(second) / np.sqrt(6.0) / 0.8326, 1e-3))  # the median of a Rayleigh variable
 
     def lag(self, way: Complexes) -> tuple[float, float, float]:
         """How late the fixes are [s], its sd, and how much it explains in chi-square."""

@@ -93,7 +93,7 @@ def _means(stream: Stream, values: Array, edges: Array) -> Array:
 def in_gap(times: Array, stamps: Array, longest: float) -> NDArray[np.bool_]:
     """Whether each time lies outside the stamps, or between two that are further apart; shape (len(times),)."""
     k = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    return (stamps[k] - stamps[k - 1] > longest) | (times < stamps[0]) | (times > stamps[-1])
+    return np.asarray((stamps[k] - stamps[k - 1] > longest) | (times < stamps[0]) | (times > stamps[-1]))
 
 
 def attitudes(rate_b: Array, step: float) -> Array:

@@ -84,8 +84,8 @@ def _magnitude(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
         said = "uT" if given else "any unit"
         yield (
             "warning",
-            f"field {middle:.4g} is not the Earth's in {said} (22 to 67 uT); is the unit wrong? Say units: {{mag: nT}}, "
-            "or calibrate it (rovgraph calibrate magnetometer)",
+            f"field {middle:.4g} is not the Earth's in {said} (22 to 67 uT); is the unit wrong? "
+            "Say units: {mag: nT}, or calibrate it (rovgraph calibrate magnetometer)",
         )
     yield level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}"
 
