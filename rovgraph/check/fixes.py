@@ -88,7 +88,8 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
         return
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     turn = np.exp(1j * np.interp(pings.time, *psi))
-    plane = _Plane(log, pings.time)
+    arm = complex(*config.fix.lever_arm_m[:2])
+    plane = _Plane(log, pings.time, arm * np.exp(1j * np.interp(log["fix"].time, *psi)))
     if plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
         yield Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
         return
@@ -118,7 +119,9 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
         if late:
             sense = "late" if lag > 0.0 else "early"
             text = f"fixes come {abs(lag):.1f} s {sense} against the DVL's track (sd {lag_sd:.1f} s)"
-            yield Finding("fix", "warning", f"{text}: correct their stamps in the file")
+            speed = float(np.median(np.linalg.norm(pings.data[:, :3], axis=1)))
+            remedy = f"correct their stamps in the file, or fix.lever_arm_m, if it is {speed * abs(lag):.1f} m off"
+            yield Finding("fix", "warning", f"{text}: {remedy}")
 
 
 def _better(one: _Line, other: _Line) -> bool:
@@ -139,16 +142,16 @@ def _turned(config: Config, as_is: _Line, unlike: _Line) -> Finding:
 
 
 class _Plane:
-    """Fixes as complex numbers, and the stretches in which the DVL's track is known."""
+    """Fixes as complex numbers, less their lever arm, and the stretches in which the DVL's track is known."""
 
-    def __init__(self, log: Log, pings: Array):
+    def __init__(self, log: Log, pings: Array, arms: Complexes):
         fix = log["fix"]
         lost = np.cumsum(np.diff(pings) > LONGEST_GAP)
         self.pings, self.time = pings, fix.time
         stretch = np.concatenate([[0], lost])[np.searchsorted(pings, fix.time).clip(0, len(pings) - 1)]
         stretch = stretch * 1_000_000 + ((fix.time - fix.time[0]) // STRETCH).astype(np.int64)
         self.stretch = np.unique(stretch, return_inverse=True)[1]
-        self.fixes: Complexes = fix.data[:, 0] + 1j * fix.data[:, 1]
+        self.fixes: Complexes = fix.data[:, 0] + 1j * fix.data[:, 1] - arms
         self.inside = ~in_gap(fix.time, pings, LONGEST_GAP)
         self.inside &= _near_median(self.fixes)
 
