@@ -331,10 +331,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     if len(pings) < MIN_WINDOWS:
         return
     down = _downwards(log["imu"], config, pings.time)
-    v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
-    dvl = Signal(pings.time, integral(pings, np.sum(v_b * down, axis=1)))
-    depth = Signal(log["depth"].time, log["depth"]["depth"])
-    window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
+    depth, dvl, window = _descents(log, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
     f = fit(depth, dvl, window)
     if f.windows < MIN_WINDOWS or f.sd_a < ENOUGH_DIVING:
         yield Finding("dvl", "ok", "too little diving to compare its vertical velocity with depth")
@@ -360,6 +357,22 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
     yield from _clock("dvl", "vertical velocity", "the change of depth", behind, WAVE_EVIDENCE)
+
+
+def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
+    """Depth, the way downwards by a DVL with a mounting, and the window over which the two are compared [s]."""
+    way = integral(pings, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
+    window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
+    return Signal(log["depth"].time, log["depth"]["depth"]), Signal(pings.time, way), window
+
+
+def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:
+    """Correlation of depth with the way downwards by a DVL with a mounting; 0 if nothing is to be seen."""
+    if "depth" not in log or len(log["depth"]) < MIN_WINDOWS:
+        return 0.0
+    pings = valid_pings(log["dvl"])
+    f = fit(*_descents(log, pings, R_bs, _downwards(log["imu"], config, pings.time)))
+    return f.correlation if f.windows >= MIN_WINDOWS and f.sd_a > ENOUGH_DIVING else 0.0
 
 
 def _depth_noise(depth: Signal, config: Config, window: float) -> float:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rovgraph.check.acceleration import ORIENTATIONS, Comparison, Fit, Search
+from rovgraph.check.agreement import dives_with_depth
 from rovgraph.check.findings import Finding, since, valid_pings
 from rovgraph.check.inertial import inertial_motion
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
@@ -20,8 +21,10 @@ from rovgraph.sensors.dvl import axes_remedy
 ENOUGH_PINGS = 50
 FOLLOWS = 0.65  # likeness of accelerations that are of one motion
 BETTER = 2.0  # times smaller an error than as configured, which chance does not make
+ALIKE = 1.1  # times the least error, that tells two orientations apart no more
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 LAG_WARNING = 0.05  # [s]
+APART = 0.15  # that search and fit may be apart [s]
 SURE = 5.0  # standard deviations of a lag
 EVIDENCE = 30.0  # in chi-square that a lag explains
 TURNED = np.deg2rad(20.0)  # a mounting that is no small error
@@ -51,12 +54,14 @@ def dvl_and_imu(log: Log, config: Config) -> Iterator[Finding]:
     if found.likeness[k, m] < FOLLOWS:
         yield Finding("dvl", "ok", "too little acceleration to compare its axes and clock with the IMU")
         return
+    if k:
+        k = _upright(log, config, found, m)
     fit = compared.refine(float(found.lags[m]), ORIENTATIONS[k])
     if fit is None:
         return
     better = found.error[0, found.now] / found.error[k, m]
     yield _mounting(config, k, fit, f"so its acceleration agrees {better:.1f} times better with the IMU's")
-    yield _clock(config, compared, ORIENTATIONS[k], fit)
+    yield _clock(config, compared, ORIENTATIONS[k], fit, float(found.lags[m]))
 
 
 def _explanation(found: Search) -> tuple[int, int]:
@@ -77,6 +82,22 @@ def _explanation(found: Search) -> tuple[int, int]:
     return int(both[0]), int(both[1])
 
 
+def _upright(log: Log, config: Config, found: Search, m: int) -> int:
+    """Of orientations that agree alike, as the two senses of the vertical do on a level dive, the one to believe.
+
+    Depth decides; where it shows nothing, an instrument is rather mounted in another way than left-handed.
+    """
+    error = found.error[:, m]
+    alike = np.flatnonzero(error < ALIKE * error.min())
+    R_bs = mount_matrix(config.dvl.mount_rpy_deg)
+    by_depth = [dives_with_depth(log, config, R_bs @ ORIENTATIONS[k]) for k in alike]
+    if max(by_depth) > FOLLOWS:
+        return int(alike[int(np.argmax(by_depth))])
+    handed = np.linalg.det(ORIENTATIONS[alike]) > 0.0
+    chosen = alike[handed] if handed.any() else alike
+    return int(chosen[int(np.argmin(error[chosen]))])
+
+
 def _mounting(config: Config, k: int, fit: Fit, better: str) -> Finding:
     """Whether the mounting of a fit is that of the configuration."""
     R_bs = mount_matrix(config.dvl.mount_rpy_deg)
@@ -94,8 +115,8 @@ def _mounting(config: Config, k: int, fit: Fit, better: str) -> Finding:
     return Finding("dvl", "warning", f"{cause}, {better} (likeness {fit.likeness:.2f}); {remedy}")
 
 
-def _clock(config: Config, compared: Comparison, H: Array, fit: Fit) -> Finding:
-    """Whether the stamps are late."""
+def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: float) -> Finding:
+    """Whether the stamps are late, by the fit and by the search, whose errors are others."""
     offset = beliefs(config)["dvl_time_offset"]
     mean = float(offset.mean[0])
     late = fit.lag - mean
@@ -104,6 +125,8 @@ def _clock(config: Config, compared: Comparison, H: Array, fit: Fit) -> Finding:
     allowed = max(LAG_WARNING, SURE * fit.lag_sd, 3.0 * offset.sd if offset.estimate else 0.0)
     if abs(late) < allowed:
         return Finding("dvl", "ok", text)
+    if abs(fit.lag - coarse) > max(APART, SURE * fit.lag_sd) or abs(coarse - mean) < 0.5 * abs(late):
+        return Finding("dvl", "ok", f"{text}, which the dive does not show well")
     as_stamped = compared.refine(mean, H, held=True)
     if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < EVIDENCE:
         return Finding("dvl", "ok", f"{text}, which the dive does not show well")
