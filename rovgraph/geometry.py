@@ -5,6 +5,7 @@ that any leading axes broadcast.
 """
 
 from functools import cache
+from itertools import permutations, product
 from typing import TypeVar
 
 import numpy as np
@@ -271,6 +272,14 @@ def earth_rate_n(latitude: float) -> Array:
 
 
 EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
+
+
+def signed_permutations() -> Array:
+    """The 48 ways to name three axes and their senses, the identity first; shape (48, 3, 3)."""
+    out = np.zeros((48, 3, 3))
+    for H, (order, signs) in zip(out, product(permutations(range(3)), product((1.0, -1.0), repeat=3)), strict=True):
+        H[range(3), order] = signs
+    return out
 
 
 def transpose(R: Array) -> Array:

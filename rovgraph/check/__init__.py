@@ -9,8 +9,9 @@ import warnings
 from collections.abc import Callable, Iterator
 
 from rovgraph.check.agreement import headings, vertical
+from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
-from rovgraph.check.fixes import track
+from rovgraph.check.fixes import repeated, track
 from rovgraph.check.frozen_sensors import standstill
 from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
@@ -35,7 +36,9 @@ CHECKS: tuple[Check, ...] = (
     own,
     standstill,
     frozen_imu,
+    dvl_and_imu,
     vertical,
+    repeated,
     track,
     places,
     plan,

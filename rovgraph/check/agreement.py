@@ -10,9 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding, integral
+from rovgraph.check.correlation import Correlator
+from rovgraph.check.findings import Finding, integral, valid_pings
+from rovgraph.check.inertial import inertial_motion
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array, rotate
+from rovgraph.geometry import Array, cross, rotate
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import Level
 
@@ -20,8 +22,14 @@ ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
 MIN_WINDOWS = 15
 FOLLOWS = 0.7  # correlation of sensors that see the same motion
+CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
 LAG_WARNING = 0.3  # [s]
 LARGEST_LAG = 3.0  # that is searched for [s]
+NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
+FARTHEST_LAG = 300.0  # that is searched for coarsely [s]
+FAR_BETTER = 4.0  # times smaller a part that two signals do not share
+EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
+WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
 SURE = 3.0  # standard deviations of a lag that is no chance
 PARTS = 10  # of the log, each left out once to see how much a lag depends on it
 OVERLAP = 5  # windows that begin within one
@@ -79,15 +87,17 @@ class Lag:
     ----------
     seconds : NaN if they do not follow each other
     sd : NaN if it is not known
+    evidence : how much better they agree than unshifted, in chi-square
     """
 
     seconds: float
     sd: float
+    evidence: float = 0.0
 
-    @property
-    def significant(self) -> bool:
-        """Whether it is more than noise makes of clocks that agree."""
-        return bool(abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd)
+    def significant(self, evidence: float) -> bool:
+        """Whether it is more than noise makes of clocks that agree, and explains so much."""
+        beyond = abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd
+        return bool(beyond and self.evidence > evidence)
 
 
 def fit(a: Signal, b: Signal, window: float) -> Fit:
@@ -103,6 +113,34 @@ def fit(a: Signal, b: Signal, window: float) -> Fit:
         return Fit(np.nan, 0.0, 0.0, 0.0, len(x))
     correlation = float(np.corrcoef(x, y)[0, 1])
     return Fit(correlation * float(y.std() / x.std()), correlation, float(x.std()), float(y.std()), len(x))
+
+
+def coarse_lag(a: Signal, b: Signal, window: float) -> float:
+    """How much later b shows the same motion than a, to a step, where that is beyond what `lag` searches; else 0 [s].
+
+    Legs of a dive are alike, so a shifted one has to agree far better than the one that is not shifted.
+    """
+    step = 0.5
+    first, last = max(a.time[0], b.time[0]), min(a.time[-1], b.time[-1])
+    times = np.arange(first, last, step)
+    apart = max(1, round(window / step))
+    if len(times) < 4 * MIN_WINDOWS * apart:
+        return 0.0
+    values = [signal.at(times, window) for signal in (a, b)]
+    changes = [value[apart:] - value[:-apart] for value in values]
+    known = [np.isfinite(change) for change in changes]
+    x, y = (np.where(k, change - np.nanmean(change), 0.0) for k, change in zip(known, changes, strict=True))
+    reach = int(min(FARTHEST_LAG / step, 0.4 * len(x)))
+    correlate = Correlator(len(x), reach)
+    left, right = (np.column_stack([k * 1.0, v, v * v]) for k, v in zip(known, (x, y), strict=True))
+    both = correlate(left, right)
+    sums = np.array([both[0, 0], both[1, 0], both[0, 1], both[2, 0], both[0, 2], both[1, 1]]).T
+    lags = step * np.arange(-reach, reach + 1)
+    correlation = np.where(sums[:, 0] > 0.5 * len(x), _correlation(sums), 0.0)
+    near = np.abs(lags) <= LARGEST_LAG
+    best = int(np.argmax(correlation))
+    far_better = 1.0 - correlation[near].max() ** 2 > FAR_BETTER * (1.0 - correlation[best] ** 2)
+    return float(lags[best]) if correlation[best] > FOLLOWS and far_better else 0.0
 
 
 def lag(a: Signal, b: Signal, window: float) -> Lag:
@@ -124,12 +162,17 @@ def lag(a: Signal, b: Signal, window: float) -> Lag:
         value = signal.at(times - late, window)
         return value[OVERLAP:] - value[:-OVERLAP]
 
+    centre = coarse_lag(a, b, window)
+    b = Signal(b.time - centre, b.value)
     part, y = np.arange(count) * PARTS // count, changes(b, 0.0)
     sums = np.array([_moments(changes(a, float(x)), y, part) for x in lags])
     every = sums.sum(axis=-1)
-    seconds = _peak(lags, _correlation(every))
+    correlation = _correlation(every)
+    seconds = _peak(lags, correlation)
     without = np.array([_peak(lags, _correlation(every - sums[..., k])) for k in range(PARTS)])
-    return Lag(seconds, float(np.sqrt((PARTS - 1) * np.var(without))))
+    unshifted = correlation[len(lags) // 2] if centre == 0.0 else 0.0
+    better = np.log((1.0 - unshifted**2) / max(1.0 - float(correlation.max()) ** 2, 1e-9))
+    return Lag(centre + seconds, float(np.sqrt((PARTS - 1) * np.var(without))), float(better * count / OVERLAP))
 
 
 def _moments(x: Array, y: Array, part: NDArray[np.int64]) -> Array:
@@ -166,12 +209,17 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
             continue
         heading = _heading(log, config, sensor)
         period = float(np.median(np.diff(heading.time)))
-        f = fit(gyro, heading, max(2.0, 3.0 * period))
-        yield _turning(log, sensor, f)
+        window = max(2.0, 3.0 * period)
+        f = fit(gyro, heading, window)
+        if abs(f.correlation) < FOLLOWS:
+            shifted = Signal(heading.time - coarse_lag(gyro, heading, window), heading.value)
+            f = fit(gyro, shifted, window)
+        noise = _change_noise(heading, window)
+        yield _turning(log, sensor, f, noise)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             # short windows: in long ones a compass's deviation looks like a lag
             found = lag(gyro, heading, max(1.0, 1.5 * period))
-            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", found)
+            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", found, EVIDENCE)
 
 
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
@@ -183,12 +231,20 @@ def _gyro_yaw(imu: Stream, config: Config) -> Signal:
 def _heading(log: Log, config: Config, sensor: str) -> Signal:
     """A heading without jumps, of whatever circle its numbers suggest."""
     stream = log[sensor]
-    if sensor == "mag":
-        field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
-        values = np.arctan2(-field_b[:, 1], field_b[:, 0])
-    else:
-        values = stream.data[:, 0]
+    values = _magnetic_heading(log, config) if sensor == "mag" else stream.data[:, 0]
     return Signal(stream.time, np.unwrap(values, period=_circle(values)))
+
+
+def _magnetic_heading(log: Log, config: Config) -> Array:
+    """Heading of the field's horizontal part, shape (n,) [rad]."""
+    stream, motion = log["mag"], inertial_motion(log, config)
+    field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
+    if motion is None:
+        return np.asarray(np.arctan2(-field_b[:, 1], field_b[:, 0]))
+    down_b = np.column_stack([np.interp(stream.time, motion.time, column) for column in motion.down_b.T])
+    starboard_b = cross(down_b, np.broadcast_to(np.eye(3)[0], down_b.shape))
+    forward_b = cross(starboard_b, down_b)
+    return np.asarray(np.arctan2(-np.sum(starboard_b * field_b, axis=1), np.sum(forward_b * field_b, axis=1)))
 
 
 def _circle(values: Array) -> float:
@@ -203,7 +259,15 @@ def _beyond_circle(values: Array) -> bool:
     return bool(np.abs(values).max() > 2.0 * np.pi + 0.01)
 
 
-def _turning(log: Log, sensor: str, f: Fit) -> Finding:
+def _change_noise(heading: Signal, window: float) -> float:
+    """Noise of a heading's changes, by the second differences at even times, which turns hardly reach [rad]."""
+    values = heading.at(np.arange(heading.time[0], heading.time[-1], window), window)
+    second = np.abs(np.diff(values, 2))
+    second = second[np.isfinite(second)]
+    return float(np.median(second)) / 0.6745 / np.sqrt(3.0) if len(second) else 0.0
+
+
+def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
     """What a comparison of a heading with the gyro means."""
     name, beyond = NAMES[sensor], sensor != "mag" and _beyond_circle(log[sensor].data[:, 0])
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b) < ENOUGH_TURNING:
@@ -212,6 +276,8 @@ def _turning(log: Log, sensor: str, f: Fit) -> Finding:
             return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; in degrees? {_say_degrees(sensor)}")
         return Finding(sensor, "ok", f"too little turning to compare {name} with the gyro")
     numbers = f"slope {f.slope:.3g}, correlation {f.correlation:.2f} over {f.windows} windows"
+    if abs(f.correlation) < FOLLOWS and f.sd_a < NOISE_MARGIN * noise:
+        return Finding(sensor, "ok", f"too little turning for its noise to compare {name} with the gyro ({numbers})")
     if abs(f.correlation) < FOLLOWS:
         hint = "hard iron, or a wrong mounting?" if sensor == "mag" else "wrong unit, mounting or clock?"
         return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); {hint}")
@@ -245,13 +311,13 @@ def _say_degrees(sensor: str) -> str:
     return f"Say units: {{{sensor}: deg}}"
 
 
-def _clock(sensor: str, what: str, against: str, found: Lag) -> Iterator[Finding]:
+def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float) -> Iterator[Finding]:
     """A lag, if there is one."""
     if np.isnan(found.seconds):
         return
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
-    if found.significant:
+    if found.significant(evidence):
         yield Finding(sensor, "warning", f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?")
     else:
         yield Finding(sensor, "ok", f"{what} comes {later}{sd}")
@@ -261,14 +327,11 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     """The DVL's velocity downwards against the change of depth: sign and clock."""
     if not {"dvl", "depth", "imu"} <= log.sensors or len(log["depth"]) < MIN_WINDOWS:
         return
-    pings = _valid_pings(log["dvl"])
+    pings = valid_pings(log["dvl"])
     if len(pings) < MIN_WINDOWS:
         return
     down = _downwards(log["imu"], config, pings.time)
-    v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
-    dvl = Signal(pings.time, integral(pings, np.sum(v_b * down, axis=1)))
-    depth = Signal(log["depth"].time, log["depth"]["depth"])
-    window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
+    depth, dvl, window = _descents(log, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
     f = fit(depth, dvl, window)
     if f.windows < MIN_WINDOWS or f.sd_a < ENOUGH_DIVING:
         yield Finding("dvl", "ok", "too little diving to compare its vertical velocity with depth")
@@ -288,10 +351,28 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             "or does depth count upwards?",
         )
     else:
-        level: Level = "ok" if 0.7 < f.slope < 1.4 else "warning"
+        low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
+        level: Level = "ok" if low < f.slope < high else "warning"
         yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
-    behind = lag(dvl, depth, window)  # the integral is the less noisy one
-    yield from _clock("dvl", "vertical velocity", "the change of depth", Lag(-behind.seconds, behind.sd))
+    found = lag(dvl, depth, window)  # the integral is the less noisy one
+    behind = Lag(-found.seconds, found.sd, found.evidence)
+    yield from _clock("dvl", "vertical velocity", "the change of depth", behind, WAVE_EVIDENCE)
+
+
+def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
+    """Depth, the way downwards by a DVL with a mounting, and the window over which the two are compared [s]."""
+    way = integral(pings, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
+    window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
+    return Signal(log["depth"].time, log["depth"]["depth"]), Signal(pings.time, way), window
+
+
+def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:
+    """Correlation of depth with the way downwards by a DVL with a mounting; 0 if nothing is to be seen."""
+    if "depth" not in log or len(log["depth"]) < MIN_WINDOWS:
+        return 0.0
+    pings = valid_pings(log["dvl"])
+    f = fit(*_descents(log, pings, R_bs, _downwards(log["imu"], config, pings.time)))
+    return f.correlation if f.windows >= MIN_WINDOWS and f.sd_a > ENOUGH_DIVING else 0.0
 
 
 def _depth_noise(depth: Signal, config: Config, window: float) -> float:
@@ -307,11 +388,6 @@ def _flip(config: Config) -> str:
     roll, pitch, yaw = config.dvl.mount_rpy_deg
     turned, points = (180, "up") if abs(roll) < 90 else (0, "down")
     return f"does the DVL's z axis point {points}? Then dvl.mount_rpy_deg is [{turned}, {pitch:g}, {yaw:g}]"
-
-
-def _valid_pings(stream: Stream) -> Stream:
-    valid = stream["dvl_valid"] == 1.0
-    return Stream(stream.sensor, stream.columns, stream.time[valid], stream.data[valid], stream.row[valid])
 
 
 def _downwards(imu: Stream, config: Config, time: Array, span: float = 2.0) -> Array:

@@ -86,6 +86,11 @@ def told(stream: Stream) -> Array:
     return np.where((stream["dvl_valid"] == 1.0)[:, None], stream.data, np.nan)
 
 
+def valid_pings(stream: Stream) -> Stream:
+    """Pings with bottom lock."""
+    return stream.take(stream["dvl_valid"] == 1.0)
+
+
 def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """First and last index of every stretch of True."""
     edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))

@@ -1,59 +1,237 @@
-"""The DVL's velocities, turned by a heading, against position fixes.
+"""The DVL's track, turned by a heading, against position fixes.
 
-In the plane as complex numbers: fixes move by ``d``, the DVL by ``D = sum exp(i psi) v dt``.
-``d = c D`` fits with ``arg c`` the error of heading and mounting and ``|c|`` the scale. A DVL
-whose y axis is mirrored fits better with the conjugate velocity.
+In the plane as complex numbers: a fix is ``p + c D(t - tau)`` with ``D`` the sum of ``exp(i psi) v dt``. ``arg c`` is
+the error of heading and mounting, ``|c|`` the scale, ``tau`` how late the fixes are, and ``p`` is free in each stretch
+of some minutes, since D drifts. Fixes of swapped north and east fit the conjugate of D; a DVL whose y axis is mirrored
+fits better with the conjugate velocity. A cause is named where it explains the fixes beyond what chance does.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding
+from rovgraph.check.findings import Finding, repeats, since, valid_pings
+from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, matrix_from_rpy, rotate
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log
 
-WINDOW = 10.0  # [s]
-MIN_WINDOWS = 20
-ENOUGH_DISTANCE = 20.0  # sum of the fixes' movement that is no noise [m]
+MIN_FIXES = 15
+STRETCH = 300.0  # over which the DVL's track drifts less than fixes scatter [s]
+LONGEST_GAP = 5.0  # between pings, in which the track is lost [s]
+ENOUGH_DISTANCE = 10.0  # spread of the fixes [m]
 MISALIGNED = np.deg2rad(15.0)
+LARGEST_LAG = 60.0  # [s]
+LAG_STEP = 0.25  # [s]
+LAG_WARNING = 0.5  # [s]
+SURE = 5.0  # standard deviations
+EVIDENCE = 40.0  # in chi-square
+CLIPPED = 4.0  # times the median residual, which counts no more
+HELD_SECONDS = 10.0  # for which a fix that repeats exactly is none
+HELD = 5  # fixes
 Complexes = NDArray[np.complex128]
 
 
+def repeated(log: Log, config: Config) -> Iterator[Finding]:
+    """Fixes that stay exactly where they were while the DVL moves."""
+    if not {"dvl", "fix"} <= log.sensors or len(log["fix"]) < HELD:
+        return
+    fix, pings = log["fix"], valid_pings(log["dvl"])
+    same = repeats(fix.data[:, :2])
+    begins = np.flatnonzero(~same)
+    counts = np.diff(np.append(begins, len(fix)))
+    longest = int(np.argmax(counts))
+    if counts[longest] < max(HELD, 3.0 * float(np.median(counts[counts > 0])) if len(counts) > 3 else HELD):
+        return
+    first, last = fix.time[begins[longest]], fix.time[begins[longest] + counts[longest] - 1]
+    during = (pings.time >= first) & (pings.time <= last)
+    speed = float(np.median(np.linalg.norm(pings.data[during, :3], axis=1))) if during.any() else 0.0
+    way = speed * (last - first)
+    if last - first >= HELD_SECONDS and way > max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
+        where = "one point throughout" if counts[longest] == len(fix) else "one point exactly"
+        yield Finding(
+            "fix",
+            "warning",
+            f"{counts[longest]} fixes repeat {where}, for {last - first:.0f} s from {since(log, first)} on, "
+            f"while the DVL moves by {way:.0f} m: a receiver repeats its last fix; leave these rows out",
+        )
+
+
+@dataclass(frozen=True)
+class _Line:
+    """Least squares of fixes by a track.
+
+    Attributes
+    ----------
+    c : turn and scale
+    sd : of c, relative
+    likeness : part of the fixes' movement that it explains, 0 to 1, as a correlation
+    error : sum of squared residuals, in units of their variance where all is right
+    """
+
+    c: complex
+    sd: float
+    likeness: float
+    error: float
+
+
 def track(log: Log, config: Config) -> Iterator[Finding]:
-    """Handedness, rotation and scale of the DVL's velocities against the fixes."""
+    """Handedness, rotation, scale and clock of the DVL's velocities against the fixes."""
     if not {"dvl", "fix"} <= log.sensors:
         return
     psi = _body_heading(log, config)
-    if psi is None:
+    pings = valid_pings(log["dvl"])
+    if psi is None or len(pings) < MIN_FIXES or len(log["fix"]) < MIN_FIXES:
         return
-    stream = log["dvl"]
-    valid = stream["dvl_valid"] == 1.0
-    if valid.sum() < MIN_WINDOWS or len(log["fix"]) < MIN_WINDOWS:
-        return
-    time = stream.time[valid]
-    v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), stream.data[valid, :3])
-    turn = np.exp(1j * np.interp(time, *psi))
-    d, D, mirrored = _moves(log, time, turn * (v_b[:, 0] + 1j * v_b[:, 1]), turn * (v_b[:, 0] - 1j * v_b[:, 1]))
-    if len(d) < MIN_WINDOWS or np.abs(d).sum() < ENOUGH_DISTANCE:
+    v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
+    turn = np.exp(1j * np.interp(pings.time, *psi))
+    arm = complex(*config.fix.lever_arm_m[:2])
+    plane = _Plane(log, pings.time, arm * np.exp(1j * np.interp(log["fix"].time, *psi)))
+    if plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
         yield Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
         return
-    c, like, unlike = _ratio(d, D), _likeness(d, D), _likeness(d, mirrored)
-    if unlike > like + 0.1 and unlike > 0.6:
-        yield Finding("dvl", "warning", _mirrored_text(config, like, unlike))
-    elif like < 0.6:
-        yield Finding("dvl", "warning", f"velocities do not fit the fixes (likeness {like:.2f}); mounting or heading?")
+    way, mirrored = (plane.way(turn * (v_b[:, 0] + sign * 1j * v_b[:, 1])) for sign in (1.0, -1.0))
+    lag, lag_sd, lag_evidence = plane.lag(way)
+    late = bool(abs(lag) > max(LAG_WARNING, SURE * lag_sd) and lag_evidence > EVIDENCE)
+    as_is, unlike, swapped = (plane.fit(one, 0.0) for one in (way, mirrored, way.conj()))
+    late &= plane.fit(way, lag).error < min(unlike.error, swapped.error)
+    if late:
+        as_is, unlike, swapped = (plane.fit(one, lag) for one in (way, mirrored, way.conj()))
+    if _better(swapped, as_is) and swapped.error <= 1.05 * unlike.error:
+        angle = round(np.rad2deg(np.angle(swapped.c)))
+        yield Finding(
+            "fix",
+            "warning",
+            "north and east are swapped or mirrored: so the fixes fit the DVL's track, turned by "
+            f"{angle:+d} deg (likeness {swapped.likeness:.2f} against {as_is.likeness:.2f})",
+        )
+    elif _better(unlike, as_is) and unlike.likeness > 0.6:
+        yield Finding("dvl", "warning", _mirrored_text(config, as_is.likeness, unlike.likeness))
+    elif as_is.likeness < 0.6:
+        if as_is.error > EVIDENCE + 2.0 * plane.count:
+            text = f"velocities do not fit the fixes (likeness {as_is.likeness:.2f}); mounting or heading?"
+            yield Finding("dvl", "warning", text)
     else:
-        angle, scale = float(np.angle(c)), float(abs(c))
-        wrong = abs(angle) > MISALIGNED or not 0.8 < scale < 1.25
-        tail = "; check dvl.mount_rpy_deg and the compass offset" if wrong else ""
-        if wrong and unlike > like - 0.05:
-            tail += f". As well it may be mirrored: {_other_way_up(config)}"
-        text = f"fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
-        yield Finding("dvl", "warning" if wrong else "ok", text)
+        yield _turned(config, as_is, unlike)
+        if late:
+            sense = "late" if lag > 0.0 else "early"
+            text = f"fixes come {abs(lag):.1f} s {sense} against the DVL's track (sd {lag_sd:.1f} s)"
+            speed = float(np.median(np.linalg.norm(pings.data[:, :3], axis=1)))
+            remedy = f"correct their stamps in the file, or fix.lever_arm_m, if it is {speed * abs(lag):.1f} m off"
+            yield Finding("fix", "warning", f"{text}: {remedy}")
+
+
+def _better(one: _Line, other: _Line) -> bool:
+    """Whether it explains the fixes beyond chance, and beyond what a drift of the track may do."""
+    return one.error + EVIDENCE < other.error and one.error * 1.5 < other.error
+
+
+def _turned(config: Config, as_is: _Line, unlike: _Line) -> Finding:
+    angle, scale = float(np.angle(as_is.c)), float(abs(as_is.c))
+    wrong = abs(angle) > MISALIGNED + SURE * as_is.sd or (
+        not 0.8 < scale < 1.25 and abs(np.log(scale)) > SURE * as_is.sd + 0.2
+    )
+    tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""
+    if wrong and unlike.likeness > as_is.likeness - 0.05:
+        tail += f". As well it may be mirrored: {_other_way_up(config)}"
+    text = f"fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
+    return Finding("dvl", "warning" if wrong else "ok", text)
+
+
+class _Plane:
+    """Fixes as complex numbers, less their lever arm, and the stretches in which the DVL's track is known."""
+
+    def __init__(self, log: Log, pings: Array, arms: Complexes):
+        fix = log["fix"]
+        lost = np.cumsum(np.diff(pings) > LONGEST_GAP)
+        self.pings, self.time = pings, fix.time
+        stretch = np.concatenate([[0], lost])[np.searchsorted(pings, fix.time).clip(0, len(pings) - 1)]
+        stretch = stretch * 1_000_000 + ((fix.time - fix.time[0]) // STRETCH).astype(np.int64)
+        self.stretch = np.unique(stretch, return_inverse=True)[1]
+        self.fixes: Complexes = fix.data[:, 0] + 1j * fix.data[:, 1] - arms
+        self.inside = ~in_gap(fix.time, pings, LONGEST_GAP)
+        self.inside &= _near_median(self.fixes)
+
+    @property
+    def count(self) -> int:
+        return int(self.inside.sum())
+
+    @property
+    def spread(self) -> float:
+        """Of the fixes within their stretches [m]."""
+        return 0.0 if self.count < MIN_FIXES else float(2.0 * np.sqrt(np.mean(np.abs(self._free(self.fixes)) ** 2)))
+
+    def way(self, velocity: Complexes) -> Complexes:
+        """Integral of a velocity at the pings."""
+        steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.minimum(np.diff(self.pings), LONGEST_GAP)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def _at(self, way: Complexes, lag: float) -> Complexes:
+        when = self.time - lag
+        return np.interp(when, self.pings, way.real) + 1j * np.interp(when, self.pings, way.imag)
+
+    def _free(self, values: Complexes) -> Complexes:
+        """Without the mean of each stretch; shape (count,)."""
+        values, stretch = values[self.inside], self.stretch[self.inside]
+        n = np.maximum(np.bincount(stretch), 1)
+        means = (np.bincount(stretch, values.real) + 1j * np.bincount(stretch, values.imag)) / n
+        return np.asarray(values - means[stretch])
+
+    def fit(self, way: Complexes, lag: float) -> _Line:
+        """Turn and scale of a track that the fixes follow after a lag."""
+        d, D = self._free(self.fixes), self._free(self._at(way, lag))
+        square = max(float(np.vdot(D, D).real), 1e-12)
+        c = complex(np.vdot(D, d)) / square
+        left = d - c * D
+        size = np.abs(left) ** 2
+        left = np.where(size > CLIPPED**2 * np.median(size), 0.0, left)
+        total = max(float(np.vdot(d, d).real), 1e-12)
+        likeness = float(abs(np.vdot(D, d))) / np.sqrt(square * total)
+        error = float(np.vdot(left, left).real)
+        return _Line(c, np.sqrt(error / len(d) * _inflation(left) / square), likeness, error / self.noise**2)
+
+    @property
+    def noise(self) -> float:
+        """Of a fix in both components together, by differences from its neighbours' mean [m]."""
+        second = np.abs(self.fixes[2:] - 2.0 * self.fixes[1:-1] + self.fixes[:-2])
+        return float(max(np.median(second) / np.sqrt(6.0) / 0.8326, 1e-3))  # the median of a Rayleigh variable
+
+    def lag(self, way: Complexes) -> tuple[float, float, float]:
+        """How late the fixes are [s], its sd, and how much it explains in chi-square."""
+        reach = min(LARGEST_LAG, 0.25 * (self.time[-1] - self.time[0]))
+        lags = np.arange(-reach, reach + 0.5 * LAG_STEP, LAG_STEP)
+        d = self._free(self.fixes)
+        error = np.empty(len(lags))
+        for k, lag in enumerate(lags):
+            D = self._free(self._at(way, float(lag)))
+            error[k] = float(np.vdot(d, d).real) - abs(np.vdot(D, d)) ** 2 / max(float(np.vdot(D, D).real), 1e-12)
+        k = int(np.argmin(error))
+        if not 0 < k < len(lags) - 1:
+            return 0.0, np.inf, 0.0
+        bend = (error[k - 1] - 2.0 * error[k] + error[k + 1]) / LAG_STEP**2
+        D = self._free(self._at(way, float(lags[k])))
+        left = d - complex(np.vdot(D, d)) / max(float(np.vdot(D, D).real), 1e-12) * D
+        variance = max(error[k] / len(d), 1e-9) * _inflation(left)
+        seconds = lags[k] + 0.5 * (error[k - 1] - error[k + 1]) / LAG_STEP / max(bend, 1e-12)
+        unshifted = error[len(lags) // 2]
+        return float(seconds), float(np.sqrt(variance / max(bend, 1e-12))), float((unshifted - error[k]) / variance)
+
+
+def _near_median(fixes: Complexes) -> NDArray[np.bool_]:
+    """Fixes near the median of the five around them."""
+    padded = np.lib.stride_tricks.sliding_window_view(np.pad(fixes, 2, mode="edge"), 5)
+    off = np.abs(fixes - np.median(padded.real, axis=1) - 1j * np.median(padded.imag, axis=1))
+    return np.asarray(off <= CLIPPED * max(float(np.median(off)), 1e-3))
+
+
+def _inflation(left: Complexes) -> float:
+    """How many residuals of a first-order process make one independent one."""
+    keep = float(np.real(np.vdot(left[:-1], left[1:]))) / max(float(np.vdot(left, left).real), 1e-12)
+    keep = min(max(keep, 0.0), 0.95)
+    return (1.0 + keep) / (1.0 - keep)
 
 
 def _mirrored_text(config: Config, like: float, unlike: float) -> str:
@@ -83,31 +261,3 @@ def _body_heading(log: Log, config: Config) -> tuple[Array, Array] | None:
         psi = np.unwrap(log[sensor].data[:, 0]) - np.arctan2(axis[1], axis[0])
         return log[sensor].time, psi + np.deg2rad(config.environment.declination_deg)
     return None
-
-
-def _moves(log: Log, time: Array, *velocities: Complexes) -> tuple[Complexes, ...]:
-    """Movement within windows, by the fixes and by each velocity; each of shape (m,)."""
-    fix = log["fix"]
-    step = max(WINDOW, 2.0 * float(np.median(np.diff(fix.time))))
-    edges = np.arange(max(fix.time[0], time[0]), min(fix.time[-1], time[-1]), step)
-    if len(edges) < 2:
-        return tuple(np.empty(0, dtype=complex) for _ in range(1 + len(velocities)))
-    k = np.searchsorted(fix.time, edges).clip(1, len(fix) - 1)
-    near = fix.time[k] - fix.time[k - 1] <= step
-    position = np.interp(edges, fix.time, fix.data[:, 0]) + 1j * np.interp(edges, fix.time, fix.data[:, 1])
-    out: list[Complexes] = [np.diff(position)]
-    usable = near[1:] & near[:-1]
-    for v in velocities:
-        way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time))])
-        out.append(np.diff(np.interp(edges, time, way.real) + 1j * np.interp(edges, time, way.imag)))
-    return tuple(x[usable] for x in out)
-
-
-def _ratio(d: Complexes, D: Complexes) -> complex:
-    return complex(np.vdot(D, d)) / max(float(np.vdot(D, D).real), 1e-12)
-
-
-def _likeness(d: Complexes, D: Complexes) -> float:
-    """Correlation of the plane's movements, whatever the rotation and scale: 0 to 1."""
-    size = float(np.linalg.norm(d) * np.linalg.norm(D))
-    return float(abs(np.vdot(D, d))) / max(size, 1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 
 from rovgraph.check.findings import Finding, frozen_runs, since
 from rovgraph.config import Config, mount_matrix
-from rovgraph.log import Log
+from rovgraph.log import Log, Stream
 from rovgraph.sensors import SENSORS, Level
 
 GRAVITY_RANGE = (9.3, 10.3)  # plausible mean specific force [m/s2]
@@ -30,15 +30,14 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
     if "imu" not in log:
         return
     f_s = log["imu"].data[:, :3].mean(axis=0)
-    size = float(np.linalg.norm(f_s))
+    size = _usual_force(log["imu"])
     low, high = GRAVITY_RANGE
     if not low <= size <= high:
         level: Level = "warning" if 5.0 < size < 15.0 else "error"
         yield Finding("imu", level, f"mean specific force is {size:.4g} m/s2, expected about 9.8; {_acc_unit(size)}")
     if size < 1e-6:
         return
-    f_b = mount_matrix(config.imu.mount_rpy_deg) @ f_s
-    angle = float(np.arccos(np.clip(-f_b[2] / size, -1.0, 1.0)))
+    angle = tilt(log, config)
     k = int(np.argmax(np.abs(f_s)))
     axis = ("-" if f_s[k] < 0 else "+") + "xyz"[k]
     if angle > GRAVITY_ANGLE:
@@ -50,6 +49,21 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
         )
     elif low <= size <= high:
         yield Finding("imu", "ok", f"mean specific force {size:.2f} m/s2, {np.rad2deg(angle):.1f} deg from upwards")
+
+
+def _usual_force(imu: Stream) -> float:
+    """Size of the specific force of a second, the median: a vehicle that rolls over has a smaller mean vector."""
+    count = max(1, round(1.0 / max(float(np.median(np.diff(imu.time))), 1e-6))) if len(imu) > 1 else 1
+    begins = np.arange(0, max(len(imu) - count + 1, 1), count)
+    sums = np.add.reduceat(imu.data[: begins[-1] + count, :3], begins)
+    return float(np.median(np.linalg.norm(sums, axis=1))) / min(count, len(imu))
+
+
+def tilt(log: Log, config: Config) -> float:
+    """Angle of the mean specific force from upwards [rad]."""
+    f_s = log["imu"].data[:, :3].mean(axis=0)
+    f_b = mount_matrix(config.imu.mount_rpy_deg) @ f_s
+    return float(np.arccos(np.clip(-f_b[2] / max(float(np.linalg.norm(f_s)), 1e-9), -1.0, 1.0)))
 
 
 def _acc_unit(size: float) -> str:

@@ -9,13 +9,29 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import MOUNT
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array, matrix_from_rpy, skew
+from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, skew
 from rovgraph.kernels import measurements as kernels
 from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Level, Observed, Sensor, instrument
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
+VELOCITIES = ("dvl_vx", "dvl_vy", "dvl_vz")
 TIME_OFFSET = "dvl_time_offset"  # of the stamps of all that a ping measures
+
+
+def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
+    """Cause and remedy where velocities agree with the IMU once their axes are named otherwise.
+
+    Parameters
+    ----------
+    H : ndarray, shape (3, 3), signed permutation that turns measured velocities into right ones
+    R_bs : ndarray, shape (3, 3), mounting as configured, or as it fits
+    """
+    named = ["-" * int(row.min() < 0.0) + VELOCITIES[int(np.abs(row).argmax())] for row in H]
+    if np.linalg.det(H) > 0.0:
+        rpy = [round(float(a), 1) + 0.0 for a in np.rad2deg(rpy_from_matrix((R_bs @ H)[None])[0])]
+        return "it is mounted in another way", f"state dvl.mount_rpy_deg: {rpy}"
+    return f"its axes are left-handed, {', '.join(named)} are right", "change those signs in the log, no mounting can"
 
 
 def dvl_mounting(state: State) -> Array:
@@ -121,7 +137,7 @@ def _bottom_lock(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
 DVL = Sensor(
     "dvl",
     (
-        *(Column(name, "speed") for name in ("dvl_vx", "dvl_vy", "dvl_vz")),
+        *(Column(name, "speed") for name in VELOCITIES),
         Column("dvl_valid", optional=True),
         Column("dvl_sd", "speed", optional=True),
     ),

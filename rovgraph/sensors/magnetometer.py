@@ -14,6 +14,9 @@ from rovgraph.sensors.model import evaluate
 from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Sensor, instrument
 from rovgraph.state import BIAS, POSE, Jacobians, State
 
+# the mean field of the Earth in each unit; "1" where it was normalised
+EARTH_FIELD = {"uT": 45.0, "nT": 45e3, "mG": 450.0, "gauss": 0.45, "T": 45e-6, "1": 1.0}
+EARTH_RANGE = (0.3, 2.5)  # of it, 22 to 67 uT and as much again for iron and an uncalibrated instrument
 DEFAULT_DIP = np.deg2rad(72.0)  # southern Sweden; used where neither log nor configuration say
 
 
@@ -70,11 +73,20 @@ def _refused(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bo
 
 
 def _magnitude(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
-    """The field's magnitude is constant but for iron near the magnetometer."""
+    """The field's magnitude is the Earth's, and constant but for iron near the magnetometer."""
     low, middle, high = np.percentile(np.linalg.norm(values, axis=1), [5, 50, 95])
     spread = (high - low) / middle if middle > 0 else np.inf
     level: Level = "warning" if spread > 0.4 else "ok"
     hint = "; large hard iron, calibrate it (rovgraph calibrate)" if level == "warning" else ""
+    given = [unit for name, unit in config.units.items() if name.startswith("mag")]
+    possible = ("uT",) if given else tuple(EARTH_FIELD)
+    if not any(low < middle / EARTH_FIELD[unit] < high for unit in possible for low, high in (EARTH_RANGE,)):
+        said = "uT" if given else "any unit"
+        yield (
+            "warning",
+            f"field {middle:.4g} is not the Earth's in {said} (22 to 67 uT); is the unit wrong? "
+            "Say units: {mag: nT}, or calibrate it (rovgraph calibrate magnetometer)",
+        )
     yield level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}"
 
 

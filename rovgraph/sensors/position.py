@@ -79,6 +79,12 @@ def _range(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
     depth = values[:, 0]
     if np.median(depth) < -0.5:
         yield "warning", f"median depth {np.median(depth):.2f} m; depth counts downwards: mirrored?"
+    elif np.percentile(depth, 1) < -1.0:
+        lowest = -float(np.percentile(depth, 1))
+        yield (
+            "warning",
+            f"it reaches {lowest:.1f} m above the surface; was the first pressure, under water, taken for it?",
+        )
     if np.ptp(depth) > 1000.0:
         yield "warning", f"depth spans {np.ptp(depth):.4g} m; in cm or mm? Say units: {{depth: mm}}"
 

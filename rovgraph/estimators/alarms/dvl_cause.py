@@ -10,7 +10,6 @@ pings and the vertical enter, so it does not matter how wrong the heading is.
 """
 
 from collections.abc import Iterator
-from itertools import permutations, product
 
 import numpy as np
 
@@ -19,8 +18,8 @@ from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
-from rovgraph.geometry import Array, cross, rotate, rpy_from_matrix, transpose
-from rovgraph.sensors.dvl import DvlVelocity
+from rovgraph.geometry import Array, cross, rotate, signed_permutations, transpose
+from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
 SUSPICIOUS = 0.1  # share of rejected pings from which on it is worth a look
 OVER_S = 3.0  # T
@@ -28,7 +27,6 @@ SHIFTS_S = np.arange(-2.0, 2.01, 0.05)
 CLIPPED = 3.0  # times the median error, beyond which an error counts no more
 BETTER = 1.15  # times smaller an error than as configured
 ENOUGH = 50  # pings
-AXES = ("dvl_vx", "dvl_vy", "dvl_vz")
 
 
 def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
@@ -41,12 +39,13 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
         return
     R_bs = mount_matrix(evidence.beginning.config.dvl.mount_rpy_deg)
     as_configured = compared.error(np.eye(3), R_bs, 0.0)
-    turned = {H: compared.error(np.array(H), R_bs, 0.0) for H in _signed_permutations()}
+    orientations = signed_permutations()
+    turned = [compared.error(H, R_bs, 0.0) for H in orientations]
     shifted = {float(s): compared.error(np.eye(3), R_bs, float(s)) for s in SHIFTS_S}
-    H, shift = min(turned, key=lambda H: turned[H]), min(shifted, key=lambda s: shifted[s])
-    if turned[H] < shifted[shift]:
-        cause, remedy = _said_of_axes(np.array(H), R_bs)
-        figure, kind = as_configured / turned[H], "axes"
+    shift = min(shifted, key=lambda s: shifted[s])
+    if min(turned) < shifted[shift]:
+        cause, remedy = axes_remedy(orientations[int(np.argmin(turned))], R_bs)
+        figure, kind = as_configured / min(turned), "axes"
     else:
         late = "late" if shift > 0 else "early"
         cause = f"its stamps are about {abs(shift):.2g} s {late} against the IMU's"
@@ -116,22 +115,3 @@ def _averaged(z: Array) -> Array:
 
 def _at(when: Array, time: Array, values: Array) -> Array:
     return np.column_stack([np.interp(when, time, column) for column in values.T])
-
-
-def _signed_permutations() -> list[tuple[tuple[float, ...], ...]]:
-    """The 48 ways to name three axes and their senses, that of the configuration among them."""
-    out = []
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        H = np.zeros((3, 3))
-        H[range(3), order] = signs
-        out.append(tuple(map(tuple, H.tolist())))
-    return out
-
-
-def _said_of_axes(H: Array, R_bs: Array) -> tuple[str, str]:
-    """What a signed permutation means, and what to do about it."""
-    named = ["-" * int(row.min() < 0.0) + AXES[int(np.abs(row).argmax())] for row in H]
-    if np.linalg.det(H) > 0.0:
-        rpy = [round(float(a), 1) + 0.0 for a in np.rad2deg(rpy_from_matrix((R_bs @ H)[None])[0])]
-        return "it is mounted in another way", f"state dvl.mount_rpy_deg: {rpy}"
-    return f"its axes are left-handed, {', '.join(named)} are right", "change those signs in the log, no mounting can"
