@@ -17,7 +17,7 @@ the standard of the rest of the dive.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +41,11 @@ USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 BURST_S, BURST_COUNT = 5.0, 10  # over which rejections are counted: a time, and as many measurements
 SAME_CAUSE_S = 20.0  # bursts that are no further apart have one cause
 AROUND_S = (5.0, 20.0, 60.0)  # around a burst, taken out to begin with
-NOTICEABLE, CLEAR = 8.0, 100.0  # cost of what is wrong and was let in: it may be chance; it is none
-SHARP = 10  # measurements from the one to the other at an edge that is sharp: each costs no more than at its gate
+NOTICEABLE, CLEAR = 12.0, 100.0  # cost of what is wrong and was let in: it may be chance; it is none
+OUTWARDS = (0, 1, 2, 4, 8, 16, 32, 64)  # measurements from what is clear
+SHARP = 16  # measurements from the one to the other at an edge that is sharp: each costs no more than at its gate
 GROWING = 5  # times what is beyond that, a slow error was there before it showed
-MARGIN = 4  # measurements outside of an edge that are left out, too
+MARGIN = 2  # measurements outside of an edge that are left out, too
 MAX_STRETCHES = 6
 
 
@@ -126,39 +127,32 @@ def _with_fitted_edges(problem: Linearizable[Point, Step], best: Solution[Point]
     """
     time = problem.measured()[best.stretches[-1].sensor].time
     for end in (False, True):
-        shown = _shortened(problem, best, end, best.cost + NOTICEABLE)
-        clear = _shortened(problem, best, end, best.cost + CLEAR)
-        at, beyond = (int(time.searchsorted(_edge(one.stretches[-1], end))) for one in (shown, clear))
-        out = MARGIN + GROWING * max(0, abs(beyond - at) - SHARP)
-        moved = float(time[np.clip(at + out if end else at - out, 0, len(time) - 1)])
-        best = _solved_without(problem, shown, _with_edge(shown.stretches, end, moved)) or shown
+        best = _with_fitted_edge(problem, best, time, end)
     return best
 
 
-def _shortened(problem: Linearizable[Point, Step], best: Solution[Point], end: bool, most: float) -> Solution[Point]:
-    """The newest stretch with one edge as far in as some cost allows, by bisection."""
-    newest = best.stretches[-1]
-    time = problem.measured()[newest.sensor].time
-    time = time[(time >= newest.begin) & (time <= newest.end)]
-    out, far = (len(time) - 1, 0) if end else (0, len(time) - 1)  # the edge lies between them
-    while abs(far - out) > 1:
-        middle = (out + far) // 2
-        shorter = _solved_without(problem, best, _with_edge(best.stretches, end, float(time[middle])))
-        if shorter is not None and shorter.cost <= most:
-            out, best = middle, shorter
-        else:
-            far = middle
-    return best
+def _with_fitted_edge(
+    problem: Linearizable[Point, Step], best: Solution[Point], time: Array, end: bool
+) -> Solution[Point]:
+    """The same for one edge: in by bisection until it is clear, then out by doubled steps until nothing shows."""
+    newest, least = best.stretches[-1], best.cost
 
+    def at(index: int) -> Solution[Point] | None:
+        edge = float(time[np.clip(index, 0, len(time) - 1)])
+        moved = replace(newest, end=edge) if end else replace(newest, begin=edge)
+        return _solved_without(problem, best, (*best.stretches[:-1], moved))
 
-def _edge(stretch: Stretch, end: bool) -> float:
-    return stretch.end if end else stretch.begin
-
-
-def _with_edge(stretches: tuple[Stretch, ...], end: bool, at: float) -> tuple[Stretch, ...]:
-    """Stretches with the begin or the end of the newest elsewhere."""
-    *others, newest = stretches
-    return (*others, replace(newest, end=at) if end else replace(newest, begin=at))
+    inside = np.flatnonzero((time >= newest.begin) & (time <= newest.end)).tolist()
+    outer, inner = (inside[-1], inside[0]) if end else (inside[0], inside[-1])
+    clear = outer
+    while abs(inner - clear) > 1:
+        middle = (inner + clear) // 2
+        shorter = at(middle)
+        clear, inner = (middle, inner) if shorter is not None and shorter.cost <= least + CLEAR else (clear, middle)
+    away = 1 if end else -1
+    costs = {k: one.cost for k in OUTWARDS if (one := at(clear + away * k)) is not None}
+    steps = next((k for k, cost in costs.items() if cost <= min(costs.values()) + NOTICEABLE), 0)
+    return at(clear + away * (steps + MARGIN + GROWING * max(0, steps - SHARP))) or best
 
 
 def _solved_without(
