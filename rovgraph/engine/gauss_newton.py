@@ -116,7 +116,11 @@ class Solution(Generic[Point]):
 
 
 def minimise(
-    problem: Linearizable[Point, Step], point: Point, gates: Gates | None = None, barred: Gates | None = None
+    problem: Linearizable[Point, Step],
+    point: Point,
+    gates: Gates | None = None,
+    barred: Gates | None = None,
+    tolerance: float | None = None,
 ) -> Solution[Point]:
     """Minimise the robust cost from ``point``, then gate and repeat.
 
@@ -124,19 +128,20 @@ def minimise(
     ----------
     gates : to begin with; None = the problem's own
     barred : sensor -> measurements that stay out, and cost nothing
+    tolerance : decrease of the cost that may be left; None = `FINE`
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
-    barred = barred or {}
+    barred, tolerance = barred or {}, FINE if tolerance is None else tolerance
     gates, iterations, gatings = _without(gates or problem.initial_gates(), barred), 0, 0
     descent, fine = _Descent(point, problem.cost(point, gates)), False
     while True:
-        descent = _descend(problem, descent, gates, fine)
+        descent = _descend(problem, descent, gates, tolerance, fine)
         iterations, within = iterations + descent.steps, _without(problem.gates(descent.point), barred)
         rest = gatings >= MAX_GATINGS or all(np.array_equal(within[s], gates[s]) for s in gates)
-        if rest and (fine or descent.left <= FINE):
+        if rest and (fine or descent.left <= tolerance):
             cost = descent.cost + _cost_of_rejected(problem, gates, barred)
             return Solution(descent.point, gates, cost, iterations, descent.steps < MAX_ITERATIONS)
         fine, gatings = rest, gatings + 1
@@ -178,15 +183,17 @@ class _Descent(Generic[Point]):
     steps: int = 0
 
 
-def _descend(problem: Linearizable[Point, Step], begin: _Descent[Point], gates: Gates, fine: bool) -> _Descent[Point]:
+def _descend(
+    problem: Linearizable[Point, Step], begin: _Descent[Point], gates: Gates, least: float, fine: bool
+) -> _Descent[Point]:
     """Gauss-Newton for fixed gates, until little is left or `MAX_ITERATIONS` steps are taken."""
     now = replace(begin, steps=0)
     for step in range(1, MAX_ITERATIONS + 1):
-        tolerance = FINE if fine else max(FINE, COARSE * now.cost)
+        tolerance = least if fine else max(least, COARSE * now.cost)
         point, cost = _search(problem, now.point, gates, now.cost, tolerance)
         decrease = now.cost - cost
         now = _Descent(point, cost, decrease, _left(decrease, now.decrease), step)
-        if now.left <= (FINE if fine else max(FINE, COARSE * cost)):
+        if now.left <= (least if fine else max(least, COARSE * cost)):
             return now
     return now
 

@@ -18,6 +18,7 @@ the standard of the rest of the dive.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +43,12 @@ BURST_S, BURST_COUNT = 5.0, 10  # over which rejections are counted: a time, and
 SAME_CAUSE_S = 20.0  # bursts that are no further apart have one cause
 AROUND_S = (5.0, 20.0, 60.0)  # around a burst, taken out to begin with
 NOTICEABLE, CLEAR = 12.0, 100.0  # cost of what is wrong and was let in: it may be chance; it is none
-OUTWARDS = (0, 1, 2, 4, 8, 16, 32, 64)  # measurements from what is clear
+OUTWARDS = (0, 2, 8, 16, 32, 64)  # measurements from what is clear
 SHARP = 16  # measurements from the one to the other at an edge that is sharp: each costs no more than at its gate
 GROWING = 5  # times what is beyond that, a slow error was there before it showed
 MARGIN = 2  # measurements outside of an edge that are left out, too
-MAX_STRETCHES = 6
+MAX_STRETCHES = 4
+TOLERANCE = 0.1  # decrease of the cost that is left when optima are compared
 
 
 def solve(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
@@ -68,13 +70,17 @@ def solve(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
         if ranked[0] is not best:
             best = _with_fitted_edges(problem, ranked[0])
         tried.append(burst)
+    if best.stretches:
+        best = resume(problem, best.point, best)
     return replace(best, runner_up=runner_up)
 
 
 def resume(problem: Linearizable[Point, Step], point: Point, known: Solution[Point]) -> Solution[Point]:
     """The optimum of a problem close to one whose solution is known, with the same stretches taken out."""
     barred = _barred(problem.measured(), known.stretches)
-    return replace(minimise(problem, point, known.gates, barred), stretches=known.stretches, runner_up=known.runner_up)
+    solution = minimise(problem, point, known.gates, barred)
+    solution = replace(solution, stretches=known.stretches, runner_up=known.runner_up)
+    return replace(solution, cost=solution.cost + _price(problem, solution))
 
 
 def _bursts(measured: Mapping[str, Measured], solution: Solution[Point]) -> list[Stretch]:
@@ -137,8 +143,9 @@ def _with_fitted_edge(
     """The same for one edge: in by bisection until it is clear, then out by doubled steps until nothing shows."""
     newest, least = best.stretches[-1], best.cost
 
+    @cache
     def at(index: int) -> Solution[Point] | None:
-        edge = float(time[np.clip(index, 0, len(time) - 1)])
+        edge = float(time[min(max(index, 0), len(time) - 1)])
         moved = replace(newest, end=edge) if end else replace(newest, begin=edge)
         return _solved_without(problem, best, (*best.stretches[:-1], moved))
 
@@ -166,12 +173,19 @@ def _solved_without(
     before = _barred(measured, begin.stretches)
     gates = {s: gate | before[s] if s in before else gate for s, gate in begin.gates.items()}
     try:
-        solution = minimise(problem, begin.point, gates, barred)
+        solution = minimise(problem, begin.point, gates, barred, TOLERANCE)
     except InputError:
         return None
-    level = _level(problem, solution)
-    price = sum(level * 0.5 * float(chdtri(barred[s].sum() * measured[s].dim, CHANCE)) for s in barred)
-    return replace(solution, cost=solution.cost + price, stretches=stretches)
+    solution = replace(solution, stretches=stretches)
+    return replace(solution, cost=solution.cost + _price(problem, solution))
+
+
+def _price(problem: Linearizable[Point, Step], solution: Solution[Point]) -> float:
+    """What the stretches of a solution cost."""
+    measured = problem.measured()
+    barred = _barred(measured, solution.stretches)
+    numbers = [int(out.sum()) * measured[sensor].dim for sensor, out in barred.items()]
+    return _level(problem, solution) * 0.5 * sum(float(chdtri(n, CHANCE)) for n in numbers)
 
 
 def _level(problem: Linearizable[Point, Step], solution: Solution[Point]) -> float:
