@@ -58,7 +58,8 @@ def solve(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
     ------
     InputError : the data do not determine some variable, which is named
     """
-    best, tried, runner_up = minimise(problem, point), [], math.inf
+    tried: list[Stretch] = []
+    best, runner_up = minimise(problem, point), math.inf
     measured = problem.measured()
     for _ in range(MAX_STRETCHES):
         burst = next((b for b in _bursts(measured, best) if not any(_overlap(b, t) for t in tried)), None)
