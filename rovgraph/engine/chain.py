@@ -17,16 +17,24 @@ from rovgraph.calibration import LAYOUT, TABLE, Belief, calibration_size
 from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, UndeterminedError, square_root
 from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING, ChainLayout
 from rovgraph.engine.dive_rows import DiveRows
-from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.gauss_newton import Gates, Measured
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.measurements import Block, Seen, blocks_of, gates_of, loss_and_weight, measurement_cost
+from rovgraph.engine.measurements import (
+    Block,
+    Seen,
+    blocks_of,
+    cost_at_gate,
+    gates_of,
+    loss_and_weight,
+    measurement_cost,
+)
 from rovgraph.engine.sensor_rows import compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
 from rovgraph.kernels.dive import eliminate_dive, robust_costs, squared_lengths
-from rovgraph.kernels.measurement_row import GATE
+from rovgraph.kernels.measurement_row import GATE, TIME
 from rovgraph.state import State
 
 CLONED = 3  # of the first keyframe, its attitude, that a border ends with where its covariance is asked for
@@ -108,6 +116,13 @@ class Chain:
     def seen(self, state: State, blocks: Mapping[str, Block]) -> Seen:
         """Sensors' blocks, with the state of each measurement's keyframe."""
         return [(sensor, block, state.at(block.keyframe)) for sensor, block in blocks.items()]
+
+    def measured(self) -> dict[str, Measured]:
+        """As `rovgraph.engine.gauss_newton.Linearizable`."""
+        times = {sensor: self.rows.rows[places, TIME] for sensor, places in self._places.items()}
+        times |= {sensor: block.time for sensor, block in self.given.items()}
+        used = {sensor: self.initial.instruments[sensor] for sensor in times}
+        return {s: Measured(times[s], i.model.dim, cost_at_gate(i)) for s, i in used.items()}
 
     def initial_gates(self) -> Gates:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""

@@ -12,11 +12,12 @@ from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_layout import COLUMNS, MOTION
 from rovgraph.engine.dive_rows import DiveRows
-from rovgraph.engine.gauss_newton import Solution, minimise
+from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, weights_of
 from rovgraph.engine.optimum import Knowledge
+from rovgraph.engine.stretches import resume, solve
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import Array
 from rovgraph.state import State
@@ -105,7 +106,7 @@ class ChainOptimum:
         kept = self.unknowns.of(set(self.unknowns.estimated) - set(names))
         without = replace(self.chain, unknowns=kept)
         begin = replace(self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}})
-        solution = minimise(without, begin)
+        solution = resume(without, begin, self.solution)
         full = self.chain.eliminate(solution.point, solution.gates)
         given = np.concatenate([np.r_[self.chain.layout.places[n][1]] for n in names])
         by_given = full.border_by(given)
@@ -146,4 +147,4 @@ def smooth_chain(
     beliefs, rows = beliefs_of(initial.config), rows or DiveRows.of(intervals, [*initial.instruments])
     wanted = unknowns(beliefs, [rows.sensors[k] for k in np.unique(rows.which)])
     chain = Chain(intervals, initial, beliefs, wanted, rows)
-    return ChainOptimum(chain, minimise(chain, chain.start(states, calibration)))
+    return ChainOptimum(chain, solve(chain, chain.start(states, calibration)))

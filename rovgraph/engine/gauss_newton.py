@@ -3,7 +3,8 @@
 A Gauss-Newton step of a reweighted problem is a direction of descent of the robust cost. It is halved until the cost
 falls, so the iteration cannot diverge, and doubled as long as that helps, since reweighted steps fall short where
 many measurements lie beyond their loss's bend. When it has converged, measurements beyond their gate are taken
-out, those back within it let in, and it is solved again until the gates rest.
+out, those back within it let in, and it is solved again until the gates rest. A measurement that is out costs what
+one at its gate costs: the robust cost is a truncated loss, of which optima with different gates compare.
 
 It has converged when the decrease that is left is small. Steps that converge by a factor leave a geometric series
 of decreases, so two of them say what is left. A decrease of e is a move of sqrt(2 e) sd in the direction in which
@@ -17,6 +18,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are let in
 
 MAX_ITERATIONS = 50
@@ -31,8 +33,28 @@ Point = TypeVar("Point")
 Step = TypeVar("Step")
 
 
+@dataclass(frozen=True)
+class Measured:
+    """The n measurements of a sensor, as far as gates are concerned.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,) [s]
+    dim : components of each
+    cost_at_gate : robust cost of one at its gate, infinite where there is none
+    """
+
+    time: Array
+    dim: int
+    cost_at_gate: float
+
+
 class Linearizable(Protocol[Point, Step]):
     """A robust least-squares problem whose linear form can be solved."""
+
+    def measured(self) -> dict[str, Measured]:
+        """Sensor -> its measurements, in the order of its gates."""
+        ...
 
     def initial_gates(self) -> Gates:
         """Which measurements are let in to begin with."""
@@ -43,7 +65,7 @@ class Linearizable(Protocol[Point, Step]):
         ...
 
     def cost(self, point: Point, gates: Gates) -> float:
-        """The robust cost that is minimised."""
+        """The robust cost of what is let in, with that of priors and motions."""
         ...
 
     def step(self, point: Point, gates: Gates) -> Step:
@@ -61,6 +83,15 @@ class Linearizable(Protocol[Point, Step]):
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """A time in which a sensor is wrong, both ends included [s]."""
+
+    sensor: str
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True)
 class Solution(Generic[Point]):
     """The optimum of a problem.
 
@@ -68,9 +99,11 @@ class Solution(Generic[Point]):
     ----------
     point : where it lies
     gates : sensor -> which measurements were let in
-    cost : robust cost
+    cost : robust cost, with that of the measurements that were not let in
     iterations : Gauss-Newton steps in all
     converged : the last cost no longer fell
+    stretches : taken out as a whole, of `rovgraph.engine.stretches`
+    runner_up : how much more the next best of the optima costs that were compared, infinite where there was one
     """
 
     point: Point
@@ -78,27 +111,57 @@ class Solution(Generic[Point]):
     cost: float
     iterations: int
     converged: bool
+    stretches: tuple[Stretch, ...] = ()
+    runner_up: float = math.inf
 
 
-def minimise(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
+def minimise(
+    problem: Linearizable[Point, Step],
+    point: Point,
+    gates: Gates | None = None,
+    barred: Gates | None = None,
+    tolerance: float | None = None,
+) -> Solution[Point]:
     """Minimise the robust cost from ``point``, then gate and repeat.
+
+    Parameters
+    ----------
+    gates : to begin with; None = the problem's own
+    barred : sensor -> measurements that stay out, and cost nothing
+    tolerance : decrease of the cost that may be left; None = `FINE`
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
-    gates, iterations, gatings = problem.initial_gates(), 0, 0
+    barred, tolerance = barred or {}, FINE if tolerance is None else tolerance
+    gates, iterations, gatings = _without(gates or problem.initial_gates(), barred), 0, 0
     descent, fine = _Descent(point, problem.cost(point, gates)), False
     while True:
-        descent = _descend(problem, descent, gates, fine)
-        iterations, within = iterations + descent.steps, problem.gates(descent.point)
+        descent = _descend(problem, descent, gates, tolerance, fine)
+        iterations, within = iterations + descent.steps, _without(problem.gates(descent.point), barred)
         rest = gatings >= MAX_GATINGS or all(np.array_equal(within[s], gates[s]) for s in gates)
-        if rest and (fine or descent.left <= FINE):
-            return Solution(descent.point, gates, descent.cost, iterations, descent.steps < MAX_ITERATIONS)
+        if rest and (fine or descent.left <= tolerance):
+            cost = descent.cost + _cost_of_rejected(problem, gates, barred)
+            return Solution(descent.point, gates, cost, iterations, descent.steps < MAX_ITERATIONS)
         fine, gatings = rest, gatings + 1
         if not rest:
             gates = within
             descent = _Descent(descent.point, problem.cost(descent.point, gates))
+
+
+def _without(gates: Gates, barred: Gates) -> Gates:
+    return {s: gate & ~barred[s] if s in barred else gate for s, gate in gates.items()}
+
+
+def _cost_of_rejected(problem: Linearizable[Point, Step], gates: Gates, barred: Gates) -> float:
+    """What measurements cost that are out by their gates."""
+    measured, total = problem.measured(), 0.0
+    for sensor, gate in gates.items():
+        count = int(np.sum(~gate & ~barred.get(sensor, np.zeros(len(gate), bool))))
+        if count and math.isfinite(measured[sensor].cost_at_gate):
+            total += count * measured[sensor].cost_at_gate
+    return total
 
 
 @dataclass(frozen=True)
@@ -120,15 +183,17 @@ class _Descent(Generic[Point]):
     steps: int = 0
 
 
-def _descend(problem: Linearizable[Point, Step], begin: _Descent[Point], gates: Gates, fine: bool) -> _Descent[Point]:
+def _descend(
+    problem: Linearizable[Point, Step], begin: _Descent[Point], gates: Gates, least: float, fine: bool
+) -> _Descent[Point]:
     """Gauss-Newton for fixed gates, until little is left or `MAX_ITERATIONS` steps are taken."""
     now = replace(begin, steps=0)
     for step in range(1, MAX_ITERATIONS + 1):
-        tolerance = FINE if fine else max(FINE, COARSE * now.cost)
+        tolerance = least if fine else max(least, COARSE * now.cost)
         point, cost = _search(problem, now.point, gates, now.cost, tolerance)
         decrease = now.cost - cost
         now = _Descent(point, cost, decrease, _left(decrease, now.decrease), step)
-        if now.left <= (FINE if fine else max(FINE, COARSE * cost)):
+        if now.left <= (least if fine else max(least, COARSE * cost)):
             return now
     return now
 

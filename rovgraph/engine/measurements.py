@@ -273,6 +273,13 @@ def gates_of(seen: Seen) -> Gates:
     return out
 
 
+def cost_at_gate(instrument: Instrument) -> float:
+    """Robust cost of a measurement at its gate; infinite where there is none."""
+    if instrument.gate_sd is None:
+        return np.inf
+    return float(_cost_and_weight(np.array([instrument.gate_sd**2]), instrument.loss, instrument.model.dim)[0][0])
+
+
 def weights_of(seen: Seen, gates: Gates) -> dict[str, Array]:
     """Weight of every measurement, shape (n,) for each sensor."""
     return {

@@ -1,7 +1,8 @@
 """Batch smoothing of a whole dive."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -173,6 +174,8 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "cost": best.solution.cost,
             "iterations": best.solution.iterations,
             "converged": best.solution.converged,
+            "stretches_taken_out": [asdict(stretch) for stretch in best.solution.stretches],
+            "runner_up": best.solution.runner_up if isfinite(best.solution.runner_up) else None,
             "bridged_intervals": sum(i.bridged for i in intervals),
             "held_at_prior": list(known.held),
         },

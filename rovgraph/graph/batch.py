@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
-from rovgraph.engine.gauss_newton import Gates, Solution, minimise
+from rovgraph.engine.gauss_newton import Gates, Measured, Solution
 from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.measurements import Block, Seen, blocks_of, gates_of, measurement_cost, weights_of
+from rovgraph.engine.measurements import Block, Seen, blocks_of, cost_at_gate, gates_of, measurement_cost, weights_of
+from rovgraph.engine.stretches import resume
+from rovgraph.engine.stretches import solve as solve_problem
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -81,6 +83,10 @@ class Problem:
     @cached_property
     def _newest_seen(self) -> deque[tuple[gtsam.Values, Seen]]:
         return deque(maxlen=2)  # reading GTSAM's values takes as long as a cost; a step is searched, then linearised
+
+    def measured(self) -> dict[str, Measured]:
+        """Times, dimension and cost at the gate of every sensor's measurements."""
+        return {s: Measured(b.time, b.z.shape[1], cost_at_gate(b.instrument)) for s, b in self.blocks.items()}
 
     def initial_gates(self) -> Gates:
         """Open, but for places that look like others."""
@@ -177,14 +183,16 @@ def make_values(problem: Problem, states: State, calibration: Mapping[str, Array
     return values
 
 
-def solve(problem: Problem, values: gtsam.Values) -> Solution[gtsam.Values]:
-    """Minimise the robust cost from ``values``, then gate and repeat.
+def solve(
+    problem: Problem, values: gtsam.Values, known: Solution[gtsam.Values] | None = None
+) -> Solution[gtsam.Values]:
+    """The cheapest optimum from ``values``; with ``known``, of a problem close by, that with the same stretches out.
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
-    return minimise(problem, values)
+    return solve_problem(problem, values) if known is None else resume(problem, values, known)
 
 
 def eliminate_step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:

@@ -87,7 +87,7 @@ class GraphOptimum:
         values = gtsam.Values(self.solution.point)
         for name in names:
             values.erase(key(name))
-        held = solve(without, values)
+        held = solve(without, values, self.solution)
         there = gtsam.Values(held.point)
         for name in names:
             there.insert(key(name), np.array(self.beliefs[name].mean, dtype=float))

@@ -6,7 +6,7 @@ small, with their limits (docs/alarms.md). What is beyond its limit is an `Alarm
 
 from collections.abc import Callable, Iterator, Sequence
 
-from rovgraph.estimators.alarms import constants, motion, residuals, sensors
+from rovgraph.estimators.alarms import constants, motion, residuals, sensors, stretches
 from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic, Verdict, alarm_of, verdict_of
 from rovgraph.estimators.alarms.dvl_cause import dvl_cause
 from rovgraph.estimators.alarms.evidence import Evidence
@@ -19,6 +19,8 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     constants.moved,
     constants.earth_rate,
     sensors.frozen,
+    stretches.taken_out,
+    stretches.close,
     residuals.rejected,
     residuals.too_large,
     residuals.too_small,

@@ -1,0 +1,208 @@
+"""Stretches in which a sensor is wrong all the time, found by the cost of leaving them out.
+
+Gates look at one measurement at a time. A DVL that is biased for half a minute moves the estimate with it, and its good
+pings before and after are rejected instead: an optimum of its own, from which no gate leads away. Rejections in a burst
+give it away. Then the measurements around the burst are taken out, one sensor's at a time, the dive is solved without
+them, and the stretch is fitted to what makes the dive cheapest.
+
+A stretch must not cost as many single outliers do, since it has one cause. It costs what as many good measurements
+cost, at the most that chance allows:
+
+    J = cost of what is let in + sum of rejected rho(gate) + sum of stretches s Q(n dim) / 2
+
+with Q the quantile of chi-square beyond which one in a million lies, and s the mean square of normalised residuals of
+what is let in, at least 1. So a stretch is taken out only where its measurements cost more than good ones ever do, by
+the standard of the rest of the dive.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc, chdtri
+
+from rovgraph.engine.gauss_newton import (
+    Array,
+    Gates,
+    Linearizable,
+    Measured,
+    Point,
+    Solution,
+    Step,
+    Stretch,
+    minimise,
+)
+from rovgraph.errors import InputError
+
+CHANCE = 1e-6  # that good measurements look like bad ones
+USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
+BURST_S, BURST_COUNT = 5.0, 10  # over which rejections are counted: a time, and as many measurements
+SAME_CAUSE_S = 20.0  # bursts that are no further apart have one cause
+AROUND_S = (5.0, 20.0, 60.0)  # around a burst, taken out to begin with
+NOTICEABLE, CLEAR = 12.0, 100.0  # cost of what is wrong and was let in: it may be chance; it is none
+OUTWARDS = (0, 2, 8, 16, 32, 64)  # measurements from what is clear
+SHARP = 16  # measurements from the one to the other at an edge that is sharp: each costs no more than at its gate
+GROWING = 5  # times what is beyond that, a slow error was there before it showed
+MARGIN = 2  # measurements outside of an edge that are left out, too
+MAX_STRETCHES = 4
+TOLERANCE = 0.1  # decrease of the cost that is left when optima are compared
+
+
+def solve(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
+    """The cheapest optimum of a dive: from ``point``, and without stretches in which a sensor contradicts the others.
+
+    Raises
+    ------
+    InputError : the data do not determine some variable, which is named
+    """
+    tried: list[Stretch] = []
+    best, runner_up = minimise(problem, point), math.inf
+    measured = problem.measured()
+    for _ in range(MAX_STRETCHES):
+        burst = next((b for b in _bursts(measured, best) if not any(_overlap(b, t) for t in tried)), None)
+        if burst is None:
+            break
+        without = [_taken_out_around(problem, best, burst, sensor) for sensor in measured]
+        ranked = sorted([best, *filter(None, without)], key=lambda one: one.cost)
+        runner_up = min(runner_up, ranked[1].cost - ranked[0].cost) if len(ranked) > 1 else runner_up
+        if ranked[0] is not best:
+            best = _with_fitted_edges(problem, ranked[0])
+        tried.append(burst)
+    if best.stretches:
+        best = resume(problem, best.point, best)
+    return replace(best, runner_up=runner_up)
+
+
+def resume(problem: Linearizable[Point, Step], point: Point, known: Solution[Point]) -> Solution[Point]:
+    """The optimum of a problem close to one whose solution is known, with the same stretches taken out."""
+    barred = _barred(problem.measured(), known.stretches)
+    solution = minimise(problem, point, known.gates, barred)
+    solution = replace(solution, stretches=known.stretches, runner_up=known.runner_up)
+    return replace(solution, cost=solution.cost + _price(problem, solution))
+
+
+def _bursts(measured: Mapping[str, Measured], solution: Solution[Point]) -> list[Stretch]:
+    """Times in which a sensor was rejected more often than chance allows, the least likely first."""
+    found: list[tuple[float, float, float]] = []
+    barred = _barred(measured, solution.stretches)
+    for sensor, gate in solution.gates.items():
+        out = ~gate & ~barred.get(sensor, np.zeros(len(gate), bool))
+        if out.any():
+            found += _bursts_of(measured[sensor].time, out)
+    return [Stretch("", begin, end) for begin, end, _ in sorted(_joined(found), key=lambda one: one[2])]
+
+
+def _bursts_of(time: Array, out: NDArray[np.bool_]) -> Iterator[tuple[float, float, float]]:
+    """Rejected measurements with too many others around them: begin, end and probability."""
+    half = 0.5 * max(BURST_S, BURST_COUNT * float(np.median(np.diff(time)))) if len(time) > 1 else 0.0
+    begin, end = time.searchsorted(time - half), time.searchsorted(time + half, side="right")
+    count = np.concatenate([[0], np.cumsum(out)])
+    k, n = count[end] - count[begin], end - begin
+    chance = bdtrc(k - 1, n, max(USUAL_SHARE, float(np.median(k / n))))
+    for at in np.flatnonzero(out & (chance < CHANCE)):
+        yield float(time[at]), float(time[at]), float(chance[at])
+
+
+def _joined(windows: Sequence[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    """Windows that have one cause, as one, with the least of their probabilities."""
+    out: list[tuple[float, float, float]] = []
+    for begin, end, chance in sorted(windows):
+        if out and begin - out[-1][1] <= SAME_CAUSE_S:
+            out[-1] = out[-1][0], max(end, out[-1][1]), min(chance, out[-1][2])
+        else:
+            out.append((begin, end, chance))
+    return out
+
+
+def _taken_out_around(
+    problem: Linearizable[Point, Step], best: Solution[Point], burst: Stretch, sensor: str
+) -> Solution[Point] | None:
+    """The cheapest optimum without a sensor's measurements around a burst; None = there is none."""
+    wider = [Stretch(sensor, burst.begin - more, burst.end + more) for more in AROUND_S]
+    found = [_solved_without(problem, best, (*best.stretches, stretch)) for stretch in wider]
+    return min(filter(None, found), key=lambda one: one.cost, default=None)
+
+
+def _with_fitted_edges(problem: Linearizable[Point, Step], best: Solution[Point]) -> Solution[Point]:
+    """The newest stretch as short as it can be at next to no cost, its edges put out where they are not sharp.
+
+    Good measurements cost about as much as they save, so the cost is flat outside of the stretch and a wall within. An
+    error that grows from nothing is there before it costs anything: the less steep the wall, the longer before.
+    """
+    time = problem.measured()[best.stretches[-1].sensor].time
+    for end in (False, True):
+        best = _with_fitted_edge(problem, best, time, end)
+    return best
+
+
+def _with_fitted_edge(
+    problem: Linearizable[Point, Step], best: Solution[Point], time: Array, end: bool
+) -> Solution[Point]:
+    """The same for one edge: in by bisection until it is clear, then out by doubled steps until nothing shows."""
+    newest, least = best.stretches[-1], best.cost
+
+    @cache
+    def at(index: int) -> Solution[Point] | None:
+        edge = float(time[min(max(index, 0), len(time) - 1)])
+        moved = replace(newest, end=edge) if end else replace(newest, begin=edge)
+        return _solved_without(problem, best, (*best.stretches[:-1], moved))
+
+    inside = np.flatnonzero((time >= newest.begin) & (time <= newest.end)).tolist()
+    outer, inner = (inside[-1], inside[0]) if end else (inside[0], inside[-1])
+    clear = outer
+    while abs(inner - clear) > 1:
+        middle = (inner + clear) // 2
+        shorter = at(middle)
+        clear, inner = (middle, inner) if shorter is not None and shorter.cost <= least + CLEAR else (clear, middle)
+    away = 1 if end else -1
+    costs = {k: one.cost for k in OUTWARDS if (one := at(clear + away * k)) is not None}
+    steps = next((k for k, cost in costs.items() if cost <= min(costs.values()) + NOTICEABLE), 0)
+    return at(clear + away * (steps + MARGIN + GROWING * max(0, steps - SHARP))) or best
+
+
+def _solved_without(
+    problem: Linearizable[Point, Step], begin: Solution[Point], stretches: tuple[Stretch, ...]
+) -> Solution[Point] | None:
+    """The optimum without some stretches, their costs included; None = they are empty, or needed."""
+    measured = problem.measured()
+    barred = _barred(measured, stretches)
+    if not barred[stretches[-1].sensor].any():
+        return None
+    before = _barred(measured, begin.stretches)
+    gates = {s: gate | before[s] if s in before else gate for s, gate in begin.gates.items()}
+    try:
+        solution = minimise(problem, begin.point, gates, barred, TOLERANCE)
+    except InputError:
+        return None
+    solution = replace(solution, stretches=stretches)
+    return replace(solution, cost=solution.cost + _price(problem, solution))
+
+
+def _price(problem: Linearizable[Point, Step], solution: Solution[Point]) -> float:
+    """What the stretches of a solution cost."""
+    measured = problem.measured()
+    barred = _barred(measured, solution.stretches)
+    numbers = [int(out.sum()) * measured[sensor].dim for sensor, out in barred.items()]
+    return _level(problem, solution) * 0.5 * sum(float(chdtri(n, CHANCE)) for n in numbers)
+
+
+def _level(problem: Linearizable[Point, Step], solution: Solution[Point]) -> float:
+    """Mean square of normalised residuals, at least 1. Motions have as many components as keyframes have."""
+    numbers = sum(int(solution.gates[s].sum()) * one.dim for s, one in problem.measured().items())
+    return max(1.0, 2.0 * problem.cost(solution.point, solution.gates) / max(numbers, 1))
+
+
+def _barred(measured: Mapping[str, Measured], stretches: Sequence[Stretch]) -> Gates:
+    """Sensor -> which of its measurements lie in a stretch."""
+    out: Gates = {}
+    for s in stretches:
+        time = measured[s.sensor].time
+        out[s.sensor] = out.get(s.sensor, np.zeros(len(time), bool)) | ((time >= s.begin) & (time <= s.end))
+    return out
+
+
+def _overlap(a: Stretch, b: Stretch) -> bool:
+    return a.begin <= b.end and b.begin <= a.end

@@ -1,0 +1,133 @@
+"""A stretch in which one sensor contradicts all others is found by its cost, and nothing else is taken out."""
+
+import numpy as np
+import pytest
+from broken import BROKEN, FROM, changed_data
+from dives import Simulated, altered, batch, falcon, interrupted, position_errors, rms, simulated, smoothed
+
+from rovgraph.config import beliefs
+from rovgraph.engine.chain import Chain
+from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
+from rovgraph.engine.gauss_newton import minimise
+from rovgraph.engine.measurements import cost_at_gate
+from rovgraph.estimators.dead_reckoning import dead_reckon
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.geometry import Array
+from rovgraph.graph.places import smooth_graph
+from rovgraph.log import Log
+from rovgraph.state import State
+
+BIASED_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def case() -> Simulated:
+    return simulated(falcon(), 200.0, 1)
+
+
+def optimum(log: Log, case: Simulated) -> ChainOptimum:
+    best = batch(log, case.config).optimum()
+    assert isinstance(best, ChainOptimum)
+    return best
+
+
+def dead_reckoned(smoother: BatchSmoother) -> State:
+    b = smoother.beginning
+    return dead_reckon(smoother.intervals, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
+
+
+def on_water(data: Array, time: Array) -> None:
+    """The DVL tracks a current along its own axes."""
+    data[(time > FROM) & (time < FROM + 40.0), :2] += [0.2, -0.15]
+
+
+def test_a_biased_stretch_of_the_dvl_is_found_and_taken_out(case):
+    log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
+    begin = float(log["imu"].time[0]) + FROM
+    (stretch,) = optimum(log, case).solution.stretches
+    assert stretch.sensor == "dvl"
+    assert abs(stretch.begin - begin) < 3.0
+    assert abs(stretch.end - begin - BIASED_S) < 3.0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_with_a_biased_stretch_the_track_is_as_good_as_without_its_pings(seed):
+    case = simulated(falcon(), 200.0, seed)
+    log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
+    silent = interrupted(case.log, float(log["imu"].time[0]) + FROM, BIASED_S, "dvl")
+    errors = [rms(position_errors(smoothed(one, case.config).trajectory, case)) for one in (log, silent)]
+    assert errors[0] <= 1.5 * errors[1]
+
+
+def test_water_track_taken_for_bottom_track_is_taken_out(case):
+    begin = float(case.log["imu"].time[0]) + FROM
+    (stretch,) = optimum(changed_data("dvl", on_water)(case.log), case).solution.stretches
+    assert stretch.sensor == "dvl"
+    assert stretch.begin == pytest.approx(begin, abs=4.0)
+    assert stretch.end == pytest.approx(begin + 40.0, abs=4.0)
+
+
+def test_the_sensor_that_is_wrong_is_taken_out_and_not_the_one_that_contradicts_it():
+    case = simulated(falcon(), 200.0, 1, fix_interval=2.0)
+    found = optimum(BROKEN["fixes 8 m off for a minute"].breaks(case.log), case).solution.stretches
+    assert {stretch.sensor for stretch in found} <= {"fix"}
+    log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
+    assert {stretch.sensor for stretch in optimum(log, case).solution.stretches} <= {"dvl"}
+
+
+def test_scattered_outliers_are_no_stretch(case):
+    data, rng = case.log["dvl"].data.copy(), np.random.default_rng(5)
+    wild = rng.random(len(data)) < 0.3
+    data[wild, :3] += rng.normal(0.0, 0.5, (wild.sum(), 3))
+    best = optimum(altered(case.log, "dvl", data), case)
+    assert best.solution.stretches == ()
+    clean = rms(position_errors(smoothed(case.log, case.config).trajectory, case))
+    spoilt = rms(position_errors(smoothed(altered(case.log, "dvl", data), case.config).trajectory, case))
+    assert spoilt < clean + 0.05
+
+
+def test_a_rejected_measurement_costs_what_one_at_its_gate_costs(case):
+    """Whether a measurement at its gate is in or out, the cost is the same: that of optima compares."""
+    data, wrong = case.log["dvl"].data.copy(), 300
+    data[wrong, 0] += 1.0
+    best = optimum(altered(case.log, "dvl", data), case)
+    count = int(np.sum(~best.solution.gates["dvl"]))
+    assert count > 0
+    let_in = best.chain.cost(best.state, best.solution.gates)
+    extra = count * cost_at_gate(best.blocks["dvl"].instrument)
+    assert best.solution.cost == pytest.approx(let_in + extra)
+
+
+def test_optima_with_other_gates_have_costs_that_compare(case):
+    """The open gates' optimum of a biased stretch is dearer than the one without it."""
+    log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
+    best = optimum(log, case)
+    alone = minimise(best.chain, best.state)
+    assert best.solution.cost < alone.cost
+    assert best.solution.runner_up > 0.0
+
+
+def test_a_healthy_dive_is_solved_once(case, monkeypatch):
+    counts, step = [0], Chain.step
+
+    def counted(self, *arguments):
+        counts[0] += 1
+        return step(self, *arguments)
+
+    monkeypatch.setattr(Chain, "step", counted)
+    smoother = batch(case.log, case.config)
+    states = dead_reckoned(smoother)
+    best = smooth_chain(smoother.intervals, smoother.beginning, states)
+    assert counts[0] == best.solution.iterations
+    assert (best.solution.stretches, best.solution.runner_up) == ((), np.inf)
+
+
+def test_chain_and_graph_take_out_the_same_stretch():
+    case = simulated(falcon(), 120.0, 2, dvl_rate=3.0, imu_rate=50.0)
+    smoother = batch(BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log), case.config)
+    states = dead_reckoned(smoother)
+    chain = smooth_chain(smoother.intervals, smoother.beginning, states).solution
+    graph = smooth_graph(smoother.intervals, smoother.beginning, states).solution
+    assert len(chain.stretches) == 1
+    assert chain.stretches == graph.stretches
+    assert chain.cost == pytest.approx(graph.cost, rel=1e-4)
