@@ -86,6 +86,11 @@ def test_scattered_outliers_are_no_stretch(case):
     assert spoilt < clean + 0.05
 
 
+@pytest.mark.parametrize("name", ["DVL y sign flipped", "DVL 0.3 s late", "DVL noise three times as stated"])
+def test_a_sensor_that_is_wrong_all_the_time_is_not_taken_out(name, case):
+    assert optimum(BROKEN[name].breaks(case.log), case).solution.stretches == ()
+
+
 def test_a_rejected_measurement_costs_what_one_at_its_gate_costs(case):
     """Whether a measurement at its gate is in or out, the cost is the same: that of optima compares."""
     data, wrong = case.log["dvl"].data.copy(), 300

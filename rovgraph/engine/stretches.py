@@ -8,11 +8,12 @@ them, and the stretch is fitted to what makes the dive cheapest.
 A stretch must not cost as many single outliers do, since it has one cause. It costs what as many good measurements
 cost, at the most that chance allows:
 
-    J = cost of what is let in + sum of rejected rho(gate) + sum of stretches s Q(n dim) / 2
+    J = cost of what is let in + sum of rejected rho(gate) + sum over sensors s Q(n dim) / 2
 
-with Q the quantile of chi-square beyond which one in a million lies, and s the mean square of normalised residuals of
-what is let in, at least 1. So a stretch is taken out only where its measurements cost more than good ones ever do, by
-the standard of the rest of the dive.
+with n a sensor's measurements in its stretches, Q the quantile of chi-square beyond which one in a million lies, and s
+the mean square of normalised residuals of what is let in, at least 1. So a stretch is taken out only where its
+measurements cost more than good ones ever do, by the standard of the rest of the dive. A sensor that is wrong most of
+the time, or a dive that is no better without it, is not as configured: alarms say so, and nothing is taken out.
 """
 
 import math
@@ -47,6 +48,8 @@ OUTWARDS = (0, 2, 8, 16, 32, 64)  # measurements from what is clear
 SHARP = 16  # measurements from the one to the other at an edge that is sharp: each costs no more than at its gate
 GROWING = 5  # times what is beyond that, a slow error was there before it showed
 MARGIN = 2  # measurements outside of an edge that are left out, too
+MOST_SHARE = 0.5  # of a sensor's measurements, that stretches may hold
+WELL = 1.5  # mean square of normalised residuals of the rest
 MAX_STRETCHES = 4
 TOLERANCE = 0.1  # decrease of the cost that is left when optima are compared
 
@@ -67,10 +70,13 @@ def solve(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
             break
         without = [_taken_out_around(problem, best, burst, sensor) for sensor in measured]
         ranked = sorted([best, *filter(None, without)], key=lambda one: one.cost)
-        runner_up = min(runner_up, ranked[1].cost - ranked[0].cost) if len(ranked) > 1 else runner_up
-        if ranked[0] is not best:
-            best = _with_fitted_edges(problem, ranked[0])
         tried.append(burst)
+        if _level(problem, ranked[0]) > WELL:
+            continue
+        fitted = best if ranked[0] is best else _with_fitted_edges(problem, ranked[0])
+        if _right_elsewhere(problem, fitted):
+            best = fitted
+            runner_up = min([runner_up, *(other.cost - ranked[0].cost for other in ranked[1:])])
     if best.stretches:
         best = resume(problem, best.point, best)
     return replace(best, runner_up=runner_up)
@@ -82,6 +88,12 @@ def resume(problem: Linearizable[Point, Step], point: Point, known: Solution[Poi
     solution = minimise(problem, point, known.gates, barred)
     solution = replace(solution, stretches=known.stretches, runner_up=known.runner_up)
     return replace(solution, cost=solution.cost + _price(problem, solution))
+
+
+def _right_elsewhere(problem: Linearizable[Point, Step], solution: Solution[Point]) -> bool:
+    """Whether every sensor is right most of the time."""
+    barred = _barred(problem.measured(), solution.stretches)
+    return all(out.mean() <= MOST_SHARE for out in barred.values())
 
 
 def _bursts(measured: Mapping[str, Measured], solution: Solution[Point]) -> list[Stretch]:
