@@ -36,7 +36,7 @@ Layers (imports go downwards only)
 ----------------------------------
 cli / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
-state, calibration, thesis / kernels / geometry, workers, fast_csv / errors.
+state, calibration, thesis / kernels / geometry, workers, fast_csv / errors, process.
 """
 
 __version__ = "0.1.0"

@@ -205,7 +205,7 @@ def test_help_loads_what_typer_does_and_the_commands_only():
         return set(run(code).stdout.rpartition("MODULES ")[2].split())
 
     names, plain = loaded(HELP.format(arguments=["--help"])), loaded(PLAIN)
-    assert {member(name) for name in first_party(names)} == {"cli", "errors"}
+    assert {member(name) for name in first_party(names)} == {"cli", "errors", "process"}
     libraries = {name.split(".")[0] for name in names} - sys.stdlib_module_names - {"rovgraph"}
     assert libraries <= {name.split(".")[0] for name in plain}
     modules = [name for name in names if name.split(".")[0] in libraries]

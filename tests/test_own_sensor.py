@@ -137,7 +137,9 @@ def test_its_faults_are_left_out(case):
     assert abs(found.value - TRUE_SCALE) < SURE * found.sd
     assert smoother.assembler.left_out["depth2", "beyond its range"] == 1
     rows = estimate.residuals[estimate.residuals["sensor"] == "depth2"]
-    assert (rows["weight"] == 0.0).sum() == (rows["normalised"].abs() > 6.0).sum() > 5
+    off, out = rows["normalised"].abs() > 6.0, rows["weight"] == 0.0
+    assert off.sum() > 5 and out[off].all()
+    assert out.sum() < 2 * off.sum()  # the stretch that is taken out reaches somewhat beyond
 
 
 def test_it_is_checked(case):
