@@ -76,6 +76,7 @@ def test_the_order_of_arrival_within_300_ms_changes_nothing(beginning, measureme
     same(live(beginning, first + shuffled(rest, 0.3), hold)[1], reference.filtered, 1e-9)
 
 
+@pytest.mark.slow
 def test_pings_about_as_far_apart_as_keyframes_may_be_make_the_same_keyframes_in_any_order():
     case = simulated(falcon(), 40.0, seed=6, dvl_rate=1.0, dvl_jitter=0.4)
     measurements, beginning = list(case.log.measurements()), initialise(case.log, case.config)

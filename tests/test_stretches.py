@@ -41,6 +41,7 @@ def on_water(data: Array, time: Array) -> None:
     data[(time > FROM) & (time < FROM + 40.0), :2] += [0.2, -0.15]
 
 
+@pytest.mark.slow
 def test_a_biased_stretch_of_the_dvl_is_found_and_taken_out(case):
     log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
     begin = float(log["imu"].time[0]) + FROM
@@ -50,7 +51,7 @@ def test_a_biased_stretch_of_the_dvl_is_found_and_taken_out(case):
     assert abs(stretch.end - begin - BIASED_S) < 3.0
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_with_a_biased_stretch_the_track_is_as_good_as_without_its_pings(seed):
     case = simulated(falcon(), 200.0, seed)
     log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
@@ -59,6 +60,7 @@ def test_with_a_biased_stretch_the_track_is_as_good_as_without_its_pings(seed):
     assert errors[0] <= 1.5 * errors[1]
 
 
+@pytest.mark.slow
 def test_water_track_taken_for_bottom_track_is_taken_out(case):
     begin = float(case.log["imu"].time[0]) + FROM
     (stretch,) = optimum(changed_data("dvl", on_water)(case.log), case).solution.stretches
@@ -67,6 +69,7 @@ def test_water_track_taken_for_bottom_track_is_taken_out(case):
     assert stretch.end == pytest.approx(begin + 40.0, abs=4.0)
 
 
+@pytest.mark.slow
 def test_the_sensor_that_is_wrong_is_taken_out_and_not_the_one_that_contradicts_it():
     case = simulated(falcon(), 200.0, 1, fix_interval=2.0)
     found = optimum(BROKEN["fixes 8 m off for a minute"].breaks(case.log), case).solution.stretches
@@ -103,6 +106,7 @@ def test_a_rejected_measurement_costs_what_one_at_its_gate_costs(case):
     assert best.solution.cost == pytest.approx(let_in + extra)
 
 
+@pytest.mark.slow
 def test_optima_with_other_gates_have_costs_that_compare(case):
     """The open gates' optimum of a biased stretch is dearer than the one without it."""
     log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)

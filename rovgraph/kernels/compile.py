@@ -86,7 +86,7 @@ def cache_folder(module: str) -> Path | None:
         return None
     folder = parent / f"rovgraph-{module.rpartition('.')[2]}-{_state_of(module)}"
     if not folder.exists():
-        _say_once("compiling rovgraph's kernels, once: this takes about half a minute")
+        _say_once("compiling rovgraph's kernels, once: this takes a minute or two")
         folder.mkdir(parents=True, exist_ok=True)
     return folder
 
