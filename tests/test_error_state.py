@@ -40,7 +40,7 @@ from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
 from rovgraph.kernels import measurement_row
-from rovgraph.kernels.correction import RETURN_SD
+from rovgraph.kernels.admission import RETURN_SD
 from rovgraph.kernels.robust_update import MAX_REWEIGHTINGS, SETTLED, innovation_covariance, joseph, reweight
 from rovgraph.kernels.weighting import LOSSES
 from rovgraph.log import Log

@@ -12,13 +12,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from rovgraph.engine.chain_information import (
-    MeasurementRows,
-    MotionRows,
-    SquareRoot,
-    UndeterminedError,
-    eliminate,
-)
+from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, UndeterminedError
+from rovgraph.engine.linear_chain import MotionRows, eliminate
 
 CHAINS = [(6, 15, 0, 0), (6, 15, 0, 4), (5, 15, 2, 5), (4, 15, 2, 0), (1, 15, 0, 3), (7, 3, 1, 20)]
 

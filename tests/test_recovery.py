@@ -10,7 +10,7 @@ from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.geometry import Array
-from rovgraph.kernels.correction import difference, move_estimate
+from rovgraph.kernels.moves import difference, move_estimate
 from rovgraph.state import VELOCITY
 
 SILENT_FROM = 40.0

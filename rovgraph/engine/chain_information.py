@@ -33,34 +33,6 @@ class UndeterminedError(Exception):
         self.keyframe, self.component = keyframe, component
 
 
-@dataclass(frozen=True)
-class MotionRows:
-    """Whitened rows of the motions between n keyframes, of s components that move and d - s that walk.
-
-    Attributes
-    ----------
-    A_i, A_j : ndarray, shape (n - 1, s, s), Jacobians by the keyframes before and after
-    r : ndarray, shape (n - 1, s), right-hand sides
-    C, targets : ndarray, shapes (n - 1, s, e) and (e,), Jacobians by other columns (see `rovgraph.kernels.chain`)
-    walk, walk_r : ndarray, shape (n - 1, d - s), one over the sd of a walk, and right-hand sides
-    """
-
-    A_i: Array
-    A_j: Array
-    r: Array
-    C: Array
-    targets: Index
-    walk: Array
-    walk_r: Array
-
-    @staticmethod
-    def of_states(A_i: Array, A_j: Array, r: Array) -> "MotionRows":
-        """Rows of motions in which nothing walks and that know nothing of the border."""
-        count, s = r.shape
-        none = np.zeros((count, 0))
-        return MotionRows(A_i, A_j, r, np.zeros((count, s, 0)), np.zeros(0, dtype=np.int64), none, none)
-
-
 class MeasurementRows:
     """Whitened rows of measurements at n keyframes, of any number of sensors.
 
@@ -75,7 +47,7 @@ class MeasurementRows:
 
     Attributes
     ----------
-    values, targets, first : as `rovgraph.kernels.chain.eliminate` takes them
+    values, targets, first : as `rovgraph.kernels.linear_chain.eliminate` takes them
     """
 
     def __init__(self, n: int, s: int, keyframes: Sequence[Index], dims: Sequence[int], others: int) -> None:
@@ -218,37 +190,13 @@ class SquareRoot:
         return 2.0 * float(np.log(np.abs(diagonals)).sum() + np.log(np.abs(np.diagonal(self.border))).sum())
 
 
-def eliminate(
-    motions: MotionRows, measurements: MeasurementRows, border_rows: Array, stops: Sequence[int] = ()
-) -> SquareRoot:
-    """Eliminate the keyframes in the order of time, then the border.
-
-    Parameters
-    ----------
-    motions, measurements : the rows of n keyframes
-    border_rows : ndarray, shape (p, c + 1), priors of the border with their right-hand sides
-    stops : increasing, keyframes at which to keep what the rows up to there say (`SquareRoot.filtered`)
-
-    Raises
-    ------
-    UndeterminedError : the rows do not determine some component
-    """
-    m, n, c = motions, len(measurements.first) - 1, border_rows.shape[1] - 1
-    rows = measurements.values, measurements.targets, measurements.first, border_rows, np.array(stops, dtype=np.int64)
-
-    def fill(*out: Array) -> int:
-        return chain.eliminate(m.A_i, m.A_j, m.r, m.C, m.targets, m.walk, m.walk_r, *rows, *out)
-
-    return square_root(n, m.A_i.shape[1] + m.walk.shape[1], c, len(stops), fill)
-
-
 def square_root(n: int, d: int, c: int, stops: int, fill: Callable[[Array, Array, Array, Array], int]) -> SquareRoot:
     """What an elimination of n keyframes of d components and a border of c leaves.
 
     Parameters
     ----------
     stops : number of keyframes at which to keep what is known
-    fill : writes ``conditionals_out`` to ``left_out`` and returns, as `rovgraph.kernels.chain.eliminate`
+    fill : writes ``conditionals_out`` to ``left_out`` and returns, as `rovgraph.kernels.linear_chain.eliminate`
 
     Raises
     ------

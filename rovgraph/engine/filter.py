@@ -44,8 +44,9 @@ from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import correct, difference, move_estimate
+from rovgraph.kernels.correction import correct
 from rovgraph.kernels.filtering import filter_intervals
+from rovgraph.kernels.moves import difference, move_estimate
 from rovgraph.kernels.prediction import predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 

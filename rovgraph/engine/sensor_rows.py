@@ -10,7 +10,7 @@ from rovgraph.engine.measurements import loss_threshold
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import linearize
+from rovgraph.kernels.linearization import linearize
 from rovgraph.kernels.weighting import LOSSES
 from rovgraph.sensors import SENSORS
 

@@ -1,6 +1,6 @@
 """What an eliminated chain says, backwards in time: solution, sensitivities, draws and covariances.
 
-From the conditionals of `rovgraph.kernels.chain.eliminate`,
+From the conditionals of `rovgraph.kernels.linear_chain.eliminate`,
 
     R_k x_k + S_k x_{k+1} + T_k y = z_k + white noise
 
@@ -19,12 +19,12 @@ from rovgraph.kernels.householder import padded
 def back_substitute(conditionals: Array, y: Array, x_out: Array) -> None:
     """Solve R_k x_k = z_k - S_k x_{k+1} - T_k y backwards in time, for m right-hand sides.
 
-    With z of `eliminate` and the border's solution, the solution; with zeros and a unit matrix, the derivative of
+    With z of the elimination and the border's solution, the solution; with zeros and a unit matrix, the derivative of
     the solution by the border; with white noise and zeros, a draw of the error where the border is held.
 
     Parameters
     ----------
-    conditionals : shape (n, d, 2 d + c + 1), of `eliminate`
+    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.linear_chain.eliminate`
     y : shape (c, m)
     x_out : shape (n, d, m), z to begin with, then x
     """
@@ -93,7 +93,7 @@ def covariances(conditionals: Array, P_y: Array, P_out: Array, cross_out: Array,
 
     Parameters
     ----------
-    conditionals : shape (n, d, 2 d + c + 1), of `eliminate`
+    conditionals : shape (n, d, 2 d + c + 1), of `rovgraph.kernels.linear_chain.eliminate`
     P_y : shape (c, c), covariance of the border
     P_out : shape (n, d, d)
     cross_out : shape (n, d, c), of the keyframes (rows) with the border, X P_y; or (0, d, c)

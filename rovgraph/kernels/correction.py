@@ -5,37 +5,21 @@
     dx, P                                             `rovgraph.kernels.robust_update`
     x <- x + dx, P <- B P B'                          `rovgraph.kernels.error_coordinates`
 
-A sensor that was left out for longer than `DISTRUSTED_S` returns only within `RETURN_SD` of what the filter, whose
-uncertainty grows without it, holds possible. Left out for longer than its `READMIT`, it is believed to see something
-that no model knows, and inflates the covariance of what it sees.
+Which measurements enter, and what a sensor does that was left out for long, is in `rovgraph.kernels.admission`.
 """
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.kernels.admission import admit, directions_seen
 from rovgraph.kernels.change_of_basis import change_basis
 from rovgraph.kernels.compile import helper, kernel
 from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
-from rovgraph.kernels.layout import TRANSLATION, VELOCITY
-from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
-from rovgraph.kernels.measurement_row import (
-    BEND,
-    DIM,
-    GATE,
-    GIVEN,
-    KIND,
-    LOSS,
-    READMIT,
-    SEEN_FRAME,
-    SEES,
-    SEES_HEADING,
-    SEES_VELOCITY,
-    TIME,
-)
+from rovgraph.kernels.linearization import NO_SCALE, Scratch, linearize_measurement, make_scratch
+from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME
+from rovgraph.kernels.moves import move
 from rovgraph.kernels.robust_update import (
     correction,
     inflate,
@@ -45,188 +29,13 @@ from rovgraph.kernels.robust_update import (
     normalised_squared,
     reweight,
 )
-from rovgraph.kernels.weighting import loss_weight
+from rovgraph.kernels.velocity_coordinates import coordinates_of_velocity
 
 Index = NDArray[np.int64]
 
-NO_SCALE = np.empty((0, 0))  # of an IMU whose scale is exact
 WIDE = 30.0  # sd of a prediction, in those of its measurement, from which it is corrected by iterations
 MAX_RELINEARIZATIONS = 5
 STANDS = 0.1  # a correction within as many sd needs no other point to linearise at
-DISTRUSTED_S = 2.0  # of being left out after which a sensor may be wrong for longer than single measurements [s]
-RETURN_SD = 3.0  # a sensor that was left out for long returns with an innovation within this many sd
-
-
-@helper
-def move(x: Array, c: Array, P: Array, delta: Array, layout: ErrorLayout) -> None:
-    """Move a state by ``delta`` along the error's coordinates, and its covariance's basis with it; in place."""
-    size, rows = len(layout.columns), len(layout.rows)
-    scratch, basis = make_coordinates_scratch(len(layout.seen), len(c)), np.zeros((size, size))
-    for i in range(size):
-        basis[i, i] = 1.0
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
-    retract(R, p, v, b, c, delta[0:size], layout, scratch, basis)
-    change_basis(P, basis, layout.rows, np.empty((rows, len(P))), np.empty((rows, size + 1), np.int64))
-
-
-@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1])")
-def move_estimate(
-    x: Array, c: Array, P: Array, delta: Array, columns: Index, seen: Index, seen_params: Array, basis_rows: Index
-) -> None:
-    """`move`, from Python; the last four are those of `rovgraph.kernels.error_coordinates.ErrorLayout`."""
-    move(x, c, P, delta, ErrorLayout(columns, seen, seen_params, basis_rows))
-
-
-@kernel("void(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8[:, ::1])")
-def difference(
-    x: Array,
-    c: Array,
-    other_x: Array,
-    other_c: Array,
-    columns: Index,
-    seen: Index,
-    seen_params: Array,
-    basis_rows: Index,
-    delta_out: Array,
-    basis_out: Array,
-) -> None:
-    """The error that leads from a state to another; ``basis_out``, the unit matrix before, takes errors back."""
-    layout = ErrorLayout(columns, seen, seen_params, basis_rows)
-    scratch = make_coordinates_scratch(len(layout.seen), len(c))
-    other = (other_x[0:9].reshape(3, 3), other_x[9:12], other_x[12:15], other_x[15:21], other_c)
-    own = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
-    local(own[0], own[1], own[2], own[3], c, other, layout, scratch, delta_out, basis_out)
-
-
-@helper
-def determinant(A: Array) -> float:
-    """Of a matrix of shape (3, 3)."""
-    total = 0.0
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        total += A[0, i] * (A[1, j] * A[2, k] - A[1, k] * A[2, j])
-    return total
-
-
-@helper
-def coordinates_of_velocity(x: Array, P: Array, layout: ErrorLayout) -> ErrorLayout:
-    """The layout in which velocity moves along those axes, n's or the body's, along which it is known more sharply.
-
-    A DVL knows it along the body's, where a correction of heading must not touch what it has seen. In its silence
-    depth alone knows velocity, along n: moved as the DVL sees it, a correction of tilt by 0.3 degrees would make
-    15 mm/s downwards of a velocity that is 3 m/s off, which depth takes for knowledge of all of the velocity.
-    The measure is the volume of the error's ellipsoid: that of v_n against that of R' v_n, whose error along n is
-    d_v + v_n x R d_R.
-    """
-    along_n, along_body, turn = P[VELOCITY : VELOCITY + 3, VELOCITY : VELOCITY + 3], np.empty((3, 3)), np.zeros((3, 6))
-    for k in range(3):  # columns v_n x R e_k
-        a, b, c = x[k], x[3 + k], x[6 + k]
-        turn[0, k] = x[13] * c - x[14] * b
-        turn[1, k] = x[14] * a - x[12] * c
-        turn[2, k] = x[12] * b - x[13] * a
-        turn[k, 3 + k] = 1.0
-    product = np.empty((3, 6))
-    for i in range(3):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += turn[i, k] * P[k if k < 3 else k + 3, j if j < 3 else j + 3]
-            product[i, j] = total
-    for i in range(3):
-        for j in range(3):
-            total = 0.0
-            for k in range(6):
-                total += product[i, k] * turn[j, k]
-            along_body[i, j] = total
-    if determinant(along_body) <= determinant(along_n):
-        return layout
-    others = layout.seen[:, 2] != VELOCITY
-    return ErrorLayout(layout.columns, layout.seen[others], layout.params[others], layout.rows)
-
-
-@helper
-def directions_seen(x: Array, sensor: Array, n: int, elapsed: float) -> tuple[Array, Array]:
-    """Directions of the error in which something unknown has moved a state by one in what a sensor sees.
-
-    Parameters
-    ----------
-    x, sensor : state (21,) and row of the sensor
-    n : length of the error
-    elapsed : time within which it happened [s]
-
-    Returns
-    -------
-    seen : shape (n, s), velocity in n, or turn or shift along n's axes; a velocity with the way since, half of the
-        time in the mean
-    spread : shape (n, s), sd of that way, since a knock may have come at any time: elapsed / sqrt(12)
-    """
-    count = 0
-    for k in range(3):
-        count += sensor[SEES + k] != 0.0
-    seen, spread, j = np.zeros((n, count)), np.zeros((n, count)), 0
-    frame = int(sensor[SEEN_FRAME])
-    for k in range(3):
-        if sensor[SEES + k] == 0.0:
-            continue
-        if frame == SEES_VELOCITY:
-            seen[VELOCITY + k, j] = 1.0
-            for i in range(3):
-                seen[TRANSLATION + i, j] = 0.5 * elapsed * x[3 * k + i]  # column k of R_bn
-                spread[TRANSLATION + i, j] = elapsed / math.sqrt(12.0) * x[3 * k + i]
-        else:
-            begin = 0 if frame == SEES_HEADING else TRANSLATION
-            for i in range(3):
-                seen[begin + i, j] = x[3 * k + i]
-        j += 1
-    return seen, spread
-
-
-@helper
-def admit(nis: float, time: float, sensor: Array, since: Array, index: int) -> bool:
-    """Whether a measurement lies within its gate; keeps in ``since`` since when its sensor is left out."""
-    gate = sensor[GATE]
-    if time - since[index] > min(DISTRUSTED_S, sensor[READMIT]):  # never where that is nan
-        gate = RETURN_SD
-    if nis > gate * gate:
-        if math.isnan(since[index]):
-            since[index] = time
-        return False
-    since[index] = math.nan
-    return True
-
-
-@kernel("void(f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8, b1, f8[::1], f8[:, ::1])")
-def linearize(
-    x: Array,
-    c: Array,
-    rows: Array,
-    which: Index,
-    sensors: Array,
-    column: Index,
-    scale: Array,
-    gravity: float,
-    weighted: bool,
-    r_out: Array,
-    H_out: Array,
-) -> None:
-    """Whitened innovations and Jacobians of m measurements of a keyframe, none of them `GIVEN`; as `correct` takes.
-
-    ``weighted`` ones are multiplied by the root of the weight of their loss.
-    """
-    begin, scratch = 0, make_scratch(len(c))
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
-    for j in range(len(which)):
-        sensor = sensors[which[j]]
-        end = begin + int(sensor[DIM])
-        own, r, H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], H_out[begin:end]
-        square = linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, r, H)
-        if weighted:
-            root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
-            for a in range(begin, end):
-                r_out[a] *= root
-                for i in range(H_out.shape[1]):
-                    H_out[a, i] *= root
-        begin = end
 
 
 @helper

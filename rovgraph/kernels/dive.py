@@ -120,7 +120,7 @@ def eliminate_dive(
     filtered_out: Array,
     left_out: Array,
 ) -> int:
-    """Linearise all factors at a point and eliminate them, as `rovgraph.kernels.chain.eliminate`.
+    """Linearise all factors at a point and eliminate them, as `rovgraph.kernels.linear_chain.eliminate`.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def eliminate_dive(
     gravity : [m/s^2]
     walk, walking : shapes (n - 1, d - 15), (d - 15,), one over the sd of each walk, and what of c walks
     given, given_targets, given_first : rows, targets and first, of what no kernel knows
-    border_rows to left_out : as `rovgraph.kernels.chain.eliminate`
+    border_rows to left_out : as `rovgraph.kernels.linear_chain.eliminate`
     """
     n, d, size = conditionals_out.shape[0], conditionals_out.shape[1], c.shape[1]
     most, of_c, of_scale = 0, len(c) > 1, len(scales) > 0

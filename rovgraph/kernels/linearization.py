@@ -5,6 +5,7 @@
 with the bias b + S k where the IMU's scale may be off by k (`rovgraph.engine.scale`).
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +13,11 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import wrap
-from rovgraph.kernels.compile import helper, view_helper
+from rovgraph.kernels.compile import helper, kernel, view_helper
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.measurement_row import (
     ASSUMED,
+    BEND,
     DIM,
     DP,
     DR,
@@ -23,6 +25,7 @@ from rovgraph.kernels.measurement_row import (
     DV,
     GAIN,
     KIND,
+    LOSS,
     MOST,
     PARAMS,
     RATE,
@@ -34,9 +37,11 @@ from rovgraph.kernels.measurements import WORK as PREDICT_WORK
 from rovgraph.kernels.measurements import is_angular, predict
 from rovgraph.kernels.propagation import WORK as PROPAGATE_WORK
 from rovgraph.kernels.propagation import chain, propagate, propagation_jacobian
-from rovgraph.kernels.weighting import whiten
+from rovgraph.kernels.weighting import loss_weight, whiten
 
 Index = NDArray[np.int64]
+
+NO_SCALE = np.empty((0, 0))  # of an IMU whose scale is exact
 
 
 class Scratch(NamedTuple):
@@ -185,3 +190,37 @@ def linearize_measurement(
                 for k in range(a + 1):
                     H_out[a, own] += W[a, k] * H[k, j]
     return square
+
+
+@kernel("void(f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8, b1, f8[::1], f8[:, ::1])")
+def linearize(
+    x: Array,
+    c: Array,
+    rows: Array,
+    which: Index,
+    sensors: Array,
+    column: Index,
+    scale: Array,
+    gravity: float,
+    weighted: bool,
+    r_out: Array,
+    H_out: Array,
+) -> None:
+    """Whitened innovations and Jacobians of m measurements of a keyframe, none of them `GIVEN`; as a filter takes.
+
+    ``weighted`` ones are multiplied by the root of the weight of their loss.
+    """
+    begin, scratch = 0, make_scratch(len(c))
+    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
+    for j in range(len(which)):
+        sensor = sensors[which[j]]
+        end = begin + int(sensor[DIM])
+        own, r, H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], H_out[begin:end]
+        square = linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, r, H)
+        if weighted:
+            root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
+            for a in range(begin, end):
+                r_out[a] *= root
+                for i in range(H_out.shape[1]):
+                    H_out[a, i] *= root
+        begin = end
