@@ -36,6 +36,8 @@ class Variable:
     excited_by : what a dive must have for the data to show it
     estimate : estimated unless the configuration says otherwise
     walk : default random walk [unit per root second], 0 = constant over the dive
+    considered : where it is not estimated, its prior's uncertainty is in that of all else, unless the configuration
+        says otherwise
     """
 
     name: str
@@ -48,6 +50,7 @@ class Variable:
     excited_by: str
     estimate: bool = False
     walk: float = 0.0
+    considered: bool = False
 
     @property
     def dim(self) -> int:
@@ -63,6 +66,8 @@ class Variable:
         """Names of the scalar components, such as ``hard_iron_x``."""
         return tuple(self.name + c for c in self.components)
 
+
+CONSIDERED = "considered"  # neither estimated nor exact
 
 _DEG = float(np.deg2rad(1.0))
 _ONE = ("",)
@@ -114,6 +119,7 @@ TABLE: dict[str, Variable] = {
             _DVL,
             "roll of the DVL's mounting",
             "moving sideways and up and down, with a depth sensor",
+            considered=True,
         ),
         Variable(
             "dvl_pitch",
@@ -124,6 +130,7 @@ TABLE: dict[str, Variable] = {
             _DVL,
             "pitch of the DVL's mounting",
             "moving forwards and up and down, with a depth sensor",
+            considered=True,
         ),
         Variable(
             "dvl_yaw",
@@ -144,6 +151,7 @@ TABLE: dict[str, Variable] = {
             _DVL,
             "scale error of the DVL (sound speed)",
             "position fixes far apart; large changes of depth; starts and stops, against the accelerometer",
+            considered=True,
         ),
         Variable(
             "dvl_lever_arm",
@@ -154,6 +162,7 @@ TABLE: dict[str, Variable] = {
             _DVL,
             "error of the DVL's place, dvl.lever_arm_m less imu.lever_arm_m, body axes",
             "turning: yaw for forward and starboard, roll and pitch for down",
+            considered=True,
         ),
         Variable(
             "dvl_time_offset",
@@ -230,6 +239,7 @@ TABLE: dict[str, Variable] = {
             ("imu",),
             "scale error of the gyro, IMU axes",
             "turning far about every axis, against compasses and gravity",
+            considered=True,
         ),
         Variable(
             "depth_offset",
@@ -240,6 +250,7 @@ TABLE: dict[str, Variable] = {
             ("depth",),
             "offset of the depth sensor",
             "a start at a known depth (start.down_m), and vertical velocity that is believed to keep it",
+            considered=True,
         ),
         Variable(
             "drag_linear",
@@ -335,6 +346,7 @@ class Belief:
     sd : float, every component [unit]
     estimate : False = held at the mean
     walk : random walk [unit per root second], 0 = constant over the dive
+    considered : held at the mean, but its uncertainty is in that of all else (Schmidt); False where it is estimated
     """
 
     variable: Variable
@@ -342,3 +354,4 @@ class Belief:
     sd: float
     estimate: bool
     walk: float = 0.0
+    considered: bool = False

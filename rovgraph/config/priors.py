@@ -2,15 +2,20 @@
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, create_model
 from pydantic_core import PydanticCustomError
 
-from rovgraph.calibration import MOUNT, TABLE, Variable
+from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Variable
 from rovgraph.config.error_messages import count
 from rovgraph.config.sections import NotNegative, Positive, Section
+
+
+def considerable(variable: Variable) -> bool:
+    """Whether it can be considered: what walks, or moves stamps, is estimated or exact."""
+    return variable.walk == 0.0 and not variable.name.endswith("_time_offset")
 
 
 def _components(dim: int) -> Callable[[Any], Any]:
@@ -38,8 +43,11 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
     mounted = variable.name in MOUNT
     fields: dict[str, Any] = {
         "estimate": (
-            bool,
-            Field(variable.estimate, description=f"estimate it: {variable.about}. Shown by: {variable.excited_by}"),
+            bool | Literal["considered"] if considerable(variable) else bool,
+            Field(
+                CONSIDERED if variable.considered else variable.estimate,
+                description=f"estimate it: {variable.about}. Shown by: {variable.excited_by}",
+            ),
         ),
         "mean" + tail: (
             Annotated[float | tuple[float, ...] | None, BeforeValidator(_components(variable.dim))],

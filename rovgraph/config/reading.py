@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rovgraph.calibration import MOUNT, TABLE, Belief, Variable
+from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable
 from rovgraph.config.error_messages import complaint
 from rovgraph.config.priors import Calibration, calibration_entry
 from rovgraph.config.registered import add_key, remove_key
@@ -108,8 +108,9 @@ def beliefs(config: Config) -> dict[str, Belief]:
             variable,
             unit * np.broadcast_to(values, (variable.dim,)),
             unit * getattr(entry, "sd" + tail),
-            entry.estimate,
+            entry.estimate is True,
             unit * getattr(entry, "walk" + tail),
+            entry.estimate == CONSIDERED,
         )
     return out
 

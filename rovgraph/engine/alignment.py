@@ -26,6 +26,7 @@ from rovgraph.geometry import (
 )
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.kernels.filtering import attitude_variances_of
+from rovgraph.state import PLACE_DIM
 
 POORLY_KNOWN = np.deg2rad([4.0, 10.0]) ** 2  # variances of tilt and heading from which a tangent does harm [rad^2]
 STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
@@ -72,7 +73,8 @@ def with_attitude(known: Gaussian, R_nb: Array) -> Gaussian:
         basis[6:9, 6:9] = turn = R_nb @ before.T
         x[12:15] = turn @ v_n
     x[:9] = R_nb.ravel()
-    return replace(known, x=x, P=basis @ known.P @ basis.T)
+    B = basis @ known.B if known.B.size else known.B
+    return replace(known, x=x, P=basis @ known.P @ basis.T, B=B)
 
 
 def _levelled(known: Gaussian, interval: KeyframeInterval, gravity: float) -> Array:
@@ -93,7 +95,7 @@ def _towards(known: Gaussian, compasses: Sequence[KeyframeMeasurement], lineariz
     Headings all around the believed one are tried, calibration and tilt being as sure as they are.
     """
     R_nb = known.state.R_nb[0]
-    size = linearize(known, compasses)[1].shape[1]
+    size = len(known.P) - PLACE_DIM * len(known.places)
     P = known.P[:size, :size]
     by_heading = P[:, :3] @ R_nb[2]
     variance = float(R_nb[2] @ by_heading[:3])
@@ -101,7 +103,7 @@ def _towards(known: Gaussian, compasses: Sequence[KeyframeMeasurement], lineariz
     angles = np.linspace(-reach, reach, 2 * int(np.ceil(reach / STEP)) + 1)
     turned = exp_rotation(np.column_stack([0.0 * angles, 0.0 * angles, angles])) @ R_nb
     rows = [linearize(replace(known, x=np.concatenate([R.ravel(), known.x[9:]])), compasses) for R in turned]
-    misfit, by = np.array([r for r, _ in rows]), np.array([H for _, H in rows])
+    misfit, by = np.array([r for r, _ in rows]), np.array([H[:, :size] for _, H in rows])
     S = by @ (P - np.outer(by_heading, by_heading) / variance) @ transpose(by) + identity(misfit.shape[1])
     nis = (misfit * np.linalg.solve(S, misfit[..., None])[..., 0]).sum(axis=1)
     likeliest = (nis + np.linalg.slogdet(S)[1] + angles**2 / variance).argmin()

@@ -159,24 +159,14 @@ class SquareRoot:
         root = np.asarray(np.linalg.inv(self.filtered[:, :, :-1]), dtype=float)
         return root @ transpose(root)
 
-    def newest_covariance(self) -> Array:
-        """Joint covariance of the last keyframe and the border, shape (d + c, d + c)."""
+    def newest_covariance(self, P_y: Array) -> Array:
+        """Joint covariance of the last keyframe and the border, shape (d + c, d + c); ``P_y`` is that of the border."""
         last, c = self.conditionals[-1], len(self.border)
         d = len(last)
-        R = np.zeros((d + c, d + c))
-        R[:d, :d], R[:d, d:], R[d:, d:] = last[:, :d], last[:, 2 * d : 2 * d + c], self.border[:, :-1]
-        root = _solve_upper(R, np.eye(d + c))
-        return np.asarray(root @ root.T)
-
-    def border_by(self, given: Index) -> Array:
-        """How the optimum of the whole border moves with k of its components, shape (c, k)."""
-        others = np.setdiff1d(np.arange(len(self.border)), given)
-        R: Array = np.asarray(np.linalg.qr(self.border[:, [*others, *given]], mode="r"))
-        free = len(others)
-        out = np.zeros((len(self.border), len(given)))
-        out[given] = np.eye(len(given))
-        out[others] = -_solve_upper(R[:free, :free], R[:free, free:])
-        return out
+        root = _solve_upper(last[:, :d], np.eye(d))
+        X = -root @ last[:, 2 * d : 2 * d + c]
+        cross = X @ P_y
+        return np.block([[root @ root.T + cross @ X.T, cross], [cross.T, P_y]])
 
     def draw(self, white: Array) -> Array:
         """A draw of the keyframes' error where the border is held, from white noise, shape (n, d)."""

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rovgraph.calibration import TABLE, Belief
+from rovgraph.calibration import Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
@@ -19,13 +19,18 @@ from rovgraph.engine.measurements import Block, weights_of
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.stretches import resume, solve
 from rovgraph.engine.unknowns import Unknowns, unknowns
+from rovgraph.engine.widened_chain import widened
 from rovgraph.geometry import Array
 from rovgraph.state import State
 
 
 @dataclass(frozen=True)
 class ChainOptimum:
-    """A chain and where its robust cost is least."""
+    """A chain and where its robust cost is least.
+
+    Constants that are considered stand last in the border of what is eliminated here: all of them are known to their
+    priors and to nothing better, which is in every covariance.
+    """
 
     chain: Chain
     solution: Solution[State]
@@ -59,23 +64,48 @@ class ChainOptimum:
         return {}
 
     @cached_property
+    def _wide(self) -> Chain:
+        """The chain with what is considered in its border."""
+        names = self.unknowns.considered
+        return widened(self.chain, self.state, names) if names else self.chain
+
+    @cached_property
+    def _believed(self) -> Array:
+        """Covariance of what is considered, shape (h, h)."""
+        beliefs = [self.beliefs[name] for name in self.unknowns.considered]
+        return np.diag(np.concatenate([np.empty(0), *(np.full(b.variable.dim, b.sd**2) for b in beliefs)]))
+
+    @cached_property
     def information(self) -> SquareRoot:
         """All factors linearised at the optimum and eliminated."""
-        return self.chain.eliminate(self.state, self.solution.gates)
+        return self._wide.eliminate(self.state, self.solution.gates)
 
     @cached_property
     def _border_covariance(self) -> Array:
-        return self.information.border_covariance()
+        return self.information.border_covariance(self._believed)
 
     @cached_property
     def _covariances(self) -> Array:
         return self.information.covariances(self._border_covariance)
 
+    def relative_sd(self) -> dict[str, Array]:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        P, places = self.information.border_covariance(), self._wide.layout.places
+        names = self.unknowns.considered
+        return {
+            name: np.sqrt(np.diagonal(P[places[name][1], places[name][1]])) / self.beliefs[name].sd for name in names
+        }
+
+    def estimating(self, names: Sequence[str]) -> "ChainOptimum":
+        """As `rovgraph.engine.optimum.Optimum`."""
+        more = replace(self.chain, unknowns=self.unknowns.estimating(names))
+        return ChainOptimum(more, resume(more, self.state, self.solution))
+
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
             return np.asarray(self._covariances[:, COLUMNS[variable], COLUMNS[variable]])
-        border, part = self.chain.layout.places[variable]
+        border, part = self._wide.layout.places[variable]
         if not border:
             return self._covariances[:, part, part]
         P = self._border_covariance[part, part]
@@ -83,8 +113,9 @@ class ChainOptimum:
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
-        chosen = np.concatenate([np.arange(MOTION), *(self.chain.layout.target(n) for n in self.unknowns.estimated)])
-        return np.asarray(self.information.newest_covariance()[np.ix_(chosen, chosen)])
+        layout, names = self._wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
+        chosen = np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
+        return np.asarray(self.information.newest_covariance(self._border_covariance)[np.ix_(chosen, chosen)])
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -101,20 +132,11 @@ class ChainOptimum:
         )
         return more, less
 
-    def holding(self, names: Sequence[str]) -> tuple["ChainOptimum", Mapping[str, Array]]:
+    def considering(self, names: Sequence[str]) -> "ChainOptimum":
         """As `rovgraph.engine.optimum.Optimum`."""
-        kept = self.unknowns.of(set(self.unknowns.estimated) - set(names))
-        without = replace(self.chain, unknowns=kept)
+        without = replace(self.chain, unknowns=self.unknowns.considering(names))
         begin = replace(self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}})
-        solution = resume(without, begin, self.solution)
-        full = self.chain.eliminate(solution.point, solution.gates)
-        given = np.concatenate([np.r_[self.chain.layout.places[n][1]] for n in names])
-        by_given = full.border_by(given)
-        x, parts = full.x_by_y @ by_given, self.chain.layout.places
-        out = {v: x[:, columns] for v, columns in COLUMNS.items()}
-        for name, (border, part) in parts.items():
-            out[name] = np.broadcast_to(by_given[part], (len(x), TABLE[name].dim, len(given))) if border else x[:, part]
-        return ChainOptimum(without, solution), out
+        return ChainOptimum(without, resume(without, begin, self.solution))
 
     def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
         P = self.chain.eliminate(point, self.solution.gates, keyframes).filtered_covariances()

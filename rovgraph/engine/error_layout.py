@@ -1,6 +1,9 @@
-"""Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated."""
+"""Where each variable stands in the error of a state: pose, velocity, bias, then the calibration that is estimated.
 
-from collections.abc import Iterable, Mapping
+In Jacobians, what is considered has columns behind those of the error.
+"""
+
+from collections.abc import Mapping, Sequence
 from typing import cast
 
 import numpy as np
@@ -29,23 +32,26 @@ class ErrorLayout:
 
     Parameters
     ----------
-    estimated : names of the calibration variables that are estimated
+    estimated, considered : names of calibration variables
     instruments : the sensors in use, by stream
 
     Attributes
     ----------
-    columns : variable -> slice of the error
-    size : length of the error
+    columns : variable -> slice of the error, or of a Jacobian's columns
+    size, width : length of the error, and columns of a Jacobian
     column : ndarray of int, shape (15 + C,), place of each component of state and calibration vector in the
-        error, -1 where it is not estimated
+        Jacobian, -1 where it has none
     coordinates : what `rovgraph.kernels.error_coordinates.ErrorLayout` holds, one by one
     """
 
-    def __init__(self, estimated: Iterable[str], instruments: Mapping[str, Instrument]) -> None:
-        sizes = DIMENSION | {name: TABLE[name].dim for name in estimated}
+    def __init__(
+        self, estimated: Sequence[str], considered: Sequence[str], instruments: Mapping[str, Instrument]
+    ) -> None:
+        sizes = DIMENSION | {name: TABLE[name].dim for name in (*estimated, *considered)}
         ends = np.cumsum(list(sizes.values())).tolist()
         self.columns = {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
-        self.size: int = ends[-1]
+        self.width: int = ends[-1]
+        self.size: int = self.width - sum(TABLE[name].dim for name in considered)
         self.column: NDArray[np.int64] = np.full(MOTION + calibration_size(), -1)
         self.column[:MOTION] = np.arange(MOTION)
         for name, part in LAYOUT.items():
@@ -57,9 +63,10 @@ class ErrorLayout:
 
     def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Index, Index, Array, Index]:
         """Columns of a full Jacobian, instruments and what they see, their numbers, rows of a basis."""
-        estimated = np.flatnonzero(self.column >= 0)
+        estimated = np.flatnonzero((self.column >= 0) & (self.column < self.size))
         columns = estimated[np.argsort(self.column[estimated])]
-        shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in self.columns}
+        own = {name for name, part in self.columns.items() if part.stop <= self.size}
+        shown = {v: seen_model(instruments[s].model) for s, v in SEEN.items() if s in instruments and v in own}
         models = [(model, self.columns[variable]) for variable, model in shown.items()]
         seen = [(model.kind, model.dim, part.start) for model, part in models]
         params = np.zeros((len(models), max((model.packed.shape[1] for model, _ in models), default=0)))
@@ -69,8 +76,8 @@ class ErrorLayout:
         return columns, np.array(seen, np.int64).reshape(-1, 3), params, rows
 
     def matrix(self, H: Jacobians) -> Array:
-        """Jacobians by variable as one, shape (n, dim, size); what is not estimated is left out."""
-        out = np.zeros((*next(iter(H.values())).shape[:2], self.size))
+        """Jacobians by variable as one, shape (n, dim, width); what is neither estimated nor considered is left out."""
+        out = np.zeros((*next(iter(H.values())).shape[:2], self.width))
         for name, jacobian in H.items():
             if name in self.columns:
                 out[..., self.columns[name]] = jacobian

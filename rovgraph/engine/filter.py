@@ -1,6 +1,7 @@
 """The error-state Kalman filter: `FilterEngine.step` takes one interval, and is the only loop body there is.
 
-The error has 15 components (attitude, position, velocity, biases) and those of the calibration that is estimated.
+The error has 15 components (attitude, position, velocity, biases) and those of the calibration that is estimated. What
+is considered moves nothing; its part of the error goes along with the estimate (`Gaussian.B`).
 Motion, measurement equations, noise, losses, gates and prior are the smoother's own. What differs: every measurement
 is linearised once, where it comes.
 
@@ -35,7 +36,6 @@ from rovgraph.engine.remembered_places import (
     RememberedPlace,
     moved,
     nearest,
-    padded,
     seen_at,
     with_another,
     without_oldest,
@@ -60,18 +60,22 @@ class FilterEngine:
     Parameters
     ----------
     initial : sensors, configuration and prior
+    considers : False takes what is considered as exact
 
     Attributes
     ----------
-    beliefs, unknowns : priors of the calibration, and what of it is estimated
+    beliefs, unknowns : priors of the calibration, and what of it is estimated and considered
     layout : of the error
     """
 
-    def __init__(self, initial: InitialConditions) -> None:
+    def __init__(self, initial: InitialConditions, considers: bool = True) -> None:
         self.initial = initial
         self.beliefs = beliefs(initial.config)
         self.unknowns = unknowns(self.beliefs, initial.instruments)
-        self.layout = ErrorLayout(self.unknowns.estimated, initial.instruments)
+        if not considers:
+            self.unknowns = replace(self.unknowns, considered=())
+        self.layout = ErrorLayout(self.unknowns.estimated, self.unknowns.considered, initial.instruments)
+        self._wide = self.unknowns.estimating(self.unknowns.considered)  # all that has a place in the error
         self._gravity = initial.config.environment.gravity_mps2
         self._walk = np.zeros(self.layout.size)  # variance that walking adds in a second
         for name, walk in self.unknowns.walks.items():
@@ -85,13 +89,14 @@ class FilterEngine:
 
     def start(self) -> Gaussian:
         """The prior: the smoother's."""
-        prior, size = self.initial.prior, self.layout.size
-        P = np.zeros((size, size))
+        prior, layout = self.initial.prior, self.layout
+        sd = np.zeros(layout.width)
+        for name in self._wide.estimated:
+            sd[layout.columns[name]] = self.beliefs[name].sd
+        P = np.diag(sd[: layout.size] ** 2)
         P[:15, :15] = prior.covariance()
-        for name in self.unknowns.estimated:
-            own = self.layout.columns[name]
-            P[own, own] = np.eye(own.stop - own.start) * self.beliefs[name].sd ** 2
-        return Gaussian(state_vector(prior.state), calibration_vector(self.unknowns.fixed), P)
+        B, L = np.zeros((layout.size, layout.width - layout.size)), np.diag(sd[layout.size :])
+        return Gaussian(state_vector(prior.state), calibration_vector(self.unknowns.fixed), P, (), B, L)
 
     def step(self, interval: KeyframeInterval, before: Gaussian, gates: Gates) -> FilterStep:
         """Take one interval.
@@ -124,29 +129,30 @@ class FilterEngine:
         gates : renewed in place
         """
         size, C = self.layout.size, len(before.c)
-        x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
+        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
         some = rows.between(begin, end)
         k, m, since = end - begin, len(some.rows), self._since(gates)
         out: Any = [np.empty(shape) for shape in ((k, 21), (k, C)) * 2]
         out += [np.empty(shape) for shape in ((k, 6, 6), (k, 3, 3), (k, size), (m,), (m,))]
-        known: Any = x, c, P, some.motions, some.scales, some.rows, some.which, some.row_scales
+        known: Any = x, c, P, B, before.L, some.motions, some.scales, some.rows, some.which, some.row_scales
         tables: Any = self._sensors, self.layout.column, self._walk, *self.layout.coordinates
         order: Any = np.append(0, some.taken), some.first[:k]
         limits: Any = since, self._gravity, POORLY_KNOWN
         taken = filter_intervals(*known, *order, *tables, *limits, *out)
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
-        return FilterRun(Gaussian(x, c, P), *(a[:taken] for a in out[:-2]), *(a[:m] for a in out[-2:]))
+        return FilterRun(Gaussian(x, c, P, (), B, before.L), *(a[:taken] for a in out[:-2]), *(a[:m] for a in out[-2:]))
 
     def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:
         """The next keyframe, from the IMU alone; calibration walks."""
         assert interval.motion is not None
         n = len(before.P)
-        P, x, F, Q = before.P.copy(), np.empty(21), np.empty((n, n)), np.empty((n, n))
+        P, B, x, F, Q = before.P.copy(), before.B.copy(), np.empty(21), np.empty((n, n)), np.empty((n, n))
         scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
         walk = self._walk if n == self.layout.size else np.append(self._walk, np.zeros(n - self.layout.size))
-        predict_filter(before.x, before.c, P, interval.motion.row, scale, self.layout.column, walk, x, F, Q)
-        return Transition(F, Q, Gaussian(x, before.c, P, before.places))
+        tables = interval.motion.row, scale, self.layout.column, walk, self.layout.size
+        predict_filter(before.x, before.c, P, B, before.L, *tables, x, F, Q)
+        return Transition(F, Q, Gaussian(x, before.c, P, before.places, B, before.L))
 
     def correct(
         self,
@@ -164,7 +170,7 @@ class FilterEngine:
         return known
 
     def linearize(self, known: Gaussian, measurements: Sequence[KeyframeMeasurement]) -> tuple[Array, Array]:
-        """Whitened innovations, shape (m,), and Jacobians, shape (m, size), of measurements of no places."""
+        """Whitened innovations, shape (m,), and Jacobians, shape (m, width), of measurements of no places."""
         r, H = [], []
         for m in measurements:
             if m.sensor in self._given:
@@ -186,18 +192,18 @@ class FilterEngine:
         rows = np.array([m.row[: at.ROW] for m in measurements])
         which = np.array([self._index[m.sensor] for m in measurements])
         layout = self.layout
-        return KeyframeRows(rows, which, self._sensors, layout.column, layout.size, scale, self._gravity)
+        return KeyframeRows(rows, which, self._sensors, layout.column, layout.width, scale, self._gravity)
 
     def block(self, measurements: Sequence[KeyframeMeasurement], unknowns: Unknowns | None = None) -> Block:
         """Measurements of one sensor; ``unknowns`` are the filter's own unless given."""
         instrument = self.initial.instruments[measurements[0].sensor]
-        return make_block(measurements, instrument, self._gravity, unknowns or self.unknowns)
+        return make_block(measurements, instrument, self._gravity, unknowns or self._wide)
 
-    def retract(self, known: Gaussian, delta: Array, P: Array) -> Gaussian:
-        """The estimate that lies ``delta``, shape (d,), away; ``P``, shape (d, d), is its covariance at the old one."""
-        x, c, P = known.x.copy(), known.c.copy(), P.copy()
-        move_estimate(x, c, P, delta, *self.layout.coordinates)
-        return Gaussian(x, c, P, moved(known.places, delta[self.layout.size :]))
+    def retract(self, known: Gaussian, delta: Array, P: Array, B: Array | None = None) -> Gaussian:
+        """The estimate that lies ``delta``, shape (d,), away; P and B, None = unchanged, are as of it at the old one."""
+        x, c, P, B = known.x.copy(), known.c.copy(), P.copy(), (known.B if B is None else B).copy()
+        move_estimate(x, c, P, B, delta, *self.layout.coordinates)
+        return Gaussian(x, c, P, moved(known.places, delta[self.layout.size :]), B, known.L)
 
     def local(self, some: Gaussian, other: Gaussian) -> tuple[Array, Array]:
         """The error, shape (size,), that leads from one estimate to another, and the basis, shape (size, size).
@@ -227,22 +233,24 @@ class FilterEngine:
         """The estimate corrected by measurements of no places."""
         given = [self._of_block(before, m) for m in measurements if m.sensor in self._given]
         r = np.concatenate([own for own, _ in given]) if given else np.empty(0)
-        H = np.vstack([own for _, own in given]) if given else np.empty((0, self.layout.size))
+        H = np.vstack([own for _, own in given]) if given else np.empty((0, self.layout.width))
         scaled = measurements[0].scale_to_bias is not None
         scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
         rows = np.array([m.row[: at.ROW] for m in measurements])
         which = np.array([self._index[m.sensor] for m in measurements])
-        x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
+        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
         since = self._since(gates or {})
         nis, weight = np.empty(len(rows)), np.empty(len(rows))
         places = np.zeros(len(P) - self.layout.size)
         tables = (self._sensors, self.layout.column, scale, r, H, *self.layout.coordinates)
-        correct(x, c, P, rows, which, *tables, since, gates is not None, self._gravity, nis, weight, places)
+        correct(
+            x, c, P, B, before.L, rows, which, *tables, since, gates is not None, self._gravity, nis, weight, places
+        )
         if gates is not None:
             self._renew(gates, since)
         met = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
         processed += [ProcessedMeasurement(m, before.x, before.c, own, w) for m, own, w in met]
-        return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places)
+        return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places, B, before.L)
 
     def _since(self, gates: Gates) -> Array:
         """Since when each sensor is left out, nan where it is not [s]."""
@@ -263,11 +271,12 @@ class FilterEngine:
         assert m.landmark is not None
         instrument, size = self.initial.instruments[m.sensor], self.layout.size
         r, H = self._of_block(before, m)
+        H, H_y = H[:, :size], H[:, size:]
         match = nearest(before.P, r, H, m.sd, size, before.places, m.landmark.name)
         gate = instrument.gate_sd or np.inf
         if match is not None and match.nis <= gate**2:
             found = before.places[match.index]
-            known, weight = self._correct_by(before, m, match.r, match.H)
+            known, weight = self._correct_by(before, m, match.r, np.hstack([match.H, H_y]))
             seen = replace(m, landmark=m.landmark._replace(number=found.number))
             processed.append(ProcessedMeasurement(seen, before.x, before.c, match.nis, weight, found.position))
             return replace(known, places=seen_at(known.places, match.index, m.time))
@@ -276,16 +285,18 @@ class FilterEngine:
         processed.append(
             ProcessedMeasurement(m, before.x, before.c, nis, 1.0 if match is None else 0.0, other.position)
         )
-        P, places = with_another(before.P, before.places, place, m.sd[:, None] * H, m.sd)
+        by = m.sd[:, None] * H, m.sd[:, None] * H_y @ before.L
+        P, B, places = with_another(before.P, before.B, before.places, place, *by, m.sd)
         most = self.initial.config.place.remembered
-        return Gaussian(before.x, before.c, *without_oldest(P, places, size, most))
+        P, B, places = without_oldest(P, B, places, size, most)
+        return Gaussian(before.x, before.c, P, places, B, before.L)
 
     def _correct_by(self, before: Gaussian, m: KeyframeMeasurement, r: Array, H: Array) -> tuple[Gaussian, float]:
         """The estimate corrected by whitened rows that are at hand, and the weight of the measurement."""
-        x, c, P = before.x.copy(), before.c.copy(), before.P.copy()
+        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
         nis, weight, places = np.empty(1), np.empty(1), np.zeros(len(P) - self.layout.size)
         rows, which = np.zeros((1, at.ROW)), np.array([self._index[m.sensor]])
-        tables = (self._sensors, self.layout.column, _EXACT, r, padded(H, len(P)), *self.layout.coordinates)
+        tables = (self._sensors, self.layout.column, _EXACT, r, H, *self.layout.coordinates)
         since = np.full(len(self._index), np.nan)
-        correct(x, c, P, rows, which, *tables, since, False, self._gravity, nis, weight, places)
-        return Gaussian(x, c, P, moved(before.places, places)), float(weight[0])
+        correct(x, c, P, B, before.L, rows, which, *tables, since, False, self._gravity, nis, weight, places)
+        return Gaussian(x, c, P, moved(before.places, places), B, before.L), float(weight[0])

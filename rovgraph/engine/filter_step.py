@@ -1,7 +1,7 @@
 """What goes into an interval of the error-state filter, and what comes out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -34,6 +34,11 @@ def states_of(x: Array, c: Array) -> State:
     return State(x[:, :9].reshape(-1, 3, 3), x[:, 9:12], x[:, 12:15], x[:, 15:21], calibration)
 
 
+def nothing() -> Array:
+    """Of what is considered where nothing is."""
+    return np.zeros((0, 0))
+
+
 @dataclass(frozen=True)
 class Gaussian:
     """A state with the covariance of its error, in the order of `rovgraph.engine.error_layout`.
@@ -42,19 +47,29 @@ class Gaussian:
     ----------
     x : ndarray, shape (21,), R_nb by rows, p_n, v_n, bias
     c : ndarray, shape (C,), calibration vector
-    P : ndarray, shape (size + 2 m, size + 2 m), the places at the end
+    P : ndarray, shape (size + 2 m, size + 2 m), the places at the end; without the part of what is considered
     places : m places that are remembered
+    B : ndarray, shape (size + 2 m, h), the part of what is considered: the error that h white numbers of unit
+        variance would make; or (0, 0)
+    L : ndarray, shape (h, h), root of the covariance of what is considered: L times these numbers
     """
 
     x: Array
     c: Array
     P: Array
     places: tuple[RememberedPlace, ...] = ()
+    B: Array = field(default_factory=nothing)
+    L: Array = field(default_factory=nothing)
 
     @staticmethod
     def of(state: State, P: Array, places: tuple[RememberedPlace, ...] = ()) -> "Gaussian":
         """From a `State` of one epoch, its calibration of shape (dim,)."""
         return Gaussian(state_vector(state), calibration_vector(state.calibration), P, places)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of the error with all that is uncertain, shape as that of P."""
+        return np.asarray(self.P + self.B @ self.B.T) if len(self.L) else self.P
 
     @cached_property
     def state(self) -> State:

@@ -71,7 +71,10 @@ class Optimum(Protocol):
     def places(self) -> Mapping[int, Array]: ...
 
     def covariances(self, variable: str) -> Array:
-        """Marginal covariances of a state or calibration variable at every keyframe, shape (n, d, d)."""
+        """Marginal covariances of a state or calibration variable at every keyframe, shape (n, d, d).
+
+        What is considered has that of its prior.
+        """
         ...
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
@@ -79,8 +82,8 @@ class Optimum(Protocol):
 
         Returns
         -------
-        ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Unknowns`, then
-            the places in the order of their numbers as given
+        ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Unknowns`, first what is
+            estimated, then what is considered, then the places in the order of their numbers as given
         """
         ...
 
@@ -95,15 +98,20 @@ class Optimum(Protocol):
         """
         ...
 
-    def holding(self, names: Sequence[str]) -> tuple["Optimum", Mapping[str, Array]]:
-        """The optimum with some constants held at their means, and how it moves with them.
+    def considering(self, names: Sequence[str]) -> "Optimum":
+        """The optimum with some of the estimated constants considered: at their means, as uncertain as their priors.
 
-        Returns
-        -------
-        optimum : without them among its unknowns
-        sensitivity : variable -> ndarray, shape (n, dim, k), its derivative at every keyframe by the k
-            components that are held
+        With K the derivative of the optimum by what is considered, P = P(that is known) + K P(prior) K', the
+        Schmidt-Kalman filter's covariance.
         """
+        ...
+
+    def relative_sd(self) -> dict[str, Array]:
+        """The sd of what is considered, were it estimated, as a part of the prior's: name -> ndarray, shape (dim,)."""
+        ...
+
+    def estimating(self, names: Sequence[str]) -> "Optimum":
+        """The optimum with some of what is considered estimated."""
         ...
 
 

@@ -127,30 +127,32 @@ def nearest(
 
 
 def with_another(
-    P: Array, places: tuple[RememberedPlace, ...], place: RememberedPlace, J: Array, sd: Array
-) -> tuple[Array, tuple[RememberedPlace, ...]]:
+    P: Array, B: Array, places: tuple[RememberedPlace, ...], place: RememberedPlace, J: Array, J_y: Array, sd: Array
+) -> tuple[Array, Array, tuple[RememberedPlace, ...]]:
     """The covariance with a place more, which lies where the estimate and its landmark put it.
 
     Parameters
     ----------
-    P : ndarray, shape (d, d)
+    P, B : ndarray, shapes (d, d), (d, h), of `rovgraph.engine.filter_step.Gaussian`
     places, place : the others, and the one more
-    J : ndarray, shape (2, size), derivative of where it lies by the error
+    J, J_y : ndarray, shapes (2, size), (2, h), derivatives of where it lies by the error, and by what is considered
     sd : ndarray, shape (2,), of the landmark [m]
     """
     clone = np.vstack([np.eye(len(P)), padded(J, len(P))])
     P = clone @ P @ clone.T
     P[-PLACE_DIM:, -PLACE_DIM:] += np.diag(sd**2)
-    return P, (*places, place)
+    if B.size:
+        B = np.vstack([B, J @ B[: J.shape[1]] + J_y])
+    return P, B, (*places, place)
 
 
 def without_oldest(
-    P: Array, places: tuple[RememberedPlace, ...], size: int, most: int
-) -> tuple[Array, tuple[RememberedPlace, ...]]:
+    P: Array, B: Array, places: tuple[RememberedPlace, ...], size: int, most: int
+) -> tuple[Array, Array, tuple[RememberedPlace, ...]]:
     """Without the place that was not seen for longest, where there are more than ``most``."""
     if len(places) <= most:
-        return P, places
+        return P, B, places
     oldest = min(range(len(places)), key=lambda k: places[k].time)
     kept = [k for k in range(len(places)) if k != oldest]
     chosen = columns(size, kept)
-    return P[np.ix_(chosen, chosen)], tuple(places[k] for k in kept)
+    return P[np.ix_(chosen, chosen)], B[chosen] if B.size else B, tuple(places[k] for k in kept)

@@ -20,8 +20,8 @@ COLUMNS = {"acc_scale": slice(0, 3), "gyr_scale": slice(3, 6)}
 
 
 def wanted(beliefs: Mapping[str, Belief]) -> bool:
-    """Whether any scale is estimated, or known to be off."""
-    return any(beliefs[name].estimate or beliefs[name].mean.any() for name in SCALES)
+    """Whether any scale is estimated or considered, or known to be off."""
+    return any(beliefs[name].estimate or beliefs[name].considered or beliefs[name].mean.any() for name in SCALES)
 
 
 def scale_to_bias(signal_b: Array, R_bs: Array) -> Array:

@@ -1,7 +1,7 @@
-"""What of the calibration is estimated."""
+"""What of the calibration is estimated, and what is considered."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rovgraph.calibration import Belief
 from rovgraph.geometry import Array
@@ -17,10 +17,12 @@ class Unknowns:
         keep them
     walks : random walk of each that is estimated [unit per root second]; with 0 it has one
         value for all of the dive, otherwise one per segment of time
+    considered : constants that keep their means, and whose uncertainty is in that of all else
     """
 
     fixed: Mapping[str, Array]
     walks: Mapping[str, float]
+    considered: tuple[str, ...] = ()
 
     @property
     def estimated(self) -> tuple[str, ...]:
@@ -33,11 +35,25 @@ class Unknowns:
     def of(self, names: Iterable[str]) -> "Unknowns":
         """Only some of the estimated variables."""
         wanted = set(names)
-        return Unknowns(self.fixed, {name: walk for name, walk in self.walks.items() if name in wanted})
+        return replace(self, walks={name: walk for name, walk in self.walks.items() if name in wanted})
+
+    def estimating(self, names: Iterable[str]) -> "Unknowns":
+        """Some of the considered variables estimated, behind the others."""
+        more = tuple(names)
+        left = tuple(name for name in self.considered if name not in more)
+        return Unknowns(self.fixed, {**self.walks, **dict.fromkeys(more, 0.0)}, left)
+
+    def considering(self, names: Iterable[str]) -> "Unknowns":
+        """Some of the estimated constants considered, behind the others."""
+        more = tuple(names)
+        kept = self.of(name for name in self.estimated if name not in more)
+        return replace(kept, considered=(*self.considered, *more))
 
 
 def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
-    """Calibration variables to be estimated: asked for, and a sensor that shows them is in use."""
+    """Calibration variables to be estimated or considered: asked for, and a sensor that shows them is in use."""
     present = {*sensors, "imu"}
-    wanted = {n: b.walk for n, b in beliefs.items() if b.estimate and present & set(b.variable.sensors)}
-    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted)
+    used = {n: b for n, b in beliefs.items() if present & set(b.variable.sensors)}
+    wanted = {n: b.walk for n, b in used.items() if b.estimate}
+    considered = tuple(n for n, b in used.items() if b.considered)
+    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted, considered)

@@ -40,8 +40,8 @@ class CalibrationEstimate:
     ----------
     label, unit, about : from the table of calibration variables
     estimated : False = held at its mean
-    value, sd, prior_mean, prior_sd : [unit]; sd is 0 where held
-    verdict : observable, weak or unobservable; empty where held, or not known
+    value, sd, prior_mean, prior_sd : [unit]; sd is that of the prior where considered, and 0 where exact
+    verdict : observable, weak or unobservable where estimated; considered; empty where exact, or not known
     """
 
     label: str

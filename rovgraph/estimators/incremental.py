@@ -66,7 +66,7 @@ class IncrementalEstimator:
 
     def __post_init__(self) -> None:
         b = self.beginning
-        self.filter = FilterEngine(b)
+        self.filter = FilterEngine(b, considers=False)
         self.known = self.filter.start()
         self.history = FilterHistory(self.filter)
         self.gates: Gates = {}

@@ -101,6 +101,15 @@ def relative_sd(best: Optimum, sd: Mapping[str, Array], prior: Mapping[str, Arra
     return dict(zip(ratio, parts, strict=True))
 
 
+def shown(best: Optimum) -> list[str]:
+    """What is considered and the dive shows, so that it is better estimated."""
+    if not best.unknowns.considered:
+        return []
+    limit = dict.fromkeys(SPURIOUSLY_OBSERVABLE, DOUBTFUL_ABOVE)
+    ratios = best.relative_sd()
+    return [name for name, ratio in ratios.items() if (ratio < limit.get(name, OBSERVABLE_BELOW)).all()]
+
+
 def spuriously_observable(unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
     """Constant variables that are unobservable, and that noise can have moved all the same.
 

@@ -7,6 +7,7 @@ from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.estimators.observability import shown
 from rovgraph.geometry import Array
 from rovgraph.state import PLACE, State
 
@@ -18,7 +19,7 @@ def optimum(
     calibration: Mapping[str, Array] | None = None,
     rows: DiveRows | None = None,
 ) -> Optimum:
-    """Solve a dive.
+    """Solve a dive; what is considered is estimated where the dive shows it.
 
     Parameters
     ----------
@@ -34,5 +35,8 @@ def optimum(
     if any(m.sensor == PLACE for interval in intervals for m in interval.measurements):
         from rovgraph.graph.places import smooth_graph  # GTSAM is slow to load, and not everywhere to be had
 
-        return smooth_graph(intervals, initial, states, calibration)
-    return smooth_chain(intervals, initial, states, calibration, rows)
+        best: Optimum = smooth_graph(intervals, initial, states, calibration)
+    else:
+        best = smooth_chain(intervals, initial, states, calibration, rows)
+    seen = shown(best)
+    return best.estimating(seen) if seen else best

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from rovgraph.calibration import TABLE, Belief
+from rovgraph.calibration import CONSIDERED, TABLE, Belief
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
@@ -71,7 +71,8 @@ def calibration_estimates(
     beliefs : all calibration variables
     sensors : in use
     values : name -> ndarray, shape (dim,)
-    covariance : name -> ndarray, shape (dim, dim), of those that were estimated
+    covariance : name -> ndarray, shape (dim, dim), of those that were estimated; others that are believed to be
+        considered keep the sd of their prior
     relative_sd : name -> ndarray, shape (dim,), sd as a part of the prior's, where it is known better than
         from ``covariance``
     """
@@ -80,12 +81,19 @@ def calibration_estimates(
         if not set(belief.variable.sensors) & {*sensors, "imu"}:
             continue
         estimated = name in covariance
-        sd = np.sqrt(np.diag(covariance[name])) if estimated else np.zeros(belief.variable.dim)
+        considered = belief.considered and not estimated
+        sd = np.full(belief.variable.dim, belief.sd if considered else 0.0)
+        sd = np.sqrt(np.diag(covariance[name])) if estimated else sd
         for k, label in enumerate(belief.variable.labels):
             v = belief.variable
-            numbers = (float(values[name][k]), float(sd[k]), float(belief.mean[k]), belief.sd if estimated else 0.0)
+            numbers = (
+                float(values[name][k]),
+                float(sd[k]),
+                float(belief.mean[k]),
+                belief.sd if estimated or considered else 0.0,
+            )
             ratio = float(sd[k]) / belief.sd if relative_sd is None or not estimated else float(relative_sd[name][k])
-            known = verdict(ratio) if estimated else ""
+            known = verdict(ratio) if estimated else CONSIDERED if considered else ""
             out.append(CalibrationEstimate(label, v.unit, v.about, estimated, *numbers, known))
     return out
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
-from rovgraph.engine.considered import Considered, consider
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
@@ -141,27 +140,28 @@ def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
 
 def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
-    known, relative = _considered(best)
-    best = known.optimum
+    best, relative = _without_what_noise_moves(best)
     states, intervals = best.state, best.intervals
     trajectory = body_trajectory(
-        intervals, states, b.config.imu.lever_arm_m, known.covariances(POSE), known.covariances(VELOCITY)
+        intervals, states, b.config.imu.lever_arm_m, best.covariances(POSE), best.covariances(VELOCITY)
     )
-    bias_sd = np.sqrt(np.diagonal(known.covariances(BIAS), axis1=1, axis2=2))
+    bias_sd = np.sqrt(np.diagonal(best.covariances(BIAS), axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd)
-    final, spread = dict(best.unknowns.fixed), {name: np.diag(sd**2) for name, sd in known.held.items()}
+    final, spread = dict(best.unknowns.fixed), {}
+    held = [name for name in best.unknowns.considered if best.beliefs[name].estimate]
     n, segment = len(intervals), np.array([i.segment for i in intervals])
     ends, begun = np.array([0, n - 1]), np.flatnonzero(np.diff(segment)) + 1
     for name, walk in best.unknowns.walks.items():
         rows = np.concatenate([[0], begun, [n - 1]]) if walk else ends
-        P = known.covariances(name)
+        P = best.covariances(name)
         value = np.broadcast_to(states.calibration[name], (n, P.shape[1]))[rows]
         history[name] = calibration_history(
             name, trajectory.time[rows], value, np.sqrt(np.diagonal(P[rows], axis1=1, axis2=2))
         )
         final[name], spread[name] = value[-1], P[-1]
-    for name, sd in known.held.items():
-        both = np.tile(final[name], (2, 1)), np.tile(sd, (2, 1))
+    for name in held:
+        spread[name] = best.covariances(name)[-1]
+        both = np.tile(final[name], (2, 1)), np.tile(np.sqrt(np.diag(spread[name])), (2, 1))
         history[name] = calibration_history(name, trajectory.time[ends], *both)
     return Estimate(
         "smoothed",
@@ -177,16 +177,20 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "stretches_taken_out": [asdict(stretch) for stretch in best.solution.stretches],
             "runner_up": best.solution.runner_up if isfinite(best.solution.runner_up) else None,
             "bridged_intervals": sum(i.bridged for i in intervals),
-            "held_at_prior": list(known.held),
+            "held_at_prior": held,
+            "considered": [name for name in best.unknowns.considered if name not in held],
         },
     )
 
 
-def _considered(best: Optimum) -> tuple[Considered, dict[str, Array]]:
-    """What to hold, and the sd of the calibration as a part of the prior's, without spurious information."""
+def _without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
+    """The optimum, and the sd of its calibration as a part of the prior's, without spurious information.
+
+    What noise moves further than the data justify is considered.
+    """
     names = best.unknowns.estimated
     sd = {name: np.sqrt(np.diag(best.covariances(name)[-1])) for name in names}
     before = joint_prior_sd(best, len(best.intervals) - 1)
     relative = relative_sd(best, sd, before)
     held = spuriously_observable(best.unknowns, {name: sd[name] / before[name] for name in sd}, relative)
-    return (consider(best, held) if held else Considered(best)), relative
+    return (best.considering(held) if held else best), relative

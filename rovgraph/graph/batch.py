@@ -142,10 +142,14 @@ def make_problem(
     config: Config,
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],
+    wanted: Unknowns | None = None,
 ) -> Problem:
-    """Assemble the graph of a dive; calibration that walks has a value at each keyframe."""
+    """Assemble the graph of a dive; calibration that walks has a value at each keyframe.
+
+    What is estimated is ``wanted``, or else what is believed to be.
+    """
     index = np.arange(len(intervals))
-    wanted = unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
+    wanted = wanted or unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
     factors = _others(intervals, prior, beliefs, wanted, index)
     blocks = blocks_of(intervals, instruments, instruments, config.environment.gravity_mps2, wanted)
     if "place" in blocks:

@@ -37,10 +37,7 @@ def newest_covariance(problem: Problem, values: gtsam.Values, gates: Gates, plac
     ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Problem.unknowns`,
         then the places in the order of their numbers as given
     """
-    linear = problem.linearize(values, gates)
-    last = [key(v, problem.count - 1) for v in DIMENSION]
-    last += [calibration_key(problem.unknowns, name, int(problem.index[-1])) for name in problem.unknowns.estimated]
-    last += [key(PLACE, number) for number in places]
+    linear, last = problem.linearize(values, gates), newest_keys(problem, places)
     before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
     for one in last:
         order.push_back(one)
@@ -50,6 +47,13 @@ def newest_covariance(problem: Problem, values: gtsam.Values, gates: Gates, plac
         raise InputError(indeterminate(error)) from None
     root = np.linalg.inv(np.linalg.qr(ends.jacobian(order)[0], mode="r"))
     return np.asarray(root @ root.T)
+
+
+def newest_keys(problem: Problem, places: Sequence[int] = ()) -> list[int]:
+    """Keys of the newest keyframe, of the calibration there, and of places."""
+    last = [key(v, problem.count - 1) for v in DIMENSION]
+    last += [calibration_key(problem.unknowns, name, int(problem.index[-1])) for name in problem.unknowns.estimated]
+    return last + [key(PLACE, number) for number in places]
 
 
 def covariances(tree: gtsam.GaussianBayesTree) -> dict[int, Array]:

@@ -14,12 +14,12 @@ from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.unknowns import Unknowns
-from rovgraph.geometry import Array
+from rovgraph.geometry import Array, transpose
 from rovgraph.graph.batch import Problem, make_problem, solve
 from rovgraph.graph.information import knowledge, noise_of_states, sensitivity
 from rovgraph.graph.keys import calibration_key, key
-from rovgraph.graph.marginals import covariances, marginals, newest_covariance
-from rovgraph.state import DIMENSION, PLACE, State
+from rovgraph.graph.marginals import covariances, marginals, newest_covariance, newest_keys
+from rovgraph.state import PLACE, PLACE_DIM, State
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,47 @@ class GraphOptimum:
     def _covariances(self) -> dict[int, Array]:
         return covariances(marginals(self.problem, self.solution.point, self.solution.gates))
 
+    @cached_property
+    def _wide(self) -> tuple[Problem, gtsam.Values]:
+        """The graph in which what is considered is estimated, and where it is linearised."""
+        names = self.unknowns.considered
+        return self._problem(self.unknowns.estimating(names)), self._with_means(self.solution.point, names)
+
+    @cached_property
+    def _sensitivity(self) -> dict[int, Array]:
+        """Derivatives of the optimum by what is considered times its prior sd, by key, shape (dim, h)."""
+        moves = sensitivity(*self._wide, self.solution.gates, self.unknowns.considered)
+        beliefs = [self.beliefs[name] for name in self.unknowns.considered]
+        sd = np.concatenate([np.full(b.variable.dim, b.sd) for b in beliefs])
+        return {one: K * sd for one, K in moves.items()}
+
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
-        return np.array([self._covariances[own] for own in self._keys(variable)])
+        if variable in self.unknowns.considered:
+            belief = self.beliefs[variable]
+            return np.broadcast_to(
+                np.eye(belief.variable.dim) * belief.sd**2, (self.problem.count, *[belief.variable.dim] * 2)
+            )
+        known = np.array([self._covariances[own] for own in self._keys(variable)])
+        if not self.unknowns.considered:
+            return known
+        K = np.array([self._sensitivity[own] for own in self._keys(variable)])
+        return np.asarray(known + K @ transpose(K))
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
-        return newest_covariance(self.problem, self.solution.point, self.solution.gates, places)
+        known = newest_covariance(self.problem, self.solution.point, self.solution.gates, places)
+        names = self.unknowns.considered
+        if not names:
+            return known
+        K = np.vstack([self._sensitivity[one] for one in newest_keys(self.problem, places)])
+        beliefs = [self.beliefs[name] for name in names]
+        sd = np.concatenate([np.full(b.variable.dim, b.sd) for b in beliefs])
+        own, end = K.shape[1], len(K) - PLACE_DIM * len(places)
+        P, K = np.zeros((len(K) + own, len(K) + own)), np.insert(K, end, np.diag(sd), axis=0)
+        others = np.r_[:end, end + own : len(P)]
+        P[np.ix_(others, others)] = known
+        return np.asarray(P + K @ K.T)
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -79,29 +113,42 @@ class GraphOptimum:
             knowledge(self.problem, less, self.solution.gates, keyframes),
         )
 
-    def holding(self, names: Sequence[str]) -> tuple["GraphOptimum", Mapping[str, Array]]:
+    def considering(self, names: Sequence[str]) -> "GraphOptimum":
         """As `rovgraph.engine.optimum.Optimum`."""
-        initial = self.initial
-        beliefs = {n: _held(b) if n in names else b for n, b in self.beliefs.items()}
-        without = make_problem(self.intervals, initial.prior, initial.config, beliefs, initial.instruments)
         values = gtsam.Values(self.solution.point)
         for name in names:
             values.erase(key(name))
-        held = solve(without, values, self.solution)
-        there = gtsam.Values(held.point)
+        return self._solved(self.unknowns.considering(names), values)
+
+    def relative_sd(self) -> dict[str, Array]:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        names, (wide, values) = self.unknowns.considered, self._wide
+        tree = marginals(wide, values, self.solution.gates)
+        P = covariances(tree)
+        return {name: np.sqrt(np.diagonal(P[key(name)])) / self.beliefs[name].sd for name in names}
+
+    def estimating(self, names: Sequence[str]) -> "GraphOptimum":
+        """As `rovgraph.engine.optimum.Optimum`."""
+        return self._solved(self.unknowns.estimating(names), self._with_means(self.solution.point, names))
+
+    def _solved(self, unknowns: Unknowns, values: gtsam.Values) -> "GraphOptimum":
+        """The optimum with other unknowns, close by."""
+        problem = self._problem(unknowns)
+        return GraphOptimum(self.intervals, self.initial, self.beliefs, problem, solve(problem, values, self.solution))
+
+    def _problem(self, unknowns: Unknowns) -> Problem:
+        initial = self.initial
+        return make_problem(self.intervals, initial.prior, initial.config, self.beliefs, initial.instruments, unknowns)
+
+    def _with_means(self, values: gtsam.Values, names: Sequence[str]) -> gtsam.Values:
+        """The values with those of some constants at their means."""
+        more = gtsam.Values(values)
         for name in names:
-            there.insert(key(name), np.array(self.beliefs[name].mean, dtype=float))
-        moves = sensitivity(self.problem, there, held.gates, names)
-        variables = [*DIMENSION, *without.unknowns.estimated]
-        by_variable = {v: np.array([moves[own] for own in self._keys(v)]) for v in variables}
-        return GraphOptimum(self.intervals, initial, self.beliefs, without, held), by_variable
+            more.insert(key(name), np.array(self.beliefs[name].mean, dtype=float))
+        return more
 
     def _keys(self, variable: str) -> list[int]:
         """Keys of a variable at every keyframe."""
         if variable in TABLE:
             return [calibration_key(self.unknowns, variable, k) for k in self.problem.index.tolist()]
         return [key(variable, k) for k in range(self.problem.count)]
-
-
-def _held(belief: Belief) -> Belief:
-    return Belief(belief.variable, belief.mean, belief.sd, False, belief.walk)

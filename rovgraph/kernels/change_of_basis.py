@@ -41,6 +41,20 @@ def change_basis(P: Array, basis: Array, rows: Indices, product: Array, filled: 
 
 
 @view_helper
+def turn_rows(A: Array, basis: Array, rows: Indices, product: Array) -> None:
+    """A <- B A in place, shape (d, h), for a basis B as of `change_basis`; ``product`` (r, h) is to calculate with."""
+    for r in range(len(rows)):
+        row = basis[rows[r]]
+        for k in range(A.shape[1]):
+            product[r, k] = 0.0
+            for j in range(len(row)):
+                product[r, k] += row[j] * A[j, k]
+    for r in range(len(rows)):
+        for k in range(A.shape[1]):
+            A[rows[r], k] = product[r, k]
+
+
+@view_helper
 def _row_of_product(row: Array, P: Array, product_out: Array, filled_out: Indices) -> None:
     """A row of B times P; which columns of the row are not zero, behind their number."""
     count = 0

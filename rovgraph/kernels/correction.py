@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.admission import admit, directions_seen
-from rovgraph.kernels.change_of_basis import change_basis
+from rovgraph.kernels.change_of_basis import change_basis, turn_rows
 from rovgraph.kernels.compile import helper, kernel
 from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
@@ -39,23 +39,44 @@ STANDS = 0.1  # a correction within as many sd needs no other point to linearise
 
 
 @helper
+def split(row: Array, L: Array, H_out: Array, H_y_out: Array) -> None:
+    """A row of a Jacobian, what is considered last: its columns, and those of the others."""
+    h, n = len(L), len(row) - len(L)
+    for i in range(len(H_out)):
+        H_out[i] = row[i]
+    for k in range(h):
+        H_y_out[k] = 0.0
+        for j in range(h):
+            H_y_out[k] += row[n + j] * L[j, k]
+
+
+@helper
 def linearize_keyframe(
     x: Array,
     c: Array,
-    measured: tuple[Array, Index, Array, Index, Array, float],
+    measured: tuple[Array, Index, Array, Index, Array, float, int],
     first: Index,
     scratch: Scratch,
     r_out: Array,
     H_out: Array,
+    H_y_out: Array,
+    L: Array,
 ) -> None:
-    """Whitened innovations and Jacobians of the measurements of a keyframe but those that are `GIVEN`."""
-    rows, which, sensors, column, scale, gravity = measured
+    """Whitened innovations and Jacobians of the measurements of a keyframe but those that are `GIVEN`.
+
+    Columns of what is considered, behind the ``estimated`` ones, are multiplied by L.
+    """
+    rows, which, sensors, column, scale, gravity, estimated = measured
+    wide = np.zeros((len(r_out), estimated + len(L))) if len(L) else H_out
     R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     for j in range(len(which)):
         sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
         if sensor[KIND] != GIVEN:
-            own, own_r, own_H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], H_out[begin:end]
+            own, own_r, own_H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], wide[begin:end]
             linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, own_r, own_H)
+            if len(L):
+                for a in range(begin, end):
+                    split(wide[a], L, H_out[a, :estimated], H_y_out[a])
 
 
 @helper
@@ -72,7 +93,9 @@ def relinearize(
     x: Array,
     c: Array,
     P: Array,
-    measured: tuple[Array, Index, Array, Index, Array, float],
+    B: Array,
+    L: Array,
+    measured: tuple[Array, Index, Array, Index, Array, float, int],
     first: Index,
     losses: tuple[Index, Array, Array, Array, Array],
     layout: ErrorLayout,
@@ -80,6 +103,7 @@ def relinearize(
     entered: Array,
     r: Array,
     H: Array,
+    H_y: Array,
     HP: Array,
     S: Array,
     behind_out: Array,
@@ -91,14 +115,14 @@ def relinearize(
 
     Parameters
     ----------
-    x, c, P, r, H, HP, S : as of `correct_keyframe`, renewed in place; r, H, HP and S without what is left out
+    x, c, P, B, r, H, H_y, HP, S : as of `correct_keyframe`, renewed in place; r, H, H_y, HP and S without what is left out
     losses : as of `reweight`
     entered : shape (m,), 0 of a measurement that is left out
     """
     n, size, rows = len(P), len(layout.columns), len(layout.rows)
     loss, bend, root, inverse, weight = losses
     coordinates = coordinates_of_velocity(x, P, layout)
-    predicted_x, predicted_c, predicted_P = x.copy(), c.copy(), P.copy()
+    predicted_x, predicted_c, predicted_P, predicted_B = x.copy(), c.copy(), P.copy(), B.copy()
     delta, basis, work = np.empty(n), np.eye(size), make_coordinates_scratch(len(layout.seen), len(c))
     for _ in range(MAX_RELINEARIZATIONS):
         reweight(r, S, first, loss, bend, root, inverse, weight)
@@ -115,16 +139,18 @@ def relinearize(
         local(R, p, v, b, c, there, coordinates, work, behind_out, basis)
         P[:] = predicted_P
         change_basis(P, basis, layout.rows, np.empty((rows, n)), np.empty((rows, size + 1), np.int64))
+        B[:] = predicted_B
+        turn_rows(B, basis, layout.rows, np.empty((rows, len(L))))
         r[:] = 0.0
         H[:] = 0.0
-        linearize_keyframe(x, c, measured, first, scratch, r, H)
+        linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
         for a in range(len(r)):
             for i in range(size):
                 r[a] -= H[a, i] * behind_out[i]
         innovation_covariance(P, H, HP, S)
         for j in range(len(entered)):
             if entered[j] == 0.0:
-                leave_out(r, H, HP, S, first[j], first[j + 1])
+                leave_out(r, H, H_y, HP, S, first[j], first[j + 1])
 
 
 @helper
@@ -132,6 +158,8 @@ def correct_keyframe(
     x: Array,
     c: Array,
     P: Array,
+    B: Array,
+    L: Array,
     rows: Array,
     which: Index,
     sensors: Array,
@@ -151,12 +179,14 @@ def correct_keyframe(
 
     Parameters
     ----------
-    x, c, P : state (21,), calibration vector and covariance (n, n); places that are remembered come last in P
+    x, c, P, B : state (21,), calibration vector, and of `rovgraph.kernels.robust_update`; places that are remembered
+        come last in P
+    L : shape (h, h), root of the covariance of what is considered
     rows, which : shapes (m, ROW), (m,), the measurements and the sensor that each is of
     sensors : shape (s, PARAMS + ...), of `rovgraph.kernels.measurement_row`
-    column : shape (15 + C,), place of each component in the error, -1 where it is not estimated
+    column : shape (15 + C,), place of each component in the error, -1 where it has none; what is considered comes last
     scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
-    given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order
+    given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order; what is considered comes last
     layout : of the error
     since : shape (s,), since when each sensor is left out, nan where it is not [s]
     gated : False lets everything in
@@ -168,7 +198,7 @@ def correct_keyframe(
     first = np.zeros(m + 1, np.int64)
     for j in range(m):
         first[j + 1] = first[j] + int(sensors[which[j], DIM])
-    r, H = np.zeros(first[m]), np.zeros((first[m], n))
+    r, H, H_y = np.zeros(first[m]), np.zeros((first[m], n)), np.zeros((first[m], len(L)))
     HP, S = np.empty((first[m], n)), np.empty((first[m], first[m]))
     loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(c))
     for j in range(m):
@@ -177,11 +207,10 @@ def correct_keyframe(
         if sensor[KIND] == GIVEN:
             for a in range(begin, end):
                 r[a] = given_r[taken]
-                for i in range(given_H.shape[1]):
-                    H[a, i] = given_H[taken, i]
+                split(given_H[taken], L, H[a, : given_H.shape[1] - len(L)], H_y[a])
                 taken += 1
-    measured = (rows, which, sensors, column, scale, gravity)
-    linearize_keyframe(x, c, measured, first, scratch, r, H)
+    measured = (rows, which, sensors, column, scale, gravity, len(layout.columns))
+    linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
     innovation_covariance(P, H, HP, S)
     entered = False
     for j in range(m):
@@ -195,7 +224,7 @@ def correct_keyframe(
                 seen, spread = directions_seen(x, sensor, n, elapsed)
                 inflate(P, r, H, begin, end, seen, spread)
                 innovation_covariance(P, H, HP, S)
-            leave_out(r, H, HP, S, begin, end)
+            leave_out(r, H, H_y, HP, S, begin, end)
         else:
             entered = True
     if not entered:
@@ -204,26 +233,28 @@ def correct_keyframe(
     behind = np.zeros(len(layout.columns))
     if taken == 0 and widest(S) > WIDE * WIDE:
         losses = (loss, bend, root, inverse, weight)
-        relinearize(x, c, P, measured, first, losses, layout, scratch, weight_out, r, H, HP, S, behind)
+        relinearize(x, c, P, B, L, measured, first, losses, layout, scratch, weight_out, r, H, H_y, HP, S, behind)
     reweight(r, S, first, loss, bend, root, inverse, weight)
-    joseph(P, r, H, HP, root, inverse, delta)
+    joseph(P, B, r, H, H_y, HP, root, inverse, delta)
     for i in range(len(behind)):
         delta[i] += behind[i]
     for j in range(m):
         weight_out[j] *= weight[j]
-    move(x, c, P, delta, coordinates_of_velocity(x, P, layout))
+    move(x, c, P, B, delta, coordinates_of_velocity(x, P, layout))
     for i in range(len(places_out)):
         places_out[i] = delta[n - len(places_out) + i]
 
 
 @kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
     "i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], f8[::1], f8[::1])"
 )
 def correct(
     x: Array,
     c: Array,
     P: Array,
+    B: Array,
+    L: Array,
     rows: Array,
     which: Index,
     sensors: Array,
@@ -245,4 +276,4 @@ def correct(
     """`correct_keyframe`, from Python; columns to basis_rows are those of its layout."""
     layout, out = ErrorLayout(columns, seen, seen_params, basis_rows), (nis_out, weight_out, places_out)
     tables = sensors, column, scale, given_r, given_H
-    correct_keyframe(x, c, P, rows, which, *tables, layout, since, gated, gravity, *out)
+    correct_keyframe(x, c, P, B, L, rows, which, *tables, layout, since, gated, gravity, *out)

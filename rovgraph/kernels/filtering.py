@@ -49,6 +49,8 @@ def _correct(
     x: Array,
     c: Array,
     P: Array,
+    B: Array,
+    L: Array,
     begin: int,
     end: int,
     rows: Array,
@@ -66,13 +68,23 @@ def _correct(
     if begin == end:
         return
     scales = row_scales[begin:end] if len(row_scales) else row_scales
-    measured = (rows[begin:end], which[begin:end], sensors, column, scales, np.empty(0), np.empty((0, len(P))))
+    measured = (rows[begin:end], which[begin:end], sensors, column, scales, np.empty(0), np.empty((0, len(L))))
     out = (nis_out[begin:end], weight_out[begin:end], np.empty(0))
-    correct_keyframe(x, c, P, *measured, layout, since, True, gravity, *out)
+    correct_keyframe(x, c, P, B, L, *measured, layout, since, True, gravity, *out)
+
+
+@helper
+def covariance(P: Array, B: Array, first: int, out: Array) -> None:
+    """P + B B' of the components from ``first`` on."""
+    for i in range(len(out)):
+        for j in range(len(out)):
+            out[i, j] = P[first + i, first + j]
+            for k in range(B.shape[1]):
+                out[i, j] += B[first + i, k] * B[first + j, k]
 
 
 @kernel(
-    "i8(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], f8[:, :, ::1], i8[::1], i8[::1],"
+    "i8(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], f8[:, :, ::1], i8[::1], i8[::1],"
     " f8[:, ::1], i8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8, f8[::1], f8[:, ::1],"
     " f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[::1])"
 )
@@ -80,6 +92,8 @@ def filter_intervals(
     x: Array,
     c: Array,
     P: Array,
+    B: Array,
+    L: Array,
     motions: Array,
     scales: Array,
     rows: Array,
@@ -111,7 +125,8 @@ def filter_intervals(
 
     Parameters
     ----------
-    x, c, P : the keyframe before them, afterwards that at the end of the last one that is taken
+    x, c, P, B : the keyframe before them, afterwards that at the end of the last one that is taken
+    L : root of the covariance of what is considered
     motions, scales : shapes (k, ROW), (k, 6, 6) or (0, 6, 6), as of `rovgraph.kernels.dive`
     rows, which, row_scales : of their measurements
     taken : shape (k + 1,), the first measurement of each interval, and how many there are
@@ -136,14 +151,15 @@ def filter_intervals(
         tilt, heading = attitude_variances(x, P)
         if tilt > poorly_known[0] or heading > poorly_known[1] or not knows_all(which[begin:end], sensors):
             return k
-        _correct(x, c, P, begin, here[k], *tables, layout, since, gravity, *out)
+        _correct(x, c, P, B, L, begin, here[k], *tables, layout, since, gravity, *out)
         scale = scales[k] if len(scales) else no_scale
-        predict_keyframe(x, c, P, motions[k], scale, column, walk, there, F, Q)
+        predict_keyframe(x, c, P, B, L, motions[k], scale, column, walk, size, there, F, Q)
         x[:] = there
         predicted_x_out[k], predicted_c_out[k] = x, c
-        _correct(x, c, P, here[k], end, *tables, layout, since, gravity, *out)
+        _correct(x, c, P, B, L, here[k], end, *tables, layout, since, gravity, *out)
         x_out[k], c_out[k] = x, c
-        pose_out[k], velocity_out[k] = P[:6, :6], P[6:9, 6:9]
+        covariance(P, B, 0, pose_out[k])
+        covariance(P, B, 6, velocity_out[k])
         for i in range(size):
-            sd_out[k, i] = np.sqrt(P[i, i])
+            sd_out[k, i] = np.sqrt(P[i, i] + np.sum(B[i] * B[i]))
     return len(here)

@@ -2,6 +2,8 @@
 
     x_j = f(x_i, b + S k),  e_j = F e_i + w,  P_j = F P_i F' + Q
 
+    B_j = F B_i + F_y                                                     of what is considered
+
 f, F and Q of pose, velocity and bias are the motion's (`rovgraph.kernels.motion`); k are the IMU's scale errors
 where S is given, and calibration that walks adds its variance a second times the interval to Q.
 """
@@ -46,14 +48,30 @@ def carry(P: Array, F: Array, Q: Array) -> None:
 
 
 @helper
+def carry_considered(B: Array, F: Array, moved: Array) -> None:
+    """B <- F B + F_y, ``moved`` being the rows of F_y that are not zero."""
+    own = np.empty(MOVED)
+    for k in range(B.shape[1]):
+        for i in range(MOVED):
+            own[i] = moved[i, k]
+            for j in range(len(B)):
+                own[i] += F[i, j] * B[j, k]
+        for i in range(MOVED):
+            B[i, k] = own[i]
+
+
+@helper
 def predict_keyframe(
     x: Array,
     c: Array,
     P: Array,
+    B: Array,
+    L: Array,
     motion: Array,
     scale: Array,
     column: NDArray[np.int64],
     walk: Array,
+    estimated: int,
     x_out: Array,
     F_out: Array,
     Q_out: Array,
@@ -63,15 +81,17 @@ def predict_keyframe(
     Parameters
     ----------
     x, c : state (21,) and calibration vector of the keyframe before
-    P : shape (n, n), its covariance; afterwards that of the keyframe after
+    P, B : shapes (n, n), (n, h), of `rovgraph.kernels.robust_update`; afterwards those of the keyframe after
+    L : shape (h, h), root of the covariance of what is considered
     motion : row of `rovgraph.kernels.motion_row`
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
     column : place of each component of state and calibration in the error, -1 where it is not estimated
     walk : shape (n,), variance that walking adds in a second
+    estimated : components of the error; those that are considered have the columns behind them
     x_out : state after it
     F_out, Q_out : shape (n, n), transition and noise
     """
-    n = len(P)
+    n, moved = len(P), np.zeros((MOVED, len(L)))
     bias, F, Q = x[15:21].copy(), np.zeros((MOTION, MOTION)), np.zeros((MOTION, MOTION))
     if len(scale):
         for i in range(6):
@@ -96,23 +116,37 @@ def predict_keyframe(
             own = column[MOTION + ACC_SCALE + k]
             if own >= 0:  # a scale moves the state as the bias does that it makes, but not the bias itself
                 for i in range(MOVED):
+                    by = 0.0
                     for j in range(6):
-                        F_out[i, own] += F[i, MOVED + j] * scale[j, k]
+                        by += F[i, MOVED + j] * scale[j, k]
+                    if own < estimated:
+                        F_out[i, own] += by
+                    else:
+                        for j in range(len(L)):
+                            moved[i, j] += by * L[own - estimated, j]
     carry(P, F_out, Q_out)
+    if len(L):
+        carry_considered(B, F_out, moved)
 
 
-@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])")
+@kernel(
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], i8, f8[::1], "
+    "f8[:, ::1], f8[:, ::1])"
+)
 def predict_filter(
     x: Array,
     c: Array,
     P: Array,
+    B: Array,
+    L: Array,
     motion: Array,
     scale: Array,
     column: NDArray[np.int64],
     walk: Array,
+    estimated: int,
     x_out: Array,
     F_out: Array,
     Q_out: Array,
 ) -> None:
     """`predict_keyframe`, from Python."""
-    predict_keyframe(x, c, P, motion, scale, column, walk, x_out, F_out, Q_out)
+    predict_keyframe(x, c, P, B, L, motion, scale, column, walk, estimated, x_out, F_out, Q_out)

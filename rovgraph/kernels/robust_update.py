@@ -8,8 +8,13 @@ are iterated (Huber 1964; Zhang 1997): weights follow from the residuals after t
 cost, not from the innovations, which a prior that knows little makes large. The covariance is Joseph's,
 P <- (I - K H) P (I - K H)' + K K', multiplied out so that it costs products of rank m only.
 
-Shapes: P (n, n), r (m,), H (m, n), HP (m, n), S (m, m); ``first`` (k + 1,) are the rows where each of k
-measurements begins.
+What is considered is uncertain and never corrected, nor does it move a gain or a gate. Its part of the estimate's error
+is B y, y white and of unit variance, so that the covariance of the estimate is P + B B'. With H_y the Jacobian by y,
+
+    B <- B - K (H B + H_y)                                              the covariance analysis of Schmidt (1966)
+
+Shapes: P (n, n), B (n, h), r (m,), H (m, n), H_y (m, h), HP (m, n), S (m, m); ``first`` (k + 1,) are the rows where each
+of k measurements begins.
 """
 
 import math
@@ -99,10 +104,11 @@ def normalised_squared(S: Array, r: Array, begin: int, end: int) -> float:
 
 
 @helper
-def leave_out(r: Array, H: Array, HP: Array, S: Array, begin: int, end: int) -> None:
+def leave_out(r: Array, H: Array, H_y: Array, HP: Array, S: Array, begin: int, end: int) -> None:
     """Make nothing of the rows ``begin`` to ``end``."""
     r[begin:end] = 0.0
     H[begin:end] = 0.0
+    H_y[begin:end] = 0.0
     HP[begin:end] = 0.0
     S[begin:end] = 0.0
     S[:, begin:end] = 0.0
@@ -209,8 +215,10 @@ def correction(r: Array, HP: Array, root: Array, inverse: Array, delta_out: Arra
 
 
 @helper
-def joseph(P: Array, r: Array, H: Array, HP: Array, root: Array, inverse: Array, delta_out: Array) -> None:
-    """The correction, and P after it in place; HP and H become W^1/2 times what they were."""
+def joseph(
+    P: Array, B: Array, r: Array, H: Array, H_y: Array, HP: Array, root: Array, inverse: Array, delta_out: Array
+) -> None:
+    """The correction, and P and B after it in place; HP and H become W^1/2 times what they were."""
     m, n = HP.shape
     Kt, HA = np.zeros((m, n)), np.zeros((m, n))  # K', and H times the transpose of A = (I - K H) P
     for a in range(m):
@@ -225,6 +233,16 @@ def joseph(P: Array, r: Array, H: Array, HP: Array, root: Array, inverse: Array,
                 Kt[a, i] += share * HP[b, i]
         for i in range(n):
             delta_out[i] += Kt[a, i] * root[a] * r[a]
+    for k in range(B.shape[1]):
+        for a in range(m):
+            off = root[a] * H_y[a, k]
+            for i in range(n):
+                off += H[a, i] * B[i, k]
+            HA[a, 0] = off
+        for i in range(n):
+            for a in range(m):
+                B[i, k] -= Kt[a, i] * HA[a, 0]
+    HA[:, 0] = 0.0
     for i in range(n):  # P <- A'
         for a in range(m):
             share = HP[a, i]

@@ -296,7 +296,7 @@ class Navigator:
 
     def _calibration(self, engine: FixedLag, known: Gaussian) -> dict[str, tuple[float, float]]:
         """Estimated calibration by label: value and sd."""
-        sd, columns = np.sqrt(np.diag(known.P)), engine.filter.layout.columns
+        sd, columns = np.sqrt(np.diag(known.covariance)), engine.filter.layout.columns
         return {
             label: (float(value), float(own))
             for name in engine.filter.unknowns.estimated

@@ -58,7 +58,7 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
     )
     for heading in ("variable", "value ± sd", "prior ± sd", "sd narrowed to", "verdict"):
         table.add_column(heading, justify="left" if heading in ("variable", "verdict") else "right")
-    silent = [e for e in main.calibration if not e.estimated and e.value == 0.0]
+    silent = [e for e in main.calibration if not e.estimated and e.value == 0.0 and e.sd == 0.0]
     told = [e for e in main.calibration if e not in silent]
     for entry in sorted(told, key=lambda e: not e.estimated):
         tail = f" [{shown(entry.unit)[1]}]" if entry.unit != "1" else ""
@@ -85,7 +85,7 @@ def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:
     factor = shown(entry.unit)[0]
     value, sd, mean, prior_sd = (factor * x for x in (entry.value, entry.sd, entry.prior_mean, entry.prior_sd))
     if not entry.estimated:
-        return plus_minus(value, 0.0), "", "held", ""
+        return plus_minus(value, sd), "", "considered" if sd > 0.0 else "held", ""
     ratio = narrowing(entry)
     narrowed = "unknown" if not np.isfinite(ratio) else f"{100 * ratio:.2g} %"
     return plus_minus(value, sd), plus_minus(mean, prior_sd), narrowed, entry.verdict

@@ -86,7 +86,8 @@ class Truth:
         for name, belief in beliefs(self.config).items():
             own = np.random.default_rng([entropy, zlib.crc32(name.encode())])
             draw = belief.sd * own.standard_normal(belief.variable.dim)
-            value = belief.mean + draw if belief.estimate and self.noise else belief.mean
+            uncertain = belief.estimate or belief.considered
+            value = belief.mean + draw if uncertain and self.noise else belief.mean
             out[name] = np.array(self.calibration.get(name, value), float).reshape(belief.variable.dim)
         return out
 

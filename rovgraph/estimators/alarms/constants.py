@@ -80,13 +80,14 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
         if r.sd > SHOWN * variable.sd:
             continue
         shown, unit = _shown(variable.unit)
-        mean = evidence.optimum.beliefs[r.name].mean[variable.labels.index(r.label)]
+        belief = evidence.optimum.beliefs[r.name]
+        mean, allowed = belief.mean[variable.labels.index(r.label)], belief.sd if belief.considered else 0.0
         yield Statistic(
             "held",
             _sensor_of(r.name),
             evidence.start,
             evidence.end,
-            abs(r.step) / float(np.hypot(r.sd, FEIGNED.get(r.name, 0.0))),
+            abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
             HELD,
             HELD_FAR_OFF,
             f"{r.label} is held at {shown * mean:.4g}{unit}, where the measurements have it "

@@ -176,7 +176,10 @@ def _back(engine: FilterEngine, departed: Gaussian, transition: Transition, foll
     G = (np.linalg.solve(P_predicted / (sd * sd.T), F @ P / sd) / sd).T
     kept = np.eye(len(P)) - G @ F
     P = kept @ P @ kept.T + G @ (basis @ P_following @ basis.T + Q) @ G.T
-    return engine.retract(departed, G @ delta, P)
+    B = departed.B
+    if B.size:  # all that is known of it moves as the estimate does
+        B = B + G @ (basis @ following.B[there] - predicted.B[here])
+    return engine.retract(departed, G @ delta, P, B)
 
 
 def replay(

@@ -177,6 +177,8 @@ class FixedLag:
             "x": known.x,
             "c": known.c,
             "P": known.P,
+            "B": known.B,
+            "L": known.L,
             "places": np.array([[p.name, p.number, *p.position, p.time] for p in known.places]).reshape(-1, 5),
             "gates": mark.gates,
             "assembler": mark.assembler.state(),
@@ -190,13 +192,8 @@ class FixedLag:
         places = tuple(RememberedPlace(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
         assembler = self._fresh()
         assembler.restore(state["assembler"])
-        self.marks = deque(
-            [
-                FilterSnapshot(
-                    interval, Gaussian(state["x"], state["c"], state["P"], places), state["gates"], [], assembler, 0
-                )
-            ]
-        )
+        known = Gaussian(state["x"], state["c"], state["P"], places, state["B"], state["L"])
+        self.marks = deque([FilterSnapshot(interval, known, state["gates"], [], assembler, 0)])
         self._record, self._forgotten, self._taken = [], 0, 0
         self._back_to(0)
         for measurement in unpack(state["record"]):
@@ -231,7 +228,7 @@ class FixedLag:
         intervals, known : the keyframes and what is known of them, n each
         """
         columns, arm = self.filter.layout.columns, self.beginning.config.imu.lever_arm_m
-        pose, velocity = (np.array([k.P[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
+        pose, velocity = (np.array([k.covariance[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
         return body_trajectory(intervals, stack_states(known), arm, pose, velocity)
 
     def _go_on(self, until: float) -> None:

@@ -82,9 +82,9 @@ class FilterHistory:
         return self._estimate(kind, [self._row(one) for one in known], stack_states(known))
 
     def _row(self, known: Gaussian) -> Row:
-        size, columns = self._engine.layout.size, self._engine.layout.columns
-        pose, velocity = (known.P[columns[v], columns[v]].copy() for v in (POSE, VELOCITY))
-        return known.x, known.c, pose, velocity, np.sqrt(np.diagonal(known.P)[:size])
+        size, columns, P = self._engine.layout.size, self._engine.layout.columns, known.covariance
+        pose, velocity = (P[columns[v], columns[v]].copy() for v in (POSE, VELOCITY))
+        return known.x, known.c, pose, velocity, np.sqrt(np.diagonal(P)[:size])
 
     def _estimate(self, kind: str, rows: Sequence[Row], smoothed: State | None) -> Estimate:
         """An estimate; residuals are those before the measurements entered where nothing was smoothed."""

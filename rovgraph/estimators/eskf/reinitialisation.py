@@ -1,6 +1,7 @@
 """A filter's newest keyframe as the smoother has it, from the whole of the dive so far."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.estimators.optimum import optimum
+from rovgraph.geometry import Array
 from rovgraph.state import PLACE_DIM, State
 
 
@@ -34,22 +36,22 @@ def reinitialised(
     initial, layout = engine.initial, engine.layout
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
     best = optimum(intervals, initial, states, calibration, rows)
-    newest = best.state.at([len(intervals) - 1])
-    known = np.concatenate([np.arange(15)] + [np.r_[layout.columns[name]] for name in best.unknowns.estimated])
+    names, size = (*best.unknowns.estimated, *best.unknowns.considered), layout.size
+    known = np.concatenate([np.arange(15)] + [np.r_[layout.columns[name]] for name in names])
     places = remembered(best, initial.config.place.remembered)
-    size = layout.size + PLACE_DIM * len(places)
-    P = np.zeros((size, size))
-    P[: layout.size, : layout.size] = engine.start().P  # of what no sensor has shown yet
-    known = np.concatenate([known, np.arange(layout.size, size)])
-    P[np.ix_(known, known)] = best.newest_covariance([place.number for place in places])
-    newest = State(
-        newest.R_nb,
-        newest.p_n,
-        newest.v_n,
-        newest.bias,
-        {name: value.reshape(-1) for name, value in newest.calibration.items()},
-    )
-    return Gaussian.of(newest, P, places), best.state
+    # the covariance of all, what is considered at the end: of what no sensor has shown yet, that of the start
+    start, more = engine.start(), PLACE_DIM * len(places)
+    joint = np.zeros((layout.width + more, layout.width + more))
+    joint[:size, :size], joint[size + more :, size + more :] = start.P, start.L @ start.L.T
+    known = np.concatenate([known + more * (known >= size), np.arange(size, size + more)])
+    joint[np.ix_(known, known)] = best.newest_covariance([place.number for place in places])
+    own = slice(0, size + more)
+    L: Array = np.linalg.cholesky(joint[size + more :, size + more :])
+    B = np.linalg.solve(L, joint[size + more :, own]).T
+    state = best.state.at([len(intervals) - 1])
+    calibration = {name: value.reshape(-1) for name, value in state.calibration.items()}
+    newest = State(state.R_nb, state.p_n, state.v_n, state.bias, calibration)
+    return replace(Gaussian.of(newest, joint[own, own] - B @ B.T, places), B=B, L=L), best.state
 
 
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:

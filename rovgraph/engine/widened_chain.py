@@ -1,0 +1,89 @@
+"""A chain with constants in its border that its estimate holds, linearised where it stands.
+
+What they would do to the estimate follows from one elimination, without another solution: their derivatives are those
+of the measurement equations, of the IMU's mean signals for its scales, and of the predictions by time for stamps.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from rovgraph.calibration import Belief
+from rovgraph.config import mount_matrix
+from rovgraph.engine.chain import Chain
+from rovgraph.engine.measurements import Block
+from rovgraph.engine.scale import COLUMNS, SCALES
+from rovgraph.engine.unknowns import Unknowns
+from rovgraph.geometry import Array, rotate
+from rovgraph.kernels import motion_row as at
+from rovgraph.state import Jacobians, State
+
+
+def widened(chain: Chain, state: State, names: tuple[str, ...], beliefs: Mapping[str, Belief] | None = None) -> Chain:
+    """The chain with some of the constants that it holds in its border, behind those that are there.
+
+    Parameters
+    ----------
+    chain : of the dive
+    state : where it is linearised afterwards
+    names : constants that are not estimated, and whose sensors are in use
+    beliefs : of all of the calibration; None = the chain's own
+    """
+    wide, timed, rows = chain.unknowns.estimating(names), {}, chain.rows
+    offsets = {i.time_offset for i in chain.initial.instruments.values()}
+    for sensor, block in chain.blocks.items() if offsets & set(names) else ():
+        if block.instrument.time_offset in names and block.window is None:
+            timed[sensor] = _timed(block, wide, state)
+    if {*SCALES} & set(names) and not len(rows.scales):
+        rows = replace(rows, scales=_mean_signal_to_bias(chain, state))
+    return _WidenedChain(chain.intervals, chain.initial, beliefs or chain.beliefs, wide, rows, timed)
+
+
+@dataclass(frozen=True)
+class _WidenedChain(Chain):
+    """A chain with the measurements of sensors whose stamps may be late, which no kernel knows."""
+
+    timed: Mapping[str, Block]
+
+    @cached_property
+    def given(self) -> dict[str, Block]:
+        return {sensor: self.timed.get(sensor, block) for sensor, block in super().given.items()}
+
+
+@dataclass(frozen=True)
+class _TimedBlock(Block):
+    """A block whose stamps may be late: ``slope``, shape (n, dim), is how a prediction changes with time."""
+
+    slope: Array | None = None
+
+    def predict(self, state: State) -> tuple[Array, Jacobians]:
+        predicted, H = super().predict(state)
+        assert self.slope is not None and self.instrument.time_offset is not None
+        return predicted, H | {self.instrument.time_offset: -self.slope[..., None]}
+
+
+def _timed(block: Block, wide: Unknowns, state: State) -> _TimedBlock:
+    """A block that knows how its predictions change with time [unit/s]."""
+    scales = SCALES if block.scale_to_bias is not None else ()
+    wider = replace(block, unknowns=wide.of([*block.instrument.calibration, *scales]))
+    slope = np.zeros_like(block.z)
+    if len(block) > 1:
+        step = np.maximum(np.gradient(block.time), 1e-6)[:, None]
+        slope = np.asarray(np.gradient(block.predicted(state.at(block.keyframe)), axis=0) / step)
+    return _TimedBlock(**{f.name: getattr(wider, f.name) for f in fields(Block)}, slope=slope)
+
+
+def _mean_signal_to_bias(chain: Chain, state: State) -> Array:
+    """As `rovgraph.engine.scale.scale_to_bias`, from the preintegrated motions, shape (n - 1, 6, 6)."""
+    rows: Array = chain.rows.motions
+    bias = state.bias[:-1]
+    R_bs = mount_matrix(chain.initial.config.imu.mount_rpy_deg)
+    seconds = np.maximum(rows[:, at.DURATION], 1e-6)[:, None]
+    rate_b = rows[:, at.TANGENT : at.TANGENT + 3] / seconds + rows[:, at.BIAS + 3 : at.BIAS + 6] - bias[:, 3:]
+    force_b = rows[:, at.TANGENT + 6 : at.TANGENT + 9] / seconds - bias[:, :3]
+    S = np.zeros((len(rows), 6, 6))
+    for signal_b, part in ((force_b, COLUMNS["acc_scale"]), (rate_b, COLUMNS["gyr_scale"])):
+        S[:, part, part] = R_bs * rotate(R_bs.T, signal_b)[:, None, :]
+    return S
