@@ -200,7 +200,7 @@ class FilterEngine:
         return make_block(measurements, instrument, self._gravity, unknowns or self._wide)
 
     def retract(self, known: Gaussian, delta: Array, P: Array, B: Array | None = None) -> Gaussian:
-        """The estimate that lies ``delta``, shape (d,), away; P and B, None = unchanged, are as of it at the old one."""
+        """The estimate that lies ``delta``, shape (d,), away; P, and B (None = its own), are about the old one."""
         x, c, P, B = known.x.copy(), known.c.copy(), P.copy(), (known.B if B is None else B).copy()
         move_estimate(x, c, P, B, delta, *self.layout.coordinates)
         return Gaussian(x, c, P, moved(known.places, delta[self.layout.size :]), B, known.L)
@@ -243,9 +243,8 @@ class FilterEngine:
         nis, weight = np.empty(len(rows)), np.empty(len(rows))
         places = np.zeros(len(P) - self.layout.size)
         tables = (self._sensors, self.layout.column, scale, r, H, *self.layout.coordinates)
-        correct(
-            x, c, P, B, before.L, rows, which, *tables, since, gates is not None, self._gravity, nis, weight, places
-        )
+        limits = since, gates is not None, self._gravity
+        correct(x, c, P, B, before.L, rows, which, *tables, *limits, nis, weight, places)
         if gates is not None:
             self._renew(gates, since)
         met = zip(measurements, nis.tolist(), weight.tolist(), strict=True)

@@ -115,7 +115,7 @@ def relinearize(
 
     Parameters
     ----------
-    x, c, P, B, r, H, H_y, HP, S : as of `correct_keyframe`, renewed in place; r, H, H_y, HP and S without what is left out
+    x, c, P, B, r, H, H_y, HP, S : as of `correct_keyframe`, renewed in place; from r on without what is left out
     losses : as of `reweight`
     entered : shape (m,), 0 of a measurement that is left out
     """
@@ -246,8 +246,9 @@ def correct_keyframe(
 
 
 @kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
-    "i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], f8[::1], f8[::1])"
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], "
+    "f8[:, :, ::1], f8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], "
+    "f8[::1], f8[::1])"
 )
 def correct(
     x: Array,

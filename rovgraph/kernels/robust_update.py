@@ -13,8 +13,8 @@ is B y, y white and of unit variance, so that the covariance of the estimate is 
 
     B <- B - K (H B + H_y)                                              the covariance analysis of Schmidt (1966)
 
-Shapes: P (n, n), B (n, h), r (m,), H (m, n), H_y (m, h), HP (m, n), S (m, m); ``first`` (k + 1,) are the rows where each
-of k measurements begins.
+Shapes: P (n, n), B (n, h), r (m,), H (m, n), H_y (m, h), HP (m, n), S (m, m); ``first`` (k + 1,) are the rows where
+each of k measurements begins.
 """
 
 import math

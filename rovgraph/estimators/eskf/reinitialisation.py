@@ -46,8 +46,8 @@ def reinitialised(
     known = np.concatenate([known + more * (known >= size), np.arange(size, size + more)])
     joint[np.ix_(known, known)] = best.newest_covariance([place.number for place in places])
     own = slice(0, size + more)
-    L: Array = np.linalg.cholesky(joint[size + more :, size + more :])
-    B = np.linalg.solve(L, joint[size + more :, own]).T
+    L = np.asarray(np.linalg.cholesky(joint[size + more :, size + more :]), dtype=float)
+    B = np.asarray(np.linalg.solve(L, joint[size + more :, own]).T, dtype=float)
     state = best.state.at([len(intervals) - 1])
     calibration = {name: value.reshape(-1) for name, value in state.calibration.items()}
     newest = State(state.R_nb, state.p_n, state.v_n, state.bias, calibration)
