@@ -171,18 +171,24 @@ def test_noise_of_the_states_adds_as_much_information_to_both(solved):
     assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < allowed).all()
 
 
-def test_both_move_alike_when_a_constant_is_held(solved):
+def test_both_move_alike_when_a_constant_is_considered(solved):
     chain, _ = solved
     constant = [name for name, walk in chain.unknowns.walks.items() if not walk]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
-        (a, by_a), (b, by_b) = (best.holding(constant[:1]) for best in solved)
+        a, b = (best.considering(constant[:1]) for best in solved)
+        again = [one.estimating(constant[:1]) for one in (a, b)]
     assert a.solution.cost == pytest.approx(b.solution.cost, rel=1e-6)
     np.testing.assert_allclose(a.state.p_n, b.state.p_n, atol=1e-5)
-    for variable in (POSE, VELOCITY, BIAS):
-        np.testing.assert_allclose(
-            by_a[variable], by_b[variable], atol=1e-4 * np.abs(by_b[variable]).max(), err_msg=variable
-        )
+    for variable in (POSE, VELOCITY, BIAS, *a.unknowns.estimated, *constant[:1]):
+        np.testing.assert_allclose(sds(a, variable), sds(b, variable), rtol=1e-3, err_msg=variable)
+    (P, Q), sd = (one.newest_covariance() for one in (a, b)), np.sqrt(np.diag(b.newest_covariance()))
+    np.testing.assert_allclose(P / np.outer(sd, sd), Q / np.outer(sd, sd), atol=2e-3)
+    (name,) = constant[:1]
+    np.testing.assert_allclose(a.relative_sd()[name], b.relative_sd()[name], rtol=1e-3)
+    for one, before in zip(again, solved, strict=True):
+        np.testing.assert_allclose(one.state.p_n, before.state.p_n, atol=1e-4)
+        assert set(one.unknowns.estimated) == set(before.unknowns.estimated)
 
 
 # a machine without GTSAM

@@ -169,7 +169,8 @@ def engine_and_estimate(rng: np.random.Generator) -> tuple[FilterEngine, Gaussia
     """A filter that estimates all calibration, and an estimate with any covariance."""
     environment = {"field_norm": 48.0}
     names = [n for i in instruments(falcon(environment=environment)).values() for n in i.model.calibration]
-    config = falcon(calibration={n: {"estimate": True} for n in names}, environment=environment)
+    estimated = {n: {"estimate": n in names} for n in {*names, *(n for n, v in TABLE.items() if v.considered)}}
+    config = falcon(calibration=estimated, environment=environment)
     calibration = {
         n: 0.05 * rng.standard_normal(TABLE[n].dim) if n in names else np.zeros(v.dim) for n, v in TABLE.items()
     }
@@ -255,7 +256,7 @@ def updated(P: Array, r: list[Array], H: list[Array], loss: str) -> tuple[Array,
     innovation_covariance(P, J, HP, S)
     bends = np.array([loss_threshold(loss, len(own)) for own in r])
     reweight(rows, S, first, np.full(len(r), LOSSES.index(loss)), bends, root, inverse, weight)
-    joseph(P, rows, J, HP, root, inverse, delta)
+    joseph(P, np.zeros((n, 0)), rows, J, np.zeros((m, 0)), HP, root, inverse, delta)
     return delta, P, weight
 
 

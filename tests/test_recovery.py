@@ -70,7 +70,7 @@ def test_a_correction_of_a_wide_prediction_is_at_the_optimum_of_its_cost(case, s
     r, H = engine.linearize(known, [ping])
     delta = known.P @ H.T @ np.linalg.solve(H @ known.P @ H.T + np.eye(3), r)
     x, c, P = known.x.copy(), known.c.copy(), after.P.copy()
-    move_estimate(x, c, P, delta, *along_n(engine))
+    move_estimate(x, c, P, np.zeros((len(P), 0)), delta, *along_n(engine))
     assert from_optimum(engine, known, after, ping) < 0.1
     assert from_optimum(engine, known, Gaussian(x, c, after.P), ping) > 2.0
 

@@ -31,6 +31,13 @@ def _components(dim: int) -> Callable[[Any], Any]:
     return check
 
 
+def _estimate(value: Any) -> Any:
+    """Refuses what is neither true nor false nor considered."""
+    if not isinstance(value, bool) and value != CONSIDERED:
+        raise PydanticCustomError("estimate", "expected true, false or considered")
+    return value
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
 
@@ -43,7 +50,7 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
     mounted = variable.name in MOUNT
     fields: dict[str, Any] = {
         "estimate": (
-            bool | Literal["considered"] if considerable(variable) else bool,
+            Annotated[bool | Literal["considered"], BeforeValidator(_estimate)] if considerable(variable) else bool,
             Field(
                 CONSIDERED if variable.considered else variable.estimate,
                 description=f"estimate it: {variable.about}. Shown by: {variable.excited_by}",

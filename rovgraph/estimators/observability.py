@@ -105,9 +105,7 @@ def shown(best: Optimum) -> list[str]:
     """What is considered and the dive shows, so that it is better estimated."""
     if not best.unknowns.considered:
         return []
-    limit = dict.fromkeys(SPURIOUSLY_OBSERVABLE, DOUBTFUL_ABOVE)
-    ratios = best.relative_sd()
-    return [name for name, ratio in ratios.items() if (ratio < limit.get(name, OBSERVABLE_BELOW)).all()]
+    return [name for name, ratio in best.relative_sd().items() if (ratio < OBSERVABLE_BELOW).all()]
 
 
 def spuriously_observable(unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:

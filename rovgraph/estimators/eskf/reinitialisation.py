@@ -12,7 +12,6 @@ from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.estimators.optimum import optimum
-from rovgraph.geometry import Array
 from rovgraph.state import PLACE_DIM, State
 
 
