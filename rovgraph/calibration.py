@@ -7,6 +7,9 @@ A variable is added by adding a row here and using its name in a measurement mod
 Compiled measurement equations take all of the calibration as one vector, the variables of `TABLE` one after
 the other: `LAYOUT` says where each stands.
 
+What every instrument has and nobody knows exactly (mounting, place and scale of the DVL, the gyro's scale, the depth
+sensor's offset) is considered by default: held at its mean, with its uncertainty in that of all else.
+
 The offset and the deviation of every compass are estimated by default, of a magnetometer its
 hard iron instead of the deviation: no compass in a vehicle is free of them, and holding them
 at zero pushes them into the DVL's misalignment and makes the track look far more certain than
@@ -141,6 +144,7 @@ TABLE: dict[str, Variable] = {
             _DVL,
             "yaw of the DVL's mounting: misalignment",
             "starts, stops and turns, against the accelerometer; position fixes beside a compass that is known",
+            considered=True,
         ),
         Variable(
             "dvl_scale",

@@ -90,7 +90,9 @@ def test_the_filters_covariance_has_what_its_estimate_would_move_by(case):
     moved, sd = [], np.sqrt(np.diag(known.covariance))[:, None]
     for one in COMPONENTS:
         other = plain_filter(case, changed(config, calibration=believing(shifted=one))).known
-        c = np.where(engine.layout.column[15:] < engine.layout.size, other.c, known.c)  # the constants' own step is none
+        c = np.where(
+            engine.layout.column[15:] < engine.layout.size, other.c, known.c
+        )  # the constants' own step is none
         moved.append(engine.local(known, replace(other, c=c))[0] / STEP)
     np.testing.assert_allclose(known.B / sd, np.column_stack(moved) / sd, atol=0.05)
     assert (np.abs(known.B / sd) > 0.5).any(axis=0).sum() >= 2

@@ -27,7 +27,7 @@ _GROUP_TEXT = {
     "depth": "depth: pressure sensor",
     "fix": "fix: position fixes",
     "place": "place: places seen before",
-    "calibration": "calibration: held at the mean, or estimated",
+    "calibration": "calibration: estimated, considered, or exact",
     "vehicle": "vehicle: hydrodynamics, thesis (2.16)-(2.24)",
     "graph": "graph: how it is built and solved",
     "online": "online: estimating as data arrive",

@@ -48,12 +48,13 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
     scale = float(np.rad2deg(1.0)) if variable.angular else 1.0
     unit = "degrees" if variable.angular else variable.unit
     mounted = variable.name in MOUNT
+    choices = "true, considered or false" if considerable(variable) else "estimate it"
     fields: dict[str, Any] = {
         "estimate": (
             Annotated[bool | Literal["considered"], BeforeValidator(_estimate)] if considerable(variable) else bool,
             Field(
                 CONSIDERED if variable.considered else variable.estimate,
-                description=f"estimate it: {variable.about}. Shown by: {variable.excited_by}",
+                description=f"{choices}: {variable.about}. Shown by: {variable.excited_by}",
             ),
         ),
         "mean" + tail: (
@@ -78,6 +79,6 @@ Calibration: type[BaseModel] = create_model(
     "Calibration",
     __base__=Section,
     __module__=__name__,
-    __doc__="Calibration variables: fixed at their mean, or estimated.",
+    __doc__="Calibration variables: estimated, considered, or exact at their mean.",
     **{name: (entry, entry()) for name, entry in _ENTRIES.items()},  # type: ignore[call-overload]
 )
