@@ -4,8 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.unknowns import unknowns
 from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
@@ -59,7 +60,8 @@ class Dive:
     def assumptions(self) -> list[str]:
         """What was assumed and what was left out, a line each."""
         counts = sorted(self.left_out.items())
-        return self.beginning.assumptions + [f"left out {n} of {sensor}: {why}" for (sensor, why), n in counts]
+        left_out = [f"left out {n} of {sensor}: {why}" for (sensor, why), n in counts]
+        return self.beginning.assumptions + _taken_as_exact(self.beginning) + left_out
 
 
 def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress = no_progress) -> Dive:
@@ -111,6 +113,13 @@ def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch]) -> dict[tuple[s
         why = (stretch.sensor, "frozen")
         counts[why] = counts.get(why, 0) + stretch.count
     return counts
+
+
+def _taken_as_exact(beginning: InitialConditions) -> list[str]:
+    """What iSAM2's filtered estimate does not doubt although the configuration does, in a line."""
+    config = beginning.config
+    names = unknowns(beliefs(config), beginning.instruments).considered if config.graph.solver == "isam2" else ()
+    return [f"the filtered estimate of iSAM2 takes as exact what is considered: {', '.join(names)}"] if names else []
 
 
 def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
