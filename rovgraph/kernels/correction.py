@@ -17,9 +17,9 @@ from rovgraph.kernels.change_of_basis import change_basis
 from rovgraph.kernels.compile import helper, kernel
 from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
-from rovgraph.kernels.linearization import NO_SCALE, Scratch, linearize_measurement, make_scratch
+from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
 from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME
-from rovgraph.kernels.moves import move
+from rovgraph.kernels.moves import move_estimate
 from rovgraph.kernels.robust_update import (
     correction,
     inflate,
@@ -50,11 +50,11 @@ def linearize_keyframe(
 ) -> None:
     """Whitened innovations and Jacobians of the measurements of a keyframe but those that are `GIVEN`."""
     rows, which, sensors, column, scale, gravity = measured
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
+    R, p, v, b, exact = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21], np.empty((0, 0))
     for j in range(len(which)):
         sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
         if sensor[KIND] != GIVEN:
-            own, own_r, own_H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], H_out[begin:end]
+            own, own_r, own_H = scale[j] if len(scale) else exact, r_out[begin:end], H_out[begin:end]
             linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, own_r, own_H)
 
 
@@ -91,7 +91,7 @@ def relinearize(
 
     Parameters
     ----------
-    x, c, P, r, H, HP, S : as of `correct_keyframe`, renewed in place; r, H, HP and S without what is left out
+    x, c, P, r, H, HP, S : as of `correct`, renewed in place; r, H, HP and S without what is left out
     losses : as of `reweight`
     entered : shape (m,), 0 of a measurement that is left out
     """
@@ -113,7 +113,9 @@ def relinearize(
         retract(R, p, v, b, c, delta[0:size], coordinates, work, basis)
         there = (predicted_x[0:9].reshape(3, 3), predicted_x[9:12], predicted_x[12:15], predicted_x[15:21], predicted_c)
         local(R, p, v, b, c, there, coordinates, work, behind_out, basis)
-        P[:] = predicted_P
+        for i in range(n):
+            for k in range(n):
+                P[i, k] = predicted_P[i, k]
         change_basis(P, basis, layout.rows, np.empty((rows, n)), np.empty((rows, size + 1), np.int64))
         r[:] = 0.0
         H[:] = 0.0
@@ -127,8 +129,11 @@ def relinearize(
                 leave_out(r, H, HP, S, first[j], first[j + 1])
 
 
-@helper
-def correct_keyframe(
+@kernel(
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
+    "i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], f8[::1], f8[::1])"
+)
+def correct(
     x: Array,
     c: Array,
     P: Array,
@@ -139,7 +144,10 @@ def correct_keyframe(
     scale: Array,
     given_r: Array,
     given_H: Array,
-    layout: ErrorLayout,
+    columns: Index,
+    seen: Index,
+    seen_params: Array,
+    basis_rows: Index,
     since: Array,
     gated: bool,
     gravity: float,
@@ -157,14 +165,14 @@ def correct_keyframe(
     column : shape (15 + C,), place of each component in the error, -1 where it is not estimated
     scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
     given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order
-    layout : of the error
+    columns to basis_rows : the error's `rovgraph.kernels.error_coordinates.ErrorLayout`
     since : shape (s,), since when each sensor is left out, nan where it is not [s]
     gated : False lets everything in
     gravity : [m/s^2]
     nis_out, weight_out : shape (m,); weight 0 = left out
     places_out : correction of the places
     """
-    m, n = len(which), len(P)
+    m, n, layout = len(which), len(P), ErrorLayout(columns, seen, seen_params, basis_rows)
     first = np.zeros(m + 1, np.int64)
     for j in range(m):
         first[j + 1] = first[j] + int(sensors[which[j], DIM])
@@ -211,38 +219,7 @@ def correct_keyframe(
         delta[i] += behind[i]
     for j in range(m):
         weight_out[j] *= weight[j]
-    move(x, c, P, delta, coordinates_of_velocity(x, P, layout))
+    layout = coordinates_of_velocity(x, P, layout)
+    move_estimate(x, c, P, delta, layout.columns, layout.seen, layout.params, layout.rows)
     for i in range(len(places_out)):
         places_out[i] = delta[n - len(places_out) + i]
-
-
-@kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[::1], f8[:, ::1], "
-    "i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], f8[::1], f8[::1])"
-)
-def correct(
-    x: Array,
-    c: Array,
-    P: Array,
-    rows: Array,
-    which: Index,
-    sensors: Array,
-    column: Index,
-    scale: Array,
-    given_r: Array,
-    given_H: Array,
-    columns: Index,
-    seen: Index,
-    seen_params: Array,
-    basis_rows: Index,
-    since: Array,
-    gated: bool,
-    gravity: float,
-    nis_out: Array,
-    weight_out: Array,
-    places_out: Array,
-) -> None:
-    """`correct_keyframe`, from Python; columns to basis_rows are those of its layout."""
-    layout, out = ErrorLayout(columns, seen, seen_params, basis_rows), (nis_out, weight_out, places_out)
-    tables = sensors, column, scale, given_r, given_H
-    correct_keyframe(x, c, P, rows, which, *tables, layout, since, gated, gravity, *out)

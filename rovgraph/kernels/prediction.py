@@ -45,8 +45,8 @@ def carry(P: Array, F: Array, Q: Array) -> None:
             P[i, j] += Q[i, j]
 
 
-@helper
-def predict_keyframe(
+@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])")
+def predict_filter(
     x: Array,
     c: Array,
     P: Array,
@@ -81,7 +81,8 @@ def predict_keyframe(
     predict_with_transition(
         motion, x[0:9].reshape(3, 3), x[9:12], x[12:15], bias, R_out, x_out[9:12], x_out[12:15], F, Q
     )
-    x_out[15:21] = x[15:21]
+    for i in range(15, 21):
+        x_out[i] = x[i]
     F_out[:] = 0.0
     Q_out[:] = 0.0
     for i in range(n):
@@ -99,20 +100,3 @@ def predict_keyframe(
                     for j in range(6):
                         F_out[i, own] += F[i, MOVED + j] * scale[j, k]
     carry(P, F_out, Q_out)
-
-
-@kernel("void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])")
-def predict_filter(
-    x: Array,
-    c: Array,
-    P: Array,
-    motion: Array,
-    scale: Array,
-    column: NDArray[np.int64],
-    walk: Array,
-    x_out: Array,
-    F_out: Array,
-    Q_out: Array,
-) -> None:
-    """`predict_keyframe`, from Python."""
-    predict_keyframe(x, c, P, motion, scale, column, walk, x_out, F_out, Q_out)
