@@ -224,8 +224,12 @@ class Chain:
         J[3:6, 3:6] = R
         return self._prior_weight @ J
 
-    def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = ()) -> SquareRoot:
+    def eliminate(
+        self, point: State, gates: Gates, stops: Sequence[int] = (), kept: int | None = None
+    ) -> SquareRoot:
         """All factors linearised at a point and eliminated; with ``stops`` the border ends with the first attitude.
+
+        ``kept`` is as of `rovgraph.engine.chain_information.square_root`.
 
         Raises
         ------
@@ -252,7 +256,7 @@ class Chain:
             return eliminate_dive(*dive, self._entered(gates), *point_and_layout, *rest, *out)
 
         try:
-            return square_root(n, d, c, len(stops), fill)
+            return square_root(n, d, c, len(stops), fill, kept)
         except UndeterminedError as error:
             raise InputError(self.layout.indeterminate(error.keyframe, error.component)) from None
 

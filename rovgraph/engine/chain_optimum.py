@@ -9,7 +9,6 @@ import numpy as np
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.chain import Chain, ChainStep
-from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_layout import COLUMNS, MOTION
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Solution
@@ -59,32 +58,27 @@ class ChainOptimum:
         return {}
 
     @cached_property
-    def information(self) -> SquareRoot:
-        """All factors linearised at the optimum and eliminated."""
-        return self.chain.eliminate(self.state, self.solution.gates)
-
-    @cached_property
-    def _border_covariance(self) -> Array:
-        return self.information.border_covariance()
-
-    @cached_property
-    def _covariances(self) -> Array:
-        return self.information.covariances(self._border_covariance)
+    def _marginals(self) -> tuple[Array, Array]:
+        """Covariances of the keyframes and of the border; what they come of would be the larger part of a long dive."""
+        root = self.chain.eliminate(self.state, self.solution.gates)
+        P_y = root.border_covariance()
+        return root.covariances(P_y), P_y
 
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
-            return np.asarray(self._covariances[:, COLUMNS[variable], COLUMNS[variable]])
+            return np.asarray(self._marginals[0][:, COLUMNS[variable], COLUMNS[variable]])
         border, part = self.chain.layout.places[variable]
         if not border:
-            return self._covariances[:, part, part]
-        P = self._border_covariance[part, part]
+            return self._marginals[0][:, part, part]
+        P = self._marginals[1][part, part]
         return np.broadcast_to(P, (len(self.intervals), *P.shape))
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         chosen = np.concatenate([np.arange(MOTION), *(self.chain.layout.target(n) for n in self.unknowns.estimated)])
-        return np.asarray(self.information.newest_covariance()[np.ix_(chosen, chosen)])
+        newest = self.chain.eliminate(self.state, self.solution.gates, kept=1).newest_covariance()
+        return np.asarray(newest[np.ix_(chosen, chosen)])
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -117,7 +111,7 @@ class ChainOptimum:
         return ChainOptimum(without, solution), out
 
     def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
-        P = self.chain.eliminate(point, self.solution.gates, keyframes).filtered_covariances()
+        P = self.chain.eliminate(point, self.solution.gates, keyframes, kept=1).filtered_covariances()
         attitude = self.chain.layout.d + self.chain.layout.c + np.arange(3)
         calibration = [self.chain.layout.target(name) for name in self.unknowns.estimated]
         chosen = np.concatenate([np.arange(9, MOTION), attitude, *calibration])

@@ -96,7 +96,7 @@ def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None
     if not len(rows.scales):
         rows = replace(rows, scales=_mean_signal_to_bias(best))  # reckoned from the motions alone
     released = _ReleasedChain(chain.intervals, chain.initial, beliefs, wide, rows, timed)
-    root = released.eliminate(state, best.solution.gates if gates is None else gates)
+    root = released.eliminate(state, best.solution.gates if gates is None else gates, kept=1)
     R, z = root.border[:, :-1], root.border[:, -1]
     information, score = R.T @ R, R.T @ z
     kept = [released.layout.places[name] for name in best.unknowns.estimated]
