@@ -224,9 +224,7 @@ class Chain:
         J[3:6, 3:6] = R
         return self._prior_weight @ J
 
-    def eliminate(
-        self, point: State, gates: Gates, stops: Sequence[int] = (), kept: int | None = None
-    ) -> SquareRoot:
+    def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = (), kept: int | None = None) -> SquareRoot:
         """All factors linearised at a point and eliminated; with ``stops`` the border ends with the first attitude.
 
         ``kept`` is as of `rovgraph.engine.chain_information.square_root`.
