@@ -46,10 +46,17 @@ _ONE = np.ones(1)
 
 @dataclass(frozen=True)
 class ChainStep:
-    """A step of all variables: keyframes, shape (n, d), and border, shape (c,)."""
+    """A step of all variables.
+
+    Attributes
+    ----------
+    x, y : ndarray, shapes (n, d), (c,), keyframes and border
+    promised : by how much the cost of the linear problem falls
+    """
 
     x: Array
     y: Array
+    promised: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -171,7 +178,11 @@ class Chain:
         return R, p, v, b, c
 
     def step(self, point: State, gates: Gates) -> ChainStep:
-        return ChainStep(*self.eliminate(point, gates).solve())
+        root = self.eliminate(point, gates)
+        return ChainStep(*root.solve(), root.explained)
+
+    def promised(self, step: ChainStep) -> float:
+        return step.promised
 
     def moved(self, point: State, step: ChainStep, share: float) -> State:
         x, y = share * step.x, share * step.y

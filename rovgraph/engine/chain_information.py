@@ -108,6 +108,12 @@ class SquareRoot:
         chain_posterior.back_substitute(self.conditionals, y, x)
         return x[..., 0], y[:, 0]
 
+    @property
+    def explained(self) -> float:
+        """Half of what the minimum takes off the sum of squares; of all conditionals."""
+        z, z_y = self.conditionals[:, :, -1], self.border[:, -1]
+        return 0.5 * float(np.sum(z * z) + z_y @ z_y)
+
     @cached_property
     def x_by_y(self) -> Array:
         """Derivative of the keyframes' optimum by the border, shape (n, d, c)."""

@@ -200,8 +200,8 @@ def correct(
             weight_out[j] = 0.0
             elapsed = rows[j, TIME] - since[which[j]]
             if elapsed > sensor[READMIT]:
-                seen, spread = directions_seen(x, sensor, n, elapsed)
-                inflate(P, r, H, begin, end, seen, spread)
+                directions, spread = directions_seen(x, sensor, n, elapsed)
+                inflate(P, r, H, begin, end, directions, spread)
                 innovation_covariance(P, H, HP, S)
             leave_out(r, H, HP, S, begin, end)
         else:
