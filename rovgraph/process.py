@@ -1,9 +1,16 @@
 """What a process of rovgraph leaves undone: threads that wait for one another, and looking for garbage."""
 
+import contextlib
+import ctypes
 import gc
 import os
+import sys
 
 GARBAGE = 100_000  # objects made and not freed before the collector looks; Python's own is 700
+# bytes of an array that glibc maps by itself, so that it goes back to the system when it is freed: its own limit rises
+# to 32 MB, and what an hour's dive has freed below that stays with the process
+MAPPED, KEPT = 1 << 20, 32 << 20
+_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 # a library's pool of threads would spin beside kernels that need none, and in workers fight over the same cores
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
@@ -16,5 +23,10 @@ def be_frugal() -> None:
     The collector of cycles would look at a million objects of a dive again and again, and hardly find any.
     """
     gc.set_threshold(GARBAGE)
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):  # of another C library than glibc
+            libc = ctypes.CDLL(None)
+            libc.mallopt(_M_MMAP_THRESHOLD, MAPPED)
+            libc.mallopt(_M_TRIM_THRESHOLD, KEPT)
     for name, count in ONE_THREAD.items():
         os.environ.setdefault(name, count)

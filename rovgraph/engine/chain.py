@@ -46,10 +46,17 @@ _ONE = np.ones(1)
 
 @dataclass(frozen=True)
 class ChainStep:
-    """A step of all variables: keyframes, shape (n, d), and border, shape (c,)."""
+    """A step of all variables.
+
+    Attributes
+    ----------
+    x, y : ndarray, shapes (n, d), (c,), keyframes and border
+    promised : by how much the cost of the linear problem falls
+    """
 
     x: Array
     y: Array
+    promised: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -171,7 +178,11 @@ class Chain:
         return R, p, v, b, c
 
     def step(self, point: State, gates: Gates) -> ChainStep:
-        return ChainStep(*self.eliminate(point, gates).solve())
+        root = self.eliminate(point, gates)
+        return ChainStep(*root.solve(), root.explained)
+
+    def promised(self, step: ChainStep) -> float:
+        return step.promised
 
     def moved(self, point: State, step: ChainStep, share: float) -> State:
         x, y = share * step.x, share * step.y
@@ -224,8 +235,10 @@ class Chain:
         J[3:6, 3:6] = R
         return self._prior_weight @ J
 
-    def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = ()) -> SquareRoot:
+    def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = (), kept: int | None = None) -> SquareRoot:
         """All factors linearised at a point and eliminated; with ``stops`` the border ends with the first attitude.
+
+        ``kept`` is as of `rovgraph.engine.chain_information.square_root`.
 
         Raises
         ------
@@ -252,7 +265,7 @@ class Chain:
             return eliminate_dive(*dive, self._entered(gates), *point_and_layout, *rest, *out)
 
         try:
-            return square_root(n, d, c, len(stops), fill)
+            return square_root(n, d, c, len(stops), fill, kept)
         except UndeterminedError as error:
             raise InputError(self.layout.indeterminate(error.keyframe, error.component)) from None
 

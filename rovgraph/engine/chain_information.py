@@ -83,7 +83,7 @@ class SquareRoot:
 
     Attributes
     ----------
-    conditionals : ndarray, shape (n, d, 2 d + c + 1), R, S, T and z of every keyframe
+    conditionals : ndarray, shape (n, d, 2 d + c + 1), R, S, T and z of every keyframe, or (1, ...) of the last one
     border : ndarray, shape (c, c + 1), R and z of the border
     left : sum of squares at the minimum
     filtered : ndarray, shape (f, d + c, d + c + 1), R and z of a keyframe and the border, of the data up to it
@@ -107,6 +107,12 @@ class SquareRoot:
         x = self.conditionals[:, :, -1:].copy()
         chain_posterior.back_substitute(self.conditionals, y, x)
         return x[..., 0], y[:, 0]
+
+    @property
+    def explained(self) -> float:
+        """Half of what the minimum takes off the sum of squares; of all conditionals."""
+        z, z_y = self.conditionals[:, :, -1], self.border[:, -1]
+        return 0.5 * float(np.sum(z * z) + z_y @ z_y)
 
     @cached_property
     def x_by_y(self) -> Array:
@@ -180,19 +186,22 @@ class SquareRoot:
         return 2.0 * float(np.log(np.abs(diagonals)).sum() + np.log(np.abs(np.diagonal(self.border))).sum())
 
 
-def square_root(n: int, d: int, c: int, stops: int, fill: Callable[[Array, Array, Array, Array], int]) -> SquareRoot:
+def square_root(
+    n: int, d: int, c: int, stops: int, fill: Callable[[Array, Array, Array, Array], int], kept: int | None = None
+) -> SquareRoot:
     """What an elimination of n keyframes of d components and a border of c leaves.
 
     Parameters
     ----------
     stops : number of keyframes at which to keep what is known
     fill : writes ``conditionals_out`` to ``left_out`` and returns, as `rovgraph.kernels.linear_chain.eliminate`
+    kept : keyframes whose conditionals are kept, None = all, 1 = the last
 
     Raises
     ------
     UndeterminedError : the rows do not determine some component
     """
-    conditionals, border = np.empty((n, d, 2 * d + c + 1)), np.empty((c, c + 1))
+    conditionals, border = np.empty((n if kept is None else kept, d, 2 * d + c + 1)), np.empty((c, c + 1))
     filtered, left = np.empty((stops, d + c, d + c + 1)), np.empty(1)
     failing = fill(conditionals, border, filtered, left)
     if failing >= n * d:

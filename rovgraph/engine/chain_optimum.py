@@ -76,21 +76,20 @@ class ChainOptimum:
         return np.diag(np.concatenate([np.empty(0), *(np.full(b.variable.dim, b.sd**2) for b in beliefs)]))
 
     @cached_property
-    def information(self) -> SquareRoot:
-        """All factors linearised at the optimum and eliminated."""
-        return self._wide.eliminate(self.state, self.solution.gates)
+    def _end(self) -> SquareRoot:
+        """All factors linearised at the optimum and eliminated: the newest keyframe and the border."""
+        return self._wide.eliminate(self.state, self.solution.gates, kept=1)
 
     @cached_property
-    def _border_covariance(self) -> Array:
-        return self.information.border_covariance(self._believed)
-
-    @cached_property
-    def _covariances(self) -> Array:
-        return self.information.covariances(self._border_covariance)
+    def _marginals(self) -> tuple[Array, Array]:
+        """Covariances of the keyframes and of the border; what they come of would be the larger part of a long dive."""
+        root = self._wide.eliminate(self.state, self.solution.gates)
+        P_y = root.border_covariance(self._believed)
+        return root.covariances(P_y), P_y
 
     def relative_sd(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""
-        P, places = self.information.border_covariance(), self._wide.layout.places
+        P, places = self._end.border_covariance(), self._wide.layout.places
         names = self.unknowns.considered
         return {
             name: np.sqrt(np.diagonal(P[places[name][1], places[name][1]])) / self.beliefs[name].sd for name in names
@@ -104,18 +103,19 @@ class ChainOptimum:
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
-            return np.asarray(self._covariances[:, COLUMNS[variable], COLUMNS[variable]])
+            return np.asarray(self._marginals[0][:, COLUMNS[variable], COLUMNS[variable]])
         border, part = self._wide.layout.places[variable]
         if not border:
-            return self._covariances[:, part, part]
-        P = self._border_covariance[part, part]
+            return self._marginals[0][:, part, part]
+        P = self._marginals[1][part, part]
         return np.broadcast_to(P, (len(self.intervals), *P.shape))
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         layout, names = self._wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
         chosen = np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
-        return np.asarray(self.information.newest_covariance(self._border_covariance)[np.ix_(chosen, chosen)])
+        newest = self._end.newest_covariance(self._end.border_covariance(self._believed))
+        return np.asarray(newest[np.ix_(chosen, chosen)])
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -139,7 +139,7 @@ class ChainOptimum:
         return ChainOptimum(without, resume(without, begin, self.solution))
 
     def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
-        P = self.chain.eliminate(point, self.solution.gates, keyframes).filtered_covariances()
+        P = self.chain.eliminate(point, self.solution.gates, keyframes, kept=1).filtered_covariances()
         attitude = self.chain.layout.d + self.chain.layout.c + np.arange(3)
         calibration = [self.chain.layout.target(name) for name in self.unknowns.estimated]
         chosen = np.concatenate([np.arange(9, MOTION), attitude, *calibration])

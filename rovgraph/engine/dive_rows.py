@@ -49,12 +49,16 @@ class DiveRows:
 
     @staticmethod
     def of(intervals: Sequence[KeyframeInterval], sensors: Sequence[str]) -> "DiveRows":
-        """Of the intervals of a dive, from its first; ``sensors`` are those in use."""
+        """Of the intervals of a dive, from its first; ``sensors`` are those in use.
+
+        The motions' rows become views of ``motions``: of a long dive they are kept once.
+        """
         n, index = len(intervals), {sensor: k for k, sensor in enumerate(sensors)}
         motions = np.zeros((max(n - 1, 0), motion_row.ROW))
         for k, interval in enumerate(intervals[1:]):
             assert interval.motion is not None
             motions[k] = interval.motion.row
+            object.__setattr__(interval.motion, "row", motions[k])
         scaled = n > 1 and intervals[1].scale_to_bias is not None
         scales = np.array([i.scale_to_bias for i in intervals[1:]]) if scaled else np.zeros((0, 6, 6))
         found = [m for interval in intervals for m in interval.measurements]

@@ -1,10 +1,11 @@
 """Gauss-Newton with a step control and gates, over any solver of the linear problem.
 
 A Gauss-Newton step of a reweighted problem is a direction of descent of the robust cost. It is halved until the cost
-falls, so the iteration cannot diverge, and doubled as long as that helps, since reweighted steps fall short where
-many measurements lie beyond their loss's bend. When it has converged, measurements beyond their gate are taken
-out, those back within it let in, and it is solved again until the gates rest. A measurement that is out costs what
-one at its gate costs: the robust cost is a truncated loss, of which optima with different gates compare.
+falls, so the iteration cannot diverge. Where the cost falls by more than the linear problem promises it is doubled as
+long as that helps: reweighted steps fall short where many measurements lie beyond their loss's bend. When it has
+converged, measurements beyond their gate are taken out, those back within it let in, and it is solved again until the
+gates rest. A measurement that is out costs what one at its gate costs: the robust cost is a truncated loss, of which
+optima with different gates compare.
 
 It has converged when the decrease that is left is small. Steps that converge by a factor leave a geometric series
 of decreases, so two of them say what is left. A decrease of e is a move of sqrt(2 e) sd in the direction in which
@@ -27,6 +28,8 @@ SMALLEST_STEP = 2.0**-12
 FINE = 1e-3  # decrease of the cost that is left when the last round stops: 0.045 sd
 COARSE = 1e-2  # the same as a part of the cost, of the rounds before the gates rest
 
+# a parabola with the slope that is promised and the decrease that is found is lower at twice the step from here on
+FALLS_SHORT = 4.0 / 3.0
 LEAST_LEFT = 0.1  # of a step's decrease: after steps that were still far away the next may converge less well
 
 Point = TypeVar("Point")
@@ -75,6 +78,10 @@ class Linearizable(Protocol[Point, Step]):
         ------
         InputError : the data do not determine some variable, which is named
         """
+        ...
+
+    def promised(self, step: Step) -> float:
+        """By how much the cost would fall by a step, were the problem linear, with weights that stay."""
         ...
 
     def moved(self, point: Point, step: Step, share: float) -> Point:
@@ -218,6 +225,8 @@ def _search(
     share, best = 1.0, at(1.0)
     if best[1] < cost:
         if cost - best[1] <= tolerance:  # it was the last
+            return best
+        if cost - best[1] < FALLS_SHORT * problem.promised(step):
             return best
         while (longer := at(2.0 * share))[1] < best[1]:
             share, best = 2.0 * share, longer

@@ -5,7 +5,7 @@ know without the angular acceleration that (3.1) neglects. Samples are rotated i
 axes first, so biases are in body axes. The equations are in `rovgraph.kernels.preintegration`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.kernels.preintegration import preintegrate as integrate
 
 INTEGRATION_SD = 1e-3  # per root second; smaller makes the covariance nearly singular
+ROWS_AT_ONCE = 512
 KNOCK = 3.0  # times the believed noise, before an interval's own scatter is taken
 
 
@@ -40,13 +41,21 @@ class PreintegrationParams:
         row = np.zeros(at.ROW)
         row[at.NOISE : at.NOISE + 5], row[at.GRAVITY] = self.densities, self.gravity
         row[at.EARTH_RATE : at.EARTH_RATE + 3] = self.earth_rate_n
-        object.__setattr__(self, "_row", row)
+        object.__setattr__(self, "_rows", _copies(row))
 
     def row(self, bias: Array, gap_s: float) -> Array:
         """The row of a motion that is yet to be integrated."""
-        row: Array = self._row.copy()  # type: ignore[attr-defined]
+        row: Array = next(self._rows)  # type: ignore[attr-defined]
         row[at.BIAS : at.BIAS + 6], row[at.GAP] = bias, gap_s
         return row
+
+
+def _copies(row: Array) -> Iterator[Array]:
+    """Copies of a row, side by side in arrays that grow: freed together, they leave no holes in the memory."""
+    count = 1
+    while True:
+        yield from np.tile(row, (count, 1))
+        count = min(2 * count, ROWS_AT_ONCE)
 
 
 def preintegration_params(config: Config, acc: float, gyr: float) -> PreintegrationParams:

@@ -54,7 +54,7 @@ def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None
         own = beliefs[name]
         beliefs[name] = replace(own, estimate=True, sd=WIDE * own.variable.sd, walk=0.0)
     released = widened(best.chain, best.state, tuple(held), beliefs)
-    root = released.eliminate(best.state, best.solution.gates if gates is None else gates)
+    root = released.eliminate(best.state, best.solution.gates if gates is None else gates, kept=1)
     R, z = root.border[:, :-1], root.border[:, -1]
     information, score = R.T @ R, R.T @ z
     kept = [released.layout.places[name] for name in best.unknowns.estimated]

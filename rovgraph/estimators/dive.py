@@ -126,7 +126,7 @@ def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
     filtering = partial(progress, "filtering")
     measurements = batch.measurements
     if not measurements:
-        return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering)
+        return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering, batch.rows)
     estimator = ErrorStateFilter(batch.beginning, REINITIALISE_AT_S)  # learns how late they are while they come
     for k, measurement in enumerate(measurements):
         if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:

@@ -123,7 +123,7 @@ def residual_frame(
     keyframes : sensor -> State of each measurement's keyframe
     weights : sensor -> ndarray, shape (n,)
     """
-    frames = []
+    parts: dict[str, list[ArrayLike]] = {}
     for sensor, block in blocks.items():
         predicted = block.predicted(keyframes[sensor])
         nu = innovation(block.instrument.model, block.z, predicted)
@@ -132,8 +132,8 @@ def residual_frame(
         for k, component in enumerate(block.instrument.components):
             columns = {
                 "time": block.time,
-                "sensor": sensor,
-                "component": component,
+                "sensor": np.full(len(block), sensor, object),
+                "component": np.full(len(block), component, object),
                 "measured": block.z[:, k],
                 "predicted": predicted[:, k],
                 "innovation": nu[:, k],
@@ -142,7 +142,10 @@ def residual_frame(
                 "weight": weights[sensor],
                 "row": block.line,
             }
-            frames.append(pd.DataFrame(columns))
-    if not frames:
+            for name, values in columns.items():
+                parts.setdefault(name, []).append(values)
+    if not parts:
         return pd.DataFrame(columns=pd.Index(RESIDUAL_COLUMNS))
-    return pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
+    order = np.argsort(np.concatenate(parts["time"]), kind="stable")
+    # column by column: of a long dive, sorting frames takes several times its memory
+    return pd.DataFrame({name: np.concatenate(parts.pop(name))[order] for name in [*parts]})

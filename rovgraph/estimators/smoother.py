@@ -8,6 +8,7 @@ import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
@@ -51,6 +52,7 @@ class BatchSmoother:
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], assumed=self.time_offsets)
         self.intervals: list[KeyframeInterval] = []
         self._log: Log | None = None
+        self._rows: DiveRows | None = None
         self._measurements: list[Measurement] = []
 
     def take(self, log: Log) -> list[KeyframeInterval]:
@@ -66,6 +68,13 @@ class BatchSmoother:
         if self._log is None or not self.assembler.time_offsets.lags:
             return self._measurements
         return list(self._log.measurements())
+
+    @property
+    def rows(self) -> DiveRows:
+        """The dive as arrays, as far as it has been taken."""
+        if self._rows is None or len(self._rows) != len(self.intervals):
+            self._rows = DiveRows.of(self.intervals, [*self.beginning.instruments])
+        return self._rows
 
     def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
@@ -98,7 +107,7 @@ class BatchSmoother:
         for _ in range(MAX_PLACINGS):
             if states is None:
                 states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
-            best = optimum(dive.intervals, b, states, calibration)
+            best = optimum(dive.intervals, b, states, calibration, dive.rows)
             found = best.state.calibration
             anew = dive.placed_again(found)
             if anew is None:

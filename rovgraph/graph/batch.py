@@ -38,6 +38,14 @@ FARTHEST_STEP = 1e7  # beyond it QR has divided by rounding, where Cholesky foun
 
 
 @dataclass(frozen=True)
+class GraphStep:
+    """A step of all variables, and by how much the cost of the linear graph falls by it."""
+
+    delta: gtsam.VectorValues
+    promised: float
+
+
+@dataclass(frozen=True)
 class Problem:
     """The whole dive's graph: native factors, and measurements as blocks.
 
@@ -112,20 +120,25 @@ class Problem:
             rows.push(linear, weighted)
         return linear
 
-    def step(self, point: gtsam.Values, gates: Gates) -> gtsam.VectorValues:
+    def step(self, point: gtsam.Values, gates: Gates) -> GraphStep:
         """The Gauss-Newton step: Cholesky, and QR where rounding makes that indefinite."""
         if not self._ordering:  # of the whole graph, as METIS crashes on what the gates have cut off
             whole = self.linearize(point, self.initial_gates())
             self._ordering.append(gtsam.Ordering.MetisGaussianFactorGraph(whole))
-        return eliminate_step(self.linearize(point, gates), self._ordering[0])
+        linear = self.linearize(point, gates)
+        delta = eliminate_step(linear, self._ordering[0])
+        return GraphStep(delta, linear.error(delta.scale(0.0)) - linear.error(delta))
+
+    def promised(self, step: GraphStep) -> float:
+        return step.promised
 
     @cached_property
     def _ordering(self) -> list[gtsam.Ordering]:
         return []
 
-    def moved(self, point: gtsam.Values, step: gtsam.VectorValues, share: float) -> gtsam.Values:
+    def moved(self, point: gtsam.Values, step: GraphStep, share: float) -> gtsam.Values:
         """The values after a share of a step."""
-        return point.retract(step if share == 1.0 else step.scale(share))
+        return point.retract(step.delta if share == 1.0 else step.delta.scale(share))
 
     def nonlinear(self) -> gtsam.NonlinearFactorGraph:
         """The same graph with one `gtsam.CustomFactor` per measurement."""

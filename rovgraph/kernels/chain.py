@@ -226,10 +226,10 @@ def pass_on(k: int, n: int, room: Room, conditionals_out: Array) -> int:
         triangularise(W, d, d, 2 * d, room.v, room.w)
         append_rows(W, d, 2 * d, d, d + c + 1, 0, room.V)
     # before the last keyframe, where scale is that of the next by now, a motion determines all that is a number
-    failing = undetermined(W, room.scale, 0, d, k * d)
+    failing, row = undetermined(W, room.scale, 0, d, k * d), min(k, conditionals_out.shape[0] - 1)
     for i in range(d):
         for j in range(2 * d + c + 1):
-            conditionals_out[k, i, j] = W[i, j]
+            conditionals_out[row, i, j] = W[i, j]
     return failing
 
 

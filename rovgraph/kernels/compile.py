@@ -23,17 +23,21 @@ from rovgraph.errors import InputError
 try:
     import numba
     from numba import njit
+    from numba.extending import register_jitable
 except ImportError as error:
     raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61'") from None
 
 F = TypeVar("F", bound=Callable[..., Any])
 config: Any = numba.config
+KERNEL: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}  # nothing in C calls them
+HELPER: Any = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # only kernels call them
 logger = logging.getLogger("rovgraph")
 
 
 def helper(function: F) -> F:
-    """A function that is compiled into the kernels that call it; it cannot be called often from Python."""
-    return cast(F, njit(error_model="numpy")(function))
+    """A function that is compiled into the kernels that call it; from Python it is called as it stands, slowly."""
+    registered: F = register_jitable(**HELPER)(function)
+    return registered
 
 
 def view_helper(function: F) -> F:
@@ -41,8 +45,8 @@ def view_helper(function: F) -> F:
 
     It saves 5 to 10 ns for each array that is given or viewed, which in a helper of branches and loops adds up.
     """
-    options: Any = {"error_model": "numpy", "_nrt": False}
-    return cast(F, njit(**options)(function))
+    registered: F = register_jitable(**HELPER, _nrt=False)(function)
+    return registered
 
 
 def given(ndim: int) -> str:
@@ -66,9 +70,9 @@ def kernel(signature: str) -> Callable[[F], F]:
         folder = cache_folder(function.__module__)
         try:
             with _cache_in(folder):
-                compiled = njit(signature, cache=folder is not None, nogil=True, error_model="numpy")(function)
+                compiled = njit(signature, cache=folder is not None, **KERNEL)(function)
         except OSError:  # the folder went away, or the disk is full
-            compiled = njit(signature, nogil=True, error_model="numpy")(function)
+            compiled = njit(signature, **KERNEL)(function)
         except numba.core.errors.NumbaError as error:
             raise InputError(
                 f"numba {numba.__version__} cannot compile {function.__name__} ({_first_line(error)}): "

@@ -17,9 +17,9 @@ from rovgraph.kernels.change_of_basis import change_basis, turn_rows
 from rovgraph.kernels.compile import helper, kernel
 from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
-from rovgraph.kernels.linearization import NO_SCALE, Scratch, linearize_measurement, make_scratch
+from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
 from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME
-from rovgraph.kernels.moves import move
+from rovgraph.kernels.moves import move_estimate
 from rovgraph.kernels.robust_update import (
     correction,
     inflate,
@@ -68,11 +68,11 @@ def linearize_keyframe(
     """
     rows, which, sensors, column, scale, gravity, estimated = measured
     wide = np.zeros((len(r_out), estimated + len(L))) if len(L) else H_out
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
+    R, p, v, b, exact = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21], np.empty((0, 0))
     for j in range(len(which)):
         sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
         if sensor[KIND] != GIVEN:
-            own, own_r, own_H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], wide[begin:end]
+            own, own_r, own_H = scale[j] if len(scale) else exact, r_out[begin:end], wide[begin:end]
             linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, own_r, own_H)
             if len(L):
                 for a in range(begin, end):
@@ -115,7 +115,7 @@ def relinearize(
 
     Parameters
     ----------
-    x, c, P, B, r, H, H_y, HP, S : as of `correct_keyframe`, renewed in place; from r on without what is left out
+    x, c, P, B, r, H, H_y, HP, S : as of `correct`, renewed in place; from r on without what is left out
     losses : as of `reweight`
     entered : shape (m,), 0 of a measurement that is left out
     """
@@ -137,7 +137,9 @@ def relinearize(
         retract(R, p, v, b, c, delta[0:size], coordinates, work, basis)
         there = (predicted_x[0:9].reshape(3, 3), predicted_x[9:12], predicted_x[12:15], predicted_x[15:21], predicted_c)
         local(R, p, v, b, c, there, coordinates, work, behind_out, basis)
-        P[:] = predicted_P
+        for i in range(n):
+            for k in range(n):
+                P[i, k] = predicted_P[i, k]
         change_basis(P, basis, layout.rows, np.empty((rows, n)), np.empty((rows, size + 1), np.int64))
         B[:] = predicted_B
         turn_rows(B, basis, layout.rows, np.empty((rows, len(L))))
@@ -151,98 +153,6 @@ def relinearize(
         for j in range(len(entered)):
             if entered[j] == 0.0:
                 leave_out(r, H, H_y, HP, S, first[j], first[j + 1])
-
-
-@helper
-def correct_keyframe(
-    x: Array,
-    c: Array,
-    P: Array,
-    B: Array,
-    L: Array,
-    rows: Array,
-    which: Index,
-    sensors: Array,
-    column: Index,
-    scale: Array,
-    given_r: Array,
-    given_H: Array,
-    layout: ErrorLayout,
-    since: Array,
-    gated: bool,
-    gravity: float,
-    nis_out: Array,
-    weight_out: Array,
-    places_out: Array,
-) -> None:
-    """Correct a keyframe by m measurements, in place.
-
-    Parameters
-    ----------
-    x, c, P, B : state (21,), calibration vector, and of `rovgraph.kernels.robust_update`; places that are remembered
-        come last in P
-    L : shape (h, h), root of the covariance of what is considered
-    rows, which : shapes (m, ROW), (m,), the measurements and the sensor that each is of
-    sensors : shape (s, PARAMS + ...), of `rovgraph.kernels.measurement_row`
-    column : shape (15 + C,), place of each component in the error, -1 where it has none; what is considered comes last
-    scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
-    given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order; what is considered comes last
-    layout : of the error
-    since : shape (s,), since when each sensor is left out, nan where it is not [s]
-    gated : False lets everything in
-    gravity : [m/s^2]
-    nis_out, weight_out : shape (m,); weight 0 = left out
-    places_out : correction of the places
-    """
-    m, n = len(which), len(P)
-    first = np.zeros(m + 1, np.int64)
-    for j in range(m):
-        first[j + 1] = first[j] + int(sensors[which[j], DIM])
-    r, H, H_y = np.zeros(first[m]), np.zeros((first[m], n)), np.zeros((first[m], len(L)))
-    HP, S = np.empty((first[m], n)), np.empty((first[m], first[m]))
-    loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(c))
-    for j in range(m):
-        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
-        loss[j], bend[j] = int(sensor[LOSS]), sensor[BEND]
-        if sensor[KIND] == GIVEN:
-            for a in range(begin, end):
-                r[a] = given_r[taken]
-                split(given_H[taken], L, H[a, : given_H.shape[1] - len(L)], H_y[a])
-                taken += 1
-    measured = (rows, which, sensors, column, scale, gravity, len(layout.columns))
-    linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
-    innovation_covariance(P, H, HP, S)
-    entered = False
-    for j in range(m):
-        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
-        nis_out[j] = normalised_squared(S, r, begin, end)
-        weight_out[j] = 1.0
-        if gated and not admit(nis_out[j], rows[j, TIME], sensor, since, which[j]):
-            weight_out[j] = 0.0
-            elapsed = rows[j, TIME] - since[which[j]]
-            if elapsed > sensor[READMIT]:
-                seen, spread = directions_seen(x, sensor, n, elapsed)
-                inflate(P, r, H, begin, end, seen, spread)
-                innovation_covariance(P, H, HP, S)
-            leave_out(r, H, H_y, HP, S, begin, end)
-        else:
-            entered = True
-    if not entered:
-        return
-    root, inverse, weight, delta = np.empty(first[m]), np.empty_like(S), np.empty(m), np.empty(n)
-    behind = np.zeros(len(layout.columns))
-    if taken == 0 and widest(S) > WIDE * WIDE:
-        losses = (loss, bend, root, inverse, weight)
-        relinearize(x, c, P, B, L, measured, first, losses, layout, scratch, weight_out, r, H, H_y, HP, S, behind)
-    reweight(r, S, first, loss, bend, root, inverse, weight)
-    joseph(P, B, r, H, H_y, HP, root, inverse, delta)
-    for i in range(len(behind)):
-        delta[i] += behind[i]
-    for j in range(m):
-        weight_out[j] *= weight[j]
-    move(x, c, P, B, delta, coordinates_of_velocity(x, P, layout))
-    for i in range(len(places_out)):
-        places_out[i] = delta[n - len(places_out) + i]
 
 
 @kernel(
@@ -274,7 +184,72 @@ def correct(
     weight_out: Array,
     places_out: Array,
 ) -> None:
-    """`correct_keyframe`, from Python; columns to basis_rows are those of its layout."""
-    layout, out = ErrorLayout(columns, seen, seen_params, basis_rows), (nis_out, weight_out, places_out)
-    tables = sensors, column, scale, given_r, given_H
-    correct_keyframe(x, c, P, B, L, rows, which, *tables, layout, since, gated, gravity, *out)
+    """Correct a keyframe by m measurements, in place.
+
+    Parameters
+    ----------
+    x, c, P, B : state (21,), calibration vector, and of `rovgraph.kernels.robust_update`; places that are remembered
+        come last in P
+    L : shape (h, h), root of the covariance of what is considered
+    rows, which : shapes (m, ROW), (m,), the measurements and the sensor that each is of
+    sensors : shape (s, PARAMS + ...), of `rovgraph.kernels.measurement_row`
+    column : shape (15 + C,), place of each component in the error, -1 where it has none; what is considered comes last
+    scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
+    given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order; what is considered comes last
+    columns to basis_rows : the error's `rovgraph.kernels.error_coordinates.ErrorLayout`
+    since : shape (s,), since when each sensor is left out, nan where it is not [s]
+    gated : False lets everything in
+    gravity : [m/s^2]
+    nis_out, weight_out : shape (m,); weight 0 = left out
+    places_out : correction of the places
+    """
+    m, n, layout = len(which), len(P), ErrorLayout(columns, seen, seen_params, basis_rows)
+    first = np.zeros(m + 1, np.int64)
+    for j in range(m):
+        first[j + 1] = first[j] + int(sensors[which[j], DIM])
+    r, H, H_y = np.zeros(first[m]), np.zeros((first[m], n)), np.zeros((first[m], len(L)))
+    HP, S = np.empty((first[m], n)), np.empty((first[m], first[m]))
+    loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(c))
+    for j in range(m):
+        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
+        loss[j], bend[j] = int(sensor[LOSS]), sensor[BEND]
+        if sensor[KIND] == GIVEN:
+            for a in range(begin, end):
+                r[a] = given_r[taken]
+                split(given_H[taken], L, H[a, : given_H.shape[1] - len(L)], H_y[a])
+                taken += 1
+    measured = (rows, which, sensors, column, scale, gravity, len(columns))
+    linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
+    innovation_covariance(P, H, HP, S)
+    entered = False
+    for j in range(m):
+        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
+        nis_out[j] = normalised_squared(S, r, begin, end)
+        weight_out[j] = 1.0
+        if gated and not admit(nis_out[j], rows[j, TIME], sensor, since, which[j]):
+            weight_out[j] = 0.0
+            elapsed = rows[j, TIME] - since[which[j]]
+            if elapsed > sensor[READMIT]:
+                directions, spread = directions_seen(x, sensor, n, elapsed)
+                inflate(P, r, H, begin, end, directions, spread)
+                innovation_covariance(P, H, HP, S)
+            leave_out(r, H, H_y, HP, S, begin, end)
+        else:
+            entered = True
+    if not entered:
+        return
+    root, inverse, weight, delta = np.empty(first[m]), np.empty_like(S), np.empty(m), np.empty(n)
+    behind = np.zeros(len(layout.columns))
+    if taken == 0 and widest(S) > WIDE * WIDE:
+        losses = (loss, bend, root, inverse, weight)
+        relinearize(x, c, P, B, L, measured, first, losses, layout, scratch, weight_out, r, H, H_y, HP, S, behind)
+    reweight(r, S, first, loss, bend, root, inverse, weight)
+    joseph(P, B, r, H, H_y, HP, root, inverse, delta)
+    for i in range(len(behind)):
+        delta[i] += behind[i]
+    for j in range(m):
+        weight_out[j] *= weight[j]
+    layout = coordinates_of_velocity(x, P, layout)
+    move_estimate(x, c, P, B, delta, layout.columns, layout.seen, layout.params, layout.rows)
+    for i in range(len(places_out)):
+        places_out[i] = delta[n - len(places_out) + i]

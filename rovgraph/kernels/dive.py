@@ -131,9 +131,10 @@ def eliminate_dive(
     gravity : [m/s^2]
     walk, walking : shapes (n - 1, d - 15), (d - 15,), one over the sd of each walk, and what of c walks
     given, given_targets, given_first : rows, targets and first, of what no kernel knows
-    border_rows to left_out : as `rovgraph.kernels.linear_chain.eliminate`
+    border_rows to left_out : as `rovgraph.kernels.linear_chain.eliminate`; of fewer ``conditionals_out`` than
+        keyframes the last one is that of the last keyframe
     """
-    n, d, size = conditionals_out.shape[0], conditionals_out.shape[1], c.shape[1]
+    n, d, size = len(R), conditionals_out.shape[1], c.shape[1]
     most, of_c, of_scale = 0, len(c) > 1, len(scales) > 0
     for k in range(n):
         most = max(most, given_first[k + 1] - given_first[k] + MOST * (first[k + 1] - first[k]))

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import given, helper, kernel
-from rovgraph.kernels.correction import correct_keyframe
-from rovgraph.kernels.error_coordinates import ErrorLayout
+from rovgraph.kernels.compile import given, helper, kernel, view_helper
+from rovgraph.kernels.correction import correct
+from rovgraph.kernels.layout import VELOCITY
 from rovgraph.kernels.measurement_row import GIVEN, KIND
-from rovgraph.kernels.prediction import predict_keyframe
+from rovgraph.kernels.prediction import predict_filter
 
 Index = NDArray[np.int64]
 
@@ -44,43 +44,22 @@ def knows_all(which: Index, sensors: Array) -> bool:
     return given == 0
 
 
-@helper
-def _correct(
-    x: Array,
-    c: Array,
-    P: Array,
-    B: Array,
-    L: Array,
-    begin: int,
-    end: int,
-    rows: Array,
-    which: Index,
-    sensors: Array,
-    column: Index,
-    row_scales: Array,
-    layout: ErrorLayout,
-    since: Array,
-    gravity: float,
-    nis_out: Array,
-    weight_out: Array,
-) -> None:
-    """Correct a keyframe by the measurements from ``begin`` to ``end``, in place."""
-    if begin == end:
-        return
-    scales = row_scales[begin:end] if len(row_scales) else row_scales
-    measured = (rows[begin:end], which[begin:end], sensors, column, scales, np.empty(0), np.empty((0, len(L))))
-    out = (nis_out[begin:end], weight_out[begin:end], np.empty(0))
-    correct_keyframe(x, c, P, B, L, *measured, layout, since, True, gravity, *out)
+@view_helper
+def _copy(v: Array, v_out: Array) -> None:
+    """The first components of a vector, as many as ``v_out`` has; a loop, since assigned slices compile slowly."""
+    for i in range(len(v_out)):
+        v_out[i] = v[i]
 
 
-@helper
-def covariance(P: Array, B: Array, first: int, out: Array) -> None:
+@view_helper
+def _covariance(P: Array, B: Array, first: int, P_out: Array) -> None:
     """P + B B' of the components from ``first`` on."""
-    for i in range(len(out)):
-        for j in range(len(out)):
-            out[i, j] = P[first + i, first + j]
+    for i in range(len(P_out)):
+        for j in range(len(P_out)):
+            total = P[first + i, first + j]
             for k in range(B.shape[1]):
-                out[i, j] += B[first + i, k] * B[first + j, k]
+                total += B[first + i, k] * B[first + j, k]
+            P_out[i, j] = total
 
 
 @kernel(
@@ -132,7 +111,7 @@ def filter_intervals(
     rows, which, row_scales : of their measurements
     taken : shape (k + 1,), the first measurement of each interval, and how many there are
     here : shape (k,), the first measurement at the keyframe that ends each
-    sensors, column, since, gravity, columns to basis_rows : as `rovgraph.kernels.correction.correct_keyframe`
+    sensors, column, since, gravity, columns to basis_rows : as `rovgraph.kernels.correction.correct`
     walk : shape (size,), variance that walking adds in a second
     poorly_known : shape (2,), variances of tilt and heading beyond which the attitude has to be found first [rad^2]
     x_out, c_out : shapes (k, 21), (k, C), the keyframes
@@ -144,23 +123,33 @@ def filter_intervals(
     -------
     How many intervals are taken
     """
-    size, layout = len(walk), ErrorLayout(columns, seen, seen_params, basis_rows)
-    F, Q, no_scale, there = np.empty((size, size)), np.empty((size, size)), np.empty((0, 0)), np.empty(21)
-    tables, out = (rows, which, sensors, column, row_scales), (nis_out, weight_out)
+    size, nothing, none_given = len(walk), np.empty(0), np.empty((0, len(L)))
+    F, Q, exact, there = np.empty((size, size)), np.empty((size, size)), np.empty((0, 0)), np.empty(21)
     for k in range(len(here)):
-        begin, end = taken[k], taken[k + 1]
         tilt, heading = attitude_variances(x, P)
-        if tilt > poorly_known[0] or heading > poorly_known[1] or not knows_all(which[begin:end], sensors):
+        known = knows_all(which[taken[k] : taken[k + 1]], sensors)
+        if tilt > poorly_known[0] or heading > poorly_known[1] or not known:
             return k
-        _correct(x, c, P, B, L, begin, here[k], *tables, layout, since, gravity, *out)
-        scale = scales[k] if len(scales) else no_scale
-        predict_keyframe(x, c, P, B, L, motions[k], scale, column, walk, size, there, F, Q)
-        x[:] = there
-        predicted_x_out[k], predicted_c_out[k] = x, c
-        _correct(x, c, P, B, L, here[k], end, *tables, layout, since, gravity, *out)
-        x_out[k], c_out[k] = x, c
-        covariance(P, B, 0, pose_out[k])
-        covariance(P, B, 6, velocity_out[k])
+        for arrived in range(2):
+            if arrived:
+                scale = scales[k] if len(scales) else exact
+                predict_filter(x, c, P, B, L, motions[k], scale, column, walk, size, there, F, Q)
+                _copy(there, x)
+                _copy(x, predicted_x_out[k])
+                _copy(c, predicted_c_out[k])
+            begin, end = (here[k], taken[k + 1]) if arrived else (taken[k], here[k])
+            if begin < end:
+                own = row_scales[begin:end] if len(row_scales) else row_scales
+                tables = (sensors, column, own, nothing, none_given, columns, seen, seen_params, basis_rows)
+                out = nis_out[begin:end], weight_out[begin:end], nothing
+                correct(x, c, P, B, L, rows[begin:end], which[begin:end], *tables, since, True, gravity, *out)
+        _copy(x, x_out[k])
+        _copy(c, c_out[k])
+        _covariance(P, B, 0, pose_out[k])
+        _covariance(P, B, VELOCITY, velocity_out[k])
         for i in range(size):
-            sd_out[k, i] = np.sqrt(P[i, i] + np.sum(B[i] * B[i]))
+            variance = P[i, i]
+            for j in range(len(L)):
+                variance += B[i, j] * B[i, j]
+            sd_out[k, i] = np.sqrt(variance)
     return len(here)

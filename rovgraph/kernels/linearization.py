@@ -41,8 +41,6 @@ from rovgraph.kernels.weighting import loss_weight, whiten
 
 Index = NDArray[np.int64]
 
-NO_SCALE = np.empty((0, 0))  # of an IMU whose scale is exact
-
 
 class Scratch(NamedTuple):
     """Arrays to calculate with.
@@ -210,12 +208,12 @@ def linearize(
 
     ``weighted`` ones are multiplied by the root of the weight of their loss.
     """
-    begin, scratch = 0, make_scratch(len(c))
+    begin, scratch, exact = 0, make_scratch(len(c)), np.empty((0, 0))
     R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     for j in range(len(which)):
         sensor = sensors[which[j]]
         end = begin + int(sensor[DIM])
-        own, r, H = scale[j] if len(scale) else NO_SCALE, r_out[begin:end], H_out[begin:end]
+        own, r, H = scale[j] if len(scale) else exact, r_out[begin:end], H_out[begin:end]
         square = linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, r, H)
         if weighted:
             root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))

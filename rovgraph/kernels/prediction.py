@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.compile import helper, kernel, view_helper
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion import predict_with_transition
 from rovgraph.kernels.motion_row import DURATION
@@ -47,10 +47,9 @@ def carry(P: Array, F: Array, Q: Array) -> None:
             P[i, j] += Q[i, j]
 
 
-@helper
-def carry_considered(B: Array, F: Array, moved: Array) -> None:
-    """B <- F B + F_y, ``moved`` being the rows of F_y that are not zero."""
-    own = np.empty(MOVED)
+@view_helper
+def carry_considered(B: Array, F: Array, moved: Array, own: Array) -> None:
+    """B <- F B + F_y, ``moved`` being the rows of F_y that are not zero; ``own`` (MOVED,) is to calculate with."""
     for k in range(B.shape[1]):
         for i in range(MOVED):
             own[i] = moved[i, k]
@@ -60,8 +59,11 @@ def carry_considered(B: Array, F: Array, moved: Array) -> None:
             B[i, k] = own[i]
 
 
-@helper
-def predict_keyframe(
+@kernel(
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], i8, f8[::1], "
+    "f8[:, ::1], f8[:, ::1])"
+)
+def predict_filter(
     x: Array,
     c: Array,
     P: Array,
@@ -101,7 +103,8 @@ def predict_keyframe(
     predict_with_transition(
         motion, x[0:9].reshape(3, 3), x[9:12], x[12:15], bias, R_out, x_out[9:12], x_out[12:15], F, Q
     )
-    x_out[15:21] = x[15:21]
+    for i in range(15, 21):
+        x_out[i] = x[i]
     F_out[:] = 0.0
     Q_out[:] = 0.0
     for i in range(n):
@@ -126,27 +129,4 @@ def predict_keyframe(
                             moved[i, j] += by * L[own - estimated, j]
     carry(P, F_out, Q_out)
     if len(L):
-        carry_considered(B, F_out, moved)
-
-
-@kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], i8, f8[::1], "
-    "f8[:, ::1], f8[:, ::1])"
-)
-def predict_filter(
-    x: Array,
-    c: Array,
-    P: Array,
-    B: Array,
-    L: Array,
-    motion: Array,
-    scale: Array,
-    column: NDArray[np.int64],
-    walk: Array,
-    estimated: int,
-    x_out: Array,
-    F_out: Array,
-    Q_out: Array,
-) -> None:
-    """`predict_keyframe`, from Python."""
-    predict_keyframe(x, c, P, B, L, motion, scale, column, walk, estimated, x_out, F_out, Q_out)
+        carry_considered(B, F_out, moved, np.empty(MOVED))

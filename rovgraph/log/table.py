@@ -9,6 +9,7 @@ import gzip
 import io
 import warnings
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -123,16 +124,17 @@ def _parquet(content: bytes, source: str) -> tuple[pd.DataFrame, NDArray[np.int6
 
 def _csv(content: bytes, source: str) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Frame and line numbers; blank lines are passed over."""
-    lines = _text_lines(content, source)
-    names = _header(lines, source)
-    lines = _without_torn_end(content, lines, len(names), source)
-    _require_even(lines, len(names), source)
-    body = b"\n".join(lines[1:])
-    if not body.strip():
+    content = _text(content, source)
+    names = _header(content, source)
+    content = _without_torn_end(content, len(names), source)
+    filled = _filled(content, len(names), source)
+    if not filled.any():
         return pd.DataFrame(columns=names), np.empty(0, dtype=np.int64)
+    body = io.BytesIO(content)
+    body.readline()
     try:
         frame = pd.read_csv(
-            io.BytesIO(body),
+            body,
             header=None,
             names=names,
             index_col=False,
@@ -143,12 +145,12 @@ def _csv(content: bytes, source: str) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     except (pd.errors.ParserError, UnicodeDecodeError, ValueError) as error:
         reason = _shortened(str(error).splitlines()[0], 80)
         raise InputError(f"{source}: not a CSV file ({reason}); expected comma-separated numbers") from None
-    filled = np.flatnonzero(np.fromiter((bool(x.strip()) for x in lines[1:]), bool, len(lines) - 1)[: len(frame)])
-    return frame.iloc[filled], filled.astype(np.int64) + 2
+    kept = np.flatnonzero(filled[: len(frame)])
+    return frame if len(kept) == len(frame) else frame.iloc[kept], kept.astype(np.int64) + 2
 
 
-def _text_lines(content: bytes, source: str) -> list[bytes]:
-    """Lines of a text file, without byte order mark."""
+def _text(content: bytes, source: str) -> bytes:
+    """A text file without byte order mark, its lines ended by line feeds."""
     try:
         content.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -157,14 +159,21 @@ def _text_lines(content: bytes, source: str) -> list[bytes]:
     if b"\0" in content:
         line = content.count(b"\n", 0, content.index(b"\0")) + 1
         raise InputError(f"{source}: line {line} holds binary data, expected a CSV or Parquet file")
-    return content.removeprefix(b"\xef\xbb\xbf").splitlines()
+    content = content.removeprefix(b"\xef\xbb\xbf")
+    return content.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in content else content
 
 
-def _header(lines: list[bytes], source: str) -> list[str]:
+def _lines(content: bytes) -> Iterator[bytes]:
+    """Lines without their ends, one at a time: a list of all would be larger than the log."""
+    return (line.rstrip(b"\n") for line in io.BytesIO(content))
+
+
+def _header(content: bytes, source: str) -> list[str]:
     """Names of the columns, without blanks around them."""
-    text = lines[0].decode("utf-8")
-    first = next((line for line in lines if not line.lstrip().startswith(b"#")), lines[0])
-    if first.count(b",") != lines[0].count(b","):
+    top = next(_lines(content))
+    text = top.decode("utf-8")
+    first = next((line for line in _lines(content) if not line.lstrip().startswith(b"#")), top)
+    if first.count(b",") != top.count(b","):
         raise InputError(
             f"{source}: line 1 begins with #, a comment? Expected the columns' names; delete what stands above them"
         )
@@ -183,23 +192,28 @@ def _header(lines: list[bytes], source: str) -> list[str]:
     return names
 
 
-def _without_torn_end(content: bytes, lines: list[bytes], width: int, source: str) -> list[bytes]:
+def _without_torn_end(content: bytes, width: int, source: str) -> bytes:
     """Lines without a last one that was cut off while it was written."""
-    torn = not content.endswith((b"\n", b"\r")) and len(lines) > 2 and lines[-1].count(b",") + 1 < width
-    if torn and lines[-1].strip():
-        warnings.warn(f"{source}: line {len(lines)}, the last, is cut off and left out", DataWarning, stacklevel=2)
-        return lines[:-1]
-    return lines
+    begin, count = content.rfind(b"\n") + 1, content.count(b"\n")
+    last = content[begin:]
+    if last.strip() and count > 1 and last.count(b",") + 1 < width:
+        warnings.warn(f"{source}: line {count + 1}, the last, is cut off and left out", DataWarning, stacklevel=2)
+        return content[:begin]
+    return content
 
 
-def _require_even(lines: list[bytes], width: int, source: str) -> None:
-    """Every line has as many cells as the header."""
-    for number, line in enumerate(lines, 1):
-        if line.count(b",") + 1 != width and line.strip() and b'"' not in line:
+def _filled(content: bytes, width: int, source: str) -> NDArray[np.bool_]:
+    """Which lines below the header are not blank; every one of them has as many cells as the header."""
+    filled = bytearray()
+    for number, line in enumerate(_lines(content), 1):
+        told = bool(line.strip())
+        filled.append(told)
+        if line.count(b",") + 1 != width and told and b'"' not in line:
             raise InputError(
                 f"{source}: line {number} has {line.count(b',') + 1} cells, expected {width} as in the header; "
                 "repair or delete that line"
             )
+    return np.frombuffer(filled, np.bool_)[1:]
 
 
 def _shortened(text: str, length: int) -> str:

@@ -105,10 +105,18 @@ class ErrorStateFilter:
         self.assembler.time_offsets.assume(self.latest().calibration)
         return done
 
-    def run(self, intervals: Sequence[KeyframeInterval], progress: Callable[[float], None]) -> None:
-        """Take the intervals of a dive, before anything else; ``progress`` is told 0 to 1 now and then."""
+    def run(
+        self, intervals: Sequence[KeyframeInterval], progress: Callable[[float], None], rows: DiveRows | None = None
+    ) -> None:
+        """Take the intervals of a dive, before anything else.
+
+        Parameters
+        ----------
+        progress : is told 0 to 1 now and then
+        rows : the dive as arrays, where they are at hand
+        """
         sensors = [*self.beginning.instruments]
-        self._rows = rows = DiveRows.of(intervals, sensors)
+        self._rows = rows = rows or DiveRows.of(intervals, sensors)
         compiled = all(self.engine.knows(sensor) or sensor == PLACE for sensor in sensors)
         while (k := len(self.intervals)) < len(intervals):
             progress(k / len(intervals))
@@ -187,8 +195,9 @@ def replay(
     beginning: InitialConditions,
     reinitialise_at: tuple[float, ...] = (),
     progress: Callable[[float], None] = lambda done: None,
+    rows: DiveRows | None = None,
 ) -> ErrorStateFilter:
-    """A filter that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
+    """A filter that has taken the intervals of a dive; ``progress`` and ``rows`` as of `ErrorStateFilter.run`."""
     estimator = ErrorStateFilter(beginning, reinitialise_at)
-    estimator.run(intervals, progress)
+    estimator.run(intervals, progress, rows)
     return estimator
