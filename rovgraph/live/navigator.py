@@ -19,6 +19,7 @@ from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
 from rovgraph.geometry import Array
+from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
 from rovgraph.live.health import Health
@@ -47,7 +48,7 @@ class Navigator:
     patient : wait for the thread that smooths, so that a replay can be repeated
     reinitialise : the filter from the smoothed dive so far, now and then
     smooth : have iSAM2 estimate the whole dive as it goes; the filter goes on from its newest keyframe
-    clocks, faults, health : of the sources, and of the sensors
+    clocks, faults, health, alarms : of the sources, of the sensors, and of the estimate
     isam2 : iSAM2, where it was asked for; it takes each keyframe that the lag has passed
     engine : None until the first seconds are over
     time : of the newest measurement, or of the last `tick` [s]
@@ -63,6 +64,7 @@ class Navigator:
     clocks: Clocks = field(default_factory=Clocks)
     faults: Faults = field(default_factory=Faults)
     health: Health = field(default_factory=Health)
+    alarms: LiveAlarms = field(default_factory=LiveAlarms)
     engine: FixedLag | None = None
     isam2: "IncrementalEstimator | None" = None
     time: float = -np.inf
@@ -178,6 +180,8 @@ class Navigator:
             calibration=self._calibration(engine, known),
             sensors=self.health.of(self.faults.watches, self.time),
             events=self._take_events(),
+            verdict=self.alarms.verdict,
+            alarms=self.alarms.active,
             distance=self._travelled(t.p_n[0]),
             predicted_s=interval.time - engine.marks[-1].interval.time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
@@ -260,6 +264,9 @@ class Navigator:
             waited = 0.0
             if self._reinitialisations is not None:
                 waited = self._reinitialisations.step(engine)
+                if self._reinitialisations.moved is not None:
+                    self.alarms.reinitialised(*self._reinitialisations.moved)
+                    self._reinitialisations.moved = None
             if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
                 self._adopt(engine, self.isam2)
             self.health.step(engine.marks)
@@ -283,6 +290,8 @@ class Navigator:
             except InputError as error:
                 self.lose_isam2(str(error))
         self.health.passed(mark)
+        assert self.engine is not None
+        self.alarms.passed(mark, self.engine.filter, self.faults.watches)
 
     def _take_events(self) -> tuple[Event, ...]:
         """All that happened since they were last taken."""
@@ -290,8 +299,8 @@ class Navigator:
             for text in self._reinitialisations.news:
                 self.say("reinitialisation", "lost", text)
             self._reinitialisations.news = []
-        events = [*self._events, *self.faults.events, *self.health.events]
-        self._events, self.faults.events, self.health.events = [], [], []
+        events = [*self._events, *self.faults.events, *self.health.events, *self.alarms.events]
+        self._events, self.faults.events, self.health.events, self.alarms.events = [], [], [], []
         return tuple(events)
 
     def _calibration(self, engine: FixedLag, known: Gaussian) -> dict[str, tuple[float, float]]:
