@@ -10,7 +10,8 @@ import time
 import numpy as np
 import pytest
 from broken import BROKEN
-from dives import LIVELY, Simulated, falcon, position_errors, simulated
+from dives import LIVELY, Simulated, changed, falcon, position_errors, simulated, without
+from test_places import circle
 
 from rovgraph.cli.app import main
 from rovgraph.engine.chain_optimum import ChainOptimum
@@ -87,6 +88,22 @@ def test_a_constant_that_is_held_wrongly_is_found_with_its_value(name, off):
     mean = case.config.dvl.mount_rpy_deg[1] if name == "dvl_pitch" else 0.0
     assert all(abs(r.step - (off - np.deg2rad(mean))) < 4.0 * r.sd + 0.15 * off for r in found)
     assert max(r.significance for r in found) > 5.0
+
+
+@pytest.mark.parametrize("kind", ["places", "isam2"])
+def test_a_constant_that_is_held_wrongly_is_found_on_dives_of_every_solver(kind):
+    wrong = {"calibration": {"dvl_pitch": np.array([0.03])}}
+    if kind == "places":
+        case = circle(1, **wrong)
+    else:
+        case = simulated(falcon(graph={"solver": "isam2"}), 60.0, 2, imu_rate=50.0, dvl_rate=2.0, **wrong)
+    (found,) = [s for s in smooth(case.log, case.config, "smoothed").statistics if "dvl_pitch is held" in s.cause]
+    assert found.kind == "held"
+    assert found.severity is not None
+    plain = without(case.log, "place")
+    chain = smooth(plain, changed(case.config, graph={"solver": "batch"}), "smoothed")
+    (same,) = [s for s in chain.statistics if "dvl_pitch is held" in s.cause]
+    assert found.figure == pytest.approx(same.figure, rel=0.1)
 
 
 def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_released():

@@ -16,13 +16,16 @@ import numpy as np
 from rovgraph.config import mount_matrix
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.measurements import Block
+from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import motion_row as at
-from rovgraph.state import Jacobians, State
+from rovgraph.state import PLACE, Jacobians, State
 
 WIDE = 100.0  # times the prior sd: what is released is free
 
@@ -69,6 +72,21 @@ class _TimedBlock(Block):
         predicted, H = super().predict(state)
         assert self.slope is not None and self.instrument.time_offset is not None
         return predicted, H | {self.instrument.time_offset: -self.slope[..., None]}
+
+
+def as_chain(best: Optimum, initial: InitialConditions) -> ChainOptimum:
+    """A dive as `release` takes it: itself, or where places were seen, its chain without them about the same point.
+
+    The step of a constant is then what all other measurements say of it.
+    """
+    if isinstance(best, ChainOptimum):
+        return best
+    intervals = [replace(i, measurements=[m for m in i.measurements if m.sensor != PLACE]) for i in best.intervals]
+    rows = DiveRows.of(intervals, [*initial.instruments])
+    wanted = unknowns(best.beliefs, [rows.sensors[k] for k in np.unique(rows.which)])
+    gates = {sensor: gate for sensor, gate in best.solution.gates.items() if sensor != PLACE}
+    chain = Chain(intervals, initial, best.beliefs, wanted, rows)
+    return ChainOptimum(chain, replace(best.solution, point=best.state, gates=gates))
 
 
 def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None) -> list[Released]:

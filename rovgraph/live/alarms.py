@@ -90,7 +90,7 @@ class LiveAlarms:
         """Of the estimate now."""
         return verdict_of(self.active)
 
-    def passed(self, mark: FilterSnapshot, engine: FilterEngine, watches: Mapping[str, Watch]) -> None:
+    def passed(self, mark: FilterSnapshot, engine: FilterEngine, watches: Mapping[str, Watch], now: float) -> None:
         """Take a keyframe that the lag has passed.
 
         Parameters
@@ -98,6 +98,7 @@ class LiveAlarms:
         mark : the keyframe
         engine : the filter that made it
         watches : of the sensors, by name
+        now : the estimate's time, that of events [s]
         """
         time, index = mark.interval.time, mark.interval.index
         if np.isnan(self._start):
@@ -124,7 +125,7 @@ class LiveAlarms:
             self._lasting = list(self._look_at_lasting(engine, time))
         if time >= self._due:
             self._due += EVERY_S * np.ceil((time - self._due + 1e-6) / EVERY_S)
-            self._look([*self._statistics(mark.known, engine, watches, time)], time)
+            self._look([*self._statistics(mark.known, engine, watches, time)], now)
             self._counts.append({})
 
     def reinitialised(self, smoothed: Trajectory, filtered: Trajectory) -> None:
@@ -140,8 +141,9 @@ class LiveAlarms:
         for sensor in {name for counts in self._counts for name in counts}:
             of = [counts[sensor] for counts in self._counts if sensor in counts]
             used, rejected = sum(c.used for c in of), sum(c.rejected for c in of)
-            share = share_rejected(np.array([rejected]), np.array([used + rejected]))[0]
-            yield rejected_in(sensor, begin, time, float(share), self._start)
+            if rejected:
+                share = share_rejected(np.array([rejected]), np.array([used + rejected]))[0]
+                yield rejected_in(sensor, begin, time, float(share), self._start)
             if used >= ENOUGH:
                 dim = engine.initial.instruments[sensor].model.dim
                 square = sum(c.nis for c in of) / (used * dim)

@@ -291,7 +291,7 @@ class Navigator:
                 self.lose_isam2(str(error))
         self.health.passed(mark)
         assert self.engine is not None
-        self.alarms.passed(mark, self.engine.filter, self.faults.watches)
+        self.alarms.passed(mark, self.engine.filter, self.faults.watches, self.time)
 
     def _take_events(self) -> tuple[Event, ...]:
         """All that happened since they were last taken."""

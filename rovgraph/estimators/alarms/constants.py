@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rovgraph.calibration import TABLE
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.released import Released, release
+from rovgraph.engine.released import Released, as_chain, release
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
 from rovgraph.estimators.estimate import CalibrationEstimate
@@ -87,16 +86,17 @@ def _moved(begin: float, end: float, sensor: str, figure: float, cause: str, rem
 
 def held(evidence: Evidence) -> Iterator[Statistic]:
     """Constants that are held, released one by one: the score test of `rovgraph.engine.released`."""
-    if not isinstance(evidence.optimum, ChainOptimum):
+    if evidence.optimum is None:
         return
+    best = as_chain(evidence.optimum, evidence.beginning)
     v, v_sd = evidence.main.trajectory.v_n, evidence.main.trajectory.v_sd
     moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
-    for r in release(evidence.optimum, [name for name in RELEASED if moving or not name.startswith("dvl")]):
+    for r in release(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]
         if r.sd > SHOWN * variable.sd:
             continue
         shown, unit = _shown(variable.unit)
-        mean = evidence.optimum.beliefs[r.name].mean[variable.labels.index(r.label)]
+        mean = best.beliefs[r.name].mean[variable.labels.index(r.label)]
         yield Statistic(
             "held",
             _sensor_of(r.name),
