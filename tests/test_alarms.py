@@ -10,10 +10,23 @@ import time
 import numpy as np
 import pytest
 from broken import BROKEN
-from dives import LIVELY, Simulated, changed, falcon, position_errors, simulated, without
+from dives import (
+    LIVELY,
+    Simulated,
+    altered,
+    attitude_errors,
+    changed,
+    falcon,
+    position_errors,
+    rms,
+    simulated,
+    true_at,
+    without,
+)
 from test_places import circle
 
 from rovgraph.cli.app import main
+from rovgraph.config import mount_matrix
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Evidence, Statistic, find_alarms, statistics, verdict_of
@@ -21,6 +34,7 @@ from rovgraph.estimators.alarms.alarm import alarm_of
 from rovgraph.estimators.dive import Dive, smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed
+from rovgraph.geometry import rotate, transpose
 
 SECONDS = 200.0
 
@@ -140,6 +154,24 @@ def test_alarms_are_cheap():
     began = time.process_time()
     best.chain.eliminate(best.state, best.solution.gates)
     assert spent < 8.0 * (time.process_time() - began)
+
+
+def test_a_field_that_changes_along_the_way_is_named_and_the_remedy_mends_it():
+    case = simulated(falcon(heading={"sources": ["mag"]}), 150.0, 2, "lawnmower", imu_rate=50.0)
+    mag, begin = case.log["mag"], case.log["imu"].time[0]
+    share = np.clip((mag.time - begin - 60.0) / 20.0, 0.0, 1.0)
+    dip, east = np.deg2rad(72.0 + 8.0 * share), np.deg2rad(case.config.environment.declination_deg)
+    across = np.column_stack([np.cos(dip) * np.cos(east), np.cos(dip) * np.sin(east), np.sin(dip)])
+    more = (1.0 + 0.15 * share)[:, None] * across - across[0]
+    imu_axes = rotate(transpose(true_at(case, mag.time).R_nb), more) @ mount_matrix(case.config.imu.mount_rpy_deg)
+    log = without(altered(case.log, "mag", mag.data + imu_axes), "dvl_heading")
+    held = smooth(log, case.config, "smoothed")
+    assert any("calibration.field_dip.walk_deg: 0.05" in alarm.text for alarm in held.alarms), held.warnings
+    walk = {"field_dip": {"walk_deg": 0.05}, "field_scale": {"walk": 0.001}}
+    walking = smooth(log, changed(case.config, calibration=walk), "smoothed")
+    assert walking.verdict == "trusted"
+    off = [rms(attitude_errors(dive.estimates[0].trajectory, case)[:, 2]) for dive in (held, walking)]
+    assert off[1] < 0.1 * off[0]
 
 
 def statistic(figure: float, kind: str = "rejected", sensor: str = "dvl") -> Statistic:

@@ -36,6 +36,11 @@ SD_KEY = {
     "thruster": "vehicle.acceleration_sd_mps2",
 }
 
+_CHANGING_FIELD = (
+    "; where the Earth's field changes along the way, state calibration.field_dip.walk_deg: 0.05 "
+    "and calibration.field_scale.walk: 0.001"
+)
+
 
 def sd_key(sensor: str) -> str:
     """The configuration's key of a sensor's noise."""
@@ -78,7 +83,7 @@ def rejected_in(sensor: str, begin: float, end: float, share: float, start: floa
         f"up to {share:.0%} of a minute's measurements contradict the others and were left out, "
         f"{span(begin, end, start)}",
         f"take that time out of the log if it is the instrument; if it is everywhere, check its mounting, signs "
-        f"and clock (rovgraph check), and {sd_key(sensor)}",
+        f"and clock (rovgraph check), and {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}",
     )
 
 
@@ -199,7 +204,12 @@ def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, 
 
 def _remedy_of_lasting(sensor: str) -> str:
     """What lets a sensor's errors last, and what to do."""
-    if sensor in ("mag", "dvl_heading", "ahrs"):
+    if sensor == "mag":
+        return (
+            "iron near the vehicle or a bad calibration (rovgraph calibrate magnetometer); "
+            f"raise {sd_key(sensor)}{_CHANGING_FIELD}"
+        )
+    if sensor in ("dvl_heading", "ahrs"):
         return f"iron near the vehicle or a bad calibration (rovgraph calibrate magnetometer); raise {sd_key(sensor)}"
     if sensor == "fix":
         return "the fixes are off together for that time: take them out, or raise fix.sd_m"
