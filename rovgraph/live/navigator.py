@@ -24,6 +24,7 @@ from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
 from rovgraph.live.health import Health
 from rovgraph.live.intake import Intake
+from rovgraph.live.joining import ANYWHERE_M, can_join, is_late, joined, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
@@ -82,6 +83,7 @@ class Navigator:
         self._events: list[Event] = []
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
+        self._located = bool(self.config.start.model_fields_set & {"north_m", "east_m"})  # where the fixes count from
 
     @property
     def origin(self) -> tuple[float, float] | None:
@@ -182,7 +184,7 @@ class Navigator:
             events=self._take_events(),
             verdict=self.alarms.verdict,
             alarms=self.alarms.active,
-            distance=self._travelled(t.p_n[0]),
+            distance=self._travelled(t.p_n[0], t.p_sd[0]),
             predicted_s=interval.time - engine.marks[-1].interval.time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
@@ -213,6 +215,7 @@ class Navigator:
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
+        self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
 
     def _consider(self, m: Measurement) -> None:
         """Give a measurement to the engine, unless it is none."""
@@ -246,17 +249,25 @@ class Navigator:
             self.say("start", "assumed", text)
         for text in self._startup.doubts:
             self.say("start", "warning", text)
+        self._located |= any(m.sensor == "fix" for m in self._startup.measurements)
         for measurement in self._startup.measurements:
             self._feed(self.engine, measurement)
         self._startup.measurements = []
 
     def _feed(self, engine: FixedLag, m: Measurement) -> None:
-        before, began = engine.marks[-1] if engine.marks else None, host.perf_counter()
-        if m.sensor == "dvl_water" and m.sensor not in engine.beginning.instruments:
-            if not self.left_out[m.sensor, UNEXPECTED]:
-                self.say(m.sensor, "unused", f"dvl_water: {UNEXPECTED} before what was recorded is smoothed")
-            self.left_out[m.sensor, UNEXPECTED] += 1
-            return
+        began = host.perf_counter()
+        if is_late(m, engine):
+            if self.smooth or not can_join(m, engine):
+                self._leave_unexpected(m.sensor)
+                return
+            engine = self._go_on_with(joined(engine, m.sensor))
+            self.say(m.sensor, "joined", f"{m.sensor}: began after the first seconds, and is used from now on")
+        elif m.sensor == "fix" and not self._located and engine.marks:
+            self._located = True
+            if not self.smooth:
+                engine = self._go_on_with(unlocated(engine))
+                self.say("fix", "joined", "fix: began after the first seconds; the position goes on from it")
+        before = engine.marks[-1] if engine.marks else None
         outcome = engine.add(m)
         if outcome != InsertResult.IN:
             self.left_out[m.sensor, outcome.value] += 1
@@ -272,6 +283,17 @@ class Navigator:
             self.health.step(engine.marks)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
+
+    def _leave_unexpected(self, sensor: str) -> None:
+        if self.smooth and not self.left_out[sensor, UNEXPECTED]:
+            self.say(sensor, "unused", f"{sensor}: {UNEXPECTED} before what was recorded is smoothed")
+        self.left_out[sensor, UNEXPECTED] += 1
+
+    def _go_on_with(self, engine: FixedLag) -> FixedLag:
+        self.engine = engine
+        if self._reinitialisations is not None:
+            self._reinitialisations.again()
+        return engine
 
     def _adopt(self, engine: FixedLag, isam2: "IncrementalEstimator") -> None:
         """Have the filter go on from iSAM2's newest keyframe."""
@@ -314,8 +336,11 @@ class Navigator:
             )
         }
 
-    def _travelled(self, p_n: Array) -> float:
-        """Distance over ground, in steps of a metre at least: less is noise."""
+    def _travelled(self, p_n: Array, sd: Array) -> float:
+        """Distance over ground, in steps of a metre at least: less is noise; none to where a first fix puts it."""
+        if sd.max() > 0.5 * ANYWHERE_M:
+            self._here = np.full(3, np.nan)
+            return self._distance
         step = float(np.linalg.norm(p_n - self._here))
         if not step < 1.0:
             self._distance += step if np.isfinite(step) else 0.0

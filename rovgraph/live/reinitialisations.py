@@ -61,6 +61,10 @@ class Reinitialisations:
                 self.close()
         return self.waited - before
 
+    def again(self) -> None:
+        """What is being smoothed is of no use to a filter that knows more sensors; begin it once more."""
+        self._running = None
+
     def close(self) -> None:
         """Wait for nothing any more."""
         self._due, self._passed, self._running = [], [], None
