@@ -185,6 +185,8 @@ def test_the_worst_alarm_is_the_verdict():
     assert verdict_of(alarms) == "doubtful"
     assert verdict_of(find_alarms([statistic(6.0), statistic(2.0, sensor="mag")], 0.0)) == "wrong"
     assert verdict_of([]) == "trusted"
+    any_is_too_much = [Statistic("taken out", "dvl", 0.0, s, s, 0.0, np.inf, "is so", "do") for s in (3.0, 5.0)]
+    assert [a.figure for a in find_alarms(any_is_too_much, 0.0)] == [5.0]
     assert alarms[0].text == "dvl: something is so; do something"
 
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from dives import Simulated, as_log, changed, falcon, simulated, true_at
+from dives import Simulated, as_log, changed, falcon, simulated, true_at, without
 from live import Flight, flown, message, navigator, turned
 
 from rovgraph.config import Config
@@ -77,8 +77,37 @@ def test_a_ping_that_is_repeated_for_5_s(case):
 
 def test_compasses_beside_steel_for_20_s(case):
     flight = flown(case, lambda m: [turned(m, np.deg2rad(30.0)) if during(m, 20.0, *COMPASSES) else m])
-    assert flight.events("mag") == ["rejected", "readmitted"]
+    assert [kind for kind in flight.events("mag") if kind.endswith("ed")] == ["rejected", "readmitted"]
+    assert "wrong" in flight.events("mag")
     honest(flight)
+
+
+def test_a_dvl_that_locks_onto_something_else_for_a_minute_is_left_out_and_the_sd_grows():
+    case, rng = simulated(falcon(), 100.0, 1, imu_rate=50.0, dvl_rate=4.0), np.random.default_rng(3)
+
+    def alter(m: Measurement) -> list[Measurement]:
+        if m.sensor != "dvl" or not 30.0 <= m.time < 90.0:
+            return [m]
+        values = m.values.copy()
+        values[:3] = np.array([0.9, -0.6, 0.3]) + 0.004 * rng.standard_normal(3)
+        return [m._replace(values=values)]
+
+    flight = flown(case, alter)
+    assert "incoherent" in flight.events("dvl")
+    assert any("dvl: contradicts the other sensors together" in e.text for s in flight.solutions for e in s.events)
+    left_out = flight.time > 30.0 + 15.0
+    assert (np.abs(flight.errors) / flight.sd)[left_out].max() < HONEST_SD
+    assert flight.sd_at(80.0) > 10.0 * flight.sd_at(29.0)
+
+
+def test_a_magnetometer_alone_contradicts_a_heading_that_is_stated_wrongly_and_is_believed_after_a_minute():
+    case = simulated(falcon(heading={"sources": ["mag"]}), 80.0, 1, imu_rate=50.0, dvl_rate=4.0)
+    heading = float(np.rad2deg(case.truth.rpy[0, 2]))
+    config = changed(case.config, start={"heading_deg": heading + 90.0, "heading_sd_deg": 5.0})
+    flight = flown(Simulated(config, case.dive, without(case.log, "dvl_heading")))
+    assert flight.events("mag") == ["rejected", "wrong", "readmitted"]
+    off = flight.solutions[-1].rpy[2] - true_at(case, flight.time[-1:]).rpy[0, 2]
+    assert abs(np.rad2deg(off)) < 2.0
 
 
 def test_an_imu_that_is_silent_for_5_s_while_the_dvl_goes_on(case):

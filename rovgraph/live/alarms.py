@@ -14,6 +14,7 @@ import numpy as np
 from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states
+from rovgraph.engine.gauss_newton import Stretch
 from rovgraph.estimators.alarms import Alarm, Statistic, Verdict, find_alarms, verdict_of
 from rovgraph.estimators.alarms.constants import MOVED, earth_rate_of, moved_constant, sds_moved
 from rovgraph.estimators.alarms.evidence import MINUTE, SensorResiduals
@@ -27,6 +28,7 @@ from rovgraph.estimators.alarms.residuals import (
     too_small_in,
 )
 from rovgraph.estimators.alarms.sensors import frozen_for
+from rovgraph.estimators.alarms.stretches import taken_out_in
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.live.faults import Watch
@@ -77,7 +79,7 @@ class LiveAlarms:
         self._samples: dict[str, list[ProcessedMeasurement]] = {}
         self._pieces: deque[dict[str, SensorResiduals]] = deque(maxlen=round(MINUTE / LASTING_EVERY_S))
         self._lasting: list[Statistic] = []
-        self._differences: list[tuple[float, Statistic]] = []
+        self._told: list[tuple[float, Statistic]] = []
         self._raised: dict[tuple[str, str], _Raised] = {}
 
     @property
@@ -132,7 +134,12 @@ class LiveAlarms:
         """The keyframe from which the filter goes on, of the smoothed dive so far, and as the filter had it."""
         time = float(smoothed.time[-1])
         if not np.isnan(self._start):
-            self._differences += [(time, one) for one in apart(smoothed, filtered, self._start)]
+            self._told += [(time, one) for one in apart(smoothed, filtered, self._start)]
+
+    def taken_out(self, stretch: Stretch) -> None:
+        """A sensor is left out for some time."""
+        if not np.isnan(self._start):
+            self._told.append((stretch.end, taken_out_in(stretch, self._start)))
 
     def _statistics(
         self, known: Gaussian, engine: FilterEngine, watches: Mapping[str, Watch], time: float
@@ -142,7 +149,7 @@ class LiveAlarms:
             of = [counts[sensor] for counts in self._counts if sensor in counts]
             used, rejected = sum(c.used for c in of), sum(c.rejected for c in of)
             if rejected:
-                share = share_rejected(np.array([rejected]), np.array([used + rejected]))[0]
+                share = share_rejected(np.array([float(rejected)]), np.array([float(used + rejected)]))[0]
                 yield rejected_in(sensor, begin, time, float(share), self._start)
             if used >= ENOUGH:
                 dim = engine.initial.instruments[sensor].model.dim
@@ -154,8 +161,8 @@ class LiveAlarms:
             if watch.state == "frozen":
                 yield frozen_for(sensor, watch.since, watch.time, watch.time - watch.since, 1, self._start)
         yield from self._lasting
-        self._differences = [(when, one) for when, one in self._differences if time - when < MINUTE]
-        yield from (one for _, one in self._differences)
+        self._told = [(when, one) for when, one in self._told if time - when < MINUTE]
+        yield from (one for _, one in self._told)
 
     def _constants(self, known: Gaussian, engine: FilterEngine, time: float) -> Iterator[Statistic]:
         """Of the calibration that is estimated, and of the gyro's bias."""

@@ -23,6 +23,7 @@ from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
 from rovgraph.live.health import Health
+from rovgraph.live.incoherence import Incoherence
 from rovgraph.live.intake import Intake
 from rovgraph.live.joining import ANYWHERE_M, can_join, is_late, joined, unlocated
 from rovgraph.live.message import Message, Reading
@@ -80,6 +81,7 @@ class Navigator:
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
+        self._incoherence = Incoherence()
         self._events: list[Event] = []
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
@@ -228,6 +230,8 @@ class Navigator:
             self.engine.retract(m.sensor, verdict.retract_since)
         if not verdict.use:
             self.left_out[m.sensor, self.faults.watches[m.sensor].state] += 1
+        elif self._incoherence.keeps_out(m.sensor, m.time):
+            self.left_out[m.sensor, "incoherent"] += 1
         elif self.engine is None:
             if (beginning := self._startup.add(m, self.origin)) is not None:
                 self._begin(beginning)
@@ -256,17 +260,10 @@ class Navigator:
 
     def _feed(self, engine: FixedLag, m: Measurement) -> None:
         began = host.perf_counter()
-        if is_late(m, engine):
-            if self.smooth or not can_join(m, engine):
-                self._leave_unexpected(m.sensor)
-                return
-            engine = self._go_on_with(joined(engine, m.sensor))
-            self.say(m.sensor, "joined", f"{m.sensor}: began after the first seconds, and is used from now on")
-        elif m.sensor == "fix" and not self._located and engine.marks:
-            self._located = True
-            if not self.smooth:
-                engine = self._go_on_with(unlocated(engine))
-                self.say("fix", "joined", "fix: began after the first seconds; the position goes on from it")
+        joining = self._joined(engine, m)
+        if joining is None:
+            return
+        engine = joining
         before = engine.marks[-1] if engine.marks else None
         outcome = engine.add(m)
         if outcome != InsertResult.IN:
@@ -280,9 +277,26 @@ class Navigator:
                     self._reinitialisations.moved = None
             if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
                 self._adopt(engine, self.isam2)
+            if (stretch := self._incoherence.step(engine)) is not None:
+                self.alarms.taken_out(stretch)
             self.health.step(engine.marks)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
+
+    def _joined(self, engine: FixedLag, m: Measurement) -> FixedLag | None:
+        """The filter that a measurement is for: one that knows its sensor; None where it cannot be used."""
+        if is_late(m, engine):
+            if self.smooth or not can_join(m, engine):
+                self._leave_unexpected(m.sensor)
+                return None
+            engine = self._go_on_with(joined(engine, m.sensor))
+            self.say(m.sensor, "joined", f"{m.sensor}: began after the first seconds, and is used from now on")
+        elif m.sensor == "fix" and not self._located and engine.marks:
+            self._located = True
+            if not self.smooth:
+                engine = self._go_on_with(unlocated(engine))
+                self.say("fix", "joined", "fix: began after the first seconds; the position goes on from it")
+        return engine
 
     def _leave_unexpected(self, sensor: str) -> None:
         if self.smooth and not self.left_out[sensor, UNEXPECTED]:
@@ -312,6 +326,7 @@ class Navigator:
             except InputError as error:
                 self.lose_isam2(str(error))
         self.health.passed(mark)
+        self._incoherence.passed(mark)
         assert self.engine is not None
         self.alarms.passed(mark, self.engine.filter, self.faults.watches, self.time)
 
@@ -321,8 +336,11 @@ class Navigator:
             for text in self._reinitialisations.news:
                 self.say("reinitialisation", "lost", text)
             self._reinitialisations.news = []
-        events = [*self._events, *self.faults.events, *self.health.events, *self.alarms.events]
-        self._events, self.faults.events, self.health.events, self.alarms.events = [], [], [], []
+        events = list(self._events)
+        self._events = []
+        for teller in (self.faults, self._incoherence, self.health, self.alarms):
+            events += teller.events
+            teller.events = []
         return tuple(events)
 
     def _calibration(self, engine: FixedLag, known: Gaussian) -> dict[str, tuple[float, float]]:

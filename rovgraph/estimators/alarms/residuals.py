@@ -51,7 +51,7 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
     """The largest share of a sensor's measurements that was left out in a minute."""
     for r in evidence.residuals.values():
         window = windows(r.time, evidence.start, MINUTE)
-        share = share_rejected(np.bincount(window, r.weight <= 0.0), np.bincount(window))
+        share = share_rejected(np.bincount(window, (r.weight <= 0.0).astype(float)), np.bincount(window).astype(float))
         worst = int(np.argmax(share))
         bad = np.flatnonzero(share > REJECTED)
         begin, end = (bad[0], bad[-1]) if len(bad) else (worst, worst)
@@ -66,7 +66,7 @@ def share_rejected(out: Array, count: Array) -> Array:
     ----------
     out, count : ndarray, shape (m,), those that were rejected, and all
     """
-    by_chance = bdtrc(np.maximum(out - 1, 0), np.maximum(count, 1), USUAL_SHARE) > CHANCE
+    by_chance = bdtrc(np.maximum(out - 1, 0), np.maximum(count, 1).astype(np.int64), USUAL_SHARE) > CHANCE
     return np.where((count < ENOUGH) | by_chance, 0.0, out / np.maximum(count, 1))
 
 
