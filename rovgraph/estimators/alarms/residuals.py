@@ -6,8 +6,10 @@ only the filter's normalised innovations squared (NIS) can tell, whose expectati
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
 from rovgraph.estimators.alarms.alarm import Statistic
@@ -51,7 +53,7 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
     """The largest share of a sensor's measurements that was left out in a minute."""
     for r in evidence.residuals.values():
         window = windows(r.time, evidence.start, MINUTE)
-        share = share_rejected(np.bincount(window, (r.weight <= 0.0).astype(float)), np.bincount(window).astype(float))
+        share = share_rejected(np.bincount(window, r.weight <= 0.0), np.bincount(window))
         worst = int(np.argmax(share))
         bad = np.flatnonzero(share > REJECTED)
         begin, end = (bad[0], bad[-1]) if len(bad) else (worst, worst)
@@ -59,7 +61,7 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
         yield rejected_in(r.sensor, begin_s, end_s, float(share[worst]), evidence.start)
 
 
-def share_rejected(out: Array, count: Array) -> Array:
+def share_rejected(out: NDArray[Any], count: NDArray[Any]) -> Array:
     """Share of rejected measurements in each of m windows, 0 where they are too few to tell, shape (m,).
 
     Parameters
