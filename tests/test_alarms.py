@@ -10,9 +10,23 @@ import time
 import numpy as np
 import pytest
 from broken import BROKEN
-from dives import LIVELY, Simulated, falcon, position_errors, simulated
+from dives import (
+    LIVELY,
+    Simulated,
+    altered,
+    attitude_errors,
+    changed,
+    falcon,
+    position_errors,
+    rms,
+    simulated,
+    true_at,
+    without,
+)
+from test_places import circle
 
 from rovgraph.cli.app import main
+from rovgraph.config import mount_matrix
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Evidence, Statistic, find_alarms, statistics, verdict_of
@@ -20,6 +34,7 @@ from rovgraph.estimators.alarms.alarm import alarm_of
 from rovgraph.estimators.dive import Dive, smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed
+from rovgraph.geometry import rotate, transpose
 
 SECONDS = 200.0
 
@@ -89,6 +104,22 @@ def test_a_constant_that_is_held_wrongly_is_found_with_its_value(name, off):
     assert max(r.significance for r in found) > 5.0
 
 
+@pytest.mark.parametrize("kind", ["places", "isam2"])
+def test_a_constant_that_is_held_wrongly_is_found_on_dives_of_every_solver(kind):
+    wrong = {"calibration": {"dvl_pitch": np.array([0.03])}}
+    if kind == "places":
+        case = circle(1, **wrong)
+    else:
+        case = simulated(falcon(graph={"solver": "isam2"}), 60.0, 2, imu_rate=50.0, dvl_rate=2.0, **wrong)
+    (found,) = [s for s in smooth(case.log, case.config, "smoothed").statistics if "dvl_pitch is held" in s.cause]
+    assert found.kind == "held"
+    assert found.severity is not None
+    plain = without(case.log, "place")
+    chain = smooth(plain, changed(case.config, graph={"solver": "batch"}), "smoothed")
+    (same,) = [s for s in chain.statistics if "dvl_pitch is held" in s.cause]
+    assert found.figure == pytest.approx(same.figure, rel=0.1)
+
+
 def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_released():
     steps = []
     for seed in range(1, 5):
@@ -125,6 +156,24 @@ def test_alarms_are_cheap():
     assert spent < 8.0 * (time.process_time() - began)
 
 
+def test_a_field_that_changes_along_the_way_is_named_and_the_remedy_mends_it():
+    case = simulated(falcon(heading={"sources": ["mag"]}), 150.0, 2, "lawnmower", imu_rate=50.0)
+    mag, begin = case.log["mag"], case.log["imu"].time[0]
+    share = np.clip((mag.time - begin - 60.0) / 20.0, 0.0, 1.0)
+    dip, east = np.deg2rad(72.0 + 8.0 * share), np.deg2rad(case.config.environment.declination_deg)
+    across = np.column_stack([np.cos(dip) * np.cos(east), np.cos(dip) * np.sin(east), np.sin(dip)])
+    more = (1.0 + 0.15 * share)[:, None] * across - across[0]
+    imu_axes = rotate(transpose(true_at(case, mag.time).R_nb), more) @ mount_matrix(case.config.imu.mount_rpy_deg)
+    log = without(altered(case.log, "mag", mag.data + imu_axes), "dvl_heading")
+    held = smooth(log, case.config, "smoothed")
+    assert any("calibration.field_dip.walk_deg: 0.05" in alarm.text for alarm in held.alarms), held.warnings
+    walk = {"field_dip": {"walk_deg": 0.05}, "field_scale": {"walk": 0.001}}
+    walking = smooth(log, changed(case.config, calibration=walk), "smoothed")
+    assert walking.verdict == "trusted"
+    off = [rms(attitude_errors(dive.estimates[0].trajectory, case)[:, 2]) for dive in (held, walking)]
+    assert off[1] < 0.1 * off[0]
+
+
 def statistic(figure: float, kind: str = "rejected", sensor: str = "dvl") -> Statistic:
     return Statistic(kind, sensor, 10.0, 70.0, figure, 1.0, 5.0, "something is so", "do something")
 
@@ -136,6 +185,8 @@ def test_the_worst_alarm_is_the_verdict():
     assert verdict_of(alarms) == "doubtful"
     assert verdict_of(find_alarms([statistic(6.0), statistic(2.0, sensor="mag")], 0.0)) == "wrong"
     assert verdict_of([]) == "trusted"
+    any_is_too_much = [Statistic("taken out", "dvl", 0.0, s, s, 0.0, np.inf, "is so", "do") for s in (3.0, 5.0)]
+    assert [a.figure for a in find_alarms(any_is_too_much, 0.0)] == [5.0]
     assert alarms[0].text == "dvl: something is so; do something"
 
 

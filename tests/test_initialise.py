@@ -415,3 +415,14 @@ def test_a_magnetometer_that_reads_zero_once_is_not_believed_then(row):
     smoother = batch(altered(case.log, "mag", data), free(case))
     assert smoother.assembler.left_out["mag", "exactly zero"] == 1
     assert np.isfinite(smoother.solve().trajectory.p_sd).all()
+
+
+def test_fixes_that_begin_late_say_where_the_dive_began_as_far_as_it_can_have_gone():
+    at = np.array([120.0, 121.0, 122.0])
+    there = np.column_stack([300.0 + 0.3 * np.arange(3), np.full(3, -200.0), np.full(3, np.nan)])
+    log = level_log(
+        125.0, np.array([0, 0, -9.81]), np.zeros(3), 10.0, fix=(at, there), ahrs=(at - 119.0, np.zeros((3, 3)))
+    )
+    prior = initialise(log, Config()).prior
+    assert np.abs(prior.state.p_n[0, :2] - [300.0, -200.0]).max() < 1.0
+    assert prior.p_sd[0] >= 120.0

@@ -94,7 +94,7 @@ def strict(line: bytes) -> dict:
 def test_a_json_line_reads_back_under_the_names_of_the_contract():
     read = strict(json_line(SOLUTION))
     names = ["north", "east", "down", "roll", "pitch", "yaw", "v_north", "v_east", "v_down"]
-    more = "latitude longitude distance predicted_s latency_s update_s calibration sensors events"
+    more = "latitude longitude distance predicted_s latency_s update_s calibration sensors verdict alarms events"
     assert " ".join(read) == " ".join(["time", *names, *(n + "_sd" for n in names), "cov_north_east", more])
     assert read["time"] == SOLUTION.time
     assert [read[n] for n in ("north", "east", "down")] == [10.0, -20.0, 5.5]

@@ -8,9 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from dives import Simulated, falcon, simulated, true_at
+from dives import Simulated, as_log, changed, falcon, simulated, true_at, without
 from live import Flight, flown, message, navigator, turned
 
+from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.incremental import IncrementalEstimator
@@ -22,6 +23,7 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import Session
 from rovgraph.live.warnings import Warnings
 from rovgraph.log import Log, Measurement, Stream
+from rovgraph.simulate import simulated as by_name
 
 AT = 20.0  # when something fails
 SETTLED_S = 8.0  # from when on solutions are looked at
@@ -75,8 +77,37 @@ def test_a_ping_that_is_repeated_for_5_s(case):
 
 def test_compasses_beside_steel_for_20_s(case):
     flight = flown(case, lambda m: [turned(m, np.deg2rad(30.0)) if during(m, 20.0, *COMPASSES) else m])
-    assert flight.events("mag") == ["rejected", "readmitted"]
+    assert [kind for kind in flight.events("mag") if kind.endswith("ed")] == ["rejected", "readmitted"]
+    assert "wrong" in flight.events("mag")
     honest(flight)
+
+
+def test_a_dvl_that_locks_onto_something_else_for_a_minute_is_left_out_and_the_sd_grows():
+    case, rng = simulated(falcon(), 100.0, 1, imu_rate=50.0, dvl_rate=4.0), np.random.default_rng(3)
+
+    def alter(m: Measurement) -> list[Measurement]:
+        if m.sensor != "dvl" or not 30.0 <= m.time < 90.0:
+            return [m]
+        values = m.values.copy()
+        values[:3] = np.array([0.9, -0.6, 0.3]) + 0.004 * rng.standard_normal(3)
+        return [m._replace(values=values)]
+
+    flight = flown(case, alter)
+    assert "incoherent" in flight.events("dvl")
+    assert any("dvl: contradicts the other sensors together" in e.text for s in flight.solutions for e in s.events)
+    left_out = flight.time > 30.0 + 15.0
+    assert (np.abs(flight.errors) / flight.sd)[left_out].max() < HONEST_SD
+    assert flight.sd_at(80.0) > 10.0 * flight.sd_at(29.0)
+
+
+def test_a_magnetometer_alone_contradicts_a_heading_that_is_stated_wrongly_and_is_believed_after_a_minute():
+    case = simulated(falcon(heading={"sources": ["mag"]}), 80.0, 1, imu_rate=50.0, dvl_rate=4.0)
+    heading = float(np.rad2deg(case.truth.rpy[0, 2]))
+    config = changed(case.config, start={"heading_deg": heading + 90.0, "heading_sd_deg": 5.0})
+    flight = flown(Simulated(config, case.dive, without(case.log, "dvl_heading")))
+    assert flight.events("mag") == ["rejected", "wrong", "readmitted"]
+    off = flight.solutions[-1].rpy[2] - true_at(case, flight.time[-1:]).rpy[0, 2]
+    assert abs(np.rad2deg(off)) < 2.0
 
 
 def test_an_imu_that_is_silent_for_5_s_while_the_dvl_goes_on(case):
@@ -232,11 +263,45 @@ def test_thruster_lines_that_change_their_count_are_left_out_and_the_estimate_be
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_water_track_is_used_from_the_start_on_and_one_that_begins_late_is_said_not_to_be(late):
-    case = simulated(falcon(), 40.0, seed=1, dvl_rate=4.0, water_track=True)
-    flight = flown(case, lambda m: [] if late and m.sensor == "dvl_water" and m.time < AT else [m])
-    assert (flight.navigator.health.used["dvl_water"] > 10) != late
-    assert flight.events("dvl_water") == (["unused"] if late else [])
+def test_water_track_is_used_whenever_it_begins_and_carries_the_filter_where_the_bottom_is_lost(late):
+    case = simulated(falcon(), 60.0, seed=1, dvl_rate=4.0, water_track=True)
+
+    def alter(m: Measurement) -> list[Measurement]:
+        lost = m.sensor == "dvl" and m.time > 35.0
+        return [] if lost or (late and m.sensor == "dvl_water" and m.time < AT) else [m]
+
+    flight = flown(case, alter)
+    assert flight.events("dvl_water") == (["joined"] if late else [])
+    assert flight.navigator.health.used["dvl_water"] > 100
+    honest(flight)
+    assert flight.sd_at(59.0) < 0.5 * flown(case, lambda m: [] if m.sensor == "dvl_water" else alter(m)).sd_at(59.0)
+
+
+def test_thruster_signals_are_used_whenever_they_begin():
+    dive, config = by_name("docking", 1)
+    config = changed(config, graph={"hydrodynamics": True})
+    case = Simulated(config, dive, as_log(dive.log_frame[dive.log_frame["time"] < 40.0]))
+    flight = flown(case, lambda m: [] if m.sensor == "thruster" and m.time < AT else [m])
+    assert flight.events("thruster")[0] == "joined"
+    assert flight.navigator.health.used["thruster"] > 50
+    honest(flight)
+
+
+def test_fixes_that_begin_late_say_where_the_vehicle_is():
+    config = falcon(fix={"sd_m": 0.5}).model_copy(update={"start": Config().start})
+    case = simulated(config, 60.0, seed=1, dvl_rate=4.0, fix_interval=1.0)
+    away = np.array([300.0, -200.0, 0.0])
+
+    def alter(m: Measurement) -> list[Measurement]:
+        return [m] if m.sensor != "fix" else [m._replace(values=m.values + away)] if m.time > 25.0 else []
+
+    flight = flown(case, alter)
+    assert flight.events("fix") == ["joined"]
+    assert flight.navigator.health.rejected["fix"] <= 1
+    after = flight.time > 26.0
+    assert (np.abs(flight.errors - away[:2]) / flight.sd)[after].max() < HONEST_SD
+    assert flight.solutions[-1].distance < 60.0
+    assert flight.solutions[-1].verdict == "trusted"
 
 
 @pytest.mark.parametrize("lag", [2.0, 20.0])

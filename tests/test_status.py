@@ -63,6 +63,7 @@ def test_it_says_where_how_sure_and_how_the_sensors_are():
         "misalignment -21.5 ± 1.9 deg",
         "update 3.1 ms, predicted over 0.15 s, 12 ms after arrival",
         "sensors imu ok, dvl silent for 12.0 s (10 of 100 rejected), depth rejected",
+        "verdict trusted",
         "22:13:21 UTC dvl silent: no ping",
     ]
 

@@ -72,6 +72,8 @@ def finished(out: Path, session: "Session", refine: bool) -> None:
         out,
         {
             "state": "finished",
+            "verdict": solution.verdict,
+            "alarms": [vars(alarm) for alarm in navigator.alarms.history.values()],
             "time": solution.time,
             "position_m": solution.position.tolist(),
             "position_sd_m": solution.position_sd.tolist(),

@@ -12,9 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates
+from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.widened_chain import widened
+from rovgraph.state import PLACE
 
 WIDE = 100.0  # times the prior sd: what is released is free
 
@@ -38,6 +43,20 @@ class Released:
     def significance(self) -> float:
         """The step in its sds, positive."""
         return abs(self.step) / self.sd
+
+
+def as_chain(best: Optimum, initial: InitialConditions) -> ChainOptimum:
+    """A dive as `release` takes it: itself, or where places were seen, its chain without them about the same point.
+
+    The step of a constant is then what all other measurements say of it.
+    """
+    if isinstance(best, ChainOptimum):
+        return best
+    intervals = [replace(i, measurements=[m for m in i.measurements if m.sensor != PLACE]) for i in best.intervals]
+    rows = DiveRows.of(intervals, [*initial.instruments])
+    gates = {sensor: gate for sensor, gate in best.solution.gates.items() if sensor != PLACE}
+    chain = Chain(intervals, initial, best.beliefs, best.unknowns, rows)
+    return ChainOptimum(chain, replace(best.solution, point=best.state, gates=gates))
 
 
 def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None) -> list[Released]:

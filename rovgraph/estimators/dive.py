@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
@@ -14,6 +15,9 @@ from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
+
+if TYPE_CHECKING:
+    from rovgraph.estimators.incremental import IncrementalEstimator
 
 Progress = Callable[[str, float], None]
 
@@ -81,8 +85,11 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     beginning = initialise(log, config)
     batch = assemble(log, beginning)
     if config.graph.solver == "isam2":
-        both, best = _isam2(batch, progress), None
-        estimates = [one for one in both if estimate in ("both", one.kind)]
+        solver = _isam2(batch, progress)
+        best = solver.optimum() if estimate != "filtered" else None
+        estimates = [] if best is None else [smoothed(best, solver.beginning)]
+        if estimate != "smoothed":
+            estimates.append(solver.filtered())
     else:
         estimates, states, best = [], None, None
         if estimate != "smoothed":
@@ -135,8 +142,8 @@ def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
     return estimator
 
 
-def _isam2(batch: BatchSmoother, progress: Progress) -> list[Estimate]:
-    """Smoothed and filtered, of one pass of iSAM2, or of two where late stamps were found to belong elsewhere."""
+def _isam2(batch: BatchSmoother, progress: Progress) -> "IncrementalEstimator":
+    """One pass of iSAM2, or two where late stamps were found to belong elsewhere."""
     from rovgraph.estimators.incremental import run_isam2  # GTSAM is slow to load, and not everywhere to be had
 
     progress("incremental smoothing", 0.0)
@@ -145,4 +152,4 @@ def _isam2(batch: BatchSmoother, progress: Progress) -> list[Estimate]:
     again = batch.placed_again(solver.latest().calibration)
     if again is not None:
         solver = run_isam2(again.intervals, again.beginning, report)
-    return [solver.solve(), solver.filtered()]
+    return solver

@@ -153,8 +153,9 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
     p_n = np.array([start.north_m, start.east_m, 0.0 if start.down_m is None else start.down_m])
     sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
     if "fix" in log and not start.model_fields_set & {"north_m", "east_m"}:
-        fixes = _opening(log["fix"], begin, WITHIN_S)
+        fixes = log["fix"]
         if len(fixes):
+            fixes = _opening(fixes, fixes.time[0], WITHIN_S)  # however late they begin: the frame is theirs
             here, own_sd = _first_fix(fixes, config.fix.sd_m)
             p_n[:2] = here - rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
             sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))

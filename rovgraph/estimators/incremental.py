@@ -179,8 +179,12 @@ class IncrementalEstimator:
 
     def solve(self) -> Estimate:
         """The smoothed trajectory with its uncertainty."""
+        return smoothed(self.optimum(), self.beginning)
+
+    def optimum(self) -> Optimum:
+        """The optimum of all that was taken, which is where the smoothed trajectory comes from."""
         self.update()
-        return smoothed(self._optimum(), self.beginning)
+        return self._optimum()
 
     def _optimum(self) -> Optimum:
         """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""

@@ -53,7 +53,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     sources = heading_sources(config, log.sensors)
     present = log.sensors | set(expected)
     own = [s for s in sensors if s in present and s != "thruster" and SENSORS[s].heading_source is None]
-    used = own + heading_sources(config, present) + _thrusters(log, config)
+    used = own + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 
@@ -85,9 +85,9 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     return InitialConditions(config, sensors, prior, assumptions)
 
 
-def _thrusters(log: Log, config: Config) -> list[str]:
-    """The stream of thruster signals, where hydrodynamics are asked for."""
-    if not config.graph.hydrodynamics:
+def _thrusters(log: Log, config: Config, expected: Collection[str]) -> list[str]:
+    """The stream of thruster signals, where hydrodynamics are asked for and it does not come later."""
+    if not config.graph.hydrodynamics or ("thruster" in expected and "thruster" not in log):
         return []
     wanted = len(config.vehicle.thrusters)
     if "thruster" not in log:

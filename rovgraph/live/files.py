@@ -14,6 +14,7 @@ import pymap3d
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.live.checkpoint import read_checkpoint
@@ -31,7 +32,7 @@ CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  
 SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
-ANEW_S = 600.0  # a recording that is shorter is estimated anew: the filter is still to be renewed
+ANEW_S = REINITIALISE_AT_S[-1]  # a recording that is shorter is estimated anew: the filter is still to be renewed
 LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
 
 

@@ -19,10 +19,13 @@ from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
 from rovgraph.geometry import Array
+from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.faults import Faults
 from rovgraph.live.health import Health
+from rovgraph.live.incoherence import Incoherence
 from rovgraph.live.intake import Intake
+from rovgraph.live.joining import ANYWHERE_M, can_join, is_late, joined, unlocated
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
@@ -47,7 +50,7 @@ class Navigator:
     patient : wait for the thread that smooths, so that a replay can be repeated
     reinitialise : the filter from the smoothed dive so far, now and then
     smooth : have iSAM2 estimate the whole dive as it goes; the filter goes on from its newest keyframe
-    clocks, faults, health : of the sources, and of the sensors
+    clocks, faults, health, alarms : of the sources, of the sensors, and of the estimate
     isam2 : iSAM2, where it was asked for; it takes each keyframe that the lag has passed
     engine : None until the first seconds are over
     time : of the newest measurement, or of the last `tick` [s]
@@ -63,6 +66,7 @@ class Navigator:
     clocks: Clocks = field(default_factory=Clocks)
     faults: Faults = field(default_factory=Faults)
     health: Health = field(default_factory=Health)
+    alarms: LiveAlarms = field(default_factory=LiveAlarms)
     engine: FixedLag | None = None
     isam2: "IncrementalEstimator | None" = None
     time: float = -np.inf
@@ -77,9 +81,11 @@ class Navigator:
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
+        self._incoherence = Incoherence()
         self._events: list[Event] = []
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
+        self._located = bool(self.config.start.model_fields_set & {"north_m", "east_m"})  # where the fixes count from
 
     @property
     def origin(self) -> tuple[float, float] | None:
@@ -178,7 +184,9 @@ class Navigator:
             calibration=self._calibration(engine, known),
             sensors=self.health.of(self.faults.watches, self.time),
             events=self._take_events(),
-            distance=self._travelled(t.p_n[0]),
+            verdict=self.alarms.verdict,
+            alarms=self.alarms.active,
+            distance=self._travelled(t.p_n[0], t.p_sd[0]),
             predicted_s=interval.time - engine.marks[-1].interval.time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
@@ -209,6 +217,7 @@ class Navigator:
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
+        self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
 
     def _consider(self, m: Measurement) -> None:
         """Give a measurement to the engine, unless it is none."""
@@ -221,6 +230,8 @@ class Navigator:
             self.engine.retract(m.sensor, verdict.retract_since)
         if not verdict.use:
             self.left_out[m.sensor, self.faults.watches[m.sensor].state] += 1
+        elif self._incoherence.keeps_out(m.sensor, m.time):
+            self.left_out[m.sensor, "incoherent"] += 1
         elif self.engine is None:
             if (beginning := self._startup.add(m, self.origin)) is not None:
                 self._begin(beginning)
@@ -242,17 +253,18 @@ class Navigator:
             self.say("start", "assumed", text)
         for text in self._startup.doubts:
             self.say("start", "warning", text)
+        self._located |= any(m.sensor == "fix" for m in self._startup.measurements)
         for measurement in self._startup.measurements:
             self._feed(self.engine, measurement)
         self._startup.measurements = []
 
     def _feed(self, engine: FixedLag, m: Measurement) -> None:
-        before, began = engine.marks[-1] if engine.marks else None, host.perf_counter()
-        if m.sensor == "dvl_water" and m.sensor not in engine.beginning.instruments:
-            if not self.left_out[m.sensor, UNEXPECTED]:
-                self.say(m.sensor, "unused", f"dvl_water: {UNEXPECTED} before what was recorded is smoothed")
-            self.left_out[m.sensor, UNEXPECTED] += 1
+        began = host.perf_counter()
+        joining = self._joined(engine, m)
+        if joining is None:
             return
+        engine = joining
+        before = engine.marks[-1] if engine.marks else None
         outcome = engine.add(m)
         if outcome != InsertResult.IN:
             self.left_out[m.sensor, outcome.value] += 1
@@ -260,11 +272,42 @@ class Navigator:
             waited = 0.0
             if self._reinitialisations is not None:
                 waited = self._reinitialisations.step(engine)
+                if self._reinitialisations.moved is not None:
+                    self.alarms.reinitialised(*self._reinitialisations.moved)
+                    self._reinitialisations.moved = None
             if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
                 self._adopt(engine, self.isam2)
+            if (stretch := self._incoherence.step(engine)) is not None:
+                self.alarms.taken_out(stretch)
             self.health.step(engine.marks)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
+
+    def _joined(self, engine: FixedLag, m: Measurement) -> FixedLag | None:
+        """The filter that a measurement is for: one that knows its sensor; None where it cannot be used."""
+        if is_late(m, engine):
+            if self.smooth or not can_join(m, engine):
+                self._leave_unexpected(m.sensor)
+                return None
+            engine = self._go_on_with(joined(engine, m.sensor))
+            self.say(m.sensor, "joined", f"{m.sensor}: began after the first seconds, and is used from now on")
+        elif m.sensor == "fix" and not self._located and engine.marks:
+            self._located = True
+            if not self.smooth:
+                engine = self._go_on_with(unlocated(engine))
+                self.say("fix", "joined", "fix: began after the first seconds; the position goes on from it")
+        return engine
+
+    def _leave_unexpected(self, sensor: str) -> None:
+        if self.smooth and not self.left_out[sensor, UNEXPECTED]:
+            self.say(sensor, "unused", f"{sensor}: {UNEXPECTED} before what was recorded is smoothed")
+        self.left_out[sensor, UNEXPECTED] += 1
+
+    def _go_on_with(self, engine: FixedLag) -> FixedLag:
+        self.engine = engine
+        if self._reinitialisations is not None:
+            self._reinitialisations.again()
+        return engine
 
     def _adopt(self, engine: FixedLag, isam2: "IncrementalEstimator") -> None:
         """Have the filter go on from iSAM2's newest keyframe."""
@@ -283,6 +326,9 @@ class Navigator:
             except InputError as error:
                 self.lose_isam2(str(error))
         self.health.passed(mark)
+        self._incoherence.passed(mark)
+        assert self.engine is not None
+        self.alarms.passed(mark, self.engine.filter, self.faults.watches, self.time)
 
     def _take_events(self) -> tuple[Event, ...]:
         """All that happened since they were last taken."""
@@ -290,8 +336,11 @@ class Navigator:
             for text in self._reinitialisations.news:
                 self.say("reinitialisation", "lost", text)
             self._reinitialisations.news = []
-        events = [*self._events, *self.faults.events, *self.health.events]
-        self._events, self.faults.events, self.health.events = [], [], []
+        events = list(self._events)
+        self._events = []
+        for teller in (self.faults, self._incoherence, self.health, self.alarms):
+            events += teller.events
+            teller.events = []
         return tuple(events)
 
     def _calibration(self, engine: FixedLag, known: Gaussian) -> dict[str, tuple[float, float]]:
@@ -305,8 +354,11 @@ class Navigator:
             )
         }
 
-    def _travelled(self, p_n: Array) -> float:
-        """Distance over ground, in steps of a metre at least: less is noise."""
+    def _travelled(self, p_n: Array, sd: Array) -> float:
+        """Distance over ground, in steps of a metre at least: less is noise; none to where a first fix puts it."""
+        if sd.max() > 0.5 * ANYWHERE_M:
+            self._here = np.full(3, np.nan)
+            return self._distance
         step = float(np.linalg.norm(p_n - self._here))
         if not step < 1.0:
             self._distance += step if np.isfinite(step) else 0.0

@@ -15,6 +15,7 @@ from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.estimators.eskf.reinitialisation import reinitialised
 from rovgraph.geometry import Array
+from rovgraph.trajectory import Trajectory
 
 Keyframe = tuple[KeyframeInterval, Array, Array]  # its interval, state vector and calibration vector
 
@@ -27,11 +28,13 @@ class Reinitialisations:
     ----------
     patient : wait for the thread, so that a replay can be repeated
     news : what went wrong, one line each, since it was last emptied
+    moved : the newest keyframe that was adopted, smoothed and as the filter had it, until it is taken
     waited : for the thread, which only a replay does that is faster than it [s]
     """
 
     patient: bool
     news: list[str] = field(default_factory=list)
+    moved: tuple[Trajectory, Trajectory] | None = None
     waited: float = 0.0
 
     def __post_init__(self) -> None:
@@ -57,6 +60,10 @@ class Reinitialisations:
                 self.news.append(f"the filter is reinitialised no more ({error}); it goes on as it is")
                 self.close()
         return self.waited - before
+
+    def again(self) -> None:
+        """What is being smoothed is of no use to a filter that knows more sensors; begin it once more."""
+        self._running = None
 
     def close(self) -> None:
         """Wait for nothing any more."""
@@ -85,7 +92,11 @@ class Reinitialisations:
         for interval in [*(i for i, _, _ in self._passed if i.index > index), *waiting]:
             if index < interval.index <= oldest:
                 known = engine.filter.step(interval, known, gates).filtered
-        engine.adopt(max(index, oldest), known)
+        newest = max(index, oldest)
+        before = next((mark for mark in engine.marks if mark.interval.index == newest), None)
+        if engine.adopt(newest, known) and before is not None:
+            after, filtered = (engine.trajectory([before.interval], [one]) for one in (known, before.known))
+            self.moved = after, filtered
         self._due.pop(0)
         self._running = None
         if not self._due:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from rovgraph.estimators.alarms import Alarm, Verdict
 from rovgraph.geometry import Array
 
 
@@ -15,7 +16,8 @@ class Event:
     ----------
     time : [s], the estimate's time
     source : sensor or source that it is about
-    kind : short and fixed, as "rejected", "readmitted", "silent", "frozen", "gap", "clock"
+    kind : short and fixed, as "rejected", "readmitted", "silent", "frozen", "gap", "clock",
+        "doubtful", "wrong", "over"
     text : one line for a person
     """
 
@@ -61,6 +63,7 @@ class Solution:
     calibration : label -> (value, sd), radians and SI
     sensors : name of the stream -> SensorHealth
     events : since the last solution
+    verdict, alarms : of the estimate now, and what it comes of
     distance : travelled [m]
     predicted_s : how far the IMU alone carried it beyond the newest keyframe [s]
     latency_s : from the arrival of the newest measurement to this, or None in a replay
@@ -80,6 +83,8 @@ class Solution:
     calibration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     sensors: Mapping[str, SensorHealth] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
+    verdict: Verdict = "trusted"
+    alarms: tuple[Alarm, ...] = ()
     distance: float = 0.0
     predicted_s: float = 0.0
     latency_s: float | None = None

@@ -15,6 +15,7 @@ from rovgraph.report.units import plus_minus
 REFRESH = 4.0  # [Hz]
 NEWEST = 5  # events shown
 UNIX = 1e9  # a time beyond this counts from 1970 [s]
+VERDICTS = {"trusted": "green", "doubtful": "yellow", "wrong": "red"}
 COLOURS = {"ok": "green", "no lock": "yellow", "rejected": "yellow", "frozen": "red", "silent": "red"}
 
 
@@ -103,7 +104,11 @@ def _rows(s: Solution) -> list[tuple[str, Text]]:
         rows.append(("misalignment", _degrees(*s.calibration["dvl_yaw"])))
     update = f"{1e3 * s.update_s:.1f} ms, predicted over {s.predicted_s:.2f} s"
     rows.append(("update", update if s.latency_s is None else f"{update}, {1e3 * s.latency_s:.0f} ms after arrival"))
-    return [*((name, Text(text)) for name, text in rows), ("sensors", _sensors(s))]
+    verdict = (
+        "verdict",
+        Text(", ".join([s.verdict, *(f"{a.sensor} {a.kind}" for a in s.alarms)]), VERDICTS[s.verdict]),
+    )
+    return [*((name, Text(text)) for name, text in rows), ("sensors", _sensors(s)), verdict]
 
 
 def _sensors(solution: Solution) -> Text:

@@ -199,4 +199,5 @@ THRUSTER = Sensor(
     standard_deviation=_of_mean,
     observes=Observed("velocity"),
     linear_in="current",
+    may_begin_later=True,
 )

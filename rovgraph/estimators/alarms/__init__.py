@@ -13,6 +13,8 @@ from rovgraph.estimators.alarms.evidence import Evidence
 
 __all__ = ["Alarm", "Evidence", "Severity", "Statistic", "Verdict", "find_alarms", "statistics", "verdict_of"]
 
+TINY = 1e-9  # a limit may be 0
+
 STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     dvl_cause,
     constants.held,
@@ -53,4 +55,4 @@ def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
 
 
 def _badness(alarm: Alarm) -> tuple[bool, float]:
-    return alarm.severity == "wrong", alarm.figure / alarm.limit
+    return alarm.severity == "wrong", alarm.figure / max(alarm.limit, TINY)

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from rovgraph.calibration import TABLE
-from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.released import Released, release
+from rovgraph.engine.released import Released, as_chain, release
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
-from rovgraph.geometry import EARTH_RATE
+from rovgraph.estimators.estimate import CalibrationEstimate
+from rovgraph.geometry import EARTH_RATE, Array
 
 # Of the 25 components of a dive one is beyond 3 sds in every fifteenth healthy dive, beyond 5 in one of 70000;
 # what is not linear in them makes up for the difference.
@@ -34,19 +34,8 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
     What data move of a healthy variable has the variance prior_sd^2 - sd^2.
     """
     for c in evidence.main.calibration:
-        if not c.estimated or c.sd > NARROWED * c.prior_sd:
-            continue
-        off = (c.value - c.prior_mean) / np.sqrt(c.prior_sd**2 - c.sd**2)
-        shown, unit = _shown(c.unit)
-        name = next((n for n in TABLE if c.label in TABLE[n].labels), c.label)
-        yield _moved(
-            evidence,
-            _sensor_of(name),
-            abs(float(off)),
-            f"{c.label} came out at {shown * c.value:.3g}{unit}, {abs(off):.0f} sd from the "
-            f"{shown * c.prior_mean:.3g} ± {shown * c.prior_sd:.2g}{unit} that was believed",
-            f"check {_key_of(name)}; if it is as it is, state its mean or a larger sd in calibration.{name}",
-        )
+        if c.estimated:
+            yield from moved_constant(c, evidence.start, evidence.end)
     prior = evidence.beginning.prior
     for name, part, key in BIASES:
         history = evidence.main.history.get(name)
@@ -56,7 +45,8 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
         off = (history.value[0] - mean) / np.sqrt(np.maximum(sd**2 - history.sd[0] ** 2, (1.0 - NARROWED**2) * sd**2))
         worst = int(np.argmax(np.abs(off)))
         yield _moved(
-            evidence,
+            evidence.start,
+            evidence.end,
             "imu",
             float(np.abs(off[worst])),
             f"{history.labels[worst]} began at {history.value[0, worst]:.3g} {history.unit}, "
@@ -65,22 +55,48 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
         )
 
 
-def _moved(evidence: Evidence, sensor: str, figure: float, cause: str, remedy: str) -> Statistic:
-    return Statistic("moved", sensor, evidence.start, evidence.end, figure, MOVED, FAR_MOVED, cause, remedy)
+def moved_constant(c: CalibrationEstimate, begin: float, end: float) -> Iterator[Statistic]:
+    """One that is estimated against its prior, where the data of a time [s] have narrowed it."""
+    off = float(sds_moved(np.array(c.value), np.array(c.sd), np.array(c.prior_mean), np.array(c.prior_sd)))
+    if c.sd > NARROWED * c.prior_sd:
+        return
+    shown, unit = _shown(c.unit)
+    name = next((n for n in TABLE if c.label in TABLE[n].labels), c.label)
+    yield _moved(
+        begin,
+        end,
+        _sensor_of(name),
+        off,
+        f"{c.label} came out at {shown * c.value:.3g}{unit}, {off:.0f} sd from the "
+        f"{shown * c.prior_mean:.3g} ± {shown * c.prior_sd:.2g}{unit} that was believed",
+        f"check {_key_of(name)}; if it is as it is, state its mean or a larger sd in calibration.{name}",
+    )
+
+
+def sds_moved(value: Array, sd: Array, prior_mean: Array, prior_sd: Array) -> Array:
+    """How far data have moved n constants, in sds of what they do to right ones; 0 where they hardly narrowed them."""
+    narrowed = sd <= NARROWED * prior_sd
+    by_data = np.sqrt(np.where(narrowed, prior_sd**2 - sd**2, np.inf))
+    return np.asarray(np.abs(value - prior_mean) / by_data)
+
+
+def _moved(begin: float, end: float, sensor: str, figure: float, cause: str, remedy: str) -> Statistic:
+    return Statistic("moved", sensor, begin, end, figure, MOVED, FAR_MOVED, cause, remedy)
 
 
 def held(evidence: Evidence) -> Iterator[Statistic]:
     """Constants that are held, released one by one: the score test of `rovgraph.engine.released`."""
-    if not isinstance(evidence.optimum, ChainOptimum):
+    if evidence.optimum is None:
         return
+    best = as_chain(evidence.optimum, evidence.beginning)
     v, v_sd = evidence.main.trajectory.v_n, evidence.main.trajectory.v_sd
     moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
-    for r in release(evidence.optimum, [name for name in RELEASED if moving or not name.startswith("dvl")]):
+    for r in release(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]
         if r.sd > SHOWN * variable.sd:
             continue
         shown, unit = _shown(variable.unit)
-        belief = evidence.optimum.beliefs[r.name]
+        belief = best.beliefs[r.name]
         mean, allowed = belief.mean[variable.labels.index(r.label)], belief.sd if belief.considered else 0.0
         yield Statistic(
             "held",
@@ -104,12 +120,16 @@ def earth_rate(evidence: Evidence) -> Iterator[Statistic]:
     history = evidence.main.history.get("gyr_bias")
     if history is None or evidence.beginning.config.environment.earth_rotation:
         return
-    sd = float(history.sd.min())
-    yield Statistic(
+    yield earth_rate_of(float(history.sd.min()), evidence.start, evidence.end)
+
+
+def earth_rate_of(sd: float, begin: float, end: float) -> Statistic:
+    """The Earth's rate against a gyro's bias that is claimed to ``sd`` [rad/s]."""
+    return Statistic(
         "earth rate",
         "imu",
-        evidence.start,
-        evidence.end,
+        begin,
+        end,
         EARTH_RATE / sd,
         FEELS_THE_EARTH,
         np.inf,

@@ -10,6 +10,7 @@ from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence, windows
 from rovgraph.geometry import Array, wrap_angle
+from rovgraph.trajectory import Trajectory
 
 CHANCE = 1e-6  # that a figure of a healthy dive is beyond its limit
 IMU_S = 20.0  # over which errors of the IMU last that are no noise
@@ -73,8 +74,12 @@ def estimates(evidence: Evidence) -> Iterator[Statistic]:
     smoothed, filtered = evidence.estimate("smoothed"), evidence.estimate("filtered")
     if smoothed is None or filtered is None or len(smoothed.trajectory) != len(filtered.trajectory):
         return
-    s, f = smoothed.trajectory, filtered.trajectory
-    at = np.flatnonzero(s.time >= evidence.start + SETTLED_S)
+    yield from apart(smoothed.trajectory, filtered.trajectory, evidence.start)
+
+
+def apart(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statistic]:
+    """A smoothed and a filtered track of the same epochs, of a dive that began at ``start`` [s]."""
+    at = np.flatnonzero(s.time >= start + SETTLED_S)
     at = at[:: max(len(at) // COARSE, 1)]
     if not len(at):
         return
@@ -83,12 +88,12 @@ def estimates(evidence: Evidence) -> Iterator[Statistic]:
     heading = turned**2 / (f.cov_theta[at, 2, 2] + s.cov_theta[at, 2, 2])
     level = np.einsum("ni,nij,nj->n", d[:, :2], np.linalg.inv(P[:, :2, :2]), d[:, :2])
     depth = d[:, 2] ** 2 / P[:, 2, 2]
-    apart = {
+    sizes = {
         "position": (level, np.linalg.norm(d[:, :2], axis=1), "m"),
         "depth": (depth, np.abs(d[:, 2]), "m"),
         "heading": (heading, np.rad2deg(np.abs(turned)), "deg"),
     }
-    for what, (square, size, unit) in apart.items():
+    for what, (square, size, unit) in sizes.items():
         k = int(np.argmax(square))
         yield Statistic(
             "estimates",
@@ -99,6 +104,6 @@ def estimates(evidence: Evidence) -> Iterator[Statistic]:
             JUMP,
             LARGE_JUMP,
             f"smoothed and filtered {what} differ by {size[k]:.2g} {unit}, {np.sqrt(square[k]):.0f} joint sds, "
-            f"at {evidence.since(float(s.time[at[k]])):.0f} s",
+            f"at {float(s.time[at[k]]) - start:.0f} s",
             "something that was believed then was given up later: look at the residuals before that time",
         )

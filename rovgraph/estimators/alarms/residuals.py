@@ -6,12 +6,15 @@ only the filter's normalised innovations squared (NIS) can tell, whose expectati
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
 from rovgraph.estimators.alarms.alarm import Statistic
-from rovgraph.estimators.alarms.evidence import MINUTE, Evidence, SensorResiduals, windows
+from rovgraph.estimators.alarms.evidence import MINUTE, Evidence, SensorResiduals, span, windows
+from rovgraph.geometry import Array
 
 CHANCE = 1e-6  # that a figure of a healthy sensor is beyond its limit
 ENOUGH = 20  # measurements
@@ -35,6 +38,11 @@ SD_KEY = {
     "thruster": "vehicle.acceleration_sd_mps2",
 }
 
+_CHANGING_FIELD = (
+    "; where the Earth's field changes along the way, state calibration.field_dip.walk_deg: 0.05 "
+    "and calibration.field_scale.walk: 0.001"
+)
+
 
 def sd_key(sensor: str) -> str:
     """The configuration's key of a sensor's noise."""
@@ -45,26 +53,40 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
     """The largest share of a sensor's measurements that was left out in a minute."""
     for r in evidence.residuals.values():
         window = windows(r.time, evidence.start, MINUTE)
-        out, count = np.bincount(window, r.weight <= 0.0), np.bincount(window)
-        by_chance = bdtrc(np.maximum(out - 1, 0), np.maximum(count, 1), USUAL_SHARE) > CHANCE
-        share = np.where((count < ENOUGH) | by_chance, 0.0, out / np.maximum(count, 1))
+        share = share_rejected(np.bincount(window, r.weight <= 0.0), np.bincount(window))
         worst = int(np.argmax(share))
         bad = np.flatnonzero(share > REJECTED)
         begin, end = (bad[0], bad[-1]) if len(bad) else (worst, worst)
         begin_s, end_s = evidence.start + begin * MINUTE, min(evidence.start + (end + 1) * MINUTE, evidence.end)
-        yield Statistic(
-            "rejected",
-            r.sensor,
-            begin_s,
-            end_s,
-            float(share[worst]),
-            REJECTED,
-            MOSTLY_REJECTED,
-            f"up to {share[worst]:.0%} of a minute's measurements contradict the others and were left out, "
-            f"{evidence.span(begin_s, end_s)}",
-            f"take that time out of the log if it is the instrument; if it is everywhere, check its mounting, signs "
-            f"and clock (rovgraph check), and {sd_key(r.sensor)}",
-        )
+        yield rejected_in(r.sensor, begin_s, end_s, float(share[worst]), evidence.start)
+
+
+def share_rejected(out: NDArray[Any], count: NDArray[Any]) -> Array:
+    """Share of rejected measurements in each of m windows, 0 where they are too few to tell, shape (m,).
+
+    Parameters
+    ----------
+    out, count : ndarray, shape (m,), those that were rejected, and all
+    """
+    by_chance = bdtrc(np.maximum(out - 1, 0), np.maximum(count, 1).astype(np.int64), USUAL_SHARE) > CHANCE
+    return np.where((count < ENOUGH) | by_chance, 0.0, out / np.maximum(count, 1))
+
+
+def rejected_in(sensor: str, begin: float, end: float, share: float, start: float) -> Statistic:
+    """A share of rejected measurements in a minute; ``start`` is when the dive began [s]."""
+    return Statistic(
+        "rejected",
+        sensor,
+        begin,
+        end,
+        share,
+        REJECTED,
+        MOSTLY_REJECTED,
+        f"up to {share:.0%} of a minute's measurements contradict the others and were left out, "
+        f"{span(begin, end, start)}",
+        f"take that time out of the log if it is the instrument; if it is everywhere, check its mounting, signs "
+        f"and clock (rovgraph check), and {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}",
+    )
 
 
 def too_large(evidence: Evidence) -> Iterator[Statistic]:
@@ -82,14 +104,19 @@ def too_large(evidence: Evidence) -> Iterator[Statistic]:
         worst = int(np.argmax(means))
         begin = evidence.start + worst * MINUTE
         end, dim = min(begin + MINUTE, evidence.end), r.normalised.shape[1]
-        yield _too_large(evidence, r.sensor, evidence.start, evidence.end, float(square.mean()), len(square) * dim, 1.0)
-        yield _too_large(evidence, r.sensor, begin, end, float(means[worst]), int(count[worst]) * dim, IN_A_MINUTE)
+        start = evidence.start
+        yield too_large_in(r.sensor, start, evidence.end, float(square.mean()), len(square) * dim, start)
+        worst_mean, numbers = float(means[worst]), int(count[worst]) * dim
+        yield too_large_in(r.sensor, begin, end, worst_mean, numbers, start, IN_A_MINUTE)
 
 
-def _too_large(
-    evidence: Evidence, sensor: str, begin: float, end: float, square: float, count: int, factor: float
+def too_large_in(
+    sensor: str, begin: float, end: float, square: float, count: int, start: float, factor: float = 1.0
 ) -> Statistic:
-    """A mean square of ``count`` numbers against its limits, and the quantile of as many independent ones."""
+    """A mean square of ``count`` numbers against its limits, and the quantile of as many independent ones.
+
+    ``start`` is when the dive began [s]; ``factor`` raises the limits.
+    """
     by_chance = float(chdtri(max(count, 1), CHANCE)) / max(count, 1)
     return Statistic(
         "too large",
@@ -99,7 +126,7 @@ def _too_large(
         square,
         max(factor * TOO_LARGE, by_chance),
         max(factor * FAR_TOO_LARGE, by_chance),
-        f"its residuals are {np.sqrt(square):.1f} times as large as its stated noise, {evidence.span(begin, end)}",
+        f"its residuals are {np.sqrt(square):.1f} times as large as its stated noise, {span(begin, end, start)}",
         f"find what disturbs it there, or raise {sd_key(sensor)}",
     )
 
@@ -110,18 +137,22 @@ def too_small(evidence: Evidence) -> Iterator[Statistic]:
     for sensor, nis in ({} if filtered is None else filtered.summary.get("nis", {})).items():
         if nis["mean"] is None or nis["count"] < ENOUGH:
             continue
-        mean = nis["mean"] / nis["dim"]
-        yield Statistic(
-            "too small",
-            sensor,
-            evidence.start,
-            evidence.end,
-            1.0 / max(mean, 1e-9),
-            1.0 / TOO_SMALL,
-            np.inf,
-            f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so more is known than is said",
-            f"lower {sd_key(sensor)}",
-        )
+        yield too_small_in(sensor, evidence.start, evidence.end, nis["mean"] / nis["dim"])
+
+
+def too_small_in(sensor: str, begin: float, end: float, mean: float) -> Statistic:
+    """A mean of normalised innovations squared, per dimension."""
+    return Statistic(
+        "too small",
+        sensor,
+        begin,
+        end,
+        1.0 / max(mean, 1e-9),
+        1.0 / TOO_SMALL,
+        np.inf,
+        f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so more is known than is said",
+        f"lower {sd_key(sensor)}",
+    )
 
 
 def lasting(evidence: Evidence) -> Iterator[Statistic]:
@@ -129,22 +160,27 @@ def lasting(evidence: Evidence) -> Iterator[Statistic]:
     if evidence.main.kind == "filtered":  # its innovations wander while it settles
         return
     for r in evidence.residuals.values():
-        worst = _most_lasting(r, evidence.start)
-        if worst is None:
-            continue
-        seconds, component, ratio, by_chance, begin = worst
-        yield Statistic(
-            "lasting",
-            r.sensor,
-            begin,
-            min(begin + seconds, evidence.end),
-            ratio,
-            max(LASTING, by_chance),
-            max(BADLY_LASTING, by_chance),
-            f"residuals of {r.components[component]} last: means over {seconds:g} s vary by {ratio:.0f} times what "
-            f"noise would, most at {evidence.since(begin):.0f} s",
-            _remedy_of_lasting(r.sensor),
-        )
+        yield from lasting_in(r, evidence.start, evidence.end)
+
+
+def lasting_in(r: SensorResiduals, start: float, end: float, began: float | None = None) -> Iterator[Statistic]:
+    """How long a sensor's residuals from ``start`` to ``end`` last; ``began`` is when the dive did [s]."""
+    worst = _most_lasting(r, start)
+    if worst is None:
+        return
+    seconds, component, ratio, by_chance, begin = worst
+    yield Statistic(
+        "lasting",
+        r.sensor,
+        begin,
+        min(begin + seconds, end),
+        ratio,
+        max(LASTING, by_chance),
+        max(BADLY_LASTING, by_chance),
+        f"residuals of {r.components[component]} last: means over {seconds:g} s vary by {ratio:.0f} times what "
+        f"noise would, most at {begin - (start if began is None else began):.0f} s",
+        _remedy_of_lasting(r.sensor),
+    )
 
 
 def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, float, float] | None:
@@ -170,7 +206,12 @@ def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, 
 
 def _remedy_of_lasting(sensor: str) -> str:
     """What lets a sensor's errors last, and what to do."""
-    if sensor in ("mag", "dvl_heading", "ahrs"):
+    if sensor == "mag":
+        return (
+            "iron near the vehicle or a bad calibration (rovgraph calibrate magnetometer); "
+            f"raise {sd_key(sensor)}{_CHANGING_FIELD}"
+        )
+    if sensor in ("dvl_heading", "ahrs"):
         return f"iron near the vehicle or a bad calibration (rovgraph calibrate magnetometer); raise {sd_key(sensor)}"
     if sensor == "fix":
         return "the fixes are off together for that time: take them out, or raise fix.sd_m"

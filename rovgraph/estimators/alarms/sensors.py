@@ -22,19 +22,23 @@ def frozen(evidence: Evidence) -> Iterator[Statistic]:
         by_sensor.setdefault(stretch.sensor, []).append((stretch.first, stretch.last))
     for sensor, times in by_sensor.items():
         seconds = sum(last - first for first, last in times)
-        first, last = times[0][0], times[-1][1]
-        often = "" if len(times) == 1 else f" in {len(times)} stretches"
-        yield Statistic(
-            "frozen",
-            sensor,
-            first,
-            last,
-            seconds,
-            FROZEN_S,
-            float("inf"),
-            f"repeats its values for {seconds:.0f} s{often}, {evidence.span(first, last)}; they were left out",
-            "look at the instrument and its driver; the track is less certain there, as its sd says",
-        )
+        yield frozen_for(sensor, times[0][0], times[-1][1], seconds, len(times), evidence.start)
+
+
+def frozen_for(sensor: str, first: float, last: float, seconds: float, times: int, start: float) -> Statistic:
+    """A sensor that repeated itself for some seconds in all, so often; ``start`` is when the dive began [s]."""
+    often = "" if times == 1 else f" in {times} stretches"
+    return Statistic(
+        "frozen",
+        sensor,
+        first,
+        last,
+        seconds,
+        FROZEN_S,
+        float("inf"),
+        f"repeats its values for {seconds:.0f} s{often}, {span(first, last, start)}; they were left out",
+        "look at the instrument and its driver; the track is less certain there, as its sd says",
+    )
 
 
 def contradictions(alarms: Sequence[Alarm], start: float) -> Iterator[Alarm]:

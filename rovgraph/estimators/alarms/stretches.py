@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 from math import exp, isfinite
 
+from rovgraph.engine.gauss_newton import Stretch
 from rovgraph.estimators.alarms.alarm import Statistic
-from rovgraph.estimators.alarms.evidence import Evidence
+from rovgraph.estimators.alarms.evidence import Evidence, span
 
 TAKEN_OUT_S = 0.0  # any
 CLOSE = 1e-4  # likelihood of the next best explanation against the best
@@ -13,19 +14,23 @@ CLOSE = 1e-4  # likelihood of the next best explanation against the best
 def taken_out(evidence: Evidence) -> Iterator[Statistic]:
     """Stretches in which a sensor contradicts all others, of `rovgraph.engine.stretches`."""
     for stretch in () if evidence.optimum is None else evidence.optimum.solution.stretches:
-        yield Statistic(
-            "taken out",
-            stretch.sensor,
-            stretch.begin,
-            stretch.end,
-            stretch.end - stretch.begin,
-            TAKEN_OUT_S,
-            float("inf"),
-            f"contradicts the other sensors together, {evidence.span(stretch.begin, stretch.end)}, and was left out "
-            "there",
-            "look at the instrument at that time: a bias, a false lock, water for the bottom; an error that grew "
-            "slowly may have begun earlier",
-        )
+        yield taken_out_in(stretch, evidence.start)
+
+
+def taken_out_in(stretch: Stretch, start: float) -> Statistic:
+    """One such stretch; ``start`` is when the dive began [s]."""
+    return Statistic(
+        "taken out",
+        stretch.sensor,
+        stretch.begin,
+        stretch.end,
+        stretch.end - stretch.begin,
+        TAKEN_OUT_S,
+        float("inf"),
+        f"contradicts the other sensors together, {span(stretch.begin, stretch.end, start)}, and was left out there",
+        "look at the instrument at that time: a bias, a false lock, water for the bottom; an error that grew "
+        "slowly may have begun earlier",
+    )
 
 
 def close(evidence: Evidence) -> Iterator[Statistic]:

@@ -155,6 +155,28 @@ class FixedLag:
             self.marks[k] = replace(mark, known=known, gates=dict(self._gates), processed=done.processed)
         self._assembler.time_offsets.assume(known.state.calibration)
 
+    def continued(self, beginning: InitialConditions, position_sd: float = 0.0) -> "FixedLag":
+        """A filter that knows more sensors, or less of where it is, and goes on from here.
+
+        Parameters
+        ----------
+        beginning : this filter's with more instruments, or another prior
+        position_sd : that is added to north and east [m]
+        """
+        oldest = self.oldest()
+        while self.marks[0] is not oldest:
+            self.passed(self.marks.popleft())
+        other = FixedLag(beginning, self.lag_s, self.hold_s, self.passed, self.learn_noise)
+        known, assembler = _taken_over(self.filter, other.filter, oldest.known), other._fresh()
+        here, R_nb = other.filter.layout.columns[POSE], known.state.R_nb[0]
+        known.P[here, here][3:, 3:] += R_nb.T @ np.diag([position_sd**2, position_sd**2, 0.0]) @ R_nb
+        assembler.restore(oldest.assembler.state())
+        other.marks = deque([replace(oldest, known=known, assembler=assembler, taken=0)])
+        other._back_to(0)
+        for measurement in self._record[oldest.taken - self._forgotten :]:
+            other.add(measurement)
+        return other
+
     def oldest(self) -> FilterSnapshot:
         """The oldest mark that the filter can go on from: the last of those that came at once."""
         ends = (a for a, b in pairwise(self.marks) if a.taken != b.taken)
@@ -269,3 +291,16 @@ class FixedLag:
     def _fresh(self) -> Assembler:
         b = self.beginning
         return Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise)
+
+
+def _taken_over(old: FilterEngine, new: FilterEngine, known: Gaussian) -> Gaussian:
+    """An estimate as a filter with more calibration has it: of what the other did not know, the prior."""
+    names = old.layout.columns
+    at_old, at_new = (np.concatenate([np.r_[f.layout.columns[name]] for name in names]) for f in (old, new))
+    more = len(known.P) - old.layout.size  # places that are remembered
+    P = np.zeros((new.layout.size + more, new.layout.size + more))
+    P[: new.layout.size, : new.layout.size] = new.start().P
+    at_old = np.append(at_old, old.layout.size + np.arange(more))
+    at_new = np.append(at_new, new.layout.size + np.arange(more))
+    P[np.ix_(at_new, at_new)] = known.P[np.ix_(at_old, at_old)]
+    return Gaussian(known.x, known.c, P, known.places)

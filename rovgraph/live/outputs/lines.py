@@ -34,6 +34,8 @@ def as_dict(solution: Solution) -> dict[str, Any]:
             name: {"state": h.state, "age": _number(h.age), "used": int(h.used), "rejected": int(h.rejected)}
             for name, h in s.sensors.items()
         },
+        "verdict": s.verdict,
+        "alarms": [[a.kind, a.sensor, a.severity] for a in s.alarms],
         "events": [event.as_dict() for event in s.events],
     }
 

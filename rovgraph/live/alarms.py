@@ -1,0 +1,220 @@
+"""Alarms while a dive goes on: the statistics of `rovgraph.estimators.alarms` on what the filter has met lately.
+
+Looked at are keyframes that the lag has passed. Rejections and mean squares of innovations are those of the last
+minute. One innovation of each sensor and keyframe, the first, enters the statistic of lasting errors: between keyframes
+they are independent where the filter is right, within one they share the error of its prediction.
+"""
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rovgraph.calibration import LAYOUT, TABLE
+from rovgraph.engine.filter import FilterEngine
+from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states
+from rovgraph.engine.gauss_newton import Stretch
+from rovgraph.estimators.alarms import Alarm, Statistic, Verdict, find_alarms, verdict_of
+from rovgraph.estimators.alarms.constants import MOVED, earth_rate_of, moved_constant, sds_moved
+from rovgraph.estimators.alarms.evidence import MINUTE, SensorResiduals
+from rovgraph.estimators.alarms.motion import SETTLED_S, apart
+from rovgraph.estimators.alarms.residuals import (
+    ENOUGH,
+    lasting_in,
+    rejected_in,
+    share_rejected,
+    too_large_in,
+    too_small_in,
+)
+from rovgraph.estimators.alarms.sensors import frozen_for
+from rovgraph.estimators.alarms.stretches import taken_out_in
+from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
+from rovgraph.estimators.estimate import CalibrationEstimate
+from rovgraph.live.faults import Watch
+from rovgraph.live.solution import Event
+from rovgraph.state import BIAS, PLACE
+from rovgraph.trajectory import Trajectory
+
+EVERY_S = 5.0  # between looks
+LASTING_EVERY_S = 20.0  # between looks at what lasts, which cost more
+LASTING_FROM_S = 60.0  # after the start: innovations wander while the calibration settles
+OVER_S = 30.0  # within its limits, after which an alarm is over
+
+
+@dataclass
+class _Count:
+    """Of one sensor in the time between two looks."""
+
+    used: int = 0
+    rejected: int = 0
+    nis: float = 0.0  # sum of those that were used
+    keyframe: int = -1  # newest
+
+
+@dataclass
+class _Raised:
+    """An alarm that has begun, and when it was beyond its limit last [s]."""
+
+    alarm: Alarm
+    last: float
+
+
+@dataclass
+class LiveAlarms:
+    """Says once that an alarm begins, or becomes worse, and once that it is over.
+
+    Attributes
+    ----------
+    events : since it was last emptied
+    history : every alarm of the run as it was at its worst, in the order in which they began
+    """
+
+    events: list[Event] = field(default_factory=list)
+    history: dict[tuple[str, str, float], Alarm] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._start = self._due = self._due_lasting = np.nan
+        self._counts: deque[dict[str, _Count]] = deque([{}], maxlen=round(MINUTE / EVERY_S))
+        self._samples: dict[str, list[ProcessedMeasurement]] = {}
+        self._pieces: deque[dict[str, SensorResiduals]] = deque(maxlen=round(MINUTE / LASTING_EVERY_S))
+        self._lasting: list[Statistic] = []
+        self._told: list[tuple[float, Statistic]] = []
+        self._raised: dict[tuple[str, str], _Raised] = {}
+
+    @property
+    def active(self) -> tuple[Alarm, ...]:
+        """Alarms that are not over."""
+        return tuple(raised.alarm for raised in self._raised.values())
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the estimate now."""
+        return verdict_of(self.active)
+
+    def passed(self, mark: FilterSnapshot, engine: FilterEngine, watches: Mapping[str, Watch], now: float) -> None:
+        """Take a keyframe that the lag has passed.
+
+        Parameters
+        ----------
+        mark : the keyframe
+        engine : the filter that made it
+        watches : of the sensors, by name
+        now : the estimate's time, that of events [s]
+        """
+        time, index = mark.interval.time, mark.interval.index
+        if np.isnan(self._start):
+            self._start = time
+            self._due, self._due_lasting = time + SETTLED_S + EVERY_S, time + LASTING_FROM_S + LASTING_EVERY_S
+        if time < self._start + SETTLED_S:
+            return
+        counts = self._counts[-1]
+        for one in mark.processed:
+            sensor = one.measurement.sensor
+            count = counts.get(sensor)
+            if count is None:
+                count = counts[sensor] = _Count()
+            if one.weight > 0.0:
+                count.used += 1
+                count.nis += one.nis
+            else:
+                count.rejected += 1
+            if count.keyframe != index and time >= self._start + LASTING_FROM_S:
+                count.keyframe = index
+                self._samples.setdefault(sensor, []).append(one)
+        if time >= self._due_lasting:
+            self._due_lasting += LASTING_EVERY_S * np.ceil((time - self._due_lasting + 1e-6) / LASTING_EVERY_S)
+            self._lasting = list(self._look_at_lasting(engine, time))
+        if time >= self._due:
+            self._due += EVERY_S * np.ceil((time - self._due + 1e-6) / EVERY_S)
+            self._look([*self._statistics(mark.known, engine, watches, time)], now)
+            self._counts.append({})
+
+    def reinitialised(self, smoothed: Trajectory, filtered: Trajectory) -> None:
+        """The keyframe from which the filter goes on, of the smoothed dive so far, and as the filter had it."""
+        time = float(smoothed.time[-1])
+        if not np.isnan(self._start):
+            self._told += [(time, one) for one in apart(smoothed, filtered, self._start)]
+
+    def taken_out(self, stretch: Stretch) -> None:
+        """A sensor is left out for some time."""
+        if not np.isnan(self._start):
+            self._told.append((stretch.end, taken_out_in(stretch, self._start)))
+
+    def _statistics(
+        self, known: Gaussian, engine: FilterEngine, watches: Mapping[str, Watch], time: float
+    ) -> Iterator[Statistic]:
+        begin = max(self._start, time - MINUTE)
+        for sensor in {name for counts in self._counts for name in counts}:
+            of = [counts[sensor] for counts in self._counts if sensor in counts]
+            used, rejected = sum(c.used for c in of), sum(c.rejected for c in of)
+            if rejected:
+                share = share_rejected(np.array([float(rejected)]), np.array([float(used + rejected)]))[0]
+                yield rejected_in(sensor, begin, time, float(share), self._start)
+            if used >= ENOUGH:
+                dim = engine.initial.instruments[sensor].model.dim
+                square = sum(c.nis for c in of) / (used * dim)
+                yield too_large_in(sensor, begin, time, square, used * dim, self._start)
+                yield too_small_in(sensor, begin, time, square)
+        yield from self._constants(known, engine, time)
+        for sensor, watch in watches.items():
+            if watch.state == "frozen":
+                yield frozen_for(sensor, watch.since, watch.time, watch.time - watch.since, 1, self._start)
+        yield from self._lasting
+        self._told = [(when, one) for when, one in self._told if time - when < MINUTE]
+        yield from (one for _, one in self._told)
+
+    def _constants(self, known: Gaussian, engine: FilterEngine, time: float) -> Iterator[Statistic]:
+        """Of the calibration that is estimated, and of the gyro's bias."""
+        sd, columns = np.sqrt(np.diagonal(known.P)), engine.layout.columns
+        for name in engine.unknowns.estimated:
+            belief, variable = engine.beliefs[name], TABLE[name]
+            values, own, prior_sd = known.c[LAYOUT[name]], sd[columns[name]], np.full(variable.dim, belief.sd)
+            for k in np.flatnonzero(sds_moved(values, own, belief.mean, prior_sd) > MOVED):
+                numbers = float(values[k]), float(own[k]), float(belief.mean[k]), belief.sd
+                estimate = CalibrationEstimate(variable.labels[k], variable.unit, variable.about, True, *numbers)
+                yield from moved_constant(estimate, self._start, time)
+        if not engine.initial.config.environment.earth_rotation:
+            yield earth_rate_of(float(sd[columns[BIAS]][3:].min()), self._start, time)
+
+    def _look_at_lasting(self, engine: FilterEngine, time: float) -> Iterator[Statistic]:
+        self._pieces.append(
+            {sensor: _innovations(engine, sensor, own) for sensor, own in self._samples.items() if sensor != PLACE}
+        )
+        self._samples = {}
+        begin = self._due_lasting - LASTING_EVERY_S * (1 + len(self._pieces))
+        for sensor in self._pieces[-1]:
+            own = [piece[sensor] for piece in self._pieces if sensor in piece]
+            arrays = (np.concatenate([getattr(one, name) for one in own]) for name in ("time", "normalised", "weight"))
+            yield from lasting_in(SensorResiduals(sensor, own[0].components, *arrays), begin, time, self._start)
+
+    def _look(self, statistics: list[Statistic], time: float) -> None:
+        """Begin and end alarms."""
+        for alarm in find_alarms(statistics, self._start):
+            key = alarm.kind, alarm.sensor
+            raised = self._raised.get(key)
+            if raised is None or (alarm.severity == "wrong" and raised.alarm.severity != "wrong"):
+                begin = time if raised is None else raised.alarm.begin
+                alarm = replace(alarm, begin=begin, end=time)
+                self._raised[key] = _Raised(alarm, time)
+                self._say(time, alarm.sensor, alarm.severity, alarm.text)
+            else:
+                raised.last, raised.alarm = time, replace(raised.alarm, end=time)
+            self.history[(*key, self._raised[key].alarm.begin)] = self._raised[key].alarm
+        for key, raised in list(self._raised.items()):
+            if time - raised.last >= OVER_S:
+                del self._raised[key]
+                self._say(time, key[1], "over", f"{key[1]}: {key[0]}: within its limits for {OVER_S:g} s")
+
+    def _say(self, time: float, sensor: str, kind: str, text: str) -> None:
+        self.events.append(Event(time, sensor, kind, text))
+
+
+def _innovations(engine: FilterEngine, sensor: str, met: list[ProcessedMeasurement]) -> SensorResiduals:
+    """Innovations in units of their sd: along those in units of the noise, and as long as the NIS says."""
+    block = engine.block([one.measurement for one in met])
+    r = block.normalised(stack_states(met))
+    length = np.sqrt(np.array([one.nis for one in met]))[:, None]
+    r *= length / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), 1e-12)
+    weight = np.array([one.weight for one in met])
+    return SensorResiduals(sensor, tuple(block.instrument.components), block.time, r, weight)

@@ -1,0 +1,105 @@
+"""Alarms while a dive goes on: said once when they begin, once when they are over, and silent on healthy dives."""
+
+import io
+import json
+import time
+
+import numpy as np
+import pytest
+from broken import BROKEN, changed_data
+from dives import Simulated, falcon, simulated
+from live import message
+from rich.console import Console
+
+from rovgraph.live.alarms import OVER_S, LiveAlarms
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.navigator import Navigator
+from rovgraph.live.outputs.lines import json_line
+from rovgraph.live.solution import Event, Solution
+from rovgraph.log import Log
+from rovgraph.report.status import status
+
+SECONDS = 120.0
+
+
+@pytest.fixture(scope="module")
+def case() -> Simulated:
+    return simulated(falcon(), SECONDS, 1, imu_rate=50.0, dvl_rate=4.0, fix_interval=2.0)
+
+
+def dived(case: Simulated, log: Log) -> tuple[Navigator, list[Event], Solution]:
+    """What a navigator says of a log: all its events, and its last solution."""
+    nav, events = Navigator(case.config, patient=True, clocks=Clocks(trust=True)), []
+    for k, m in enumerate(log.measurements()):
+        nav.take(message(m))
+        if k % 500 == 0 and (solution := nav.solution()) is not None:
+            events += solution.events
+    nav.finish()
+    last = nav.solution()
+    return nav, events + list(last.events), last
+
+
+def test_a_healthy_dive_is_trusted_from_beginning_to_end(case):
+    nav, events, last = dived(case, case.log)
+    assert {e.source for e in events} == {"start"}
+    assert (last.verdict, last.alarms, nav.alarms.history) == ("trusted", (), {})
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("DVL y sign flipped", "dvl: up to"),
+        ("IMU mounted 2, 1, 3 degrees off", "depth: residuals of down last"),
+        ("DVL biased by 0.3 m/s for 20 s", "dvl: contradicts the other sensors together"),
+        ("depth stuck", "depth: residuals of down last"),
+        ("DVL 0.3 s late", "dvl: up to"),
+        ("DVL noise three times as stated", "raise dvl.velocity_sd_mps"),
+        ("fixes 8 m off for a minute", "fix: residuals of north last"),
+    ],
+)
+def test_what_is_broken_is_named_while_the_dive_goes_on(name, words):
+    broken = BROKEN[name]
+    case = simulated(falcon(), SECONDS, 1, imu_rate=50.0, **broken.truth)
+    _, events, last = dived(case, broken.breaks(case.log))
+    assert any(e.kind in ("doubtful", "wrong") and words in e.text for e in events), events
+    assert last.verdict != "trusted"
+
+
+def test_an_alarm_is_said_once_when_it_begins_and_once_when_it_is_over(case):
+    def held(data, seconds):
+        now = np.flatnonzero((seconds > 30.0) & (seconds < 45.0))
+        data[now, :3] = data[now[0] - 1, :3]
+
+    nav, events, last = dived(case, changed_data("dvl", held)(case.log))
+    said = [(e.kind, e.text.split(" ", 2)[1]) for e in events if e.source == "dvl"]
+    assert said == [("frozen", "the"), ("doubtful", "repeats"), ("back", "measures"), ("over", "frozen:")]
+    over = next(e.time for e in events if e.kind == "over")
+    assert 45.0 + OVER_S < over < 45.0 + OVER_S + 15.0
+    assert last.verdict == "trusted"
+    assert [a.kind for a in nav.alarms.history.values()] == ["frozen"]
+
+
+def test_line_and_status_carry_the_verdict_and_what_it_comes_of(case):
+    _, _, last = dived(case, BROKEN["DVL noise three times as stated"].breaks(case.log))
+    line = json.loads(json_line(last))
+    assert line["verdict"] == "doubtful"
+    assert ["too large", "dvl", "doubtful"] in line["alarms"]
+    console = Console(file=io.StringIO(), width=200)
+    console.print(status(last))
+    shown = " ".join(console.file.getvalue().split())
+    assert "verdict doubtful, " in shown
+    assert "dvl too large" in shown
+
+
+def test_alarms_cost_a_small_part_of_the_estimate(case, monkeypatch):
+    spent, passed = [], LiveAlarms.passed
+
+    def timed(*given):
+        began = time.thread_time()
+        passed(*given)
+        spent.append(time.thread_time() - began)
+
+    monkeypatch.setattr(LiveAlarms, "passed", timed)
+    began = time.process_time()
+    dived(case, case.log)
+    assert sum(spent) < 0.05 * (time.process_time() - began)
