@@ -12,10 +12,12 @@ from dives import altered, batch, changed, falcon, interrupted, simulated, start
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
 from rovgraph.engine import gauss_newton
+from rovgraph.engine.chain import ChainStep
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
 from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.geometry import Array, log_rotation, transpose
+from rovgraph.graph.batch import make_values
 from rovgraph.graph.optimum import GraphOptimum
 from rovgraph.graph.places import smooth_graph
 from rovgraph.log import Log
@@ -234,3 +236,24 @@ def test_a_dive_with_places_says_in_one_line_that_gtsam_is_missing(recorded):
     said = [line for line in done.stderr.splitlines() if not line.startswith("warning:")]
     assert len(said) == 1 and "gtsam" in said[0] and "pip install" in said[0]
     assert not (recorded / "out-places.csv").exists()
+
+
+def test_a_step_promises_what_the_slope_of_the_cost_says(solved):
+    chain, graph = solved
+    rng, n, layout = np.random.default_rng(1), len(chain.intervals), chain.chain.layout
+    x, y = 1e-3 * rng.standard_normal((n, layout.d)), 1e-3 * rng.standard_normal(layout.c)
+    there = chain.chain.moved(chain.state, ChainStep(x, y), 1.0)
+    for problem, point in ((chain.chain, there), (graph.problem, make_values(graph.problem, there))):
+        gates = chain.solution.gates
+        step, small = problem.step(point, gates), 1e-5
+        ends = [problem.cost(problem.moved(point, step, sign * small), gates) for sign in (1.0, -1.0)]
+        assert 2.0 * problem.promised(step) == pytest.approx((ends[1] - ends[0]) / (2.0 * small), rel=1e-4)
+
+
+def test_what_is_known_last_needs_the_last_conditionals_only(solved):
+    chain, _ = solved
+    whole, last = (chain.chain.eliminate(chain.state, chain.solution.gates, (1,), kept) for kept in (None, 1))
+    assert len(last.conditionals) == 1
+    np.testing.assert_array_equal(last.conditionals[0], whole.conditionals[-1])
+    np.testing.assert_array_equal(last.border, whole.border)
+    np.testing.assert_array_equal(last.filtered, whole.filtered)
