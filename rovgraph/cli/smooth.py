@@ -62,7 +62,7 @@ def smooth(
     warn_of_unused(config, log)
     check_writable(out, force)
     began = time.perf_counter()
-    dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated)
+    dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s)
     check.warn(dive_log, settings)
     seconds = {"reading": time.perf_counter() - began}
     with progress_bar() as progress:

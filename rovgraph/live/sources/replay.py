@@ -37,7 +37,8 @@ class LogReplay:
 def log_replay(url: str, path: str, config: Config, pace: float) -> LogReplay:
     """Replay of a file, with the configuration's columns and units.
 
-    The magnetometer's samples stay raw, as those of other sources: the navigator calibrates them.
+    Samples of the magnetometer and stamps stay raw, as those of other sources: the navigator calibrates them and takes
+    off known delays.
 
     Raises
     ------
