@@ -318,7 +318,8 @@ def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float) ->
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
     if found.significant(evidence):
-        yield Finding(sensor, "warning", f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?")
+        text = f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?"
+        yield Finding(sensor, "warning", text, "lag")
     else:
         yield Finding(sensor, "ok", f"{what} comes {later}{sd}")
 

@@ -121,7 +121,7 @@ def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: flo
     mean = float(offset.mean[0])
     late = fit.lag - mean
     sense = "late" if late >= 0.0 else "early"
-    text = f"its stamps are {abs(late):.2f} s {sense} against the IMU's (sd {fit.lag_sd:.2f} s)"
+    text = f"its stamps are {abs(late):.3f} s {sense} against the IMU's (sd {fit.lag_sd:.3f} s)"
     allowed = max(LAG_WARNING, SURE * fit.lag_sd, 3.0 * offset.sd if offset.estimate else 0.0)
     if abs(late) < allowed:
         return Finding("dvl", "ok", text)
@@ -130,10 +130,8 @@ def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: flo
     as_stamped = compared.refine(mean, H, held=True)
     if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < EVIDENCE:
         return Finding("dvl", "ok", f"{text}, which the dive does not show well")
-    entry = f"{{estimate: true, mean: {fit.lag:.2f}, sd: {max(0.02, 3.0 * fit.lag_sd):.2f}}}"
-    return Finding(
-        "dvl", "warning", f"{text}: correct the clock in the file, or state calibration.dvl_time_offset: {entry}"
-    )
+    entry = f"{{estimate: true, mean: {fit.lag:.3f}, sd: {max(0.02, 3.0 * fit.lag_sd):.2f}}}"
+    return Finding("dvl", "warning", f"{text}: correct its clock, or state calibration.dvl_time_offset: {entry}", "lag")
 
 
 @dataclass(frozen=True)
@@ -186,7 +184,7 @@ def _said_of_jump(log: Log, split: _Split, lags: list[float]) -> Finding:
         f"and {lags[1]:.1f} s after {since(log, split.after)}"
     )
     if not split.sensor:
-        return Finding("log", "warning", f"{told}: a clock drifts or jumps; put both on one clock")
+        return Finding("log", "warning", f"{told}: a clock drifts or jumps; put both on one clock", "jump")
     name, by = ("DVL", by) if split.sensor == "dvl" else ("IMU", -by)
     return Finding(split.sensor, "warning", f"{told}: the {name}'s clock jumps by {by:+.1f} s in the gap between; "
-                   f"correct its stamps from there on, or split the log")  # fmt: skip
+                   f"correct its stamps from there on, or split the log", "jump")  # fmt: skip

@@ -59,9 +59,8 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
     for sensor, stream in log.streams.items():
         inside = np.mean((stream.time >= first) & (stream.time <= last))
         if inside == 0.0:
-            yield Finding(
-                sensor, "error", "no time in common with the IMU; are the clocks of different epochs? Put them on one"
-            )
+            text = "no time in common with the IMU; are the clocks of different epochs? Put them on one"
+            yield Finding(sensor, "error", text, "epoch")
         elif inside < 0.8:
             yield Finding(
                 sensor, "warning", f"{1.0 - inside:.0%} of its measurements lie before or after the IMU's and are lost"
