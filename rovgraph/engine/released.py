@@ -22,8 +22,10 @@ from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import motion_row as at
+from rovgraph.sensors import innovation
 from rovgraph.state import Jacobians, State
 
+SHORT_S = 1e-3  # from its keyframe, a measurement is taken to be at it
 WIDE = 100.0  # times the prior sd: what is released is free
 
 
@@ -92,7 +94,7 @@ def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None
             scales = SCALES if block.scale_to_bias is not None else ()
             wider = replace(block, unknowns=wide.of([*block.instrument.calibration, *scales]))
             shared = {f.name: getattr(wider, f.name) for f in fields(Block)}
-            timed[sensor] = _TimedBlock(**shared, slope=_slope(block, state.at(block.keyframe)))
+            timed[sensor] = _TimedBlock(**shared, slope=_slope(block, best))
     if not len(rows.scales):
         rows = replace(rows, scales=_mean_signal_to_bias(best))  # reckoned from the motions alone
     released = _ReleasedChain(chain.intervals, chain.initial, beliefs, wide, rows, timed)
@@ -112,12 +114,14 @@ def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None
     return out
 
 
-def _slope(block: Block, state: State) -> Array:
-    """Change of the predicted measurements with time, shape (n, dim) [unit/s]."""
-    if len(block) < 2:
-        return np.zeros_like(block.z)
-    step = np.maximum(np.gradient(block.time), 1e-6)[:, None]
-    return np.asarray(np.gradient(block.predicted(state), axis=0) / step)
+def _slope(block: Block, best: ChainOptimum) -> Array:
+    """Change of the predicted measurements with time, from the keyframes around each, shape (n, dim) [unit/s]."""
+    model, time = block.instrument.model, np.array([i.time for i in best.intervals])
+    rate_b = np.array([i.rate_b for i in best.intervals])
+    before = np.maximum(block.keyframe - (block.motion.dt < SHORT_S), 0)
+    after = np.minimum(block.keyframe + 1, len(time) - 1)
+    begin, end = (model.predict(best.state.at(k), rate_b[k])[0] for k in (before, after))
+    return np.asarray(innovation(model, end, begin) / np.maximum(time[after] - time[before], 1e-6)[:, None])
 
 
 def _mean_signal_to_bias(best: ChainOptimum) -> Array:

@@ -66,6 +66,10 @@ class Lags:
         self._next = m.time + float(np.clip(0.25 * span, *EVERY_S))
         return list(self._compared())
 
+    def finish(self) -> list[tuple[str, str]]:
+        """No more measurements: what `add` has not said yet."""
+        return list(self._compared()) if self._suspected else []
+
     def _average(self) -> None:
         """One sample of the IMU instead of some."""
         some, self._samples = self._samples, []

@@ -146,6 +146,8 @@ class Navigator:
 
     def finish(self) -> None:
         """No more measurements: take what is held back."""
+        for sensor, text in self._lags.finish():
+            self.say(sensor, "clock", text)
         if self.engine is None and (beginning := self._startup.begin(self.origin)) is not None:
             self._begin(beginning)
         if self.engine is not None:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rovgraph.calibration import TABLE
+from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import Released, release
 from rovgraph.estimators.alarms.alarm import Statistic
@@ -24,7 +25,8 @@ DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
 FEELS_THE_EARTH = 10.0  # sds
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
-RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_time_offset", "gyr_scale")
+TIME_OFFSETS = tuple(name for name in TABLE if name.endswith("_time_offset"))
+RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "gyr_scale", *TIME_OFFSETS)
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
 
 
@@ -91,7 +93,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             HELD_FAR_OFF,
             f"{r.label} is held at {shown * mean:.4g}{unit}, where the measurements have it "
             f"{shown * r.step:+.2g} ± {shown * r.sd:.1g}{unit} from that",
-            _remedy_of_held(r),
+            _remedy_of_held(r, evidence.beginning.config),
         )
 
 
@@ -170,8 +172,8 @@ def _key_of(name: str) -> str:
         return "dvl.mount_rpy_deg and the signs of the DVL's axes"
     if name == "dvl_lever_arm":
         return "dvl.lever_arm_m and imu.lever_arm_m"
-    if name == "dvl_time_offset":
-        return "the DVL's clock"
+    if name in TIME_OFFSETS:
+        return f"the clock that stamps {_sensor_of(name)}"
     if name.endswith("_offset") and name != "depth_offset":
         return "environment.declination_deg and the compass's mounting"
     if name in ("hard_iron", "soft_iron", "field_scale", "field_dip", "mag_deviation"):
@@ -179,11 +181,17 @@ def _key_of(name: str) -> str:
     return f"calibration.{name}"
 
 
-def _remedy_of_held(r: Released) -> str:
+def _remedy_of_held(r: Released, config: Config) -> str:
     """What to do about a constant that is not what it is held at."""
     if r.name == "dvl_time_offset":
         return (
             "the DVL's stamps are late (early if negative): estimate it, calibration.dvl_time_offset: {estimate: true}"
+        )
+    if r.name in TIME_OFFSETS:
+        sensor, known = _sensor_of(r.name), config.delay_s.get(_sensor_of(r.name), 0.0)
+        return (
+            f"stamps of {sensor} are late (early if negative): state delay_s: {{{sensor}: {known + r.step:.2g}}}, "
+            f"or estimate calibration.{r.name}"
         )
     if r.name == "gyr_scale":
         return "estimate calibration.gyr_scale, or calibrate the gyro"
