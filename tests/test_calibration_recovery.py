@@ -144,7 +144,7 @@ def others_late(noise: bool) -> Simulated:
     """A dive whose stamps of compasses, depth and fixes are late, each by as much as `OTHERS` says."""
     held = {name: {"estimate": name in ("ahrs_offset", "mag_offset")} for name in TABLE}
     config = falcon(
-        heading={"sources": ["ahrs", "mag"]},
+        heading={"sources": ["ahrs", "mag"], "ahrs_sd_deg": 0.3, "mag_sd_deg": 0.3},
         calibration=held | {name: {"estimate": True} for name in OTHERS},
         fix={"sd_m": 0.1},
     )

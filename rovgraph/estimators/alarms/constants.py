@@ -19,8 +19,14 @@ NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
 HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
 # errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
 SHOWN = 0.3
+SHOWN_OF = {"fix_time_offset": 1.0}  # the velocity that makes a late fix wrong is known well, whatever fixes scatter
 MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
-FEIGNED = {"dvl_scale": 1.5e-3, "gyr_scale": 5e-4}  # by errors in variables, however long the dive is
+FEIGNED = {
+    "dvl_scale": 1.5e-3,
+    "gyr_scale": 5e-4,
+    "ahrs_time_offset": 0.01,
+    "mag_time_offset": 5e-3,
+}  # by errors in variables, however long the dive is
 DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
 FEELS_THE_EARTH = 10.0  # sds
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
@@ -79,7 +85,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
     moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
     for r in release(evidence.optimum, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]
-        if r.sd > SHOWN * variable.sd:
+        if r.sd > SHOWN_OF.get(r.name, SHOWN) * variable.sd:
             continue
         shown, unit = _shown(variable.unit)
         mean = evidence.optimum.beliefs[r.name].mean[variable.labels.index(r.label)]
