@@ -13,7 +13,7 @@ RIGHT = {"ahrs_offset": {"estimate": False}, "ahrs_deviation": {"estimate": Fals
 
 @pytest.fixture(scope="module")
 def dive() -> Simulated:
-    config = falcon(heading={"sources": ["ahrs", "dvl"]}, fix={"sd_m": 0.5}, calibration=RIGHT)
+    config = falcon(heading={"sources": ["ahrs", "dvl"], "ahrs_sd_deg": 1}, fix={"sd_m": 0.5}, calibration=RIGHT)
     return simulated(config, 240.0, 5, "lawnmower", fix_interval=2.0, ahrs_rate=10.0)
 
 
@@ -22,8 +22,10 @@ def said(dive: Simulated, late: Callable[[Measurement], float] = lambda m: 0.0) 
     stamped = [m._replace(time=m.time + late(m)) for m in dive.log.measurements()]
     lags = Lags(dive.config)
     texts = [text for m in sorted(stamped, key=lambda m: m.time) for text in lags.add(m)]
-    assert len({sensor for sensor, _ in texts}) == len(texts)
-    return dict(texts)
+    found: dict[str, str] = {}
+    for sensor, text in texts:
+        found[sensor] = found.get(sensor, "") + text
+    return found
 
 
 def test_healthy_streams_are_not_late(dive):
@@ -32,15 +34,14 @@ def test_healthy_streams_are_not_late(dive):
 
 def test_a_dvl_that_is_stamped_late_is_said_to_be(dive):
     (text,) = said(dive, lambda m: 0.3 * (m.sensor == "dvl")).values()
-    assert text.startswith("its stamps are 0.")
-    found = float(text.split("calibration.dvl_time_offset: {estimate: true, mean: ")[1].split(",")[0])
-    assert found == pytest.approx(0.3, abs=0.06)
+    mean, sd = text.split("calibration.dvl_time_offset: {estimate: true, mean: ")[1].rstrip("}").split(", sd: ")
+    assert abs(float(mean) - 0.3) < 2.0 * float(sd) < 0.2
 
 
 def test_fixes_and_a_compass_that_are_late_are_said_to_be(dive):
     texts = said(dive, lambda m: {"fix": 4.0, "ahrs": 2.0}.get(m.sensor, 0.0))
     assert "delay_s: {fix: " in texts["fix"]
-    assert "2.0" in texts["ahrs"] and "later than the gyro's" in texts["ahrs"]
+    assert "state delay_s: {ahrs: 2}" in texts["ahrs"]
 
 
 def test_a_clock_that_jumps_is_said_with_both_times(dive):

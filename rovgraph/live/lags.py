@@ -2,7 +2,7 @@
 
 What was received goes through the comparisons of `rovgraph check` again and again: acceleration by DVL and IMU,
 turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What two windows in a row say
-is said, once for each sensor.
+is said, and again after some minutes if it lasts, with the figures that it then has.
 """
 
 from collections import deque
@@ -22,6 +22,7 @@ from rovgraph.log.streams import gathered
 WINDOW_S = 300.0  # of motion that is compared
 FIRST_S = 60.0  # of motion, before which nothing is compared
 EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
+AGAIN_S = 300.0  # after which what lasts is said again
 STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
 CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track)
 
@@ -40,7 +41,7 @@ class Lags:
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
     _next: float = np.inf
     _suspected: set[tuple[str, str]] = field(default_factory=set)
-    _said: set[tuple[str, str]] = field(default_factory=set)
+    _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
     def add(self, m: Measurement) -> list[tuple[str, str]]:
         """Take a measurement.
@@ -79,10 +80,12 @@ class Lags:
     def _compared(self) -> Iterator[tuple[str, str]]:
         log = gathered(sorted(self._window, key=lambda m: m.time), "the last minutes")
         found = [f for check in CHECKS for f in check(log, self.config) if f.clock and f.level != "ok"]
+        found = [f for f in found if f.clock == "jump"] or found  # a lag before and after is the mean of two
         for finding in found:
             key = finding.sensor, finding.clock
-            if key in self._suspected and key not in self._said:
-                self._said.add(key)
+            now = float(log["imu"].time[-1])
+            if key in self._suspected and now - self._said.get(key, -np.inf) > AGAIN_S:
+                self._said[key] = now
                 start = min(float(stream.time[0]) for stream in log.streams.values())
                 yield finding.sensor, finding.text + (f"; 0 s is {start:.1f} s" if finding.clock == "jump" else "")
         self._suspected = {(finding.sensor, finding.clock) for finding in found}
