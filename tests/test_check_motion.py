@@ -134,6 +134,21 @@ def test_a_log_whose_clocks_go_on_is_left_alone(dive):
     assert bridge_jumps(log, config) is log
 
 
+@pytest.mark.parametrize("seconds", [7200.0 + 12.3, -1.7e9])
+def test_clocks_of_different_epochs_are_put_together_by_the_motion(dive, seconds):
+    log, config = dive
+    text = said(later(log, "dvl", seconds), config, "dvl")
+    found = float(text.split("delay_s: {dvl: ")[1].split("}")[0])
+    assert found == pytest.approx(seconds, abs=0.2)
+    assert "no time in common" in text
+
+
+def test_recordings_of_other_dives_are_not_put_together(dive):
+    log, config = dive
+    other = later(altered(log, "dvl", log["dvl"].data[::-1]), "dvl", 7200.0)
+    assert "delay_s" not in said(other, config, "dvl")
+
+
 def test_a_compass_that_is_half_a_minute_late_is_measured(dive):
     log, config = dive
     text = said(later(log, "dvl_heading", 27.0), config, "dvl_heading")

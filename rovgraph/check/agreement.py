@@ -226,6 +226,15 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
             yield from _clock(sensor, what, "the gyro's", found, EVIDENCE, remedy)
 
 
+def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
+    """How much later a compass turns than the gyro, and its sd [s]; None where it does not follow the gyro."""
+    if sensor not in NAMES or len(log[sensor]) < MIN_WINDOWS:
+        return None
+    heading = _heading(log, config, sensor)
+    found = lag(_gyro_yaw(log["imu"], config), heading, max(1.0, 1.5 * float(np.median(np.diff(heading.time)))))
+    return None if np.isnan(found.seconds) or np.isnan(found.sd) else (found.seconds, found.sd)
+
+
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
     """Integrated rate about the body's z axis [rad]."""
     rate_b = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rovgraph.check.epochs import shift_of_epoch
 from rovgraph.check.findings import Finding, Timing, repeats, since, told
 from rovgraph.config import Config
 from rovgraph.instruments import heading_sources
@@ -60,6 +61,11 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
         inside = np.mean((stream.time >= first) & (stream.time <= last))
         if inside == 0.0:
             text = "no time in common with the IMU; are the clocks of different epochs? Put them on one"
+            shift = shift_of_epoch(log, config, sensor)
+            if shift is not None:
+                delay = config.delay_s.get(sensor, 0.0) + shift[0]
+                text += f": it moves as the IMU does if put {shift[0]:.3f} s earlier (sd {shift[1]:.2g} s), "
+                text += f"delay_s: {{{sensor}: {delay:.3f}}}"
             yield Finding(sensor, "error", text, "epoch")
         elif inside < 0.8:
             yield Finding(
