@@ -1096,3 +1096,12 @@ def test_logs_of_different_epochs_are_refused_before_any_solution_and_both_are_n
     dvl.write_text("time,dvl_vx,dvl_vy,dvl_vz\n1700000001,1,0,0\n1700000002,1,0,0\n")
     with pytest.raises(InputError, match=r"dvl\.csv: its times.*imu\.csv.*clocks of different epochs"):
         open_sources([f"file:{imu}", f"file:{dvl}"])
+
+
+def test_logs_that_are_replayed_together_begin_together(tmp_path):
+    early, late = tmp_path / "early.csv", tmp_path / "late.csv"
+    early.write_text("time,depth\n10,1\n11,1\n")
+    late.write_text("time,fix_north,fix_east\n10.5,0,0\n11,0,0\n")
+    first, second = (source.messages(threading.Event()) for source in open_sources([f"file:{early}", f"file:{late}"]))
+    before = next(first).arrival
+    assert next(second).arrival - before == pytest.approx(0.5, abs=0.3)

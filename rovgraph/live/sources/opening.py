@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -53,8 +54,10 @@ def open_sources(
             raise InputError(f"{url}: given twice; each source can be read once")
     warnings = warnings or Warnings()
     opened = tuple(open_source(url, warnings, config, speed) for url in urls)
-    refuse_other_epochs([source for source in opened if isinstance(source, LogReplay)])
-    return opened
+    logs = [source for source in opened if isinstance(source, LogReplay)]
+    refuse_other_epochs(logs)
+    begin = min((log.span[0] for log in logs), default=None)
+    return tuple(replace(source, begin=begin) if isinstance(source, LogReplay) else source for source in opened)
 
 
 def open_source(

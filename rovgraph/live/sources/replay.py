@@ -17,12 +17,18 @@ from rovgraph.log import Log, read_log
 
 @dataclass(frozen=True)
 class LogReplay:
-    """A log's measurements in the order of time, one per message; stamps are the log's times."""
+    """A log's measurements in the order of time, one per message; stamps are the log's times.
+
+    Attributes
+    ----------
+    begin : time that the replay begins at, as of logs that are replayed together [s]; None = the log's first
+    """
 
     url: str
     log: Log
     pace: float
     lossy: bool = False
+    begin: float | None = None
 
     @property
     def span(self) -> tuple[float, float]:
@@ -31,7 +37,7 @@ class LogReplay:
         return min(float(t[0]) for t in times), max(float(t[-1]) for t in times)
 
     def messages(self, stop: threading.Event) -> Iterator[Message]:
-        return paced(self._recorded(), self.pace, stop)
+        return paced(self._recorded(), self.pace, stop, self.begin)
 
     def _recorded(self) -> Iterator[Message]:
         places = _geodetic(self.log)
