@@ -98,12 +98,13 @@ def find_jump(log: Log, compared: Comparison) -> Jump | None:
         sides = [compared.search(reach, span) for span in spans]
         best = [int(np.argmin(side.error[0])) for side in sides]
         lags = [float(side.lags[k]) for side, k in zip(sides, best, strict=True)]
-        sure = all(side.likeness[0, k] > FOLLOWS for side, k in zip(sides, best, strict=True))
+        if not all(side.likeness[0, k] > FOLLOWS for side, k in zip(sides, best, strict=True)):
+            continue
         worse = [
             side.error[0, _index(side, lag)] / side.error[0, k]
             for side, k, lag in zip(sides, best, lags[::-1], strict=True)
         ]
-        if sure and min(worse) > BETTER:
+        if min(worse) > BETTER:
             return _refined(compared, split, lags)
     return None
 

@@ -2,7 +2,7 @@
 
 What was received goes through the comparisons of `rovgraph check` again and again: acceleration by DVL and IMU,
 turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What two windows in a row say
-is said, and again after some minutes if it lasts, with the figures that it then has.
+is said, and again after half an hour if it lasts, with the figures that it then has.
 """
 
 from collections import deque
@@ -22,7 +22,7 @@ from rovgraph.log.streams import gathered
 WINDOW_S = 300.0  # of motion that is compared
 FIRST_S = 60.0  # of motion, before which nothing is compared
 EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
-AGAIN_S = 300.0  # after which what lasts is said again
+AGAIN_S = 1800.0  # after which what lasts is said again
 STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
 CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track)
 
