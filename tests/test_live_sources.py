@@ -1081,7 +1081,7 @@ def test_a_report_of_a_water_linked_dvl_among_json_lines_is_read_as_by_its_own_s
     decoders = waterlinked("w", heard), json_lines("-", heard, Config())
     (direct,), (passed_on,) = (decoded(decoder, report()) for decoder in decoders)
     assert direct.latency == pytest.approx(0.189319, abs=1e-6)
-    assert (passed_on.stamp, passed_on.latency) == (direct.stamp, direct.latency)
+    assert (passed_on.stamp, passed_on.latency, passed_on.clock) == (direct.stamp, direct.latency, "DVL")
     np.testing.assert_array_equal(passed_on.readings[0].values, direct.readings[0].values)
 
 

@@ -63,7 +63,7 @@ class _Clock:
     shift: float = 0.0  # what was put right when it was set
     apart: float | None = None  # from the IMU's clock at the start; None = not compared yet
     odd: list[tuple[float, float]] = field(default_factory=list)  # arrival, delay
-    newest: float = 0.0  # its newest stamp
+    newest: float | None = None  # its newest stamp
 
 
 @dataclass
@@ -138,7 +138,7 @@ class Clocks:
     def _recorded(self, stamp: float, clock: _Clock) -> float:
         """The time of a recording's stamp."""
         base = self._base
-        if base is None or abs(stamp - base.newest) < EPOCH_S:
+        if base is None or base.newest is None or abs(stamp - base.newest) < EPOCH_S:
             return stamp
         time = stamp + self._correction(clock, AGREE_S)
         if abs(time - base.newest) > EPOCH_S:

@@ -65,7 +65,8 @@ class JsonRow:
         """
         row = json_object(line)
         if is_report(row):  # of a Water Linked DVL, passed on as it came
-            return report_message(row, self._url, arrival, self._notify)
+            report = report_message(row, self._url, arrival, self._notify)
+            return None if report is None else report._replace(clock="DVL")  # not that of the other lines
         cells = self._cells(row)
         stamp = cells.pop("time", None)
         _check(cells)
