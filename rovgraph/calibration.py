@@ -78,6 +78,7 @@ _XYZ = ("_x", "_y", "_z")
 _CURVE = ("_sin", "_cos")
 _SYMMETRIC = ("_xx", "_yy", "_zz", "_xy", "_xz", "_yz")
 _DVL = ("dvl", "dvl_water")
+_LATE = ": what it measured was valid that long before its stamp"
 
 
 def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "") -> tuple[Variable, Variable]:
@@ -175,12 +176,32 @@ TABLE: dict[str, Variable] = {
             "s",
             0.1,
             (*_DVL, "dvl_heading"),
-            "how late the DVL's stamps are: what it measured was valid that long before its stamp",
+            "how late the DVL's stamps are" + _LATE,
             "starts, stops and turns; waves",
         ),
         *_compass("dvl_compass", "de", "dvl_heading", "the DVL's compass"),
         *_compass("ahrs", "af", "ahrs", "the IMU's own heading"),
+        Variable(
+            "ahrs_time_offset",
+            "A",
+            _ONE,
+            "s",
+            0.05,  # what a fusing filter and one period of a message at 10 Hz add to a compass
+            ("ahrs",),
+            "how late the stamps of the IMU's own heading are" + _LATE,
+            "turning in both senses, against the gyro",
+        ),
         *_compass("mag", "mg", "mag", "the magnetometer's heading", " beside its hard iron"),
+        Variable(
+            "mag_time_offset",
+            "M",
+            _ONE,
+            "s",
+            0.05,  # a period at 20 Hz
+            ("mag",),
+            "how late the magnetometer's stamps are" + _LATE,
+            "turning in both senses, against the gyro",
+        ),
         Variable(
             "hard_iron",
             "h",
@@ -255,6 +276,26 @@ TABLE: dict[str, Variable] = {
             "offset of the depth sensor",
             "a start at a known depth (start.down_m), and vertical velocity that is believed to keep it",
             considered=True,
+        ),
+        Variable(
+            "depth_time_offset",
+            "Z",
+            _ONE,
+            "s",
+            0.1,  # a pressure sensor's averaging and one period of a message at 10 Hz
+            ("depth",),
+            "how late the depth sensor's stamps are" + _LATE,
+            "diving and waves, against the vertical velocity of a DVL",
+        ),
+        Variable(
+            "fix_time_offset",
+            "F",
+            _ONE,
+            "s",
+            0.3,  # 200 m of sound through water both ways; a receiver of GPS at 5 Hz has less
+            ("fix",),
+            "how late the stamps of fixes are" + _LATE,
+            "legs in several directions, against a DVL and a heading",
         ),
         Variable(
             "drag_linear",

@@ -73,9 +73,12 @@ def _scaled(data: Array, _: Array) -> None:
     data[:, 3:] *= 1.005
 
 
-def _late(log: Log) -> Log:
-    pings = log["dvl"]
-    return replace(log, streams={**log.streams, "dvl": replace(pings, time=pings.time + 0.3)})
+def late(sensor: str, seconds: float) -> Callable[[Log], Log]:
+    def breaks(log: Log) -> Log:
+        stream = log[sensor]
+        return replace(log, streams={**log.streams, sensor: replace(stream, time=stream.time + seconds)})
+
+    return breaks
 
 
 def _mounted(log: Log) -> Log:
@@ -89,7 +92,7 @@ BROKEN: dict[str, Broken] = {
     "DVL biased by 0.3 m/s for 20 s": Broken(changed_data("dvl", _offset(0, 0.3, 20.0))),
     "DVL frozen for a minute": Broken(changed_data("dvl", _held(60.0))),
     "depth stuck": Broken(changed_data("depth", _held(1e9))),
-    "DVL 0.3 s late": Broken(_late),
+    "DVL 0.3 s late": Broken(late("dvl", 0.3)),
     "DVL noise three times as stated": Broken(changed_data("dvl", _noisier)),
     "fixes 8 m off for a minute": Broken(changed_data("fix", _offset(0, 8.0, 60.0)), {"fix_interval": 2.0}),
     "gyro scale 0.5 %": Broken(changed_data("imu", _scaled)),

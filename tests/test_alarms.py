@@ -4,12 +4,13 @@ python tests/test_alarms.py 1 6 [PATH] prints what is said of every broken dive 
 """
 
 import json
+import re
 import sys
 import time
 
 import numpy as np
 import pytest
-from broken import BROKEN
+from broken import BROKEN, late
 from dives import (
     LIVELY,
     Simulated,
@@ -31,6 +32,7 @@ from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Evidence, Statistic, find_alarms, statistics, verdict_of
 from rovgraph.estimators.alarms.alarm import alarm_of
+from rovgraph.estimators.alarms.constants import TIME_OFFSETS
 from rovgraph.estimators.dive import Dive, smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed
@@ -82,6 +84,14 @@ def test_a_healthy_dive_is_trusted():
     }
 
 
+def test_fixes_that_are_late_are_named_with_the_delay_that_mends_them():
+    case = simulated(falcon(fix={"sd_m": 0.5}), 120.0, 1, fix_interval=2.0)
+    dive = smooth(late("fix", 2.0)(case.log), case.config, "smoothed")
+    assert dive.verdict != "trusted"
+    (delay,) = re.findall(r"state delay_s: \{fix: ([0-9.]+)\}", "\n".join(dive.warnings))
+    assert float(delay) == pytest.approx(2.0, abs=0.5)
+
+
 def test_a_dvl_whose_z_axis_points_the_other_way_gets_its_mounting():
     case = simulated(falcon(), SECONDS, 1)
     config = falcon(dvl={"mount_rpy_deg": [0.0, 0.0, case.config.dvl.mount_rpy_deg[2]]})
@@ -126,9 +136,9 @@ def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_rele
         case = simulated(falcon(), 120.0, seed)
         batch = BatchSmoother(initialise(case.log, case.config))
         batch.take(case.log)
-        found = release(batch.optimum(), ["dvl_roll", "dvl_pitch", "dvl_scale", "dvl_time_offset", "gyr_scale"])
+        found = release(batch.optimum(), ["dvl_roll", "dvl_pitch", "dvl_scale", "gyr_scale", *TIME_OFFSETS])
         steps += [r.step / r.sd for r in found]
-    assert len(steps) == 28
+    assert len(steps) == 36
     assert 0.5 < float(np.std(steps)) < 1.6
     assert np.abs(steps).max() < 4.5
 
@@ -136,8 +146,8 @@ def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_rele
 def test_alarms_of_a_filter_alone_need_no_smoother():
     case = simulated(falcon(), 100.0, 1)
     assert smooth(case.log, case.config, "filtered").verdict == "trusted"
-    late = smooth(BROKEN["DVL 0.3 s late"].breaks(case.log), case.config, "filtered")
-    assert any(line.startswith("dvl: up to") for line in late.warnings)
+    broken = smooth(BROKEN["DVL 0.3 s late"].breaks(case.log), case.config, "filtered")
+    assert any(line.startswith("dvl: up to") for line in broken.warnings)
 
 
 def test_alarms_are_cheap():

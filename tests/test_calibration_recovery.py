@@ -134,3 +134,39 @@ def test_pings_that_the_imu_does_not_cover_are_left_out_and_counted():
     early = (case.log["dvl"].time < 0.8).sum()
     reason = "calibration.dvl_time_offset reaches beyond the IMU's samples"
     assert smoother.assembler.left_out["dvl", reason] >= early > 0
+
+
+OTHERS = {"ahrs_time_offset": 0.1, "mag_time_offset": -0.08, "depth_time_offset": 0.15, "fix_time_offset": 0.7}
+
+
+@cache
+def others_late(noise: bool) -> Simulated:
+    """A dive whose stamps of compasses, depth and fixes are late, each by as much as `OTHERS` says."""
+    held = {name: {"estimate": name in ("ahrs_offset", "mag_offset")} for name in TABLE}
+    config = falcon(
+        heading={"sources": ["ahrs", "mag"], "ahrs_sd_deg": 0.3, "mag_sd_deg": 0.3},
+        calibration=held | {name: {"estimate": True} for name in OTHERS},
+        fix={"sd_m": 0.1},
+    )
+    truth = {name: np.array([late]) for name, late in OTHERS.items()}
+    aids = {"fix_interval": 1.0, "ahrs_rate": 5.0, "dvl_rate": PINGS}
+    return simulated(config, 60.0, seed=2, noise=noise, calibration=truth, **aids)
+
+
+@pytest.mark.parametrize("estimator", [batch, renewed], ids=["batch", "filter"])
+@pytest.mark.parametrize("noise", [False, True], ids=["without noise", "with noise"])
+def test_time_offsets_of_compasses_depth_and_fixes_are_found(estimator, noise):
+    case = others_late(noise)
+    estimate = estimator(case.log, started(case)).solve()
+    for name, late in OTHERS.items():
+        error, sd = errors(estimate, name, [late])
+        assert sd < 0.3 * TABLE[name].sd, name
+        assert np.abs(error) < (4.0 if noise else 1.0) * sd, name
+
+
+def test_smoother_and_filter_agree_on_every_time_offset():
+    case = others_late(True)
+    both = [estimator(case.log, started(case)).solve() for estimator in (batch, renewed)]
+    for name in OTHERS:
+        (smoothed, sd), (filtered, _) = (errors(estimate, name, [0.0]) for estimate in both)
+        assert np.abs(smoothed - filtered) < sd, name

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from dives import altered, falcon, simulated, without
 
-from rovgraph.check import Finding, examine
+from rovgraph.check import Finding, bridge_jumps, examine
 from rovgraph.check.acceleration import ORIENTATIONS
 from rovgraph.check.inertial import inertial_motion
 from rovgraph.config import Config, mount_matrix
+from rovgraph.errors import DataWarning
 from rovgraph.geometry import rotate, transpose
 from rovgraph.log import Log
 from rovgraph.simulate import CALM, Style
@@ -116,6 +117,36 @@ def test_a_clock_that_jumps_is_named_with_both_times(dive, sensor):
     before, after = (float(jump.split(word)[1].split(" s")[0]) for word in ("s before ", " s after "))
     assert before == pytest.approx(139.9, abs=0.2)
     assert after == pytest.approx(142.0, abs=0.2)
+
+
+@pytest.mark.parametrize("sensor", ["dvl", "imu"])
+def test_a_clock_that_jumps_is_bridged_and_both_times_are_said(dive, sensor):
+    log, config = dive
+    with pytest.warns(DataWarning, match=rf"{sensor.upper()}'s clock jumps by .2\.0. s .* between 1.* and 14.*bridged"):
+        bridged = bridge_jumps(later(log, sensor, 2.0, 140.0), config)
+    assert complaints(bridged, config, sensor) == []
+    np.testing.assert_allclose(bridged[sensor].time, log[sensor].time, atol=0.1)
+    assert bridged["depth"] is log["depth"]
+
+
+def test_a_log_whose_clocks_go_on_is_left_alone(dive):
+    log, config = dive
+    assert bridge_jumps(log, config) is log
+
+
+@pytest.mark.parametrize("seconds", [7200.0 + 12.3, -1.7e9])
+def test_clocks_of_different_epochs_are_put_together_by_the_motion(dive, seconds):
+    log, config = dive
+    text = said(later(log, "dvl", seconds), config, "dvl")
+    found = float(text.split("delay_s: {dvl: ")[1].split("}")[0])
+    assert found == pytest.approx(seconds, abs=0.2)
+    assert "no time in common" in text
+
+
+def test_recordings_of_other_dives_are_not_put_together(dive):
+    log, config = dive
+    other = later(altered(log, "dvl", log["dvl"].data[::-1]), "dvl", 7200.0)
+    assert "delay_s" not in said(other, config, "dvl")
 
 
 def test_a_compass_that_is_half_a_minute_late_is_measured(dive):

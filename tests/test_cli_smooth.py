@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from dives import falcon, simulated
 
 from rovgraph.cli.app import main
 
@@ -338,3 +339,17 @@ def test_the_real_dive_meets_its_targets(tmp_path, monkeypatch):
     yaw = table[(table["label"] == "dvl_yaw") & (table["estimate"] == "smoothed")].iloc[0]
     assert -24.0 <= yaw["value"] <= -19.5
     assert abs(yaw["value"] + 21.8) <= 2.0 * yaw["sd"]
+
+
+@pytest.mark.parametrize("stated", [{"delay_s": {"fix": 2}}, {"online": {"delay_s": {"fix": 2}}}])
+def test_fixes_that_are_late_by_a_known_time_give_the_track_of_punctual_ones(monkeypatch, tmp_path, stated):
+    case = simulated(falcon(), 45.0, seed=2, fix_interval=2.0)
+    late, tracks = case.dive.log_frame.copy(), []
+    late.loc[late["fix_north"].notna(), "time"] += 2.0
+    for name, frame, more in (("punctual", case.dive.log_frame, {}), ("late", late, stated)):
+        config = tmp_path / f"{name}.yaml"
+        config.write_text(json.dumps(case.config.model_dump(mode="json") | more))  # JSON is YAML
+        log = save(frame.sort_values("time", kind="stable"), tmp_path / f"{name}.csv")
+        assert run(monkeypatch, "smooth", log, "-c", config, "-o", tmp_path / name, *FAST) == 0
+        tracks.append(pd.read_csv(tmp_path / name / "trajectory_smoothed.csv"))
+    pd.testing.assert_frame_equal(*tracks)

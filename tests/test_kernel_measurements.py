@@ -142,8 +142,8 @@ def registered():
     """Calibration of two sensors that the package does not know."""
     about = ("a deviation", "turning")
     variables = (
-        Variable("buoy_offset", "A", ("",), "m", 0.1, ("buoy",), *about),
-        Variable("buoy_deviation", "B", ("_sin", "_cos"), "rad", 0.1, ("buoy",), *about),
+        Variable("buoy_offset", "P", ("",), "m", 0.1, ("buoy",), *about),
+        Variable("buoy_deviation", "Q", ("_sin", "_cos"), "rad", 0.1, ("buoy",), *about),
     )
     for variable in variables:
         register(variable)
@@ -156,7 +156,7 @@ def test_registered_variables_follow_the_built_in_ones(registered):
     assert LAYOUT["buoy_offset"] == slice(SIZE, SIZE + 1) and LAYOUT["buoy_deviation"] == slice(SIZE + 1, SIZE + 3)
     assert calibration_size() == SIZE + 3
     assert SIZE == layout.SIZE
-    for name, letter in (("buoy_offset", "C"), ("other", "A"), ("other", "z")):
+    for name, letter in (("buoy_offset", "C"), ("other", "P"), ("other", "z")):
         with pytest.raises(ValueError, match=name):
             register(Variable(name, letter, ("",), "m", 0.1, ("buoy",), "", ""))
     assert calibration_size() == SIZE + 3

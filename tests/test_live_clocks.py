@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rovgraph.errors import InputError
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.message import Message, Reading
 
@@ -88,3 +89,22 @@ def test_the_imus_own_clock_that_was_set_goes_on_too():
 def test_recorded_stamps_are_trusted():
     clocks = Clocks(trust=True)
     assert clocks.time(dvl(5.0, 123.0)) == 123.0
+
+
+@pytest.mark.parametrize("boot", [0.3, 970.0])
+def test_processing_that_an_instrument_states_never_becomes_a_stamp(boot):
+    clocks, rng = begun(), np.random.default_rng(2)
+    for k in range(100):
+        true, processing = 1005.0 + 0.2 * k, 0.087 + 0.05 * rng.random()
+        clocks.time(imu(true, 0.01))
+        arrival = true + processing + 0.01 + 0.002 * rng.random()
+        time = clocks.time(Message("waterlinked://dvl", arrival, true - boot, DVL, latency=processing))
+    assert time == pytest.approx(true, abs=0.003)  # by the stamps alone it would be 0.09 s late
+
+
+def test_recordings_of_different_epochs_are_put_together_by_their_arrivals_or_refused_with_both_named():
+    clocks = Clocks(trust=True)
+    assert clocks.time(Message("mavlink:a.tlog", 1.7e9, 100.0, IMU, "boot")) == 100.0
+    assert clocks.time(Message("mavlink:a.tlog", 1.7e9 + 1.0, 1.7e9 + 1.0, DVL, "unix")) == pytest.approx(101.0)
+    with pytest.raises(InputError, match=r"b\.csv: its clock reads 1900000000\.0 s where that of mavlink:a\.tlog boot"):
+        clocks.time(Message("file:b.csv", 1.9e9, 1.9e9, DVL))

@@ -1075,3 +1075,33 @@ def test_an_sd_of_0_or_less_is_not_known(sd, heard):
     (message,) = decoded(json_lines("-", heard, Config()), b'{"fix_north": 1, "fix_east": 2, "fix_sd": %d}\n' % sd)
     np.testing.assert_array_equal(message.readings[0].values, [1.0, 2.0, np.nan])
     assert not heard.kinds
+
+
+def test_a_report_of_a_water_linked_dvl_among_json_lines_is_read_as_by_its_own_source(heard):
+    decoders = waterlinked("w", heard), json_lines("-", heard, Config())
+    (direct,), (passed_on,) = (decoded(decoder, report()) for decoder in decoders)
+    assert direct.latency == pytest.approx(0.189319, abs=1e-6)
+    assert (passed_on.stamp, passed_on.latency, passed_on.clock) == (direct.stamp, direct.latency, "DVL")
+    np.testing.assert_array_equal(passed_on.readings[0].values, direct.readings[0].values)
+
+
+def test_a_processing_time_that_cannot_be_is_none(heard):
+    (message,) = decoded(waterlinked("w", heard), report(time_of_transmission=12))
+    assert message.latency is None
+
+
+def test_logs_of_different_epochs_are_refused_before_any_solution_and_both_are_named(tmp_path):
+    imu, dvl = tmp_path / "imu.csv", tmp_path / "dvl.csv"
+    imu.write_text("time,acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z\n1,0,0,-9.8,0,0,0\n2,0,0,-9.8,0,0,0\n")
+    dvl.write_text("time,dvl_vx,dvl_vy,dvl_vz\n1700000001,1,0,0\n1700000002,1,0,0\n")
+    with pytest.raises(InputError, match=r"dvl\.csv: its times.*imu\.csv.*clocks of different epochs"):
+        open_sources([f"file:{imu}", f"file:{dvl}"])
+
+
+def test_logs_that_are_replayed_together_begin_together(tmp_path):
+    early, late = tmp_path / "early.csv", tmp_path / "late.csv"
+    early.write_text("time,depth\n10,1\n11,1\n")
+    late.write_text("time,fix_north,fix_east\n10.5,0,0\n11,0,0\n")
+    first, second = (source.messages(threading.Event()) for source in open_sources([f"file:{early}", f"file:{late}"]))
+    before = next(first).arrival
+    assert next(second).arrival - before == pytest.approx(0.5, abs=0.3)

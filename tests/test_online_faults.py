@@ -243,7 +243,7 @@ def stream_until(stream: Stream, time: float) -> Stream:
 
 
 def test_a_fix_in_degrees_is_as_late_as_one_in_metres(case):
-    config = case.config.model_copy(update={"online": case.config.online.model_copy(update={"delay_s": {"fix": 0.5}})})
+    config = case.config.model_copy(update={"delay_s": {"fix": 0.5}})
     intake = Intake(config, Counter())
     local, geodetic = Reading("fix", np.zeros(3)), Reading(GEODETIC, np.array([58.0, 14.0, 1.0]))
     assert [time for time, _ in intake.timed(100.0, (local, geodetic))] == [99.5, 99.5]

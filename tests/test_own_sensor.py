@@ -104,7 +104,7 @@ def test_its_column_is_read_in_any_unit_of_its_quantity(depth2, tmp_path):
 
 def test_its_keys_are_those_of_a_configuration(depth2):
     assert {"sensors.depth2.sd", "calibration.depth2_scale.estimate"} <= {key for key, _, _ in describe()}
-    config = parse_config(SETTINGS + "online: {delay_s: {depth2: 0.1}}")
+    config = parse_config(SETTINGS + "delay_s: {depth2: 0.1}")
     assert config.sensors.depth2.sd == 0.03
     assert parse_config(config.to_yaml()) == config
     with pytest.raises(InputError, match=r"unknown key sensors\.depth2\.sdd, nearest known key is sensors\.depth2\.sd"):

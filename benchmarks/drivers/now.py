@@ -21,7 +21,9 @@ from rovgraph.simulate.files import write_log
 
 def read(log: str, config: str) -> tuple[Log, Config]:
     settings = load_config(Path(config))
-    return read_log(Path(log), settings.columns, settings.units, settings.imu.mag.calibrated), settings
+    return read_log(
+        Path(log), settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s
+    ), settings
 
 
 def filtered(*files: str) -> float:

@@ -13,6 +13,7 @@ from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
 from rovgraph.check.fixes import repeated, track
 from rovgraph.check.frozen_sensors import standstill
+from rovgraph.check.jumps import bridge_jumps
 from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
 from rovgraph.check.times import overlap, presence, regularity, timing
@@ -22,7 +23,7 @@ from rovgraph.errors import DataWarning, InputError
 from rovgraph.log import Log
 from rovgraph.sensors import Level
 
-__all__ = ["Finding", "Level", "Report", "Timing", "examine", "warn"]
+__all__ = ["Finding", "Level", "Report", "Timing", "bridge_jumps", "examine", "warn"]
 
 Check = Callable[[Log, Config], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (

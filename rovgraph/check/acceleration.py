@@ -20,6 +20,8 @@ from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, signed_permutations
 from rovgraph.log import Stream
 
+FOLLOWS = 0.65  # likeness of accelerations that are of one motion
+BETTER = 2.0  # times smaller an error than as configured, which chance does not make
 WINDOW = 1.0  # over which velocities change, at least two pings [s]
 LARGEST_LAG = 300.0  # that is searched for [s]
 OVERLAP = 0.6  # of the dive, that a shift leaves

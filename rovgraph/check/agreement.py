@@ -219,7 +219,20 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             # short windows: in long ones a compass's deviation looks like a lag
             found = lag(gyro, heading, max(1.0, 1.5 * period))
-            yield from _clock(sensor, f"the turning that {NAMES[sensor]} shows", "the gyro's", found, EVIDENCE)
+            remedy = (
+                f" If it is late, state delay_s: {{{sensor}: {config.delay_s.get(sensor, 0.0) + found.seconds:.2g}}}"
+            )
+            what = f"the turning that {NAMES[sensor]} shows"
+            yield from _clock(sensor, what, "the gyro's", found, EVIDENCE, remedy)
+
+
+def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
+    """How much later a compass turns than the gyro, and its sd [s]; None where it does not follow the gyro."""
+    if sensor not in NAMES or len(log[sensor]) < MIN_WINDOWS:
+        return None
+    heading = _heading(log, config, sensor)
+    found = lag(_gyro_yaw(log["imu"], config), heading, max(1.0, 1.5 * float(np.median(np.diff(heading.time)))))
+    return None if np.isnan(found.seconds) or np.isnan(found.sd) else (found.seconds, found.sd)
 
 
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
@@ -311,14 +324,15 @@ def _say_degrees(sensor: str) -> str:
     return f"Say units: {{{sensor}: deg}}"
 
 
-def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float) -> Iterator[Finding]:
+def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float, remedy: str = "") -> Iterator[Finding]:
     """A lag, if there is one."""
     if np.isnan(found.seconds):
         return
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
     if found.significant(evidence):
-        yield Finding(sensor, "warning", f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?")
+        text = f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?{remedy}"
+        yield Finding(sensor, "warning", text, "lag")
     else:
         yield Finding(sensor, "ok", f"{what} comes {later}{sd}")
 

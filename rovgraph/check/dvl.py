@@ -4,23 +4,18 @@ Nothing else is needed: no heading, no depth, no change of depth.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
-from rovgraph.check.acceleration import ORIENTATIONS, Comparison, Fit, Search
+from rovgraph.check.acceleration import BETTER, FOLLOWS, ORIENTATIONS, Comparison, Fit, Search
 from rovgraph.check.agreement import dives_with_depth
-from rovgraph.check.findings import Finding, since, valid_pings
-from rovgraph.check.inertial import inertial_motion
-from rovgraph.check.values import GRAVITY_ANGLE, tilt
+from rovgraph.check.findings import Finding
+from rovgraph.check.jumps import compare, find_jump
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, log_rotation
-from rovgraph.log import Log, Stream
+from rovgraph.log import Log
 from rovgraph.sensors.dvl import axes_remedy
 
-ENOUGH_PINGS = 50
-FOLLOWS = 0.65  # likeness of accelerations that are of one motion
-BETTER = 2.0  # times smaller an error than as configured, which chance does not make
 ALIKE = 1.1  # times the least error, that tells two orientations apart no more
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 LAG_WARNING = 0.05  # [s]
@@ -28,27 +23,19 @@ APART = 0.15  # that search and fit may be apart [s]
 SURE = 5.0  # standard deviations of a lag
 EVIDENCE = 30.0  # in chi-square that a lag explains
 TURNED = np.deg2rad(30.0)  # a mounting that is no small error; steady circles confuse smaller ones with a lag
-JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
-LARGEST_JUMP = 120.0  # [s]
-PIECE = 30.0  # shortest part of a dive that shows a lag [s]
-GAPS = 2  # the largest, of IMU and DVL each, at which a clock may have been set
-GAP = 0.5  # [s]
 
 
 def dvl_and_imu(log: Log, config: Config) -> Iterator[Finding]:
     """Axes, mounting and clock of the DVL, by the IMU's accelerations."""
-    if not {"dvl", "imu"} <= log.sensors or tilt(log, config) > GRAVITY_ANGLE:
+    compared = compare(log, config)
+    if compared is None:
         return
-    pings, motion = valid_pings(log["dvl"]), inertial_motion(log, config)
-    if motion is None or len(pings) < ENOUGH_PINGS:
-        return
-    compared = Comparison(motion, pings, config)
     found = compared.search()
     if np.isfinite(found.error).sum() == 0:
         return
-    jump = _jump(log, compared, found)
+    jump = find_jump(log, compared)
     if jump is not None:
-        yield jump
+        yield jump.finding(log)
         return
     k, m = _explanation(found)
     if found.likeness[k, m] < FOLLOWS:
@@ -121,7 +108,7 @@ def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: flo
     mean = float(offset.mean[0])
     late = fit.lag - mean
     sense = "late" if late >= 0.0 else "early"
-    text = f"its stamps are {abs(late):.2f} s {sense} against the IMU's (sd {fit.lag_sd:.2f} s)"
+    text = f"its stamps are {abs(late):.3f} s {sense} against the IMU's (sd {fit.lag_sd:.3f} s)"
     allowed = max(LAG_WARNING, SURE * fit.lag_sd, 3.0 * offset.sd if offset.estimate else 0.0)
     if abs(late) < allowed:
         return Finding("dvl", "ok", text)
@@ -130,63 +117,5 @@ def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: flo
     as_stamped = compared.refine(mean, H, held=True)
     if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < EVIDENCE:
         return Finding("dvl", "ok", f"{text}, which the dive does not show well")
-    entry = f"{{estimate: true, mean: {fit.lag:.2f}, sd: {max(0.02, 3.0 * fit.lag_sd):.2f}}}"
-    return Finding(
-        "dvl", "warning", f"{text}: correct the clock in the file, or state calibration.dvl_time_offset: {entry}"
-    )
-
-
-@dataclass(frozen=True)
-class _Split:
-    """A time at which a clock may have jumped: a gap of one sensor, or the middle of the dive."""
-
-    sensor: str
-    before: float
-    after: float
-
-
-def _jump(log: Log, compared: Comparison, found: Search) -> Finding | None:
-    """A lag that is another before and after some time."""
-    time = compared.motion.time
-    middle = float(0.5 * (time[0] + time[-1]))
-    splits = [*_gaps(compared.pings), *_gaps(log["imu"]), _Split("", middle, middle)]
-    for split in sorted(splits, key=lambda s: s.before - s.after):
-        reach = min(1.5 * (split.after - split.before) + JUMP_REACH, LARGEST_JUMP)
-        if split.before - time[0] < PIECE or time[-1] - split.after < PIECE:
-            continue
-        sides = [compared.search(reach, span) for span in ((time[0], split.before), (split.after, time[-1]))]
-        best = [int(np.argmin(side.error[0])) for side in sides]
-        lags = [float(side.lags[k]) for side, k in zip(sides, best, strict=True)]
-        sure = all(side.likeness[0, k] > FOLLOWS for side, k in zip(sides, best, strict=True))
-        worse = [
-            side.error[0, _index(side, lag)] / side.error[0, k]
-            for side, k, lag in zip(sides, best, lags[::-1], strict=True)
-        ]
-        if sure and min(worse) > BETTER:
-            return _said_of_jump(log, split, lags)
-    return None
-
-
-def _index(side: Search, lag: float) -> int:
-    return int(np.argmin(np.abs(side.lags - lag)))
-
-
-def _gaps(stream: Stream) -> list[_Split]:
-    """The largest gaps of a stream, after which its clock may be another."""
-    periods = np.diff(stream.time)
-    widest = np.argsort(periods)[-GAPS:]
-    wide = widest[periods[widest] > max(GAP, 2.5 * float(np.median(periods)))]
-    return [_Split(stream.sensor, float(stream.time[k]), float(stream.time[k + 1])) for k in wide]
-
-
-def _said_of_jump(log: Log, split: _Split, lags: list[float]) -> Finding:
-    by = lags[1] - lags[0]
-    told = (
-        f"the DVL's stamps are {lags[0]:.1f} s late against the IMU's before {since(log, split.before)} "
-        f"and {lags[1]:.1f} s after {since(log, split.after)}"
-    )
-    if not split.sensor:
-        return Finding("log", "warning", f"{told}: a clock drifts or jumps; put both on one clock")
-    name, by = ("DVL", by) if split.sensor == "dvl" else ("IMU", -by)
-    return Finding(split.sensor, "warning", f"{told}: the {name}'s clock jumps by {by:+.1f} s in the gap between; "
-                   f"correct its stamps from there on, or split the log")  # fmt: skip
+    entry = f"{{estimate: true, mean: {fit.lag:.3f}, sd: {max(0.02, 3.0 * fit.lag_sd):.2f}}}"
+    return Finding("dvl", "warning", f"{text}: correct its clock, or state calibration.dvl_time_offset: {entry}", "lag")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,13 @@ class Finding:
     sensor : name of the stream, or "log", "configuration"
     level : "error": cannot be worked with as it is
     text : one sentence, with the numbers it rests on
+    clock : what it says of a clock: "epoch", "lag" or "jump"; empty where it is about something else
     """
 
     sensor: str
     level: Level
     text: str
+    clock: Literal["", "epoch", "lag", "jump"] = ""
 
 
 @dataclass(frozen=True)

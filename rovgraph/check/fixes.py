@@ -119,9 +119,10 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
         if late:
             sense = "late" if lag > 0.0 else "early"
             text = f"fixes come {abs(lag):.1f} s {sense} against the DVL's track (sd {lag_sd:.1f} s)"
-            speed = float(np.median(np.linalg.norm(pings.data[:, :3], axis=1)))
-            remedy = f"correct their stamps in the file, or fix.lever_arm_m, if it is {speed * abs(lag):.1f} m off"
-            yield Finding("fix", "warning", f"{text}: {remedy}")
+            moved = float(np.median(np.linalg.norm(pings.data[:, :3], axis=1))) * abs(lag)
+            known = config.delay_s.get("fix", 0.0) + lag
+            remedy = f"state delay_s: {{fix: {known:.2g}}}, or correct fix.lever_arm_m, if it is {moved:.1f} m off"
+            yield Finding("fix", "warning", f"{text}: {remedy}", "lag")
 
 
 def _better(one: _Line, other: _Line) -> bool:

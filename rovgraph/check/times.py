@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rovgraph.check.epochs import shift_of_epoch
 from rovgraph.check.findings import Finding, Timing, repeats, since, told
 from rovgraph.config import Config
 from rovgraph.instruments import heading_sources
@@ -59,9 +60,13 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
     for sensor, stream in log.streams.items():
         inside = np.mean((stream.time >= first) & (stream.time <= last))
         if inside == 0.0:
-            yield Finding(
-                sensor, "error", "no time in common with the IMU; are the clocks of different epochs? Put them on one"
-            )
+            text = "no time in common with the IMU; are the clocks of different epochs? Put them on one"
+            shift = shift_of_epoch(log, config, sensor)
+            if shift is not None:
+                delay = config.delay_s.get(sensor, 0.0) + shift[0]
+                text += f": it moves as the IMU does if put {shift[0]:.3f} s earlier (sd {shift[1]:.2g} s), "
+                text += f"delay_s: {{{sensor}: {delay:.3f}}}"
+            yield Finding(sensor, "error", text, "epoch")
         elif inside < 0.8:
             yield Finding(
                 sensor, "warning", f"{1.0 - inside:.0%} of its measurements lie before or after the IMU's and are lost"

@@ -28,7 +28,9 @@ def check(
     from rovgraph.log import read_log
 
     settings = load_config(config)
-    report = examine(read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated), settings)
+    report = examine(
+        read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s), settings
+    )
     if as_json:
         typer.echo(json.dumps(_without_nan(asdict(report)), indent=2, allow_nan=False))
     else:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -15,6 +16,7 @@ from rovgraph.config.error_messages import complaint
 from rovgraph.config.priors import Calibration, calibration_entry
 from rovgraph.config.registered import add_key, remove_key
 from rovgraph.config.sections import (
+    Delays,
     Depth,
     Dvl,
     Environment,
@@ -56,6 +58,25 @@ class Config(Section):
     online: Online = Online()
     columns: dict[str, str] = Field(default_factory=dict, description="rovgraph's column: the log's own name for it")
     units: dict[str, str] = Field(default_factory=dict, description="column or sensor: unit it is in, e.g. gyr: deg/s")
+    delay_s: Delays = Field(
+        {},
+        description="sensor: how much older its measurements are than their stamps, in a log and online; e.g. fix: 2",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_delays_of_online(cls, data: Any) -> Any:
+        """``online.delay_s``, the key's former place, still holds, unless both name the same sensor."""
+        online = data.get("online") if isinstance(data, dict) else None
+        if not isinstance(online, dict) or "delay_s" not in online:
+            return data
+        rest, former, own = dict(online), online["delay_s"] or {}, data.get("delay_s") or {}
+        del rest["delay_s"]
+        if not isinstance(former, dict) or not isinstance(own, dict):
+            return data | {"online": rest, "delay_s": former if isinstance(own, dict) else own}
+        if twice := sorted(map(str, former.keys() & own.keys())):
+            raise PydanticCustomError("stated_twice", f"delay_s and online.delay_s both name {twice[0]}; state it once")
+        return data | {"online": rest, "delay_s": {**former, **own}}
 
     def to_yaml(self) -> str:
         """The effective configuration, every key written out."""

@@ -253,12 +253,12 @@ def _stamped(sensor: str) -> str:
     return sensor
 
 
+Delays = dict[Annotated[str, AfterValidator(_stamped)], float]  # sensor -> how late its stamps are known to be [s]
+
+
 class Online(Section):
     """The online mode."""
 
     hold_s: NotNegative = Field(
         0.3, description="measurements wait this long for late ones; what is later than that costs more"
-    )
-    delay_s: dict[Annotated[str, AfterValidator(_stamped)], float] = Field(
-        {}, description="sensor: how much older its measurements are than their stamps, e.g. dvl: 0.15"
     )

@@ -18,7 +18,10 @@ from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import motion_row as at
+from rovgraph.sensors import innovation
 from rovgraph.state import Jacobians, State
+
+SHORT_S = 1e-3  # from its keyframe, a measurement is taken to be at it
 
 
 def widened(chain: Chain, state: State, names: tuple[str, ...], beliefs: Mapping[str, Belief] | None = None) -> Chain:
@@ -35,7 +38,7 @@ def widened(chain: Chain, state: State, names: tuple[str, ...], beliefs: Mapping
     offsets = {i.time_offset for i in chain.initial.instruments.values()}
     for sensor, block in chain.blocks.items() if offsets & set(names) else ():
         if block.instrument.time_offset in names and block.window is None:
-            timed[sensor] = _timed(block, wide, state)
+            timed[sensor] = _timed(block, wide, chain, state)
     if {*SCALES} & set(names) and not len(rows.scales):
         rows = replace(rows, scales=_mean_signal_to_bias(chain, state))
     return _WidenedChain(chain.intervals, chain.initial, beliefs or chain.beliefs, wide, rows, timed)
@@ -64,14 +67,15 @@ class _TimedBlock(Block):
         return predicted, H | {self.instrument.time_offset: -self.slope[..., None]}
 
 
-def _timed(block: Block, wide: Unknowns, state: State) -> _TimedBlock:
-    """A block that knows how its predictions change with time [unit/s]."""
+def _timed(block: Block, wide: Unknowns, chain: Chain, state: State) -> _TimedBlock:
+    """A block that knows how its predictions change with time [unit/s], from the keyframes around each."""
     scales = SCALES if block.scale_to_bias is not None else ()
     wider = replace(block, unknowns=wide.of([*block.instrument.calibration, *scales]))
-    slope = np.zeros_like(block.z)
-    if len(block) > 1:
-        step = np.maximum(np.gradient(block.time), 1e-6)[:, None]
-        slope = np.asarray(np.gradient(block.predicted(state.at(block.keyframe)), axis=0) / step)
+    model, time, rate_b = block.instrument.model, chain.rows.time, np.array([i.rate_b for i in chain.intervals])
+    before = np.maximum(block.keyframe - (block.motion.dt < SHORT_S), 0)
+    after = np.minimum(block.keyframe + 1, len(time) - 1)
+    begin, end = (model.predict(state.at(k), rate_b[k])[0] for k in (before, after))
+    slope = np.asarray(innovation(model, end, begin) / np.maximum(time[after] - time[before], 1e-6)[:, None])
     return _TimedBlock(**{f.name: getattr(wider, f.name) for f in fields(Block)}, slope=slope)
 
 

@@ -1,11 +1,16 @@
 """Many clocks become one.
 
 The estimator's time is that of the clock that stamps the IMU. Any other clock is compared
-with it by way of the host's: the least delay between a stamp and its arrival, of the last
-minute, is taken for the transport, which is the same for all. Two clocks that agree from the
-start within `AGREE_S` are taken for synchronised, and their stamps believed to the
+with it by way of the host's: the least delay between a message's leaving and its arrival, of the
+last minute, is taken for the transport, which is the same for all. An instrument that says when it
+sent a message, too, has its processing taken off, so that only the transport is left; of others the
+stamp stands for the leaving. Two clocks that agree from the start within `AGREE_S` (`AGREE_SENT_S` where
+the transport alone is left) are taken for synchronised, and their stamps believed to the
 millisecond; what they drift apart later is put right. Clocks that do not agree (seconds since
 switching on, say) are shifted by the difference of their least delays.
+
+The stamps of recordings are believed. Those of another epoch than the IMU's are shifted by the recorded arrivals, and
+refused where these do not tell.
 
 A stamp that is suddenly seconds off is left out. When the stamps go on like that, the clock
 was set: it is shifted, so that time goes on.
@@ -16,9 +21,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rovgraph.errors import InputError
 from rovgraph.live.message import Message
 
 AGREE_S = 0.5
+AGREE_SENT_S = 0.1
+EPOCH_S = 86400.0  # recorded stamps that are further apart are of different epochs
 JUMP_S = 5.0  # a delay that differs by more from the one before is no delay
 CONFIRM_S, CONFIRM = 2.0, 5  # so long, and so many stamps, until a clock counts as set
 WINDOW_S = 60.0  # over which the least delay is taken
@@ -27,7 +35,7 @@ PIECES = 6  # that the window is kept in
 
 @dataclass
 class _LeastDelay:
-    """The least of arrival minus stamp over a sliding window."""
+    """The least delay, arrival minus leaving, over a sliding window."""
 
     pieces: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=PIECES))
 
@@ -55,6 +63,7 @@ class _Clock:
     shift: float = 0.0  # what was put right when it was set
     apart: float | None = None  # from the IMU's clock at the start; None = not compared yet
     odd: list[tuple[float, float]] = field(default_factory=list)  # arrival, delay
+    newest: float | None = None  # its newest stamp
 
 
 @dataclass
@@ -78,28 +87,33 @@ class Clocks:
         """Of a message's measurements [s]; None = not to be known, leave it out.
 
         A message of a source without a clock is as old as the IMU's newest at its arrival.
+
+        Raises
+        ------
+        InputError : recordings whose clocks are of different epochs, and whose arrivals do not tell by how much
         """
-        if self.trust and message.stamp is not None:
-            return message.stamp
         if message.stamp is None:
-            now = self.now(message.arrival)
-            return message.arrival if now is None else now
+            return message.arrival if self._base is None else message.arrival - self._base.delay.value
         clock = self._clocks.setdefault(
             (message.source, message.clock), _Clock(f"{message.source} {message.clock}".strip())
         )
         if self._base is None and any(r.sensor == "imu" for r in message.readings):
             self._base, clock.apart = clock, 0.0
+        clock.newest, processing = message.stamp, message.latency or 0.0
         stamp = message.stamp + clock.shift
-        if self._is_odd(clock, message.arrival, message.arrival - stamp):
+        if self.trust:
+            clock.delay.add(message.arrival, message.arrival - stamp - processing)
+            return self._recorded(stamp, clock)
+        if self._is_odd(clock, message.arrival, message.arrival - stamp - processing):
             self.odd += 1
             return None
         stamp = message.stamp + clock.shift  # it may have been set
-        clock.delay.add(message.arrival, message.arrival - stamp)
-        return stamp + self._correction(clock)
+        clock.delay.add(message.arrival, message.arrival - stamp - processing)
+        return stamp + self._correction(clock, AGREE_S if message.latency is None else AGREE_SENT_S)
 
     def now(self, host: float) -> float | None:
-        """The estimator's time at a time of the host's clock; None before the IMU has been heard."""
-        return None if self._base is None else host - self._base.delay.value
+        """The estimator's time at a time of the host's clock; None before the IMU has been heard, and in a replay."""
+        return None if self.trust or self._base is None else host - self._base.delay.value
 
     def state(self) -> dict[str, Any]:
         """What it has learnt of the clocks, as plain values."""
@@ -121,15 +135,29 @@ class Clocks:
             if clock.name == state["base"]:
                 self._base = clock
 
-    def _correction(self, clock: _Clock) -> float:
+    def _recorded(self, stamp: float, clock: _Clock) -> float:
+        """The time of a recording's stamp."""
+        base = self._base
+        if base is None or base.newest is None or abs(stamp - base.newest) < EPOCH_S:
+            return stamp
+        time = stamp + self._correction(clock, AGREE_S)
+        if abs(time - base.newest) > EPOCH_S:
+            raise InputError(
+                f"{clock.name}: its clock reads {stamp:.1f} s where that of {base.name} reads {base.newest:.1f} s; "
+                "recordings of different epochs cannot be put together: put both on one clock"
+            )
+        return time
+
+    def _correction(self, clock: _Clock, within: float) -> float:
+        """What a clock is shifted by; one that is ``within`` so much at first is taken for synchronised [s]."""
         if clock is self._base or self._base is None:
             return 0.0
         apart = clock.delay.value - self._base.delay.value
         if clock.apart is None:
-            agree = abs(apart) < AGREE_S
+            agree = abs(apart) < within
             clock.apart = apart if agree else 0.0
             if not agree:
-                self.news.append((clock.name, f"its clock differs by {-apart:.1f} s from the IMU's and is shifted"))
+                self.news.append((clock.name, f"its clock differs by {-apart:.3g} s from the IMU's and is shifted"))
         return apart - clock.apart
 
     def _is_odd(self, clock: _Clock, arrival: float, delay: float) -> bool:

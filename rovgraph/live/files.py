@@ -186,4 +186,4 @@ def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
 
 def _as_recorded(config: Config) -> dict[str, Any]:
     """What of a configuration has been applied to a recording already."""
-    return {"columns": {}, "units": {}, "online": config.online.model_copy(update={"delay_s": {}})}
+    return {"columns": {}, "units": {}, "delay_s": {}}

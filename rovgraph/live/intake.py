@@ -31,7 +31,7 @@ class Intake:
 
     def __init__(self, config: Config, left_out: Counter[tuple[str, str]]) -> None:
         self.origin: tuple[float, float] | None = None
-        self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.online.delay_s.items()}
+        self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.delay_s.items()}
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._left_out = left_out
         self._newest: dict[str, float] = {}

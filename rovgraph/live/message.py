@@ -36,6 +36,7 @@ class Message(NamedTuple):
     stamp : time of validity by the source's own clock [s], None where it has none
     readings : one per sensor
     clock : which of the source's clocks the stamp is from, where it has several
+    latency : time from validity to transmission, by the same clock [s]; None where the source does not say
     """
 
     source: str
@@ -43,6 +44,7 @@ class Message(NamedTuple):
     stamp: float | None
     readings: tuple[Reading, ...]
     clock: str = ""
+    latency: float | None = None
 
 
 def readings(cells: Mapping[str, float]) -> tuple[Reading, ...]:

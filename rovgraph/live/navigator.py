@@ -26,6 +26,7 @@ from rovgraph.live.health import Health
 from rovgraph.live.incoherence import Incoherence
 from rovgraph.live.intake import Intake
 from rovgraph.live.joining import ANYWHERE_M, can_join, is_late, joined, unlocated
+from rovgraph.live.lags import Lags
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
@@ -78,6 +79,7 @@ class Navigator:
     def __post_init__(self) -> None:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
+        self._lags = Lags(self.config)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
@@ -150,6 +152,8 @@ class Navigator:
 
     def finish(self) -> None:
         """No more measurements: take what is held back."""
+        for sensor, text in self._lags.finish():
+            self.say(sensor, "clock", text)
         if self.engine is None and (beginning := self._startup.begin(self.origin)) is not None:
             self._begin(beginning)
         if self.engine is not None:
@@ -230,7 +234,10 @@ class Navigator:
             self.engine.retract(m.sensor, verdict.retract_since)
         if not verdict.use:
             self.left_out[m.sensor, self.faults.watches[m.sensor].state] += 1
-        elif self._incoherence.keeps_out(m.sensor, m.time):
+            return
+        for sensor, text in self._lags.add(m):
+            self.say(sensor, "clock", text)
+        if self._incoherence.keeps_out(m.sensor, m.time):
             self.left_out[m.sensor, "incoherent"] += 1
         elif self.engine is None:
             if (beginning := self._startup.add(m, self.origin)) is not None:

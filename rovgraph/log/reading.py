@@ -43,6 +43,7 @@ def read_log(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     mag: Callable[[Array], Array] | None = None,
+    delay_s: Mapping[str, float] | None = None,
 ) -> Log:
     """Read a log.
 
@@ -53,6 +54,8 @@ def read_log(
     units : column or group of columns -> unit, where it is not SI
     mag : the magnetometer's calibration, from samples to field, both of shape (n, 3) (`Mag.calibrated`
         of a configuration); everything that takes the log then sees the field
+    delay_s : sensor -> how much older its measurements are than their stamps; the log's times are those of the
+        measurements
 
     Returns
     -------
@@ -66,26 +69,32 @@ def read_log(
     -----
     DataWarning : what was left out or put in order
     """
-    return _assembled(read_table(path), columns or {}, units or {}, mag)
+    return _assembled(read_table(path), columns or {}, units or {}, mag, delay_s or {})
 
 
-def log_from_frame(frame: pd.DataFrame, source: str = "log") -> Log:
+def log_from_frame(frame: pd.DataFrame, source: str = "log", delay_s: Mapping[str, float] | None = None) -> Log:
     """A log that is in memory already, as `read_log` would read it from a file.
 
     Parameters
     ----------
     frame : columns of a log under rovgraph's names, in SI
     source : name for messages
+    delay_s : of `read_log`
 
     Raises
     ------
     InputError : a frame that cannot be worked with
     """
-    return _assembled(Table(source, frame, np.arange(len(frame), dtype=np.int64) + 2), {}, {}, None)
+    table = Table(source, frame, np.arange(len(frame), dtype=np.int64) + 2)
+    return _assembled(table, {}, {}, None, delay_s or {})
 
 
 def _assembled(
-    table: Table, columns: Mapping[str, str], units: Mapping[str, str], mag: Callable[[Array], Array] | None
+    table: Table,
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    mag: Callable[[Array], Array] | None,
+    delay_s: Mapping[str, float],
 ) -> Log:
     """The streams of a table."""
     scale = factors(units, table.source)
@@ -102,6 +111,8 @@ def _assembled(
         raise InputError(f"{table.source}: no measurement of any sensor in it; {_found(table.names)}")
     if mag is not None and "mag" in found:
         found["mag"] = replace(found["mag"], data=mag(found["mag"].data))
+    for sensor in delay_s.keys() & found.keys():
+        found[sensor] = replace(found[sensor], time=found[sensor].time - delay_s[sensor])
     return Log(table.source, found, origin)
 
 

@@ -61,7 +61,8 @@ def of_imu(config: Config, origin_b: Array) -> Instrument:
     """The heading that the IMU makes itself."""
     declination = float(np.deg2rad(config.environment.declination_deg))
     model = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, mount_matrix(config.imu.mount_rpy_deg))
-    return instrument(config.heading, model, np.deg2rad(config.heading.ahrs_sd_deg), ("heading",))
+    sd = np.deg2rad(config.heading.ahrs_sd_deg)
+    return instrument(config.heading, model, sd, ("heading",), time_offset="ahrs_time_offset")
 
 
 def of_dvl(config: Config, origin_b: Array) -> Instrument:

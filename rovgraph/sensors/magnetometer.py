@@ -65,7 +65,7 @@ def magnetometer(config: Config, origin_b: Array) -> Instrument:
     declination = float(np.deg2rad(env.declination_deg))
     model = MagneticField(declination, dip, magnitude, mount_matrix(config.imu.mount_rpy_deg))
     sd = np.deg2rad(config.heading.mag_sd_deg) * magnitude * max(np.cos(dip), 0.1)
-    return instrument(config.heading, model, sd, ("x", "y", "z"))
+    return instrument(config.heading, model, sd, ("x", "y", "z"), time_offset="mag_time_offset")
 
 
 def _refused(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:

@@ -60,14 +60,14 @@ def pressure_sensor(config: Config, origin_b: Array) -> Instrument:
     """Depth, positive down."""
     depth = config.depth
     model = Position("depth", np.array(depth.lever_arm_m) - origin_b, (2,), "depth_offset")
-    return instrument(depth, model, depth.sd_m, ("down",))
+    return instrument(depth, model, depth.sd_m, ("down",), time_offset="depth_time_offset")
 
 
 def positioning(config: Config, origin_b: Array) -> Instrument:
     """Fixes, north and east."""
     fix = config.fix
     model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1))
-    return instrument(fix, model, fix.sd_m, ("north", "east"))
+    return instrument(fix, model, fix.sd_m, ("north", "east"), time_offset="fix_time_offset")
 
 
 def _too_deep(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:

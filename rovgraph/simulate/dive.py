@@ -79,7 +79,7 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     if truth.noise:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
     sample = _Sampler(truth, calibration, rng)
-    frames = [_inertial(sample, motion, bias), _pings(sample, path)]
+    frames = [_inertial(sample, path, motion, bias), _pings(sample, path)]
     makers = (_depths, _attitudes, _fixes, _signals, _sightings)
     frames += [frame for make in makers if (frame := make(sample, path)) is not None]
     frames += [_regular(sample, path, s.name, 1.0 / s.simulated_hz) for s in SENSORS.values() if s.simulated_hz]
@@ -109,6 +109,12 @@ class _Sampler:
         self.truth, self.calibration, self.rng = truth, calibration, rng
         self.instruments = instruments(truth.config)
         self.covariances = truth.covariances if truth.noise else None
+
+    def motion(self, sensor: str, path: Path, stamps: Array) -> Motion:
+        """The motion that a sensor measured: stamps are as late as its time offset says."""
+        offset = self.instruments[sensor].time_offset
+        late = 0.0 if offset is None else float(self.calibration[offset][0])
+        return path.motion(np.clip(stamps - late, 0.0, path.duration))
 
     def exact(self, sensor: str, motion: Motion) -> Array:
         """The measurement without noise, shape (n, dim)."""
@@ -168,7 +174,7 @@ def _frame(time: Array, columns: list[str], values: Array) -> pd.DataFrame:
     return frame
 
 
-def _inertial(sample: _Sampler, motion: Motion, bias: Array) -> pd.DataFrame:
+def _inertial(sample: _Sampler, path: Path, motion: Motion, bias: Array) -> pd.DataFrame:
     """Accelerometer, gyro and magnetometer, one row per sample."""
     truth, rng, n = sample.truth, sample.rng, len(motion)
     signal = specific_force_and_rate(motion, truth.config)
@@ -176,24 +182,25 @@ def _inertial(sample: _Sampler, motion: Motion, bias: Array) -> pd.DataFrame:
     values = to_imu_axes(signal + bias, truth.config) + scale * to_imu_axes(signal, truth.config)
     if truth.vibration is not None:
         values[:, :3] += truth.vibration.at(motion.time, rng)
+    seen = sample.motion("mag", path, motion.time) if sample.calibration["mag_time_offset"].any() else motion
     if sample.covariances is None:
         if truth.noise:
             values = values + white(truth.config.imu.noise, truth.imu_rate, n, rng)
-        field = sample.noisy("mag", motion)
+        field = sample.noisy("mag", seen)
     else:
         at_this_rate = sample.covariances.imu * (truth.imu_rate / sample.covariances.imu_rate)
         noise = correlated(at_this_rate, n, rng)
-        values, field = values + noise[:, :6], sample.exact("mag", motion) + sample.magnitude * noise[:, 6:]
+        values, field = values + noise[:, :6], sample.exact("mag", seen) + sample.magnitude * noise[:, 6:]
     if truth.magnetism.distortion is not None:
         field = truth.magnetism.distortion.raw(field)
     return _frame(motion.time, IMU_COLUMNS + MAG_COLUMNS, np.hstack([values, field]))
 
 
 def _pings(sample: _Sampler, path: Path) -> pd.DataFrame:
-    """DVL velocity, its validity and its compass, one row per ping, stamped as late as the DVL's stamps are."""
+    """DVL velocity, its validity and its compass, one row per ping."""
     truth, rng = sample.truth, sample.rng
     stamps = sample.epochs(path, 1.0 / truth.dvl_rate, truth.dvl_jitter)
-    motion = path.motion(np.clip(stamps - sample.calibration["dvl_time_offset"], 0.0, path.duration))
+    motion = sample.motion("dvl", path, stamps)
     velocity = sample.exact("dvl", motion)
     if sample.covariances is None:
         noise, speed = None, np.linalg.norm(velocity, axis=1)[:, None]
@@ -230,13 +237,14 @@ def _attitudes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
     truth = sample.truth
     if truth.ahrs_rate is None:
         return None
-    motion = path.motion(sample.epochs(path, 1.0 / truth.ahrs_rate))
+    stamps = sample.epochs(path, 1.0 / truth.ahrs_rate)
+    motion = sample.motion("ahrs", path, stamps)
     memory = truth.ahrs_memory * truth.ahrs_rate
     tilt = rpy_from_matrix(motion.R_nb @ mount_matrix(truth.config.imu.mount_rpy_deg))[:, :2]
     tilt = tilt + remembered(sample.noise(AHRS_TILT_SD, tilt.shape), memory)
     yaw = sample.exact("ahrs", motion)
     yaw = yaw + remembered(sample.noise(sample.instruments["ahrs"].sd, yaw.shape), memory)
-    return _frame(motion.time, ["ahrs_roll", "ahrs_pitch", "ahrs_yaw"], wrap_angle(np.hstack([tilt, yaw])))
+    return _frame(stamps, ["ahrs_roll", "ahrs_pitch", "ahrs_yaw"], wrap_angle(np.hstack([tilt, yaw])))
 
 
 def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
@@ -246,9 +254,9 @@ def _fixes(sample: _Sampler, path: Path) -> pd.DataFrame | None:
 
 def _regular(sample: _Sampler, path: Path, sensor: str, interval: float) -> pd.DataFrame:
     """A sensor with a clock of its own and white noise; its first columns are the measurement."""
-    motion = path.motion(sample.epochs(path, interval))
-    z = sample.noisy(sensor, motion)
-    return _frame(motion.time, list(SENSORS[sensor].column_names[: z.shape[1]]), z)
+    stamps = sample.epochs(path, interval)
+    z = sample.noisy(sensor, sample.motion(sensor, path, stamps))
+    return _frame(stamps, list(SENSORS[sensor].column_names[: z.shape[1]]), z)
 
 
 def _sightings(sample: _Sampler, path: Path) -> pd.DataFrame | None:

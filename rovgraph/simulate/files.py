@@ -60,12 +60,12 @@ def write_log(log_frame: pd.DataFrame, path: Path) -> None:
 def known(dive: Dive, config: Config) -> Config:
     """What an estimator knows: the configuration with the planned start, for a log in rovgraph's own columns.
 
-    The simulated magnetometer needs no calibration.
+    The simulated magnetometer needs no calibration, and stamps are not late.
     """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
     start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
     imu = config.imu.model_copy(update={"mag": Mag()})
-    return config.model_copy(update={"start": start, "columns": {}, "units": {}, "imu": imu})
+    return config.model_copy(update={"start": start, "columns": {}, "units": {}, "delay_s": {}, "imu": imu})
 
 
 def secrets(dive: Dive) -> dict[str, Any]:

@@ -184,7 +184,7 @@ def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: Sensors) -> Observability:
     """What a manoeuvre would show by itself."""
     ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
-    own = config.model_copy(update={"columns": {}, "units": {}})
+    own = config.model_copy(update={"columns": {}, "units": {}, "delay_s": {}})
     truth = Truth(
         own, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
         fix_interval=sensors.fix_interval, ahrs_rate=ahrs,

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rovgraph.calibration import TABLE
+from rovgraph.config import Config
 from rovgraph.engine.released import Released, as_chain, release
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
@@ -18,13 +19,20 @@ NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
 HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
 # errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
 SHOWN = 0.3
+SHOWN_OF = {"fix_time_offset": 1.0}  # the velocity that makes a late fix wrong is known well, whatever fixes scatter
 MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
-FEIGNED = {"dvl_scale": 1.5e-3, "gyr_scale": 5e-4}  # by errors in variables, however long the dive is
+FEIGNED = {
+    "dvl_scale": 1.5e-3,
+    "gyr_scale": 5e-4,
+    "ahrs_time_offset": 0.01,
+    "mag_time_offset": 5e-3,
+}  # by errors in variables, however long the dive is
 DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
 FEELS_THE_EARTH = 10.0  # sds
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
-RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm", "dvl_time_offset", "gyr_scale")
+TIME_OFFSETS = tuple(name for name in TABLE if name.endswith("_time_offset"))
+RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm", "gyr_scale", *TIME_OFFSETS)
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
 
 
@@ -93,7 +101,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
     moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
     for r in release(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]
-        if r.sd > SHOWN * variable.sd:
+        if r.sd > SHOWN_OF.get(r.name, SHOWN) * variable.sd:
             continue
         shown, unit = _shown(variable.unit)
         belief = best.beliefs[r.name]
@@ -108,7 +116,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             HELD_FAR_OFF,
             f"{r.label} is held at {shown * mean:.4g}{unit}, where the measurements have it "
             f"{shown * r.step:+.2g} ± {shown * r.sd:.1g}{unit} from that",
-            _remedy_of_held(r),
+            _remedy_of_held(r, evidence.beginning.config),
         )
 
 
@@ -191,8 +199,8 @@ def _key_of(name: str) -> str:
         return "dvl.mount_rpy_deg and the signs of the DVL's axes"
     if name == "dvl_lever_arm":
         return "dvl.lever_arm_m and imu.lever_arm_m"
-    if name == "dvl_time_offset":
-        return "the DVL's clock"
+    if name in TIME_OFFSETS:
+        return f"the clock that stamps {_sensor_of(name)}"
     if name.endswith("_offset") and name != "depth_offset":
         return "environment.declination_deg and the compass's mounting"
     if name in ("hard_iron", "soft_iron", "field_scale", "field_dip", "mag_deviation"):
@@ -200,11 +208,17 @@ def _key_of(name: str) -> str:
     return f"calibration.{name}"
 
 
-def _remedy_of_held(r: Released) -> str:
+def _remedy_of_held(r: Released, config: Config) -> str:
     """What to do about a constant that is not what it is held at."""
     if r.name == "dvl_time_offset":
         return (
             "the DVL's stamps are late (early if negative): estimate it, calibration.dvl_time_offset: {estimate: true}"
+        )
+    if r.name in TIME_OFFSETS:
+        sensor, known = _sensor_of(r.name), config.delay_s.get(_sensor_of(r.name), 0.0)
+        return (
+            f"stamps of {sensor} are late (early if negative): state delay_s: {{{sensor}: {known + r.step:.2g}}}, "
+            f"or estimate calibration.{r.name}"
         )
     if r.name == "gyr_scale":
         return "estimate calibration.gyr_scale, or calibrate the gyro"

@@ -11,6 +11,7 @@ from rovgraph.geometry import Array
 from rovgraph.live.message import GEODETIC, Message, readings
 from rovgraph.live.sources.lines import LineDecoder, Refused, json_number, json_object, shown
 from rovgraph.live.sources.source import Notify
+from rovgraph.live.sources.waterlinked import is_report, report_message
 from rovgraph.log.reading import ACC_GAP
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, THRUSTER, is_column, label_number
 from rovgraph.log.units import factors, near_miss
@@ -56,13 +57,17 @@ class JsonRow:
         self._acc: tuple[Array, float | None, float] | None = None  # the last one, its stamp and arrival
 
     def message(self, line: bytes, arrival: float) -> Message | None:
-        """What a line says.
+        """What a line says; None where that is no measurement.
 
         Raises
         ------
         Refused : the line is to be skipped
         """
-        cells = self._cells(json_object(line))
+        row = json_object(line)
+        if is_report(row):  # of a Water Linked DVL, passed on as it came
+            report = report_message(row, self._url, arrival, self._notify)
+            return None if report is None else report._replace(clock="DVL")  # not that of the other lines
+        cells = self._cells(row)
         stamp = cells.pop("time", None)
         _check(cells)
         alone = self._join(cells, stamp, arrival)

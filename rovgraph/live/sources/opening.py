@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from rovgraph.live.sources.links import SerialLink, StandardInput, TcpLink, UdpL
 from rovgraph.live.sources.mavlink import IMUS, MavlinkDecoder, Options
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.recordings import FileLink, TelemetryLog
-from rovgraph.live.sources.replay import log_replay
+from rovgraph.live.sources.replay import LogReplay, log_replay, refuse_other_epochs
 from rovgraph.live.sources.source import Decoder, LinkSource, Notify, Source
 from rovgraph.live.warnings import Warnings
 from rovgraph.log.units import nearest
@@ -44,7 +45,7 @@ def open_sources(
 
     Raises
     ------
-    InputError : no URL, one of them is wrong, or stands there twice
+    InputError : no URL, one of them is wrong, or stands there twice; logs that are not on one clock
     """
     if not urls:
         raise InputError(f"expected at least one source, such as {', '.join(FORMS.values())}")
@@ -52,7 +53,11 @@ def open_sources(
         if urls.count(url) > 1:
             raise InputError(f"{url}: given twice; each source can be read once")
     warnings = warnings or Warnings()
-    return tuple(open_source(url, warnings, config, speed) for url in urls)
+    opened = tuple(open_source(url, warnings, config, speed) for url in urls)
+    logs = [source for source in opened if isinstance(source, LogReplay)]
+    refuse_other_epochs(logs)
+    begin = min((log.span[0] for log in logs), default=None)
+    return tuple(replace(source, begin=begin) if isinstance(source, LogReplay) else source for source in opened)
 
 
 def open_source(

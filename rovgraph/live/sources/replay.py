@@ -1,13 +1,14 @@
 """A log of ours, as if it came in now."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pymap3d
 
 from rovgraph.config import Config
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.sources.source import paced
@@ -16,15 +17,27 @@ from rovgraph.log import Log, read_log
 
 @dataclass(frozen=True)
 class LogReplay:
-    """A log's measurements in the order of time, one per message; stamps are the log's times."""
+    """A log's measurements in the order of time, one per message; stamps are the log's times.
+
+    Attributes
+    ----------
+    begin : time that the replay begins at, as of logs that are replayed together [s]; None = the log's first
+    """
 
     url: str
     log: Log
     pace: float
     lossy: bool = False
+    begin: float | None = None
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time of the log [s]."""
+        times = [stream.time for stream in self.log.streams.values()]
+        return min(float(t[0]) for t in times), max(float(t[-1]) for t in times)
 
     def messages(self, stop: threading.Event) -> Iterator[Message]:
-        return paced(self._recorded(), self.pace, stop)
+        return paced(self._recorded(), self.pace, stop, self.begin)
 
     def _recorded(self) -> Iterator[Message]:
         places = _geodetic(self.log)
@@ -34,10 +47,30 @@ class LogReplay:
             yield Message(self.url, time, time, (reading,))
 
 
+def refuse_other_epochs(replays: Sequence[LogReplay]) -> None:
+    """See that logs that are replayed together are on one clock: only what they share with the IMU's can be used.
+
+    Raises
+    ------
+    InputError : a log that has no time in common with the one that holds the IMU; both are named
+    """
+    base = next((replay for replay in replays if "imu" in replay.log), None)
+    for other in replays:
+        if base is None or other is base:
+            continue
+        (begin, end), (first, last) = base.span, other.span
+        if first > end or last < begin:
+            raise InputError(
+                f"{other.url}: its times, {first:.1f} to {last:.1f} s, have none in common with those of {base.url}, "
+                f"{begin:.1f} to {end:.1f} s; are the clocks of different epochs? Put both files on one clock"
+            )
+
+
 def log_replay(url: str, path: str, config: Config, pace: float) -> LogReplay:
     """Replay of a file, with the configuration's columns and units.
 
-    The magnetometer's samples stay raw, as those of other sources: the navigator calibrates them.
+    Samples of the magnetometer and stamps stay raw, as those of other sources: the navigator calibrates them and takes
+    off known delays.
 
     Raises
     ------

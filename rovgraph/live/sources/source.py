@@ -87,11 +87,17 @@ class LinkSource:
         return heard if self.pace is None else paced(heard, self.pace, stop)
 
 
-def paced(messages: Iterable[Message], pace: float, stop: threading.Event) -> Iterator[Message]:
+def paced(
+    messages: Iterable[Message], pace: float, stop: threading.Event, first: float | None = None
+) -> Iterator[Message]:
     """Messages of a recording, each at its time.
 
     At pace 1 they arrive by the host's clock, so that live sources may stand beside the recording;
     at any other, by the recording's.
+
+    Parameters
+    ----------
+    first : the recorded time that the replay begins at, the same for recordings of one clock; None = the first message
     """
     begin, offset = time.monotonic(), None
     for message in messages:
@@ -101,7 +107,9 @@ def paced(messages: Iterable[Message], pace: float, stop: threading.Event) -> It
             yield message
             continue
         if offset is None:
-            first, offset = message.arrival, time.time() - message.arrival
+            first = message.arrival if first is None else first
+            offset = time.time() - first
+        assert first is not None
         if stop.wait(max(0.0, begin + (message.arrival - first) / pace - time.monotonic())):
             return
         yield message._replace(arrival=message.arrival + offset) if pace == 1.0 else message

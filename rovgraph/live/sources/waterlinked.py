@@ -1,6 +1,7 @@
 """Water Linked A50 and A125: the DVL's own TCP protocol, JSON lines of the format json_v3.
 
-Source: the protocol's description at https://docs.waterlinked.com/dvl/dvl-protocol.
+Source: the protocol's description at https://docs.waterlinked.com/dvl/dvl-protocol: ``time_of_validity`` is that of the
+reflection at the bottom, ``time_of_transmission`` when the report leaves the DVL, both in microseconds of its clock.
 """
 
 import math
@@ -14,22 +15,35 @@ from rovgraph.live.sources.source import Notify
 
 PORT = 16171
 FORMAT = "json_v3"  # minor versions, as json_v3.1, only add to it
+LONGEST_LATENCY_S = 5.0  # between validity and transmission; more is no latency
 IGNORED = ("position_local", "response")
 
 
 def waterlinked(url: str, notify: Notify) -> LineDecoder:
     """Decoder of a Water Linked DVL's reports."""
+    return LineDecoder(lambda line, arrival: report_message(json_object(line), url, arrival, notify), notify)
 
-    def message(line: bytes, arrival: float) -> Message | None:
-        report = json_object(line)
-        if report.get("type") in IGNORED:
-            return None
-        _check(report)
-        if report.get("status"):
-            notify("status", "the DVL reports a fault, such as being too hot; its velocities are used as long as valid")
-        return Message(url, arrival, _stamp(report), _readings(report))
 
-    return LineDecoder(message, notify)
+def is_report(row: dict[str, Any]) -> bool:
+    """Whether a JSON object is one of this protocol."""
+    return row.get("type") in ("velocity", *IGNORED) and "format" in row
+
+
+def report_message(report: dict[str, Any], url: str, arrival: float, notify: Notify) -> Message | None:
+    """What a report says; None where it is about no measurement.
+
+    Raises
+    ------
+    Refused : the report is to be skipped
+    """
+    if report.get("type") in IGNORED:
+        return None
+    _check(report)
+    if report.get("status"):
+        notify("status", "the DVL reports a fault, such as being too hot; its velocities are used as long as valid")
+    stamp, sent = _time(report, "time_of_validity"), _time(report, "time_of_transmission")
+    latency = None if stamp is None or sent is None or not 0.0 <= sent - stamp < LONGEST_LATENCY_S else sent - stamp
+    return Message(url, arrival, stamp, _readings(report), latency=latency)
 
 
 def _check(report: dict[str, Any]) -> None:
@@ -42,10 +56,10 @@ def _check(report: dict[str, Any]) -> None:
         raise Refused("malformed", "a velocity report without velocity_valid is skipped")
 
 
-def _stamp(report: dict[str, Any]) -> float | None:
-    """Time of the reflection at the bottom, by the DVL's clock [s]."""
-    time = report.get("time_of_validity")
-    return None if time is None else 1e-6 * json_number("time_of_validity", time)
+def _time(report: dict[str, Any], name: str) -> float | None:
+    """A time by the DVL's clock [s]."""
+    time = report.get(name)
+    return None if time is None else 1e-6 * json_number(name, time)
 
 
 def _readings(report: dict[str, Any]) -> tuple[Reading, ...]:

@@ -1,0 +1,91 @@
+"""The motion of the last minutes, as each sensor shows it: whose stamps are late, and whose clock has jumped.
+
+What was received goes through the comparisons of `rovgraph check` again and again: acceleration by DVL and IMU,
+turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What two windows in a row say
+is said, and again after half an hour if it lasts, with the figures that it then has.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rovgraph.check.agreement import headings, vertical
+from rovgraph.check.dvl import dvl_and_imu
+from rovgraph.check.findings import Finding
+from rovgraph.check.fixes import track
+from rovgraph.config import Config
+from rovgraph.log import Log, Measurement
+from rovgraph.log.streams import gathered
+
+WINDOW_S = 300.0  # of motion that is compared
+FIRST_S = 60.0  # of motion, before which nothing is compared
+EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
+AGAIN_S = 1800.0  # after which what lasts is said again
+STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
+CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track)
+
+
+@dataclass
+class Lags:
+    """Compares the clocks of sensors by the motion that they show.
+
+    Attributes
+    ----------
+    config : what is believed of mountings and of stamps that are known to be late
+    """
+
+    config: Config
+    _window: deque[Measurement] = field(default_factory=deque)
+    _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
+    _next: float = np.inf
+    _suspected: set[tuple[str, str]] = field(default_factory=set)
+    _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
+
+    def add(self, m: Measurement) -> list[tuple[str, str]]:
+        """Take a measurement.
+
+        Returns
+        -------
+        list of (sensor, text) : what is known to be late from now on, with the configuration that mends it
+        """
+        if m.sensor != "imu":
+            self._window.append(m)
+            return []
+        self._samples.append(m)
+        if m.time - self._samples[0].time < STEP_S:
+            return []
+        self._average()
+        if not np.isfinite(self._next):
+            self._next = m.time + FIRST_S
+        if m.time < self._next:
+            return []
+        while self._window[0].time < m.time - WINDOW_S:
+            self._window.popleft()
+        span = m.time - self._window[0].time
+        self._next = m.time + float(np.clip(0.25 * span, *EVERY_S))
+        return list(self._compared())
+
+    def finish(self) -> list[tuple[str, str]]:
+        """No more measurements: what `add` has not said yet."""
+        return list(self._compared()) if self._suspected else []
+
+    def _average(self) -> None:
+        """One sample of the IMU instead of some."""
+        some, self._samples = self._samples, []
+        time, values = np.mean([m.time for m in some]), np.mean([m.values for m in some], axis=0)
+        self._window.append(some[0]._replace(time=float(time), values=values))
+
+    def _compared(self) -> Iterator[tuple[str, str]]:
+        log = gathered(sorted(self._window, key=lambda m: m.time), "the last minutes")
+        found = [f for check in CHECKS for f in check(log, self.config) if f.clock and f.level != "ok"]
+        found = [f for f in found if f.clock == "jump"] or found  # a lag before and after is the mean of two
+        for finding in found:
+            key = finding.sensor, finding.clock
+            now = float(log["imu"].time[-1])
+            if key in self._suspected and now - self._said.get(key, -np.inf) > AGAIN_S:
+                self._said[key] = now
+                start = min(float(stream.time[0]) for stream in log.streams.values())
+                yield finding.sensor, finding.text + (f"; 0 s is {start:.1f} s" if finding.clock == "jump" else "")
+        self._suspected = {(finding.sensor, finding.clock) for finding in found}
