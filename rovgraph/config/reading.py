@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rovgraph.calibration import MOUNT, TABLE, Belief, Variable
+from rovgraph.calibration import MOUNT, TABLE, Belief, Variable, stationary_walk
 from rovgraph.config.error_messages import complaint
 from rovgraph.config.priors import Calibration, calibration_entry
 from rovgraph.config.registered import add_key, remove_key
@@ -104,12 +104,15 @@ def beliefs(config: Config) -> dict[str, Belief]:
         mean = getattr(entry, "mean" + tail)
         mean = mount.get(name, 0.0) if mean is None else mean
         values = np.atleast_1d(np.asarray(mean, dtype=float))
+        sd, walk = unit * getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
+        lasts = entry.time_constant_s
         out[name] = Belief(
             variable,
             unit * np.broadcast_to(values, (variable.dim,)),
-            unit * getattr(entry, "sd" + tail),
+            sd,
             entry.estimate,
-            unit * getattr(entry, "walk" + tail),
+            walk if lasts is None else stationary_walk(sd, lasts),
+            np.inf if lasts is None else lasts,
         )
     return out
 

@@ -73,9 +73,12 @@ class FilterEngine:
         self.unknowns = unknowns(self.beliefs, initial.instruments)
         self.layout = ErrorLayout(self.unknowns.estimated, initial.instruments)
         self._gravity = initial.config.environment.gravity_mps2
-        self._walk = np.zeros(self.layout.size)  # variance that walking adds in a second
+        self._walk = np.zeros((3, self.layout.size))  # as `rovgraph.kernels.prediction` takes it
         for name, walk in self.unknowns.walks.items():
-            self._walk[self.layout.columns[name]] = walk**2
+            self._walk[0, self.layout.columns[name]] = walk**2
+        for name, seconds in self.unknowns.time_constants.items():
+            self._walk[1, self.layout.columns[name]] = 1.0 / seconds
+            self._walk[2, self.layout.columns[name]] = self.unknowns.fixed[name]
         instruments = initial.instruments
         self._given = {  # linearised outside the kernels
             s for s, i in instruments.items() if not compiled(i, i.time_offset in self.unknowns.walks) or s == PLACE
@@ -142,11 +145,11 @@ class FilterEngine:
         """The next keyframe, from the IMU alone; calibration walks."""
         assert interval.motion is not None
         n = len(before.P)
-        P, x, F, Q = before.P.copy(), np.empty(21), np.empty((n, n)), np.empty((n, n))
+        P, x, c, F, Q = before.P.copy(), np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n))
         scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
-        walk = self._walk if n == self.layout.size else np.append(self._walk, np.zeros(n - self.layout.size))
-        predict_filter(before.x, before.c, P, interval.motion.row, scale, self.layout.column, walk, x, F, Q)
-        return Transition(F, Q, Gaussian(x, before.c, P, before.places))
+        walk = self._walk if n == self.layout.size else np.pad(self._walk, ((0, 0), (0, n - self.layout.size)))
+        predict_filter(before.x, before.c, P, interval.motion.row, scale, self.layout.column, walk, x, c, F, Q)
+        return Transition(F, Q, Gaussian(x, c, P, before.places))
 
     def correct(
         self,

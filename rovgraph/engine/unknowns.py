@@ -1,9 +1,12 @@
 """What of the calibration is estimated."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from rovgraph.calibration import Belief
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rovgraph.calibration import Belief, walked
 from rovgraph.geometry import Array
 
 
@@ -17,10 +20,12 @@ class Unknowns:
         keep them
     walks : random walk of each that is estimated [unit per root second]; with 0 it has one
         value for all of the dive, otherwise one per segment of time
+    time_constants : of those that return to their mean [s]
     """
 
     fixed: Mapping[str, Array]
     walks: Mapping[str, float]
+    time_constants: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def estimated(self) -> tuple[str, ...]:
@@ -33,11 +38,17 @@ class Unknowns:
     def of(self, names: Iterable[str]) -> "Unknowns":
         """Only some of the estimated variables."""
         wanted = set(names)
-        return Unknowns(self.fixed, {name: walk for name, walk in self.walks.items() if name in wanted})
+        walks = {name: walk for name, walk in self.walks.items() if name in wanted}
+        return Unknowns(self.fixed, walks, self.time_constants)
+
+    def walked(self, name: str, seconds: ArrayLike) -> tuple[Array, Array]:
+        """How one that walks moves in a time: `rovgraph.calibration.walked`."""
+        return walked(self.walks[name], self.time_constants.get(name, np.inf), seconds)
 
 
 def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
     """Calibration variables to be estimated: asked for, and a sensor that shows them is in use."""
     present = {*sensors, "imu"}
     wanted = {n: b.walk for n, b in beliefs.items() if b.estimate and present & set(b.variable.sensors)}
-    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted)
+    lasting = {n: beliefs[n].time_constant for n in wanted if np.isfinite(beliefs[n].time_constant)}
+    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted, lasting)

@@ -73,7 +73,7 @@ def _correct(
 
 @kernel(
     "i8(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], f8[:, :, ::1], i8[::1], i8[::1],"
-    " f8[:, ::1], i8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8, f8[::1], f8[:, ::1],"
+    " f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], f8, f8[::1], f8[:, ::1],"
     " f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[::1])"
 )
 def filter_intervals(
@@ -117,7 +117,7 @@ def filter_intervals(
     taken : shape (k + 1,), the first measurement of each interval, and how many there are
     here : shape (k,), the first measurement at the keyframe that ends each
     sensors, column, since, gravity, columns to basis_rows : as `rovgraph.kernels.correction.correct_keyframe`
-    walk : shape (size,), variance that walking adds in a second
+    walk : shape (3, size), as `rovgraph.kernels.prediction.predict_keyframe`
     poorly_known : shape (2,), variances of tilt and heading beyond which the attitude has to be found first [rad^2]
     x_out, c_out : shapes (k, 21), (k, C), the keyframes
     predicted_x_out, predicted_c_out : the same before what was measured at them
@@ -128,7 +128,7 @@ def filter_intervals(
     -------
     How many intervals are taken
     """
-    size, layout = len(walk), ErrorLayout(columns, seen, seen_params, basis_rows)
+    size, layout = walk.shape[1], ErrorLayout(columns, seen, seen_params, basis_rows)
     F, Q, no_scale, there = np.empty((size, size)), np.empty((size, size)), np.empty((0, 0)), np.empty(21)
     tables, out = (rows, which, sensors, column, row_scales), (nis_out, weight_out)
     for k in range(len(here)):
@@ -138,7 +138,7 @@ def filter_intervals(
             return k
         _correct(x, c, P, begin, here[k], *tables, layout, since, gravity, *out)
         scale = scales[k] if len(scales) else no_scale
-        predict_keyframe(x, c, P, motions[k], scale, column, walk, there, F, Q)
+        predict_keyframe(x, c, P, motions[k], scale, column, walk, there, c, F, Q)
         x[:] = there
         predicted_x_out[k], predicted_c_out[k] = x, c
         _correct(x, c, P, here[k], end, *tables, layout, since, gravity, *out)
