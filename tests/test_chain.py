@@ -47,9 +47,9 @@ def walking() -> Case:
 
 
 def lasting() -> Case:
-    errors = {name: {"estimate": True} for name in ("fix_error", "dvl_compass_error", "dvl_error")}
+    errors = {name: {"estimate": True} for name in ("dvl_compass_error", "fix_error")}
     config = falcon(calibration=errors | {"dvl_error": {"estimate": True, "mean": 0.01, "time_constant_s": 5.0}})
-    case = simulated(config, 60.0, seed=2, fix_interval=2.0, **SHORT)
+    case = simulated(config, 45.0, seed=2, fix_interval=2.0, dvl_rate=1.5, imu_rate=50.0)
     return case.log, case.config
 
 
