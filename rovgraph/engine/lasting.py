@@ -1,0 +1,155 @@
+"""Errors that last, found in a dive by its likelihood.
+
+The configuration's noise is white. Here a sensor gets an error that lasts, too, a first-order Gauss-Markov process of
+some sd and time constant, and the likelihood says whether the dive is better explained with it. With whitened rows of
+priors, motions, walks and measurements, and the square root R of their information, it is
+
+    -log L = cost + sum log |diag R| - sum log (weights of walks and priors)
+
+which counts what the error's freedom costs (Bar-Shalom et al. 2001, 11.4), so dives with and without it compare. It
+sees the error through all that the estimate has followed of it, where the autocovariance of residuals would not: fixes
+that are off for a minute take the track along. One elimination at the optimum, with an error as large as the noise,
+tells whether to look for more; that is all that a healthy dive costs.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from rovgraph.calibration import TABLE, stationary_walk
+from rovgraph.engine.chain import Chain
+from rovgraph.engine.chain_information import SquareRoot
+from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.gauss_newton import Gates, Solution, minimise
+from rovgraph.engine.unknowns import unknowns
+from rovgraph.geometry import Array
+from rovgraph.state import State
+
+LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time_constant)}  # sensor -> its error
+ENOUGH = 30  # measurements
+LIKELY = 3.0  # gain of log likelihood, at the optimum without the error, that is worth a look
+CLEAR = 12.0  # gain that is no chance
+LONGEST = 3.0  # time constant, in the length of the dive: what lasts longer is as good as a walk
+SHORTEST = 5.0  # the same in intervals between measurements: what is shorter is noise
+LARGEST = 100.0  # sd, in that of the table
+ROUNDS, EVALUATIONS = 2, 20  # of solving the dive, and of the likelihood in each
+TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
+
+
+@dataclass(frozen=True)
+class LastingError:
+    """An error that was found.
+
+    Attributes
+    ----------
+    sensor, variable : of `LASTING`
+    sd, time_constant : of the process [unit of the variable, s]
+    gain : of log likelihood
+    """
+
+    sensor: str
+    variable: str
+    sd: float
+    time_constant: float
+    gain: float
+
+
+Fit = tuple[LastingError, Chain, Solution[State]]
+
+
+def find_lasting(best: ChainOptimum) -> list[LastingError]:
+    """Errors that last, the clearest first, each looked for beside those before it.
+
+    Parameters
+    ----------
+    best : the optimum; what it estimates is passed over
+    """
+    found: list[LastingError] = []
+    chain, solution, root = best.chain, best.solution, best.information
+    while likely := _likely(chain, solution, root):
+        known = _minus_log_likelihood(chain, root, solution.cost)
+        fits = [_fit(chain, solution, sensor, known) for sensor in likely]
+        clearest, fitted, after = max(fits, key=lambda fit: fit[0].gain)
+        if clearest.gain < CLEAR:
+            break
+        found.append(clearest)
+        chain, solution = fitted, after
+        root = chain.eliminate(solution.point, solution.gates)
+    return found
+
+
+def _likely(chain: Chain, solution: Solution[State], root: SquareRoot) -> list[str]:
+    """Sensors with which an error that is as large as their noise makes the dive more likely."""
+    known, out = _minus_log_likelihood(chain, root, 0.5 * root.left), []
+    for sensor, name in LASTING.items():
+        block = chain.blocks.get(sensor)
+        if block is None or len(block) < ENOUGH or name in chain.unknowns.estimated:
+            continue
+        H = block.by_calibration(solution.point.at(block.keyframe), name)
+        seen = np.sum(H**2, axis=(1, 2)) / H.shape[2]
+        if not np.any(seen > 0.0):
+            continue
+        wider = _with(chain, name, float(1.0 / np.sqrt(np.median(seen[seen > 0.0]))), TABLE[name].time_constant)
+        if known - _linear(wider, solution.point, solution.gates) > LIKELY:
+            out.append(sensor)
+    return out
+
+
+def _fit(chain: Chain, solution: Solution[State], sensor: str, known: float) -> Fit:
+    """The most likely error of a sensor, the chain with it among its unknowns, and the optimum of that."""
+    name, interval = LASTING[sensor], float(np.median(np.diff(chain.blocks[sensor].time)))
+    duration = float(chain.rows.time[-1] - chain.rows.time[0])
+    low = np.log([TABLE[name].sd / LARGEST, SHORTEST * interval])
+    high = np.log([TABLE[name].sd * LARGEST, max(LONGEST, SHORTEST) * duration])
+    x = np.clip(np.log([TABLE[name].sd, TABLE[name].time_constant]), low, high)
+    options = {"maxfev": EVALUATIONS, "xatol": 0.05, "fatol": 0.1}
+    wider, after = chain, solution
+    for spread in np.array([1.0, 0.3])[:ROUNDS]:
+        here = after
+
+        def value(x: Array, here: Solution[State] = here) -> float:
+            inside = np.clip(x, low, high)
+            return _linear(_with(chain, name, *np.exp(inside)), here.point, here.gates) + float(
+                np.sum((x - inside) ** 2)
+            )
+
+        simplex = x + spread * np.array([[0.0, 0.0], [-1.0, 0.0], [0.0, -0.7]])
+        x = np.clip(
+            minimize(value, x, method="Nelder-Mead", options=options | {"initial_simplex": simplex}).x, low, high
+        )
+        wider = _with(chain, name, *np.exp(x))
+        after = minimise(wider, _begin(wider, here.point), tolerance=TOLERANCE)
+    gain = known - _minus_log_likelihood(wider, wider.eliminate(after.point, after.gates), after.cost)
+    sd, time_constant = np.exp(x).tolist()
+    return LastingError(sensor, name, sd, time_constant, gain), wider, after
+
+
+def _begin(chain: Chain, point: State) -> State:
+    """A point of a chain, from one of a chain with other unknowns."""
+    n, calibration = len(chain.intervals), dict(point.calibration)
+    for name in chain.layout.walking:
+        calibration[name] = np.array(np.broadcast_to(calibration[name], (n, TABLE[name].dim)))
+    return replace(point, calibration=calibration)
+
+
+def _with(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
+    """The chain with an error that lasts among its unknowns."""
+    walk = stationary_walk(sd, time_constant)
+    believed = replace(chain.beliefs[name], estimate=True, sd=sd, walk=walk, time_constant=time_constant)
+    beliefs = {**chain.beliefs, name: believed}
+    return replace(chain, beliefs=beliefs, unknowns=unknowns(beliefs, chain.rows.used))
+
+
+def _linear(chain: Chain, point: State, gates: Gates) -> float:
+    """Minus log likelihood of the dive linearised at a point, where that is least."""
+    root = chain.eliminate(_begin(chain, point), gates)
+    return _minus_log_likelihood(chain, root, 0.5 * root.left)
+
+
+def _minus_log_likelihood(chain: Chain, root: SquareRoot, cost: float) -> float:
+    """Of a dive that costs as much, up to what does not change with the errors that last."""
+    diagonals = np.diagonal(root.conditionals, axis1=1, axis2=2), np.diagonal(root.border)
+    freedom = sum(float(np.sum(np.log(np.abs(d)))) for d in diagonals)
+    priors = sum(TABLE[name].dim * np.log(chain.beliefs[name].sd) for name in chain.layout.walking)
+    return cost + freedom - float(np.sum(np.log(chain.walk[0]))) + float(priors)
