@@ -12,6 +12,7 @@ that are off for a minute take the track along. One elimination at the optimum, 
 tells whether to look for more; that is all that a healthy dive costs.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +34,8 @@ CLEAR = 12.0  # gain that is no chance
 LONGEST = 3.0  # time constant, in the length of the dive: what lasts longer is as good as a walk
 SHORTEST = 5.0  # the same in intervals between measurements: what is shorter is noise
 LARGEST = 100.0  # sd, in that of the table
-ROUNDS, EVALUATIONS = 2, 20  # of solving the dive, and of the likelihood in each
+SPREADS = (1.0, 0.3)  # of the search, of sd and time constant by their logarithms, each from an optimum
+EVALUATIONS = 20  # of the likelihood in each
 TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
 
 
@@ -58,16 +60,17 @@ class LastingError:
 Fit = tuple[LastingError, Chain, Solution[State]]
 
 
-def find_lasting(best: ChainOptimum) -> list[LastingError]:
+def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> list[LastingError]:
     """Errors that last, the clearest first, each looked for beside those before it.
 
     Parameters
     ----------
     best : the optimum; what it estimates is passed over
+    without : calibration variables that are, too
     """
     found: list[LastingError] = []
     chain, solution, root = best.chain, best.solution, best.information
-    while likely := _likely(chain, solution, root):
+    while likely := _likely(chain, solution, root, without):
         known = _minus_log_likelihood(chain, root, solution.cost)
         fits = [_fit(chain, solution, sensor, known) for sensor in likely]
         clearest, fitted, after = max(fits, key=lambda fit: fit[0].gain)
@@ -79,12 +82,12 @@ def find_lasting(best: ChainOptimum) -> list[LastingError]:
     return found
 
 
-def _likely(chain: Chain, solution: Solution[State], root: SquareRoot) -> list[str]:
+def _likely(chain: Chain, solution: Solution[State], root: SquareRoot, without: Collection[str]) -> list[str]:
     """Sensors with which an error that is as large as their noise makes the dive more likely."""
     known, out = _minus_log_likelihood(chain, root, 0.5 * root.left), []
     for sensor, name in LASTING.items():
         block = chain.blocks.get(sensor)
-        if block is None or len(block) < ENOUGH or name in chain.unknowns.estimated:
+        if block is None or len(block) < ENOUGH or name in {*chain.unknowns.estimated, *without}:
             continue
         H = block.by_calibration(solution.point.at(block.keyframe), name)
         seen = np.sum(H**2, axis=(1, 2)) / H.shape[2]
@@ -105,7 +108,7 @@ def _fit(chain: Chain, solution: Solution[State], sensor: str, known: float) -> 
     x = np.clip(np.log([TABLE[name].sd, TABLE[name].time_constant]), low, high)
     options = {"maxfev": EVALUATIONS, "xatol": 0.05, "fatol": 0.1}
     wider, after = chain, solution
-    for spread in np.array([1.0, 0.3])[:ROUNDS]:
+    for spread in SPREADS:
         here = after
 
         def value(x: Array, here: Solution[State] = here) -> float:
