@@ -30,8 +30,10 @@ from rovgraph.state import State
 LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time_constant)}  # sensor -> its error
 ENOUGH = 30  # measurements
 LIKELY = 3.0  # gain of log likelihood, at the optimum without the error, that is worth a look
-CLEAR = 12.0  # gain that is no chance
-LONGEST = 3.0  # time constant, in the length of the dive: what lasts longer is as good as a walk
+CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
+LONGEST = 1.0  # time constant, in the length of the dive
+NO_GROUND = 0.5  # the same of a velocity's fraction that is the IMU's own scale rather than the bottom
+CONSTANT = np.array([1.0, 10.0])  # sds of the same error as a constant, in that of the table
 SHORTEST = 5.0  # the same in intervals between measurements: what is shorter is noise
 LARGEST = 100.0  # sd, in that of the table
 SPREADS = (1.0, 0.3)  # of the search, of sd and time constant by their logarithms, each from an optimum
@@ -100,32 +102,58 @@ def _likely(chain: Chain, solution: Solution[State], root: SquareRoot, without: 
 
 
 def _fit(chain: Chain, solution: Solution[State], sensor: str, known: float) -> Fit:
-    """The most likely error of a sensor, the chain with it among its unknowns, and the optimum of that."""
+    """The most likely error of a sensor, the chain with it among its unknowns, and the optimum of that.
+
+    Its gain is that over the same error as a constant, where that is more likely than none: a scale or an offset that
+    is held wrongly is no error that lasts for a while.
+    """
     name, interval = LASTING[sensor], float(np.median(np.diff(chain.blocks[sensor].time)))
     duration = float(chain.rows.time[-1] - chain.rows.time[0])
-    low = np.log([TABLE[name].sd / LARGEST, SHORTEST * interval])
-    high = np.log([TABLE[name].sd * LARGEST, max(LONGEST, SHORTEST) * duration])
-    x = np.clip(np.log([TABLE[name].sd, TABLE[name].time_constant]), low, high)
-    options = {"maxfev": EVALUATIONS, "xatol": 0.05, "fatol": 0.1}
-    wider, after = chain, solution
-    for spread in SPREADS:
-        here = after
-
-        def value(x: Array, here: Solution[State] = here) -> float:
-            inside = np.clip(x, low, high)
-            return _linear(_with(chain, name, *np.exp(inside)), here.point, here.gates) + float(
-                np.sum((x - inside) ** 2)
-            )
-
-        simplex = x + spread * np.array([[0.0, 0.0], [-1.0, 0.0], [0.0, -0.7]])
-        x = np.clip(
-            minimize(value, x, method="Nelder-Mead", options=options | {"initial_simplex": simplex}).x, low, high
+    shortest = SHORTEST * interval
+    least, wider, after = _most_likely(chain, solution, name, shortest, max(LONGEST * duration, shortest))
+    if known - least >= CLEAR:
+        known = min(
+            [known, *(_solved(_with(chain, name, sd, np.inf), solution)[0] for sd in CONSTANT * TABLE[name].sd)]
         )
-        wider = _with(chain, name, *np.exp(x))
-        after = minimise(wider, _begin(wider, here.point), tolerance=TOLERANCE)
-    gain = known - _minus_log_likelihood(wider, wider.eliminate(after.point, after.gates), after.cost)
-    sd, time_constant = np.exp(x).tolist()
+    sd, time_constant = wider.beliefs[name].sd, wider.beliefs[name].time_constant
+    gain = -np.inf if name == "dvl_error" and time_constant > NO_GROUND * duration else known - least
     return LastingError(sensor, name, sd, time_constant, gain), wider, after
+
+
+def _most_likely(
+    chain: Chain, solution: Solution[State], name: str, shortest: float, longest: float
+) -> tuple[float, Chain, Solution[State]]:
+    """The least minus log likelihood with an error of a time constant within bounds [s], its chain and optimum."""
+    low = np.log([TABLE[name].sd / LARGEST, shortest])
+    high = np.log([TABLE[name].sd * LARGEST, longest])
+    x, least, wider = np.clip(np.log([TABLE[name].sd, TABLE[name].time_constant]), low, high), np.inf, chain
+    for spread in SPREADS:
+        x = _search(chain, solution, name, x, spread, low, high)
+        wider = _with(chain, name, *np.exp(x).tolist())
+        least, solution = _solved(wider, solution)
+    return least, wider, solution
+
+
+def _solved(chain: Chain, near: Solution[State]) -> tuple[float, Solution[State]]:
+    """Minus log likelihood of a dive, and its optimum, from that of one close by."""
+    solution = minimise(chain, _begin(chain, near.point), tolerance=TOLERANCE)
+    root = chain.eliminate(solution.point, solution.gates)
+    return _minus_log_likelihood(chain, root, solution.cost), solution
+
+
+def _search(
+    chain: Chain, solution: Solution[State], name: str, x: Array, spread: float, low: Array, high: Array
+) -> Array:
+    """Logarithms of sd and time constant, shape (2,), that make the dive linearised at an optimum the most likely."""
+
+    def value(x: Array) -> float:
+        inside = np.clip(x, low, high)
+        outside = float(np.sum((x - inside) ** 2))
+        return outside + _linear(_with(chain, name, *np.exp(inside).tolist()), solution.point, solution.gates)
+
+    simplex = x + spread * np.array([[0.0, 0.0], [-1.0, 0.0], [0.0, -0.7]])
+    options = {"maxfev": EVALUATIONS, "xatol": 0.05, "fatol": 0.1, "initial_simplex": simplex}
+    return np.asarray(np.clip(minimize(value, x, method="Nelder-Mead", options=options).x, low, high))
 
 
 def _begin(chain: Chain, point: State) -> State:
@@ -137,7 +165,7 @@ def _begin(chain: Chain, point: State) -> State:
 
 
 def _with(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
-    """The chain with an error that lasts among its unknowns."""
+    """The chain with an error that lasts among its unknowns; one of infinite time constant is constant."""
     walk = stationary_walk(sd, time_constant)
     believed = replace(chain.beliefs[name], estimate=True, sd=sd, walk=walk, time_constant=time_constant)
     beliefs = {**chain.beliefs, name: believed}
@@ -154,5 +182,6 @@ def _minus_log_likelihood(chain: Chain, root: SquareRoot, cost: float) -> float:
     """Of a dive that costs as much, up to what does not change with the errors that last."""
     diagonals = np.diagonal(root.conditionals, axis1=1, axis2=2), np.diagonal(root.border)
     freedom = sum(float(np.sum(np.log(np.abs(d)))) for d in diagonals)
-    priors = sum(TABLE[name].dim * np.log(chain.beliefs[name].sd) for name in chain.layout.walking)
+    own = [name for name in LASTING.values() if name in chain.unknowns.estimated]
+    priors = sum(TABLE[name].dim * np.log(chain.beliefs[name].sd) for name in own)
     return cost + freedom - float(np.sum(np.log(chain.walk[0]))) + float(priors)
