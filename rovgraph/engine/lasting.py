@@ -16,6 +16,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from rovgraph.calibration import TABLE, stationary_walk
@@ -23,6 +24,7 @@ from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import Gates, Solution, minimise
+from rovgraph.engine.measurements import Block
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.state import State
@@ -30,6 +32,8 @@ from rovgraph.state import State
 LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time_constant)}  # sensor -> its error
 ENOUGH = 30  # measurements
 LIKELY = 3.0  # gain of log likelihood, at the optimum without the error, that is worth a look
+WINDOW_S = 20.0  # over which residuals are summed
+WORTH_A_LOOK = {"ahrs": 0.5, "dvl_heading": 0.5, "fix": 1.0}  # least `unity`; the track takes a DVL's error along
 CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
 LONGEST = 1.0  # time constant, in the length of the dive
 NO_GROUND = 0.5  # the same of a velocity's fraction that is the IMU's own scale rather than the bottom
@@ -91,14 +95,31 @@ def _likely(chain: Chain, solution: Solution[State], root: SquareRoot, without: 
         block = chain.blocks.get(sensor)
         if block is None or len(block) < ENOUGH or name in {*chain.unknowns.estimated, *without}:
             continue
-        H = block.by_calibration(solution.point.at(block.keyframe), name)
+        state = solution.point.at(block.keyframe)
+        H = block.by_calibration(state, name)
         seen = np.sum(H**2, axis=(1, 2)) / H.shape[2]
-        if not np.any(seen > 0.0):
+        if not np.any(seen > 0.0) or unity(block, state, H, solution.gates[sensor]) < WORTH_A_LOOK.get(sensor, 0.0):
             continue
         wider = _with(chain, name, float(1.0 / np.sqrt(np.median(seen[seen > 0.0]))), TABLE[name].time_constant)
         if known - _linear(wider, solution.point, solution.gates) > LIKELY:
             out.append(sensor)
     return out
+
+
+def unity(block: Block, state: State, H: Array, gate: NDArray[np.bool_]) -> float:
+    """How far a sensor's residuals go together for seconds: variance of sums over a time, 1 for independent noise.
+
+    Parameters
+    ----------
+    block, state, gate : measurements, their keyframes' states, and which are let in
+    H : ndarray, shape (n, dim, k), whitened Jacobian by what the residuals are looked at as
+    """
+    r = block.normalised(state)
+    r = r * (gate / np.sqrt(np.maximum(np.mean(r**2, axis=1), 1.0)))[:, None]  # an outlier counts as one
+    score, information = np.einsum("nij,ni->nj", H, r), np.einsum("nij,nij->nj", H, H) * gate[:, None]
+    window = ((block.time - block.time[0]) // WINDOW_S).astype(np.int64)
+    sums = np.array([[np.bincount(window, column) for column in part.T] for part in (score, information)])
+    return float(np.mean(sums[0] ** 2 / np.maximum(sums[1], 0.1 * np.median(sums[1]))))
 
 
 def _fit(chain: Chain, solution: Solution[State], sensor: str, known: float) -> Fit:
