@@ -62,6 +62,8 @@ def _walk(unknowns: Unknowns, name: str, index: int, duration: float) -> Factor:
     """Whitened, ``x' - mean = kept (x - mean)``."""
     mean, (kept, sd) = unknowns.fixed[name], unknowns.walked(name, duration)
     here, there = calibration_key(unknowns, name, index), calibration_key(unknowns, name, index - 1)
+    if name not in unknowns.time_constants:
+        return gtsam.BetweenFactorVector(there, here, 0.0 * mean, gtsam.noiseModel.Isotropic.Sigma(len(mean), sd))
     weight, origin = np.eye(len(mean)) / sd, gtsam.Values()
     origin.insert(here, np.zeros(len(mean)))
     origin.insert(there, np.zeros(len(mean)))
