@@ -36,6 +36,7 @@ WINDOW_S = 20.0  # over which residuals are summed
 WORTH_A_LOOK = {"ahrs": 0.5, "dvl_heading": 0.5, "fix": 1.0}  # least `unity`; the track takes a DVL's error along
 CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
 LONGEST = 1.0  # time constant, in the length of the dive
+IMPLAUSIBLE = 10.0  # sd, in that of the table: a heading that is mirrored is no noise
 NO_GROUND = 0.5  # the same of a velocity's fraction that is the IMU's own scale rather than the bottom
 CONSTANT = np.array([1.0, 10.0])  # sds of the same error as a constant, in that of the table
 SHORTEST = 5.0  # the same in intervals between measurements: what is shorter is noise
@@ -137,7 +138,8 @@ def _fit(chain: Chain, solution: Solution[State], sensor: str, known: float) -> 
             [known, *(_solved(_with(chain, name, sd, np.inf), solution)[0] for sd in CONSTANT * TABLE[name].sd)]
         )
     sd, time_constant = wider.beliefs[name].sd, wider.beliefs[name].time_constant
-    gain = -np.inf if name == "dvl_error" and time_constant > NO_GROUND * duration else known - least
+    other_cause = name == "dvl_error" and time_constant > NO_GROUND * duration
+    gain = -np.inf if other_cause or sd > IMPLAUSIBLE * TABLE[name].sd else known - least
     return LastingError(sensor, name, sd, time_constant, gain), wider, after
 
 
