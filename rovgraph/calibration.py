@@ -19,6 +19,7 @@ it is.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rovgraph.geometry import Array
 
@@ -41,6 +42,8 @@ class Variable:
     walk : default random walk [unit per root second], 0 = constant over the dive
     considered : where it is not estimated, its prior's uncertainty is in that of all else, unless the configuration
         says otherwise
+    time_constant : default time constant of an error that lasts, first-order Gauss-Markov with the prior's sd [s];
+        infinite = no such error
     """
 
     name: str
@@ -54,6 +57,7 @@ class Variable:
     estimate: bool = False
     walk: float = 0.0
     considered: bool = False
+    time_constant: float = np.inf
 
     @property
     def dim(self) -> int:
@@ -106,6 +110,21 @@ def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "
         estimate=not beside,
     )
     return offset, deviation
+
+
+def _compass_error(prefix: str, letter: str, sensor: str, whose: str) -> Variable:
+    """Error of a compass that lasts for a while."""
+    return Variable(
+        prefix + "_error",
+        letter,
+        _ONE,
+        "rad",
+        2 * _DEG,
+        (sensor,),
+        f"error of {whose} that lasts (fusion, steel near by)",
+        "the gyro, over its time constant",
+        time_constant=60.0,
+    )
 
 
 STATE_LETTERS = frozenset("xvbn")  # of the graph's other variables
@@ -331,6 +350,30 @@ TABLE: dict[str, Variable] = {
             estimate=True,
             walk=5e-4,  # a centimetre a second in seven minutes: none stays as it is to the millimetre
         ),
+        Variable(
+            "fix_error",
+            "1",
+            ("_north", "_east"),
+            "m",
+            1.0,
+            ("fix",),
+            "error of the fixes that lasts (multipath, a ship's heading, satellites)",
+            "motion that the IMU and the DVL know better over its time constant",
+            time_constant=60.0,
+        ),
+        _compass_error("ahrs", "2", "ahrs", "the IMU's own heading"),
+        _compass_error("dvl_compass", "3", "dvl_heading", "the DVL's compass"),
+        Variable(
+            "dvl_error",
+            "4",
+            _ONE,
+            "1",
+            0.01,
+            ("dvl",),
+            "error of bottom track that lasts, as a fraction of the velocity (slope and roughness of the bottom)",
+            "position fixes; starts and stops, against the accelerometer",
+            time_constant=30.0,
+        ),
     )
 }
 
@@ -392,6 +435,7 @@ class Belief:
     estimate : False = held at the mean
     walk : random walk [unit per root second], 0 = constant over the dive
     considered : held at the mean, but its uncertainty is in that of all else (Schmidt); False where it is estimated
+    time_constant : time in which what has walked returns to the mean [s]; infinite = it does not
     """
 
     variable: Variable
@@ -400,3 +444,30 @@ class Belief:
     estimate: bool
     walk: float = 0.0
     considered: bool = False
+    time_constant: float = np.inf
+
+
+def stationary_walk(sd: float, time_constant: float) -> float:
+    """The random walk that keeps a first-order Gauss-Markov process at a standard deviation [unit per root second]."""
+    return float(sd * np.sqrt(2.0 / time_constant))
+
+
+def walked(walk: ArrayLike, time_constant: ArrayLike, seconds: ArrayLike) -> tuple[Array, Array]:
+    """A first-order Gauss-Markov process after a time (Gelb 1974, 3.8), of infinite time constant a random walk.
+
+        x(t + dt) - mean = exp(-dt / T) (x(t) - mean) + w,  var w = walk^2 T / 2 (1 - exp(-2 dt / T))
+
+    Parameters
+    ----------
+    walk, time_constant, seconds : array_like that broadcast [unit per root second], [s], [s]
+
+    Returns
+    -------
+    kept : exp(-dt / T)
+    sd : of w
+    """
+    q, T, dt = np.broadcast_arrays(np.asarray(walk, float), np.asarray(time_constant, float), seconds)
+    lasting = np.isfinite(T)
+    finite = np.where(lasting, T, 1.0)
+    kept = np.where(lasting, np.exp(-dt / finite), 1.0)
+    return kept, q * np.sqrt(np.where(lasting, -0.5 * finite * np.expm1(-2.0 * dt / finite), dt))

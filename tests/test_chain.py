@@ -48,6 +48,13 @@ def walking() -> Case:
     return case.log, case.config
 
 
+def lasting() -> Case:
+    errors = {name: {"estimate": True} for name in ("dvl_compass_error", "fix_error")}
+    config = falcon(calibration=errors | {"dvl_error": {"estimate": True, "mean": 0.01, "time_constant_s": 5.0}})
+    case = simulated(config, 45.0, seed=2, fix_interval=2.0, dvl_rate=1.5, imu_rate=50.0)
+    return case.log, case.config
+
+
 def scales() -> Case:
     config = falcon(calibration={n: {"estimate": True, "sd": 0.01} for n in ("acc_scale", "gyr_scale")})
     case = simulated(config, 50.0, seed=2, style=WILD, **SHORT)
@@ -76,6 +83,7 @@ def outliers() -> Case:
 SCENARIOS: dict[str, Callable[[], Case]] = {
     "both compasses and misalignment": both_compasses,
     "calibration that walks": walking,
+    "errors that last": lasting,
     "scales of the IMU": scales,
     "time offset of the DVL": time_offset,
     "IMU outage": outage,
@@ -99,6 +107,7 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
 IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
     "both compasses and misalignment": lambda best: {"mag", "dvl_heading"} <= set(best.blocks),
     "calibration that walks": lambda best: best.chain.layout.d > 15,
+    "errors that last": lambda best: len(best.chain.unknowns.time_constants) == 3,
     "scales of the IMU": lambda best: {"acc_scale", "gyr_scale"} <= set(best.unknowns.estimated),
     "time offset of the DVL": lambda best: "dvl_time_offset" in best.unknowns.estimated,
     "IMU outage": lambda best: any(i.motion is not None and i.motion.coasted for i in best.intervals),

@@ -83,7 +83,7 @@ class Chain:
                 yield m.r[k, i], parts
             for i in range(self.w):
                 here = k * d + self.s + i
-                yield m.walk_r[k, i], [(here, -m.walk[k, i]), (here + d, m.walk[k, i])]
+                yield m.walk_r[k, i], [(here, -m.walk[k, i] * m.kept[k, i]), (here + d, m.walk[k, i])]
 
     def _measurement_rows(self, last: int) -> Iterator[tuple[float, list[tuple[int, float]]]]:
         for sensor in self.sensors:
@@ -125,6 +125,7 @@ def random_chain(n: int, s: int, w: int, c: int, seed: int = 0) -> Chain:
         rng.standard_normal((n - 1, s, len(motion_targets))),
         np.array(motion_targets, dtype=np.int64),
         rng.uniform(0.5, 2.0, (n - 1, w)),
+        rng.uniform(0.5, 1.0, (n - 1, w)),
         rng.standard_normal((n - 1, w)),
     )
     of_border, walking = [d + j for j in range(min(c, 3))], [s + j for j in range(w)]

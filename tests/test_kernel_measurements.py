@@ -29,11 +29,11 @@ DVL_COMPASS = [layout.DVL_COMPASS_OFFSET, layout.DVL_COMPASS_DEVIATION]
 CASES = {
     "dvl": (kernels.DVL, 3, ARM),
     "dvl_water": (kernels.DVL_WATER, 3, ARM),
-    "dvl_compass": (kernels.DVL_COMPASS, 1, [0.1, *DVL_COMPASS, 0.0, 0.0, 0.0]),
-    "compass": (kernels.COMPASS, 1, [0.1, *AHRS, *TURN[:, 0]]),
+    "dvl_compass": (kernels.DVL_COMPASS, 1, [0.1, *DVL_COMPASS, layout.DVL_COMPASS_ERROR, 0.0, 0.0, 0.0]),
+    "compass": (kernels.COMPASS, 1, [0.1, *AHRS, layout.AHRS_ERROR, *TURN[:, 0]]),
     "magnetometer": (kernels.MAGNETOMETER, 3, [0.1, 1.2, 0.5, *TURN.ravel()]),
     "depth": (kernels.POSITION, 1, [*ARM, layout.DEPTH_OFFSET, 2]),
-    "fix": (kernels.POSITION, 2, [*ARM, -1, 0, 1]),
+    "fix": (kernels.POSITION, 2, [*ARM, layout.FIX_ERROR, 0, 1]),
     "place": (kernels.PLACE_OFFSET, 2, ARM),
     "water_velocity": (kernels.WATER_VELOCITY, 2, []),
 }

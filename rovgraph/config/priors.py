@@ -66,6 +66,13 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
             NotNegative,
             Field(round(variable.walk * scale, 12), description=f"random walk [{unit}/rts]; 0 = constant"),
         ),
+        "time_constant_s": (
+            Positive | None,
+            Field(
+                variable.time_constant if np.isfinite(variable.time_constant) else None,
+                description="an error of that sd that lasts so long, in the place of the walk; null = none",
+            ),
+        ),
     }
     entry = create_model(
         f"Calibration_{variable.name}", __base__=Section, __module__=__name__, __doc__=variable.about, **fields

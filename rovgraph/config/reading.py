@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable
+from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable, stationary_walk
 from rovgraph.config.error_messages import complaint
 from rovgraph.config.priors import Calibration, calibration_entry
 from rovgraph.config.registered import add_key, remove_key
@@ -125,13 +125,16 @@ def beliefs(config: Config) -> dict[str, Belief]:
         mean = getattr(entry, "mean" + tail)
         mean = mount.get(name, 0.0) if mean is None else mean
         values = np.atleast_1d(np.asarray(mean, dtype=float))
+        sd, walk = unit * getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
+        lasts = entry.time_constant_s
         out[name] = Belief(
             variable,
             unit * np.broadcast_to(values, (variable.dim,)),
-            unit * getattr(entry, "sd" + tail),
+            sd,
             entry.estimate is True,
-            unit * getattr(entry, "walk" + tail),
+            walk if lasts is None else stationary_walk(sd, lasts),
             entry.estimate == CONSIDERED,
+            np.inf if lasts is None else lasts,
         )
     return out
 

@@ -233,6 +233,9 @@ class Graph(Section):
     segment_s: Positive = Field(10.0, description="isam2: calibration has a new value this often")
     lag_s: Positive = Field(5.0, description="how late a measurement may come online; without effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
+    find_noise: bool = Field(
+        True, description="look for noise that is larger than stated or lasts, and solve the dive again with it"
+    )
 
     @property
     def ping_due_s(self) -> float:

@@ -87,7 +87,10 @@ class Assembler:
         self._sighted: dict[float, float] = {}  # place -> when it last counted [s]
         self._sightings = 0
         self.time_offsets = assumed or TimeOffsets.of(self.config, self.instruments)
-        self._scaled = wanted(beliefs(self.config))
+        believed = beliefs(self.config)
+        self._scaled = wanted(believed)
+        lasting = any(b.estimate and np.isfinite(b.time_constant) for b in believed.values())  # at every keyframe
+        self._segment_s = 0.0 if lasting else self.config.graph.segment_s
         self._around = HALF_WINDOW_S + self.time_offsets.span
         self._dim = max(i.model.dim for i in self.instruments.values()) if self.instruments else 0
         # the rate reaches these: by a lever arm, or by the motion of a turning body
@@ -265,7 +268,7 @@ class Assembler:
             motion, attached = self._integrate(samples, every, self._between[:later], time)
         before = self._start
         self._index, self._start, self._between = self._index + 1, time, self._between[later:]
-        if time - self._segment_start >= self.config.graph.segment_s:
+        if time - self._segment_start >= self._segment_s:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._samples.rate(samples, time)
         if ping is not None:

@@ -81,11 +81,26 @@ class Chain:
         return ChainLayout(self.unknowns.walks)
 
     @cached_property
-    def walk(self) -> Array:
-        """Square-root information of the walks, shape (n - 1, d - 15)."""
-        rates = [np.full(TABLE[n].dim, walk) for n, walk in self.unknowns.walks.items() if walk]
-        rate = np.concatenate([np.empty(0), *rates])
-        return np.asarray(1.0 / (rate * np.sqrt(np.diff(self.rows.time))[:, None]))
+    def walk(self) -> tuple[Array, Array]:
+        """Square-root information of the walks, and what they keep of a deviation; shape (n - 1, d - 15) each."""
+        seconds = np.diff(self.rows.time)
+        kept, sd = np.empty((2, len(seconds), self.layout.d - MOTION))
+        for name in self.layout.walking:
+            own = self.unknowns.walked(name, seconds[:, None])
+            kept[:, self._walking(name)], sd[:, self._walking(name)] = own
+        return 1.0 / sd, kept
+
+    def _walking(self, name: str) -> slice:
+        part = self.layout.places[name][1]
+        return slice(part.start - MOTION, part.stop - MOTION)
+
+    def walk_residuals(self, point: State) -> Array:
+        """Whitened residuals of the walks, shape (n - 1, d - 15)."""
+        weight, kept = self.walk
+        away = np.empty((len(weight) + 1, weight.shape[1]))
+        for name in self.layout.walking:
+            away[:, self._walking(name)] = point.calibration[name] - self.unknowns.fixed[name]
+        return np.asarray(weight * (away[1:] - kept * away[:-1]))
 
     @cached_property
     def blocks(self) -> dict[str, Block]:
@@ -147,8 +162,7 @@ class Chain:
         motions = self.rows.motion_residuals(point)
         total = 0.5 * float(np.vdot(motions, motions))
         total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
-        for name in self.layout.walking:
-            total += 0.5 * float(np.sum((np.diff(point.calibration[name], axis=0) * self._walk_of(name)) ** 2))
+        total += 0.5 * float(np.sum(self.walk_residuals(point) ** 2))
         squares = self._squared_lengths(point)
         total += robust_costs(squares, self.rows.which, self._sensors, self._entered(gates))
         return total + measurement_cost(self.seen(point, self.given), gates)
@@ -251,7 +265,8 @@ class Chain:
         r, n, d, c = self.rows, len(self.intervals), self.layout.d, self.layout.c + clones
         dive = r.motions, r.weights, r.scales, r.rows, r.which, r.first, r.row_scales, self._sensors
         gravity = self.initial.config.environment.gravity_mps2
-        point_and_layout: Any = (*self._arrays(point), self.layout.column, gravity, self.walk, self.layout.walking_of_c)
+        walks = *self.walk, -self.walk_residuals(point)
+        point_and_layout: Any = *self._arrays(point), self.layout.column, gravity, *walks
         rest: Any = (
             given.values,
             given.targets,
@@ -329,7 +344,3 @@ class Chain:
                 out[part, part] = np.eye(belief.variable.dim) / belief.sd
                 out[part, -1] = (belief.mean - point.calibration[name]) / belief.sd
         return out
-
-    def _walk_of(self, name: str) -> Array:
-        part = self.layout.places[name][1]
-        return self.walk[:, part.start - MOTION : part.stop - MOTION]

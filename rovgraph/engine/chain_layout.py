@@ -66,11 +66,6 @@ class ChainLayout:
             out[MOTION + part.start : MOTION + part.stop] = self.target(name)
         return out
 
-    @cached_property
-    def walking_of_c(self) -> NDArray[np.int64]:
-        """What of the calibration vector walks, shape (d - 15,)."""
-        return np.concatenate([NOTHING, *(np.r_[LAYOUT[name]] for name in self.walking)])
-
     def indeterminate(self, keyframe: int | None, component: int) -> str:
         """One line on a system that cannot be solved."""
         if keyframe is not None and component < MOTION:

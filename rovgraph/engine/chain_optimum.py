@@ -167,6 +167,6 @@ def smooth_chain(
     InputError : the data do not determine some variable, which is named
     """
     beliefs, rows = beliefs_of(initial.config), rows or DiveRows.of(intervals, [*initial.instruments])
-    wanted = unknowns(beliefs, [rows.sensors[k] for k in np.unique(rows.which)])
+    wanted = unknowns(beliefs, rows.used)
     chain = Chain(intervals, initial, beliefs, wanted, rows)
     return ChainOptimum(chain, solve(chain, chain.start(states, calibration)))

@@ -87,6 +87,11 @@ class DiveRows:
     def __len__(self) -> int:
         return len(self.taken)
 
+    @property
+    def used(self) -> list[str]:
+        """Sensors that have measured something."""
+        return [self.sensors[k] for k in np.unique(self.which)]
+
     def upto(self, count: int) -> "DiveRows":
         """The first intervals."""
         m = int(self.taken[count - 1])

@@ -77,9 +77,12 @@ class FilterEngine:
         self.layout = ErrorLayout(self.unknowns.estimated, self.unknowns.considered, initial.instruments)
         self._wide = self.unknowns.estimating(self.unknowns.considered)  # all that has a place in the error
         self._gravity = initial.config.environment.gravity_mps2
-        self._walk = np.zeros(self.layout.size)  # variance that walking adds in a second
+        self._walk = np.zeros((3, self.layout.size))  # as `rovgraph.kernels.prediction` takes it
         for name, walk in self.unknowns.walks.items():
-            self._walk[self.layout.columns[name]] = walk**2
+            self._walk[0, self.layout.columns[name]] = walk**2
+        for name, seconds in self.unknowns.time_constants.items():
+            self._walk[1, self.layout.columns[name]] = 1.0 / seconds
+            self._walk[2, self.layout.columns[name]] = self.unknowns.fixed[name]
         instruments = initial.instruments
         self._given = {  # linearised outside the kernels
             s for s, i in instruments.items() if not compiled(i, i.time_offset in self.unknowns.walks) or s == PLACE
@@ -147,12 +150,12 @@ class FilterEngine:
         """The next keyframe, from the IMU alone; calibration walks."""
         assert interval.motion is not None
         n = len(before.P)
-        P, B, x, F, Q = before.P.copy(), before.B.copy(), np.empty(21), np.empty((n, n)), np.empty((n, n))
-        scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
-        walk = self._walk if n == self.layout.size else np.append(self._walk, np.zeros(n - self.layout.size))
+        P, B, x, c, F = before.P.copy(), before.B.copy(), np.empty(21), np.empty_like(before.c), np.empty((n, n))
+        Q, scale = np.empty((n, n)), _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
+        walk = self._walk if n == self.layout.size else np.pad(self._walk, ((0, 0), (0, n - self.layout.size)))
         tables = interval.motion.row, scale, self.layout.column, walk, self.layout.size
-        predict_filter(before.x, before.c, P, B, before.L, *tables, x, F, Q)
-        return Transition(F, Q, Gaussian(x, before.c, P, before.places, B, before.L))
+        predict_filter(before.x, before.c, P, B, before.L, *tables, x, c, F, Q)
+        return Transition(F, Q, Gaussian(x, c, P, before.places, B, before.L))
 
     def correct(
         self,

@@ -20,7 +20,8 @@ class MotionRows:
     A_i, A_j : ndarray, shape (n - 1, s, s), Jacobians by the keyframes before and after
     r : ndarray, shape (n - 1, s), right-hand sides
     C, targets : ndarray, shapes (n - 1, s, e) and (e,), Jacobians by other columns (see `rovgraph.kernels.chain`)
-    walk, walk_r : ndarray, shape (n - 1, d - s), one over the sd of a walk, and right-hand sides
+    walk, kept, walk_r : ndarray, shape (n - 1, d - s), one over the sd of a walk, what it keeps of the value before,
+        and right-hand sides
     """
 
     A_i: Array
@@ -29,6 +30,7 @@ class MotionRows:
     C: Array
     targets: Index
     walk: Array
+    kept: Array
     walk_r: Array
 
     @staticmethod
@@ -36,7 +38,7 @@ class MotionRows:
         """Rows of motions in which nothing walks and that know nothing of the border."""
         count, s = r.shape
         none = np.zeros((count, 0))
-        return MotionRows(A_i, A_j, r, np.zeros((count, s, 0)), np.zeros(0, dtype=np.int64), none, none)
+        return MotionRows(A_i, A_j, r, np.zeros((count, s, 0)), np.zeros(0, dtype=np.int64), none, none, none)
 
 
 def eliminate(
@@ -58,6 +60,6 @@ def eliminate(
     rows = measurements.values, measurements.targets, measurements.first, border_rows, np.array(stops, dtype=np.int64)
 
     def fill(*out: Array) -> int:
-        return eliminate_rows(m.A_i, m.A_j, m.r, m.C, m.targets, m.walk, m.walk_r, *rows, *out)
+        return eliminate_rows(m.A_i, m.A_j, m.r, m.C, m.targets, m.walk, m.kept, m.walk_r, *rows, *out)
 
     return square_root(n, m.A_i.shape[1] + m.walk.shape[1], c, len(stops), fill)

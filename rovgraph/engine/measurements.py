@@ -127,6 +127,11 @@ class Block:
         """Measured minus predicted, shape (n, dim); ``state`` is at each one's keyframe."""
         return innovation(self.instrument.model, self.z, self.predicted(state))
 
+    def by_calibration(self, state: State, name: str) -> Array:
+        """Whitened Jacobian by a calibration variable, estimated or not, shape (n, dim, dim of the variable)."""
+        there = state if self.at_keyframes else propagate(state, self._placed(state)[0], self.gravity)
+        return np.asarray(self.W @ self.instrument.model.predict(there, self.rate_b)[1][name])
+
     def _placed(self, state: State) -> tuple[Delta, Array]:
         """The motion to where each measurement was valid, and the rate there."""
         return (self.motion, self.rate_b) if self.window is None else self.window.placed(self._late(state))

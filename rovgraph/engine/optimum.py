@@ -133,6 +133,6 @@ def joint_prior_sd(optimum: Optimum, keyframe: int) -> dict[str, Array]:
     seconds = optimum.intervals[keyframe].time - optimum.intervals[0].time
     beliefs = optimum.beliefs
     return {
-        name: np.full(beliefs[name].variable.dim, np.hypot(beliefs[name].sd, walk * np.sqrt(seconds)))
-        for name, walk in optimum.unknowns.walks.items()
+        name: np.full(beliefs[name].variable.dim, np.hypot(kept * beliefs[name].sd, walked))
+        for name, (kept, walked) in ((n, optimum.unknowns.walked(n, seconds)) for n in optimum.unknowns.estimated)
     }

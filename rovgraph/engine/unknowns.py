@@ -1,9 +1,12 @@
 """What of the calibration is estimated, and what is considered."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
-from rovgraph.calibration import Belief
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rovgraph.calibration import Belief, walked
 from rovgraph.geometry import Array
 
 
@@ -18,11 +21,13 @@ class Unknowns:
     walks : random walk of each that is estimated [unit per root second]; with 0 it has one
         value for all of the dive, otherwise one per segment of time
     considered : constants that keep their means, and whose uncertainty is in that of all else
+    time_constants : of those that return to their mean [s]
     """
 
     fixed: Mapping[str, Array]
     walks: Mapping[str, float]
     considered: tuple[str, ...] = ()
+    time_constants: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def estimated(self) -> tuple[str, ...]:
@@ -41,13 +46,17 @@ class Unknowns:
         """Some of the considered variables estimated, behind the others."""
         more = tuple(names)
         left = tuple(name for name in self.considered if name not in more)
-        return Unknowns(self.fixed, {**self.walks, **dict.fromkeys(more, 0.0)}, left)
+        return replace(self, walks={**self.walks, **dict.fromkeys(more, 0.0)}, considered=left)
 
     def considering(self, names: Iterable[str]) -> "Unknowns":
         """Some of the estimated constants considered, behind the others."""
         more = tuple(names)
         kept = self.of(name for name in self.estimated if name not in more)
         return replace(kept, considered=(*self.considered, *more))
+
+    def walked(self, name: str, seconds: ArrayLike) -> tuple[Array, Array]:
+        """How one that walks moves in a time: `rovgraph.calibration.walked`."""
+        return walked(self.walks[name], self.time_constants.get(name, np.inf), seconds)
 
 
 def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
@@ -56,4 +65,5 @@ def unknowns(beliefs: Mapping[str, Belief], sensors: Iterable[str]) -> Unknowns:
     used = {n: b for n, b in beliefs.items() if present & set(b.variable.sensors)}
     wanted = {n: b.walk for n, b in used.items() if b.estimate}
     considered = tuple(n for n, b in used.items() if b.considered)
-    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted, considered)
+    lasting = {n: used[n].time_constant for n in wanted if np.isfinite(used[n].time_constant)}
+    return Unknowns({name: belief.mean for name, belief in beliefs.items()}, wanted, considered, lasting)

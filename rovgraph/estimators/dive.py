@@ -1,18 +1,22 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 from rovgraph.config import Config, beliefs
+from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed
+from rovgraph.estimators.unstated_noise import UnstatedNoise, find_noise
+from rovgraph.estimators.unstated_noise import changed as with_noise
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
 
@@ -20,6 +24,7 @@ if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
 
 Progress = Callable[[str, float], None]
+MAX_NOISES = 3  # times that a dive is solved again with noise that was found in it
 
 
 def no_progress(what: str, done: float) -> None:
@@ -82,6 +87,21 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     InputError : the log lacks what is needed, or does not determine some variable
     """
     log, frozen = without_frozen(log, config)
+    found: list[UnstatedNoise] = []
+    dive, best = _solve(log, config, frozen, estimate, progress)
+    for _ in range(MAX_NOISES if config.graph.find_noise else 0):
+        more = find_noise(best, dive.beginning.config, dive.alarms) if isinstance(best, ChainOptimum) else []
+        if not more:
+            break
+        found, config = found + more, with_noise(config, more)
+        dive, best = _solve(log, config, frozen, estimate, progress)
+    return _saying(dive, found) if found else dive
+
+
+def _solve(
+    log: Log, config: Config, frozen: list[FrozenStretch], estimate: str, progress: Progress
+) -> tuple[Dive, Optimum | None]:
+    """The dive as configured, and the optimum of its smoothed estimate where a batch solver found it."""
     beginning = initialise(log, config)
     batch = assemble(log, beginning)
     if config.graph.solver == "isam2":
@@ -103,7 +123,16 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
             estimates.insert(0, smoothed(best, beginning))
     intervals = batch.intervals if best is None else best.intervals
     numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen))
-    return Dive([*estimates, batch.dead_reckoning()], beginning, _left_out(batch, frozen), frozen, numbers)
+    left_out = _left_out(batch, frozen)
+    return Dive([*estimates, batch.dead_reckoning()], beginning, left_out, frozen, numbers), best
+
+
+def _saying(dive: Dive, found: list[UnstatedNoise]) -> Dive:
+    """A dive that says what noise was found in it."""
+    beginning = replace(dive.beginning, assumptions=[*(one.text for one in found), *dive.beginning.assumptions])
+    main = dive.estimates[0]
+    main = replace(main, summary={**main.summary, "noise_found": [asdict(one) for one in found]})
+    return replace(dive, beginning=beginning, estimates=[main, *dive.estimates[1:]])
 
 
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:

@@ -54,15 +54,19 @@ def motion(interval: KeyframeInterval, unknowns: Unknowns, index: int) -> list[F
 
 
 def drift(unknowns: Unknowns, index: int, duration: float) -> list[Factor]:
-    """The random walk of calibration variables to a value from the one before, over ``duration`` [s]."""
-    if index == 0:
-        return []
-    return [
-        gtsam.BetweenFactorVector(
-            calibration_key(unknowns, name, index - 1),
-            calibration_key(unknowns, name, index),
-            np.zeros(len(unknowns.fixed[name])),
-            gtsam.noiseModel.Isotropic.Sigma(len(unknowns.fixed[name]), unknowns.walks[name] * np.sqrt(duration)),
-        )
-        for name in unknowns.begun_by(index)
-    ]
+    """The walk of calibration variables to a value from the one before, over ``duration`` [s]."""
+    return [] if index == 0 else [_walk(unknowns, name, index, duration) for name in unknowns.begun_by(index)]
+
+
+def _walk(unknowns: Unknowns, name: str, index: int, duration: float) -> Factor:
+    """Whitened, ``x' - mean = kept (x - mean)``."""
+    mean, (kept, sd) = unknowns.fixed[name], unknowns.walked(name, duration)
+    here, there = calibration_key(unknowns, name, index), calibration_key(unknowns, name, index - 1)
+    if name not in unknowns.time_constants:
+        return gtsam.BetweenFactorVector(there, here, 0.0 * mean, gtsam.noiseModel.Isotropic.Sigma(len(mean), sd))
+    weight, origin = np.eye(len(mean)) / sd, gtsam.Values()
+    origin.insert(here, np.zeros(len(mean)))
+    origin.insert(there, np.zeros(len(mean)))
+    off = (1.0 - kept) / sd * mean
+    linear = gtsam.JacobianFactor(there, -kept * weight, here, weight, off, gtsam.noiseModel.Unit.Create(len(mean)))
+    return gtsam.LinearContainerFactor(linear, origin)

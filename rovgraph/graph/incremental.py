@@ -17,7 +17,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from rovgraph.calibration import LAYOUT, Belief
+from rovgraph.calibration import LAYOUT, Belief, walked
 from rovgraph.engine.filter import ORIGIN, FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.gauss_newton import Gates
@@ -65,9 +65,9 @@ class Incremental:
         self._linearization = Linearization(filter, filter.initial.prior)
         self._parts = np.concatenate([np.empty(0, int), *(np.r_[LAYOUT[b.variable.name]] for b in estimated)])
         self._mean = np.concatenate([np.empty(0), *(b.mean for b in estimated)])
-        self._sd, self._walk = (
+        self._sd, self._walk, self._time_constant = (
             np.concatenate([np.empty(0), *(np.full(b.variable.dim, getattr(b, of)) for b in estimated)])
-            for of in ("sd", "walk")
+            for of in ("sd", "walk", "time_constant")
         )
         self._terms: list[IntervalTerms] = []
         self._x: list[Array] = []  # the point: states of the keyframes, calibration of the segments, places
@@ -254,10 +254,10 @@ class Incremental:
         if s == 0:
             return gtsam.JacobianFactor(own, np.diag(1.0 / self._sd), (self._mean - here) / self._sd, _unit(len(here)))
         duration = time - self._terms[self._begun[s - 1]].interval.time
-        weight = 1.0 / (self._walk * np.sqrt(duration))
-        off = weight * (self._c[s - 1][self._parts] - here)
+        kept, sd = walked(self._walk, self._time_constant, duration)
+        off = (self._mean + kept * (self._c[s - 1][self._parts] - self._mean) - here) / sd
         return gtsam.JacobianFactor(
-            key(CALIBRATION, s - 1), -np.diag(weight), own, np.diag(weight), off, _unit(len(here))
+            key(CALIBRATION, s - 1), -np.diag(kept / sd), own, np.diag(1.0 / sd), off, _unit(len(here))
         )
 
     def _landmarks(self, term: IntervalTerms, x: Array, c: Array) -> list[gtsam.JacobianFactor]:

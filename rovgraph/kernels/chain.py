@@ -118,6 +118,7 @@ def load_motion(
     C: Array,
     targets: Index,
     walk: Array,
+    kept: Array,
     walk_r: Array,
     room: Room,
 ) -> None:
@@ -142,7 +143,8 @@ def load_motion(
         W_out[d + i, d + scale_out.shape[0]] = r[k, i]
     for i in range(s, d):
         factor = walk[k, i - s]
-        W_out[d + i, i], W_out[d + i, d + i], W_out[d + i, d + scale_out.shape[0]] = -factor, factor, walk_r[k, i - s]
+        W_out[d + i, i], W_out[d + i, d + i] = -factor * kept[k, i - s], factor
+        W_out[d + i, d + scale_out.shape[0]] = walk_r[k, i - s]
         scale_out[i] = factor * factor
 
 

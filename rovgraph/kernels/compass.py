@@ -1,7 +1,7 @@
 """Heading, deviation of a compass, and the magnetometer, for one epoch.
 
     h = atan2(u_e, u_n) - declination, u = R_nb a, a the instrument's x axis in b
-    deviation = A + B sin h + C cos h                                     Bowditch
+    deviation = A + e + B sin h + C cos h, e an error that lasts          Bowditch
     compass       z = h + deviation                                       (3.17)
     magnetometer  z = |H| ((1 + s) S R_sb R_bn u(declination - deviation, dip + d) + iron)
                                                                           (3.11), (3.14), S: (3.2)
@@ -66,14 +66,18 @@ def heading_of(R: Array, axis_b: Array, gradient_out: Array) -> float:
 def compass(R: Array, c: Array, params: Array, in_dvl: bool, z_out: Array, H_out: Array, work: Array) -> None:
     """Magnetic heading of an instrument's x axis, of the DVL's with the mounting that the calibration has."""
     R_bs, axes, axis, gradient = work[0], work[1], work[2, 0], work[2, 1]
-    offset, curve = int(params[1]), int(params[2])
+    offset, curve, error = int(params[1]), int(params[2]), int(params[3])
     if in_dvl:
         dvl_mount(c[DVL_ROLL], c[DVL_ROLL + 1], c[DVL_ROLL + 2], R_bs, axes)
     for i in range(3):
-        axis[i] = R_bs[i, 0] if in_dvl else params[3 + i]
+        axis[i] = R_bs[i, 0] if in_dvl else params[4 + i]
     heading = heading_of(R, axis, gradient) - params[0]
     sine, cosine = math.sin(heading), math.cos(heading)
-    z_out[0] = wrap(heading + c[offset] + c[curve] * sine + c[curve + 1] * cosine)
+    deviation = c[offset] + c[curve] * sine + c[curve + 1] * cosine
+    if error >= 0:
+        deviation += c[error]
+        H_out[0, MOTION + error] = 1.0
+    z_out[0] = wrap(heading + deviation)
 
     gain = 1.0 + c[curve] * cosine - c[curve + 1] * sine
     for i in range(3):

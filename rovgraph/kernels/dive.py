@@ -88,7 +88,7 @@ def load_linearized(
 
 @kernel(
     "i8(f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], b1[::1],"
-    " f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8, f8[:, ::1], i8[::1],"
+    " f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8, f8[:, ::1], f8[:, ::1], f8[:, ::1],"
     " f8[:, ::1], i8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1])"
 )
 def eliminate_dive(
@@ -109,7 +109,8 @@ def eliminate_dive(
     column: Index,
     gravity: float,
     walk: Array,
-    walking: Index,
+    kept: Array,
+    walk_r: Array,
     given: Array,
     given_targets: Index,
     given_first: Index,
@@ -129,7 +130,7 @@ def eliminate_dive(
     R, p, v, b, c : the point
     column : shape (15 + C,), target of each component of state and calibration, -1 where it is not estimated
     gravity : [m/s^2]
-    walk, walking : shapes (n - 1, d - 15), (d - 15,), one over the sd of each walk, and what of c walks
+    walk, kept, walk_r : as `rovgraph.kernels.linear_chain.eliminate`
     given, given_targets, given_first : rows, targets and first, of what no kernel knows
     border_rows to left_out : as `rovgraph.kernels.linear_chain.eliminate`; of fewer ``conditionals_out`` than
         keyframes the last one is that of the last keyframe
@@ -144,7 +145,6 @@ def eliminate_dive(
     C, targets, bias = np.zeros((1, MOTION, 6 * of_scale)), np.empty(6 * of_scale, np.int64), np.empty((2, 6))
     for i in range(len(targets)):
         targets[i] = column[MOTION + ACC_SCALE + i]
-    walk_r = np.empty((1, len(walking)))
     left_out[0] = 0.0
     for k in range(n):
         c_k = c[k * of_c]
@@ -167,9 +167,7 @@ def eliminate_dive(
                     C[0, i, j] = 0.0
                     for m in range(6):  # of both biases alike, which leaves the walk of the bias out of it
                         C[0, i, j] += (A_i[0, i, 9 + m] + A_j[0, i, 9 + m]) * scales[k, m, j]
-            for j in range(len(walking)):
-                walk_r[0, j] = -walk[k, j] * (c[k + 1, walking[j]] - c[k, walking[j]])
-            load_motion(0, A_i, A_j, r, C, targets, walk[k : k + 1], walk_r, room)
+            load_motion(0, A_i, A_j, r, C, targets, walk[k : k + 1], kept[k : k + 1], walk_r[k : k + 1], room)
         failing = max(failing, pass_on(k, n, room, conditionals_out))
         if failing >= 0:
             return failing

@@ -64,7 +64,7 @@ def _covariance(P: Array, B: Array, first: int, P_out: Array) -> None:
 
 @kernel(
     "i8(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], "
-    "f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], i8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], "
+    "f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], "
     "f8[::1], f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], "
     "f8[:, ::1], f8[::1], f8[::1])"
 )
@@ -112,7 +112,7 @@ def filter_intervals(
     taken : shape (k + 1,), the first measurement of each interval, and how many there are
     here : shape (k,), the first measurement at the keyframe that ends each
     sensors, column, since, gravity, columns to basis_rows : as `rovgraph.kernels.correction.correct`
-    walk : shape (size,), variance that walking adds in a second
+    walk : shape (3, size), as `rovgraph.kernels.prediction.predict_filter`
     poorly_known : shape (2,), variances of tilt and heading beyond which the attitude has to be found first [rad^2]
     x_out, c_out : shapes (k, 21), (k, C), the keyframes
     predicted_x_out, predicted_c_out : the same before what was measured at them
@@ -123,7 +123,7 @@ def filter_intervals(
     -------
     How many intervals are taken
     """
-    size, nothing, none_given = len(walk), np.empty(0), np.empty((0, len(L)))
+    size, nothing, none_given = walk.shape[1], np.empty(0), np.empty((0, len(L)))
     F, Q, exact, there = np.empty((size, size)), np.empty((size, size)), np.empty((0, 0)), np.empty(21)
     for k in range(len(here)):
         tilt, heading = attitude_variances(x, P)
@@ -133,7 +133,7 @@ def filter_intervals(
         for arrived in range(2):
             if arrived:
                 scale = scales[k] if len(scales) else exact
-                predict_filter(x, c, P, B, L, motions[k], scale, column, walk, size, there, F, Q)
+                predict_filter(x, c, P, B, L, motions[k], scale, column, walk, size, there, c, F, Q)
                 _copy(there, x)
                 _copy(x, predicted_x_out[k])
                 _copy(c, predicted_c_out[k])

@@ -7,7 +7,7 @@ from rovgraph.kernels.compile import kernel
 
 @kernel(
     "i8(f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1],"
-    " i8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1])"
+    " f8[:, ::1], i8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1])"
 )
 def eliminate(
     A_i: Array,
@@ -16,6 +16,7 @@ def eliminate(
     C: Array,
     C_targets: Index,
     walk: Array,
+    kept: Array,
     walk_r: Array,
     rows: Array,
     targets: Index,
@@ -34,7 +35,7 @@ def eliminate(
     A_i, A_j : shape (n - 1, s, s), whitened Jacobians of a motion by the keyframes before and after it
     r : shape (n - 1, s), its right-hand side
     C, C_targets : shapes (n - 1, s, e) and (e,), its other columns, of the keyframe before it or of the border
-    walk, walk_r : shape (n - 1, d - s), the last components walk: ``walk (x_{k+1} - x_k) = walk_r`` is white
+    walk, kept, walk_r : shape (n - 1, d - s), the last components walk: ``walk (x_{k+1} - kept x_k) = walk_r`` is white
     rows : shape (m, s + q + 1), of measurements in the order of keyframes: the first s components of the
         keyframe, q others, right-hand side
     targets : shape (m, q), of the q others
@@ -60,7 +61,7 @@ def eliminate(
         end = load_measurements(rows, targets, first[k], first[k + 1], s, d, room)
         last, stop, failing = absorb(k, n, end, last, stops, stop, room, filtered_out, left_out)
         if k < n - 1:
-            load_motion(k, A_i, A_j, r, C, C_targets, walk, walk_r, room)
+            load_motion(k, A_i, A_j, r, C, C_targets, walk, kept, walk_r, room)
         failing = max(failing, pass_on(k, n, room, conditionals_out))
         if failing >= 0:
             return failing

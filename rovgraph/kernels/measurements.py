@@ -6,10 +6,10 @@ call it through the models of `rovgraph.sensors`, the filter's kernel calls `pre
 ==============  =========================================================  ==================
 kind            equation                                                   source
 ==============  =========================================================  ==================
-DVL             z = (1 + k) R_sb (R_bn v_n + (w - b_g) x (l + dl))         (3.16), (3.17)
-DVL_WATER       the same with v_n - c_n, c the current
-DVL_COMPASS     z = h + A + B sin h + C cos h, h the DVL's heading less    (3.17); deviation
-                the declination                                            curve: Bowditch
+DVL             z = (1 + k + e) R_sb (R_bn v_n + (w - b_g) x (l + dl))     (3.16), (3.17)
+DVL_WATER       the same with v_n - c_n, c the current, without e
+DVL_COMPASS     z = h + A + e + B sin h + C cos h, h the DVL's heading     (3.17); deviation
+                less the declination, e an error that lasts                curve: Bowditch
 COMPASS         the same, with an x axis that is known
 MAGNETOMETER    z = |H| ((1 + s) S R_sb R_bn u(declination - A - ...,      (3.11), (3.14),
                 dip + d) + iron)                                           S: (3.2)
@@ -31,9 +31,9 @@ Arguments of `predict`, in the order of `rovgraph.kernels.layout`:
 Of ``H_out`` a kind writes the columns that it depends on, and always the same ones, so that a buffer which was zero
 at first can be used again and again:
 
-    DVL, DVL_WATER   rotation, velocity, gyro, dvl_roll to dvl_lever_arm; DVL_WATER: current
-    DVL_COMPASS      rotation, its offset and its curve, dvl_roll to dvl_yaw
-    COMPASS          rotation, its offset and its curve
+    DVL, DVL_WATER   rotation, velocity, gyro, dvl_roll to dvl_lever_arm; dvl_error, DVL_WATER: current
+    DVL_COMPASS      rotation, its offset, error and curve, dvl_roll to dvl_yaw
+    COMPASS          rotation, its offset, error and curve
     MAGNETOMETER     rotation, mag_offset to field_scale
     POSITION         rotation, translation, its offset
     PLACE_OFFSET     rotation, translation, the last two
@@ -46,7 +46,17 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import compass, dvl_mount, magnetometer
 from rovgraph.kernels.compile import given, kernel, view_helper
-from rovgraph.kernels.layout import CURRENT, DVL_LEVER_ARM, DVL_ROLL, DVL_SCALE, GYR_BIAS, MOTION, TRANSLATION, VELOCITY
+from rovgraph.kernels.layout import (
+    CURRENT,
+    DVL_ERROR,
+    DVL_LEVER_ARM,
+    DVL_ROLL,
+    DVL_SCALE,
+    GYR_BIAS,
+    MOTION,
+    TRANSLATION,
+    VELOCITY,
+)
 from rovgraph.kernels.rotations import cross, dot, rotate, rotate_back
 
 Indices = NDArray[np.int64]
@@ -89,6 +99,8 @@ def dvl_velocity(
     for i in range(3):
         v_b[i] += body[i]
     gain = 1.0 + c[DVL_SCALE]
+    if not water:  # the bottom's slope is the bottom's
+        gain += c[DVL_ERROR]
     for i in range(3):
         for k in range(3):
             row[k] = gain * R_bs[k, i]  # of (1 + k) R_sb; a row times S(u) is the row x u
@@ -103,6 +115,8 @@ def dvl_velocity(
         if water:
             H_out[i, MOTION + CURRENT] = -H_out[i, VELOCITY]
             H_out[i, MOTION + CURRENT + 1] = -H_out[i, VELOCITY + 1]
+        else:
+            H_out[i, MOTION + DVL_ERROR] = H_out[i, MOTION + DVL_SCALE]
 
 
 @view_helper

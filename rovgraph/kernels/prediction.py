@@ -5,8 +5,11 @@
     B_j = F B_i + F_y                                                     of what is considered
 
 f, F and Q of pose, velocity and bias are the motion's (`rovgraph.kernels.motion`); k are the IMU's scale errors
-where S is given, and calibration that walks adds its variance a second times the interval to Q.
+where S is given. Calibration that walks adds its variance a second times the interval to Q; with a time constant it
+is a first-order Gauss-Markov process (Gelb 1974), of which F keeps exp(-dt / T).
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +25,7 @@ MOVED = 9  # components that the motion mixes: rotation, position, velocity; bia
 
 @helper
 def carry(P: Array, F: Array, Q: Array) -> None:
-    """P <- F P F' + Q, where F differs from the unit matrix in its first rows only; P stays symmetric."""
+    """P <- F P F' + Q, F the unit matrix but for its first rows and its diagonal; P stays symmetric."""
     n = len(P)
     FP, own = np.zeros((MOVED, n)), np.empty(MOVED)
     for i in range(MOVED):
@@ -42,6 +45,12 @@ def carry(P: Array, F: Array, Q: Array) -> None:
             own[k] = total
         for k in range(i + 1):
             P[i, k] = P[k, i] = own[k]
+    for i in range(MOVED, n):
+        if F[i, i] != 1.0:
+            for k in range(n):
+                P[i, k] *= F[i, i]
+            for k in range(n):
+                P[k, i] *= F[i, i]
     for i in range(n):
         for j in range(n):
             P[i, j] += Q[i, j]
@@ -57,11 +66,13 @@ def carry_considered(B: Array, F: Array, moved: Array, own: Array) -> None:
                 own[i] += F[i, j] * B[j, k]
         for i in range(MOVED):
             B[i, k] = own[i]
+        for i in range(MOVED, len(B)):
+            B[i, k] *= F[i, i]
 
 
 @kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[::1], i8, f8[::1], "
-    "f8[:, ::1], f8[:, ::1])"
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8, "
+    "f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 def predict_filter(
     x: Array,
@@ -75,6 +86,7 @@ def predict_filter(
     walk: Array,
     estimated: int,
     x_out: Array,
+    c_out: Array,
     F_out: Array,
     Q_out: Array,
 ) -> None:
@@ -88,9 +100,9 @@ def predict_filter(
     motion : row of `rovgraph.kernels.motion_row`
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
     column : place of each component of state and calibration in the error, -1 where it is not estimated
-    walk : shape (n,), variance that walking adds in a second
+    walk : shape (3, n), variance that walking adds in a second, one over its time constant [1/s], the mean
     estimated : components of the error; those that are considered have the columns behind them
-    x_out : state after it
+    x_out, c_out : state and calibration vector after it; ``c_out`` may be ``c``
     F_out, Q_out : shape (n, n), transition and noise
     """
     n, moved = len(P), np.zeros((MOVED, len(L)))
@@ -109,7 +121,16 @@ def predict_filter(
     Q_out[:] = 0.0
     for i in range(n):
         F_out[i, i] = 1.0
-        Q_out[i, i] = walk[i] * motion[DURATION]
+        Q_out[i, i] = walk[0, i] * motion[DURATION]
+    c_out[:] = c
+    for i in range(MOTION, len(column)):
+        own = column[i]
+        if 0 <= own < estimated and walk[1, own] > 0.0:
+            rate = walk[1, own]
+            keep = math.exp(-rate * motion[DURATION])
+            F_out[own, own] = keep
+            Q_out[own, own] = walk[0, own] * (1.0 - keep * keep) / (2.0 * rate)
+            c_out[i - MOTION] = walk[2, own] + keep * (c[i - MOTION] - walk[2, own])
     for i in range(MOTION):
         for j in range(MOTION):
             F_out[i, j] = F[i, j]

@@ -26,6 +26,7 @@ class CompassHeading:
     declination : [rad], east positive; one for all epochs or for each
     R_bs : ndarray, shape (3, 3), mounting of the instrument; the DVL's own comes from
         the calibration variables instead
+    error : name of the variable of its error that lasts, or None
     """
 
     sensor: str
@@ -33,6 +34,7 @@ class CompassHeading:
     curve: str
     declination: float | Array
     R_bs: Array = field(default_factory=lambda: np.eye(3))
+    error: str | None = None
     dim = 1
     angular = True
     state = (POSE, BIAS)
@@ -40,7 +42,7 @@ class CompassHeading:
     @property
     def calibration(self) -> tuple[str, ...]:
         mount = MOUNT if self.sensor == "dvl_heading" else ()
-        return (self.offset, self.curve, *mount)
+        return (self.offset, self.curve, *mount, *(() if self.error is None else (self.error,)))
 
     @property
     def kind(self) -> int:
@@ -48,9 +50,10 @@ class CompassHeading:
 
     @cached_property
     def packed(self) -> Array:
-        """Declination, places of offset and curve in the calibration vector, the instrument's x axis in b."""
+        """Declination, places of offset, curve and error (or -1) in the calibration vector, the x axis in b."""
         declination = np.atleast_1d(self.declination)
-        own = LAYOUT[self.offset].start, LAYOUT[self.curve].start, *self.R_bs[:, 0]
+        error = -1 if self.error is None else LAYOUT[self.error].start
+        own = LAYOUT[self.offset].start, LAYOUT[self.curve].start, error, *self.R_bs[:, 0]
         return np.column_stack([declination, np.tile(own, (len(declination), 1))])
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
@@ -60,7 +63,8 @@ class CompassHeading:
 def of_imu(config: Config, origin_b: Array) -> Instrument:
     """The heading that the IMU makes itself."""
     declination = float(np.deg2rad(config.environment.declination_deg))
-    model = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, mount_matrix(config.imu.mount_rpy_deg))
+    R_bs = mount_matrix(config.imu.mount_rpy_deg)
+    model = CompassHeading("ahrs", "ahrs_offset", "ahrs_deviation", declination, R_bs, "ahrs_error")
     sd = np.deg2rad(config.heading.ahrs_sd_deg)
     return instrument(config.heading, model, sd, ("heading",), time_offset="ahrs_time_offset")
 
@@ -68,7 +72,8 @@ def of_imu(config: Config, origin_b: Array) -> Instrument:
 def of_dvl(config: Config, origin_b: Array) -> Instrument:
     """The heading of the DVL's compass."""
     declination = float(np.deg2rad(config.environment.declination_deg))
-    model = CompassHeading("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation", declination)
+    names = "dvl_compass_offset", "dvl_compass_deviation"
+    model = CompassHeading("dvl_heading", *names, declination, error="dvl_compass_error")
     sd = np.deg2rad(config.heading.dvl_sd_deg)
     return instrument(config.heading, model, sd, ("heading",), time_offset=TIME_OFFSET)
 

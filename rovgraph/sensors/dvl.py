@@ -60,7 +60,7 @@ class DvlVelocity:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        return _DVL_WATER if self.sensor == "dvl_water" else _DVL
+        return (*_DVL, "current" if self.sensor == "dvl_water" else "dvl_error")
 
     @property
     def kind(self) -> int:
@@ -76,7 +76,6 @@ class DvlVelocity:
 
 
 _DVL = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm")
-_DVL_WATER = (*_DVL, "current")
 
 
 def over_ground(config: Config, origin_b: Array) -> Instrument:

@@ -66,7 +66,7 @@ def pressure_sensor(config: Config, origin_b: Array) -> Instrument:
 def positioning(config: Config, origin_b: Array) -> Instrument:
     """Fixes, north and east."""
     fix = config.fix
-    model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1))
+    model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1), "fix_error")
     return instrument(fix, model, fix.sd_m, ("north", "east"), time_offset="fix_time_offset")
 
 

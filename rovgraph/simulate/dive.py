@@ -17,6 +17,7 @@ from rovgraph.geometry import Array, rotate, rpy_from_matrix, transpose, wrap_an
 from rovgraph.instruments import instruments
 from rovgraph.sensors import SENSORS, field_direction
 from rovgraph.simulate.imu import specific_force_and_rate, to_imu_axes, walk, white
+from rovgraph.simulate.lasting import LastingErrors, draw_lasting
 from rovgraph.simulate.magnetism import compass_turn
 from rovgraph.simulate.noise import correlated, remembered
 from rovgraph.simulate.path import Motion, Path
@@ -41,9 +42,9 @@ class Dive:
     ----------
     log_frame : the log, sparse and wide, columns of the log's contract, sorted by time
     truth : Trajectory at the IMU's epochs, without uncertainty
-    hidden : "calibration": name -> ndarray, shape (dim,); "bias": ndarray, shape (n, 6), at
-        the epochs of ``truth``; "start_offset": ndarray, shape (3,) [m]; "world": name -> ndarray,
-        what else is so and an estimator must not know
+    hidden : "calibration": name -> ndarray, shape (dim,), of an error that lasts at the end of the dive; "lasting":
+        `LastingErrors`, all of these; "bias": ndarray, shape (n, 6), at the epochs of ``truth``; "start_offset":
+        ndarray, shape (3,) [m]; "world": name -> ndarray, what else is so and an estimator must not know
     path : the path that was followed
     """
 
@@ -71,6 +72,7 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     rng : numpy Generator; the same seed gives the same dive
     """
     calibration = truth.draw_calibration(rng)
+    lasting = draw_lasting(truth, calibration, path.duration, rng)
     bias_start, offset = truth.draw_bias(rng), truth.draw_start(rng)
     path = path.shifted(offset)
     time = np.round(np.arange(int(path.duration * truth.imu_rate + 1e-6) + 1) / truth.imu_rate, 4)
@@ -78,14 +80,16 @@ def simulate(path: Path, truth: Truth, rng: np.random.Generator) -> Dive:
     bias = np.broadcast_to(bias_start, (len(time), 6))
     if truth.noise:
         bias = walk(bias_start, truth.config.imu.noise, truth.imu_rate, len(time), rng)
-    sample = _Sampler(truth, calibration, rng)
+    sample = _Sampler(truth, calibration, lasting, rng)
     frames = [_inertial(sample, path, motion, bias), _pings(sample, path)]
     makers = (_depths, _attitudes, _fixes, _signals, _sightings)
     frames += [frame for make in makers if (frame := make(sample, path)) is not None]
     frames += [_regular(sample, path, s.name, 1.0 / s.simulated_hz) for s in SENSORS.values() if s.simulated_hz]
     log = pd.concat(frames, ignore_index=True)
     log = log.sort_values("time", kind="stable", ignore_index=True)
+    calibration |= {name: values[-1] for name, values in lasting.at(time).items()}
     hidden = {"calibration": calibration, "bias": np.array(bias), "start_offset": offset, "world": _world(truth)}
+    hidden["lasting"] = lasting
     return Dive(log, Trajectory.certain(time, motion.p_n, motion.R_nb, motion.v_n), hidden, path)
 
 
@@ -105,8 +109,10 @@ def _world(truth: Truth) -> dict[str, Any]:
 class _Sampler:
     """Samples the measurement models at the true state."""
 
-    def __init__(self, truth: Truth, calibration: Mapping[str, Array], rng: np.random.Generator) -> None:
-        self.truth, self.calibration, self.rng = truth, calibration, rng
+    def __init__(
+        self, truth: Truth, calibration: Mapping[str, Array], lasting: LastingErrors, rng: np.random.Generator
+    ) -> None:
+        self.truth, self.calibration, self.lasting, self.rng = truth, calibration, lasting, rng
         self.instruments = instruments(truth.config)
         self.covariances = truth.covariances if truth.noise else None
 
@@ -119,7 +125,7 @@ class _Sampler:
     def exact(self, sensor: str, motion: Motion) -> Array:
         """The measurement without noise, shape (n, dim)."""
         zero = np.zeros((len(motion), 6))
-        state = State(motion.R_nb, motion.p_n, motion.v_n, zero, self.calibration)
+        state = State(motion.R_nb, motion.p_n, motion.v_n, zero, {**self.calibration, **self.lasting.at(motion.time)})
         z = self.instruments[sensor].model.predict(state, motion.w_b)[0]
         return self._disturbed(sensor, motion, z) if len(self.truth.magnetism.iron.p_n) else z
 

@@ -1,0 +1,126 @@
+"""Noise that the configuration does not state, found in the residuals: larger than stated, or errors that last.
+
+Both come back as keys of the configuration, with which the dive is solved again, filter and smoother alike. A
+constant that is held wrongly makes residuals that look like either, so where alarms name one nothing is found.
+
+The factor of white noise comes from differences of successive residuals, which errors that last leave alone:
+
+    factor^2 = median |r_k+1 - r_k|^2 / (2 m)
+
+with m the median of chi-square. A smoother's residuals vary less than the noise, so the factor is a little low.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+from scipy.special import chdtri
+
+from rovgraph.calibration import TABLE
+from rovgraph.config import Config
+from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
+from rovgraph.estimators.alarms import Alarm
+from rovgraph.estimators.alarms.residuals import SD_KEY
+
+NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
+LARGER = 1.5  # factor of the noise that is not as stated
+ENOUGH = 50  # differences
+OWN_SD = 0.05  # relative difference to the configuration's that makes it the log's own
+
+
+@dataclass(frozen=True)
+class UnstatedNoise:
+    """Noise that was found.
+
+    Attributes
+    ----------
+    sensor : log stream
+    key : of the configuration, that holds it
+    values : what stands there with it; numbers, or keys of the section and theirs
+    text : one line
+    """
+
+    sensor: str
+    key: str
+    values: Any
+    text: str
+
+
+def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> list[UnstatedNoise]:
+    """What the residuals of a dive say of its noise; white noise goes first, as errors that last stand out of it.
+
+    Parameters
+    ----------
+    best : the optimum
+    config : with which it was solved
+    alarms : of the same dive
+    """
+    if any(alarm.kind in NAMED for alarm in alarms):
+        return []
+    larger = [found for sensor in best.blocks if (found := _larger(best, sensor, config)) is not None]
+    if larger:
+        return larger
+    said = [name for name in LASTING.values() if "estimate" in getattr(config.calibration, name).model_fields_set]
+    return [_lasting(error, config) for error in find_lasting(best, said)]
+
+
+def changed(config: Config, found: Sequence[UnstatedNoise]) -> Config:
+    """The configuration with the noise that was found."""
+    for one in found:
+        config = _set(config, one.key.split("."), one.values)
+    return config
+
+
+def _set(section: Any, keys: Sequence[str], value: Any) -> Any:
+    """A section with one value changed, somewhere inside."""
+    inner = value if len(keys) == 1 else _set(getattr(section, keys[0]), keys[1:], value)
+    if isinstance(inner, Mapping) and isinstance(getattr(section, keys[0]), BaseModel):
+        inner = getattr(section, keys[0]).model_copy(update=dict(inner))
+    return section.model_copy(update={keys[0]: inner})
+
+
+def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | None:
+    """White noise of a sensor that is larger than the configuration states."""
+    key, block = SD_KEY.get(sensor), best.blocks[sensor]
+    if key is None:
+        return None
+    section, name = key.split(".")
+    stated = getattr(getattr(config, section), name)
+    used = best.weights[sensor] > 0.0
+    factor = noise_factor(block.normalised(best.state.at(block.keyframe))[used])
+    if factor is None or factor < LARGER or not _is_stated(best, sensor):
+        return None
+    value = tuple(factor * s for s in stated) if isinstance(stated, tuple) else factor * stated
+    text = f"{sensor}: its noise is {factor:.2g} times what {key} states, as its residuals vary; it is believed so"
+    return UnstatedNoise(sensor, key, value, text)
+
+
+def noise_factor(r: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+    """How many times larger the white noise of n normalised residuals is, shape (n, dim); None = too few."""
+    if len(r) <= ENOUGH:
+        return None
+    squares = np.sum(np.diff(r, axis=0) ** 2, axis=1)
+    return float(np.sqrt(np.median(squares) / (2.0 * chdtri(r.shape[1], 0.5))))
+
+
+def _is_stated(best: ChainOptimum, sensor: str) -> bool:
+    """Whether a sensor's noise is the configuration's, and not what the log says of most measurements."""
+    believed = best.chain.initial.instruments[sensor].sd
+    sd = np.array([m.sd for interval in best.intervals for m in interval.measurements if m.sensor == sensor])
+    return bool(np.median(np.abs(sd / believed - 1.0)) < OWN_SD)
+
+
+def _lasting(error: LastingError, config: Config) -> UnstatedNoise:
+    variable = TABLE[error.variable]
+    unit, shown = (np.rad2deg(1.0), "degrees") if variable.angular else (1.0, variable.unit)
+    sd, seconds = float(unit * error.sd), float(error.time_constant)
+    values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd, "time_constant_s": seconds}
+    size = f"{100.0 * sd:.2g} % of the velocity" if shown == "1" else f"{sd:.2g} {shown}"
+    text = (
+        f"{error.sensor}: its errors are correlated over {seconds:.0f} s with an sd of {size}; "
+        f"they are estimated (calibration.{error.variable})"
+    )
+    return UnstatedNoise(error.sensor, f"calibration.{error.variable}", values, text)

@@ -1,0 +1,120 @@
+"""Noise that the configuration does not state: it is found, said and applied, and healthy dives have none."""
+
+import numpy as np
+import pytest
+from dives import altered, changed, falcon, simulated, true_at
+
+from rovgraph.calibration import TABLE
+from rovgraph.engine.lasting import LASTING
+from rovgraph.estimators.dive import smooth
+from rovgraph.estimators.unstated_noise import noise_factor
+from rovgraph.simulate.files import known
+
+SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0, "start_error": True}
+ERROR = {"estimate": True, "sd": 1.5, "time_constant_s": 20.0}
+WHITE = {"fix": {"sd_m": 0.3}}
+
+
+def with_fixes(seed=1, **calibration):
+    """A dive, and what an estimator is told, to whom all noise is white."""
+    case = simulated(falcon(**WHITE, calibration=calibration), 120.0, seed=seed, fix_interval=1.0, **SHORT)
+    return case, changed(known(case.dive, case.config), calibration={name: {"estimate": False} for name in calibration})
+
+
+def unsaid(config):
+    """A configuration that leaves the errors that last to the log."""
+    data = config.model_dump(exclude_unset=True)
+    for name in LASTING.values():
+        data.get("calibration", {}).pop(name, None)
+    return type(config).model_validate(data)
+
+
+def nees(case, dive, kind):
+    """Normalised error squared of the horizontal position per component, mean over the second half."""
+    t = next(e for e in dive.estimates if e.kind == kind).trajectory
+    half = slice(len(t) // 2, None)
+    off, P = (t.p_n - true_at(case, t.time).p_n)[half, :2], t.cov_p[half, :2, :2]
+    return float(np.mean(np.einsum("ni,ni->n", off, np.linalg.solve(P, off[..., None])[..., 0])) / 2)
+
+
+@pytest.fixture(scope="module")
+def correlated():
+    return with_fixes(fix_error=ERROR)
+
+
+@pytest.fixture(scope="module")
+def found(correlated):
+    return smooth(correlated[0].log, unsaid(correlated[1]))
+
+
+def test_every_sensor_has_one_error_that_lasts():
+    assert LASTING == {
+        "fix": "fix_error",
+        "ahrs": "ahrs_error",
+        "dvl_heading": "dvl_compass_error",
+        "dvl": "dvl_error",
+    }
+    assert all(np.isfinite(TABLE[name].time_constant) for name in LASTING.values())
+
+
+def test_fixes_whose_errors_last_are_found_and_believed_so(correlated, found):
+    (one,) = found.estimates[0].summary["noise_found"]
+    assert one["key"] == "calibration.fix_error" and one["values"]["estimate"]
+    assert 0.7 < one["values"]["sd"] < 3.0 and 8.0 < one["values"]["time_constant_s"] < 50.0
+    assert found.beginning.config.calibration.fix_error.time_constant_s == one["values"]["time_constant_s"]
+    assert "fix: its errors are correlated over" in found.assumptions[0]
+    for kind in ("smoothed", "filtered"):
+        assert nees(correlated[0], found, kind) < 2.0, kind
+
+
+def test_what_the_configuration_says_of_an_error_stands(correlated):
+    """And without the search the track is a lie, so the test above can fail."""
+    case, config = correlated
+    for told in (config, changed(unsaid(config), graph={"find_noise": False})):
+        dive = smooth(case.log, told, "smoothed")
+        assert "noise_found" not in dive.estimates[0].summary
+        assert nees(case, dive, "smoothed") > 4.0
+
+
+def test_a_healthy_dive_is_solved_as_before():
+    case, config = with_fixes(seed=2)
+    dive, plain = (smooth(case.log, c, "smoothed") for c in (config, changed(config, graph={"find_noise": False})))
+    assert "noise_found" not in dive.estimates[0].summary
+    np.testing.assert_array_equal(dive.estimates[0].trajectory.p_n, plain.estimates[0].trajectory.p_n)
+
+
+def test_noise_three_times_what_is_stated_is_found_and_believed():
+    case, config = with_fixes(seed=3)
+    stated = changed(config, fix={"sd_m": 0.1})
+    dive = smooth(case.log, stated, "smoothed")
+    (one,) = dive.estimates[0].summary["noise_found"]
+    assert one["key"] == "fix.sd_m" and one["values"] == pytest.approx(0.3, rel=0.2)
+    assert dive.beginning.config.fix.sd_m == one["values"]
+    assert dive.assumptions[0].startswith("fix: its noise is ")
+
+
+def test_outliers_and_gaps_are_no_noise():
+    rng = np.random.default_rng(0)
+    r = rng.standard_normal((600, 2))
+    assert noise_factor(r) == pytest.approx(1.0, abs=0.08)
+    r[::7] += 30.0
+    assert noise_factor(r) < 1.35
+    assert noise_factor(3.0 * r[:40]) is None
+
+
+def test_an_error_that_lasts_is_not_taken_for_noise():
+    """Differences leave it alone."""
+    time = np.arange(1000.0)
+    r = np.random.default_rng(1).standard_normal((1000, 1)) + 20.0 * np.sin(time / 60.0)[:, None]
+    assert noise_factor(r) == pytest.approx(1.0, abs=0.1)
+
+
+def test_fixes_that_jump_for_a_minute_do_not_spoil_the_search():
+    """A dive that is broken in another way: the sd covers the track, or the line of the stretch says why not."""
+    case, config = with_fixes(seed=4)
+    data = case.log["fix"].data.copy()
+    data[40:80, :2] += 4.0
+    dive = smooth(altered(case.log, "fix", data), config, "smoothed")
+    summary = dive.estimates[0].summary
+    assert nees(case, dive, "smoothed") < 3.0
+    assert summary["stretches_taken_out"] or "noise_found" in summary
