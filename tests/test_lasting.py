@@ -5,7 +5,7 @@ import pytest
 from dives import changed, falcon, incremental, renewed, rms, simulated, smoothed, true_at
 from scipy.stats import chi2
 
-from rovgraph.calibration import stationary_walk, walked
+from rovgraph.calibration import LAYOUT, stationary_walk, walked
 from rovgraph.config import beliefs, parse_config
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.optimum import joint_prior_sd
@@ -65,12 +65,12 @@ def test_prediction_is_the_process_and_its_mean():
     engine = FilterEngine(dive.beginning)
     before, interval = engine.start(), dive.intervals[5]
     own, seconds = engine.layout.columns["current"], interval.time - dive.intervals[4].time
-    before.c[41:43] = 1.3, 0.8
+    before.c[LAYOUT["current"]] = 1.3, 0.8
     before.P[own, own] *= 0.25
     before.P[own, 0:3] = before.P[0:3, own].T[:] = 1e-4
     done = engine.predict(interval, before)
     kept = np.exp(-seconds / 5.0)
-    np.testing.assert_allclose(done.predicted.c[41:43], [0.3 + kept, -0.2 + kept])
+    np.testing.assert_allclose(done.predicted.c[LAYOUT["current"]], [0.3 + kept, -0.2 + kept])
     expected = done.F @ before.P @ done.F.T + done.Q
     np.testing.assert_allclose(done.predicted.P, expected, rtol=1e-9, atol=1e-14)
     np.testing.assert_allclose(np.diag(done.predicted.P[own, own]), 0.01 * (1 - kept**2 * 0.75))
@@ -82,7 +82,7 @@ def test_the_filter_ends_where_the_smoother_does(case, best):
     there, P = newest_calibration(best.state.calibration)["fix_error"], best.covariances("fix_error")[-1]
     sd = np.sqrt(np.diag(P))
     np.testing.assert_allclose(np.sqrt(np.diag(end.P[own, own])), sd, rtol=0.02)
-    assert (np.abs(end.c[43:45] - there) < 0.1 * sd).all()
+    assert (np.abs(end.c[LAYOUT["fix_error"]] - there) < 0.1 * sd).all()
 
 
 def test_isam2_knows_position_as_well_as_the_smoother_does(case, best):

@@ -74,7 +74,9 @@ def _timed(block: Block, wide: Unknowns, chain: Chain, state: State) -> _TimedBl
     model, time, rate_b = block.instrument.model, chain.rows.time, np.array([i.rate_b for i in chain.intervals])
     before = np.maximum(block.keyframe - (block.motion.dt < SHORT_S), 0)
     after = np.minimum(block.keyframe + 1, len(time) - 1)
-    begin, end = (model.predict(state.at(k), rate_b[k])[0] for k in (before, after))
+    here, there = state.at(before), state.at(after)
+    there = replace(there, calibration=here.calibration)  # errors that come and go are no motion
+    begin, end = model.predict(here, rate_b[before])[0], model.predict(there, rate_b[after])[0]
     slope = np.asarray(innovation(model, end, begin) / np.maximum(time[after] - time[before], 1e-6)[:, None])
     return _TimedBlock(**{f.name: getattr(wider, f.name) for f in fields(Block)}, slope=slope)
 

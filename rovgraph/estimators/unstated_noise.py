@@ -1,7 +1,8 @@
 """Noise that the configuration does not state, found in the residuals: larger than stated, or errors that last.
 
 Both come back as keys of the configuration, with which the dive is solved again, filter and smoother alike. A
-constant that is held wrongly makes residuals that look like either, so where alarms name one nothing is found.
+constant that is held wrongly makes residuals that look like either, so where alarms name one nothing is found. Late
+stamps of the same sensor are a rival: an error that lasts must make the dive likelier than these do.
 
 The factor of white noise comes from differences of successive residuals, which errors that last leave alone:
 
@@ -26,6 +27,7 @@ from rovgraph.estimators.alarms import Alarm
 from rovgraph.estimators.alarms.residuals import SD_KEY
 
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
+ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
 LARGER = 1.5  # factor of the noise that is not as stated
 ENOUGH = 50  # differences
 OWN_SD = 0.05  # relative difference to the configuration's that makes it the log's own
@@ -58,13 +60,17 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
     config : with which it was solved
     alarms : of the same dive
     """
-    if any(alarm.kind in NAMED for alarm in alarms):
+    named = [alarm for alarm in alarms if alarm.kind in NAMED]
+    late = {alarm.sensor: alarm.figure for alarm in named if alarm.kind == "held" and alarm.sensor in ALONE}
+    if len(late) < len(named):
         return []
     larger = [found for sensor in best.blocks if (found := _larger(best, sensor, config)) is not None]
     if larger:
         return larger
     said = [name for name in LASTING.values() if "estimate" in getattr(config.calibration, name).model_fields_set]
-    return [_lasting(error, config) for error in find_lasting(best, said)]
+    errors = find_lasting(best, said)
+    # a score test's figure z is worth z^2 / 2 of log likelihood
+    return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
 
 
 def changed(config: Config, found: Sequence[UnstatedNoise]) -> Config:

@@ -157,7 +157,7 @@ def halves(evidence: Evidence) -> Iterator[Statistic]:
         return
     middle = 0.5 * (evidence.start + evidence.end)
     for name, history in filtered.history.items():
-        if name not in TABLE or TABLE[name].walk or len(history.time) < 3:
+        if name not in TABLE or np.isfinite(TABLE[name].time_constant) or TABLE[name].walk or len(history.time) < 3:
             continue
         k = int(np.searchsorted(history.time, middle))
         for label, value, sd in zip(history.labels, history.value[k], history.sd[k], strict=True):
