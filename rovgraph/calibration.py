@@ -297,6 +297,17 @@ TABLE: dict[str, Variable] = {
             considered=True,
         ),
         Variable(
+            "depth_scale",
+            "D",
+            _ONE,
+            "1",
+            0.015,
+            ("depth",),
+            "scale error of the depth (density of the water, as fresh is to salt)",
+            "large changes of depth, against a DVL whose scale is known",
+            considered=True,
+        ),
+        Variable(
             "depth_time_offset",
             "Z",
             _ONE,

@@ -110,7 +110,7 @@ def dead_reckon(
     step = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(epochs.time)[:, None]
     k = epochs.keyframe
     p_n = (beginning.prior.state.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)]))[k]
-    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb[k], beginning, float(calibration["depth_offset"][0]))
+    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb[k], beginning, calibration)
     return State(R_nb[k], p_n, v_n[k], bias[k], dict(calibration))
 
 
@@ -265,7 +265,11 @@ def _through_water(
 
 
 def _depths(
-    intervals: Sequence[KeyframeInterval], integrated: Array, R_nb: Array, beginning: InitialConditions, offset: float
+    intervals: Sequence[KeyframeInterval],
+    integrated: Array,
+    R_nb: Array,
+    beginning: InitialConditions,
+    calibration: Mapping[str, Array],
 ) -> Array:
     """Depth of the IMU from the pressure sensor, where there is one."""
     found = [(a.time, a.z[0]) for i in intervals for a in i.measurements if a.sensor == "depth"]
@@ -273,5 +277,6 @@ def _depths(
         return integrated
     time, depth = np.array(found).T
     arm = beginning.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
-    own = np.interp([i.time for i in intervals], time, depth) - offset
+    own = np.interp([i.time for i in intervals], time, depth) - calibration["depth_offset"]
+    own /= 1.0 + calibration["depth_scale"]
     return np.asarray(own - rotate(R_nb, arm)[:, 2])

@@ -27,13 +27,14 @@ class Position:
     sensor : "depth" or "fix"
     lever_arm_b : ndarray, shape (3,), of the sensor relative to the state's origin [m]
     axes : indices of the components measured, (2,) for depth, (0, 1) for a fix
-    offset : name of the calibration variable that is added, or None
+    offset, scale : names of the calibration variables that are added, and of the scale's error, or None
     """
 
     sensor: str
     lever_arm_b: Array
     axes: tuple[int, ...]
     offset: str | None = None
+    scale: str | None = None
     angular = False
     state = (POSE, VELOCITY, BIAS)
     kind = kernels.POSITION
@@ -44,13 +45,13 @@ class Position:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        return () if self.offset is None else (self.offset,)
+        return tuple(name for name in (self.offset, self.scale) if name is not None)
 
     @cached_property
     def packed(self) -> Array:
-        """The lever arm, the offset's place in the calibration vector or -1, the components measured."""
-        offset = -1 if self.offset is None else LAYOUT[self.offset].start
-        return np.array([[*self.lever_arm_b, offset, *self.axes]], dtype=float)
+        """The lever arm, places of offset and scale in the calibration vector or -1, the components measured."""
+        offset, scale = (-1 if name is None else LAYOUT[name].start for name in (self.offset, self.scale))
+        return np.array([[*self.lever_arm_b, offset, scale, *self.axes]], dtype=float)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, (POSE,), state, rate_b)
@@ -59,7 +60,7 @@ class Position:
 def pressure_sensor(config: Config, origin_b: Array) -> Instrument:
     """Depth, positive down."""
     depth = config.depth
-    model = Position("depth", np.array(depth.lever_arm_m) - origin_b, (2,), "depth_offset")
+    model = Position("depth", np.array(depth.lever_arm_m) - origin_b, (2,), "depth_offset", "depth_scale")
     return instrument(depth, model, depth.sd_m, ("down",), time_offset="depth_time_offset")
 
 
