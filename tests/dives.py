@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rovgraph.config import Config, load_config
+from rovgraph.config import Config, beliefs, load_config
 from rovgraph.engine.filter_step import FilterStep, Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
@@ -38,6 +38,12 @@ def changed(config: Config, **sections: Mapping[str, Any]) -> Config:
     data = config.model_dump(exclude_unset=True)
     merge(data, sections)
     return Config.model_validate(data)
+
+
+def exact(config: Config) -> Config:
+    """A configuration that considers nothing."""
+    considered = {name for name, belief in beliefs(config).items() if belief.considered}
+    return changed(config, calibration={name: {"estimate": False} for name in considered})
 
 
 def merge(into: dict[str, Any], new: Mapping[str, Any]) -> None:

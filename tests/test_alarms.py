@@ -54,8 +54,14 @@ SAID = {
 }
 
 
-def broken(name: str, seed: int, path: str = "falcon") -> tuple[Simulated, Dive]:
-    case = simulated(falcon(), SECONDS, seed, path, **BROKEN[name].truth)
+NOISE = {  # found in the dive, and believed
+    "DVL noise three times as stated": ("dvl: its noise is 2.", "dvl.velocity_sd_mps"),
+    "fixes 8 m off for a minute": ("fix: its errors are correlated over ", "calibration.fix_error"),
+}
+
+
+def broken(name: str, seed: int, path: str = "falcon", find_noise: bool = False) -> tuple[Simulated, Dive]:
+    case = simulated(falcon(graph={"find_noise": find_noise}), SECONDS, seed, path, **BROKEN[name].truth)
     return case, smooth(BROKEN[name].breaks(case.log), case.config)
 
 
@@ -67,6 +73,16 @@ def test_what_is_broken_is_named_with_a_remedy(name):
     lines = [alarm.text for alarm in dive.alarms if alarm.kind == kind]
     assert any(words in line for line in lines), dive.warnings
     assert all("\n" not in line for line in dive.warnings)
+
+
+@pytest.mark.parametrize("name", NOISE)
+def test_noise_that_is_found_is_said_and_the_dive_with_it_is_trusted(name):
+    case, dive = broken(name, 1, find_noise=True)
+    begins, key = NOISE[name]
+    assert any(line.startswith(begins) and key in line for line in dive.assumptions), dive.assumptions
+    assert (dive.verdict, dive.warnings) == ("trusted", [])
+    track = dive.estimates[0].trajectory
+    assert (position_errors(track, case) < 4.0 * np.linalg.norm(track.p_sd, axis=1)).all()
 
 
 def test_a_healthy_dive_is_trusted():

@@ -12,7 +12,7 @@ import rovgraph.engine, rovgraph.kernels
 for package in (rovgraph.engine, rovgraph.kernels):
     for module in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
         importlib.import_module(module.name)
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.transition import predict, transitions
 from rovgraph.instruments import instruments
@@ -23,7 +23,8 @@ config, time = Config(), np.arange(0.0, 3.0, 0.01)
 data = np.tile([0.1, 0.0, -9.81, 0.0, 0.0, 0.2], (len(time), 1))
 imu = Stream("imu", tuple("abcdef"), time, data, np.arange(len(time)))
 intervals = Assembler(config, instruments(config), np.zeros(6)).take(Log("log", {"imu": imu}))
-state = State(np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)))
+means = {name: belief.mean for name, belief in beliefs(config).items()}
+state = State(np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)), means)
 for interval in intervals[1:]:
     state = predict(interval, state)
     transitions([interval], [state])

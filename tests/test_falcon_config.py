@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from rovgraph.calibration import TABLE
 from rovgraph.config import Config, load_config, mount_matrix
 from rovgraph.geometry import exp_rotation
 from rovgraph.instruments import instruments
@@ -51,7 +52,7 @@ def test_dvl_measures_what_3_17_says(config):
     expected = sensor_to_thesis_body(THETA_DVL).T @ (v_thesis + np.cross(w_thesis, r_thesis))
     angles = np.deg2rad(config.dvl.mount_rpy_deg)
     calibration = {f"dvl_{n}": angles[[i]] for i, n in enumerate(("roll", "pitch", "yaw"))}
-    calibration |= {"dvl_scale": np.zeros(1), "dvl_lever_arm": np.zeros(3)}
+    calibration = {name: np.zeros(v.dim) for name, v in TABLE.items()} | calibration
     state = State(np.eye(3)[None], np.zeros((1, 3)), (FLIP @ v_thesis)[None], np.zeros((1, 6)), calibration)
     z, _ = instruments(config)["dvl"].model.predict(state, (FLIP @ w_thesis)[None])
     np.testing.assert_allclose(z[0], expected, atol=1e-12)

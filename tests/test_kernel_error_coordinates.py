@@ -37,7 +37,7 @@ def instruments(request):
 
 @pytest.fixture(params=ESTIMATED)
 def layout(request, instruments) -> Layout:
-    return Layout(ESTIMATED[request.param], instruments)
+    return Layout(ESTIMATED[request.param], (), instruments)
 
 
 @pytest.fixture

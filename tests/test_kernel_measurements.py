@@ -32,8 +32,8 @@ CASES = {
     "dvl_compass": (kernels.DVL_COMPASS, 1, [0.1, *DVL_COMPASS, layout.DVL_COMPASS_ERROR, 0.0, 0.0, 0.0]),
     "compass": (kernels.COMPASS, 1, [0.1, *AHRS, layout.AHRS_ERROR, *TURN[:, 0]]),
     "magnetometer": (kernels.MAGNETOMETER, 3, [0.1, 1.2, 0.5, *TURN.ravel()]),
-    "depth": (kernels.POSITION, 1, [*ARM, layout.DEPTH_OFFSET, 2]),
-    "fix": (kernels.POSITION, 2, [*ARM, layout.FIX_ERROR, 0, 1]),
+    "depth": (kernels.POSITION, 1, [*ARM, layout.DEPTH_OFFSET, layout.DEPTH_SCALE, 2]),
+    "fix": (kernels.POSITION, 2, [*ARM, layout.FIX_ERROR, -1, 0, 1]),
     "place": (kernels.PLACE_OFFSET, 2, ARM),
     "water_velocity": (kernels.WATER_VELOCITY, 2, []),
 }

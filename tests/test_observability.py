@@ -7,7 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from dives import batch, changed, kept, simulated, true_at
+from dives import batch, changed, exact, kept, simulated, true_at
 
 from rovgraph.calibration import TABLE
 from rovgraph.cli import app
@@ -32,7 +32,7 @@ from rovgraph.studies.observability import examined, observe, solved
 from rovgraph.studies.plan import Known, Sensors, plan, predicted
 
 CALMLY = Style(waves=CALM)
-ONE_COMPASS = changed(Config(), calibration={"dvl_yaw": {"estimate": True}}, heading={"sources": ["ahrs"]})
+ONE_COMPASS = changed(exact(Config()), calibration={"dvl_yaw": {"estimate": True}}, heading={"sources": ["ahrs"]})
 UNBIASED = changed(ONE_COMPASS, calibration={"ahrs_offset": {"estimate": False}})
 SLOW = {"imu_rate": 50.0, "dvl_rate": 4.0, "ahrs_rate": 5.0}
 
@@ -176,7 +176,7 @@ def test_figure8_with_fixes_and_unbiased_heading_shows_the_misalignment():
 def test_a_compass_on_the_dvl_shows_only_the_sum():
     """Its heading is the vehicle's, its offset and the DVL's mounting; no acceleration parts the last two."""
     config = changed(
-        Config(),
+        exact(Config()),
         calibration={
             "dvl_yaw": {"estimate": True},
             "ahrs_offset": {"estimate": False},

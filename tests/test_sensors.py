@@ -193,8 +193,9 @@ def test_depth_and_fix_are_those_of_their_own_place():
     sensors, state = instruments(CONFIG), random_state()
     for sensor, rows in (("depth", [2]), ("fix", [0, 1])):
         arm = getattr(CONFIG, sensor).lever_arm_m
-        offset = state.calibration["depth_offset"] if sensor == "depth" else 0.0
-        expected = (state.p_n + rotate(state.R_nb, np.array(arm)))[:, rows] + offset
+        c = state.calibration
+        offset, scale = (c["depth_offset"], c["depth_scale"]) if sensor == "depth" else (c["fix_error"], 0.0)
+        expected = (1.0 + scale) * (state.p_n + rotate(state.R_nb, np.array(arm)))[:, rows] + offset
         np.testing.assert_allclose(sensors[sensor].model.predict(state, np.zeros((N, 3)))[0], expected)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from dives import exact as exactly
 
 from rovgraph.cli.app import main
 from rovgraph.config import Config, beliefs, parse_config
@@ -189,7 +190,7 @@ def test_same_seed_same_dive_other_seed_other_dive(config):
 
 def test_imu_noise_has_the_configured_density(config):
     walkless = config.imu.noise.model_copy(update={"acc_walk": 1e-12, "gyr_walk": 1e-12})
-    config = config.model_copy(update={"imu": config.imu.model_copy(update={"noise": walkless})})
+    config = exactly(config.model_copy(update={"imu": config.imu.model_copy(update={"noise": walkless})}))
     for rate in (50.0, 200.0):
         noisy = dive_of(config, imu_rate=rate, bias=np.zeros(6)).log_frame
         exact = dive_of(config, imu_rate=rate, noise=False).log_frame
@@ -234,12 +235,16 @@ def test_bias_is_in_body_axes_and_in_the_samples(config):
     np.testing.assert_allclose(shift, R_bs.T @ bias[:3], atol=5e-3)
 
 
-def test_only_estimated_calibration_is_drawn_and_from_its_prior():
-    text = "calibration: {dvl_yaw: {estimate: true, mean_deg: 20, sd_deg: 4}, dvl_pitch: {mean_deg: 1}}"
+def test_only_calibration_that_is_uncertain_is_drawn_and_from_its_prior():
+    text = (
+        "calibration: {dvl_yaw: {estimate: true, mean_deg: 20, sd_deg: 4}, dvl_scale: {estimate: considered}, "
+        "dvl_pitch: {estimate: false, mean_deg: 1}}"
+    )
     truth = Truth(parse_config(text))
     draws = [truth.draw_calibration(np.random.default_rng(seed)) for seed in range(400)]
     yaw = np.rad2deg([d["dvl_yaw"][0] for d in draws])
     assert yaw.mean() == pytest.approx(20, abs=1.0) and yaw.std() == pytest.approx(4, rel=0.15)
+    assert np.std([d["dvl_scale"][0] for d in draws]) == pytest.approx(0.01, rel=0.15)
     np.testing.assert_allclose([d["dvl_pitch"][0] for d in draws], np.deg2rad(1.0))
 
 

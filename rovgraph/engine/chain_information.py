@@ -160,10 +160,25 @@ class SquareRoot:
         chain_posterior.covariances(self.conditionals, np.ascontiguousarray(P_y), P, cross, following)
         return P, cross, following
 
-    def filtered_covariances(self) -> Array:
-        """Joint covariances of a keyframe and the border, of the data up to it, shape (f, d + c, d + c)."""
-        root = np.asarray(np.linalg.inv(self.filtered[:, :, :-1]), dtype=float)
-        return root @ transpose(root)
+    def filtered_covariances(self, held: Sequence[int] = (), believed: Array | None = None) -> Array:
+        """Joint covariances of a keyframe and the border, of the data up to it, shape (f, d + c, d + c).
+
+        Parameters
+        ----------
+        held, believed : components that are held and not estimated, and their covariance, shape (h, h)
+        """
+        R = self.filtered[:, :, :-1]
+        if believed is None or not len(held):
+            root = np.asarray(np.linalg.inv(R), dtype=float)
+            return root @ transpose(root)
+        free, out = np.setdiff1d(np.arange(R.shape[1]), held), np.zeros_like(R)
+        R = np.asarray(np.linalg.qr(R[:, :, [*free, *held]], mode="r"), dtype=float)
+        own = slice(0, len(free))
+        root = np.asarray(np.linalg.inv(R[:, own, own]), dtype=float)
+        gain = np.asarray(-root @ R[:, own, len(free) :], dtype=float)
+        out[:, free[:, None], free] = root @ transpose(root) + gain @ believed @ transpose(gain)
+        out[:, np.array(held)[:, None], held] = believed
+        return out
 
     def newest_covariance(self, P_y: Array) -> Array:
         """Joint covariance of the last keyframe and the border, shape (d + c, d + c); ``P_y`` is that of the border."""

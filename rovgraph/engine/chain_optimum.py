@@ -139,9 +139,12 @@ class ChainOptimum:
         return ChainOptimum(without, resume(without, begin, self.solution))
 
     def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
-        P = self.chain.eliminate(point, self.solution.gates, keyframes, kept=1).filtered_covariances()
-        attitude = self.chain.layout.d + self.chain.layout.c + np.arange(3)
-        calibration = [self.chain.layout.target(name) for name in self.unknowns.estimated]
+        wide = self._wide
+        root, layout = wide.eliminate(point, self.solution.gates, keyframes, kept=1), wide.layout
+        held = [int(k) for name in self.unknowns.considered for k in layout.target(name)]
+        P = root.filtered_covariances(held, self._believed)
+        attitude = layout.d + layout.c + np.arange(3)
+        calibration = [layout.target(name) for name in self.unknowns.estimated]
         chosen = np.concatenate([np.arange(9, MOTION), attitude, *calibration])
         return Knowledge(np.array(keyframes), P[:, chosen[:, None], chosen])
 
