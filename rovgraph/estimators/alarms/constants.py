@@ -23,6 +23,7 @@ SHOWN_OF = {"fix_time_offset": 1.0}  # the velocity that makes a late fix wrong 
 MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
 FEIGNED = {
     "dvl_scale": 1.5e-3,
+    "dvl_lever_arm": 0.05,
     "gyr_scale": 5e-4,
     "ahrs_time_offset": 0.01,
     "mag_time_offset": 5e-3,
