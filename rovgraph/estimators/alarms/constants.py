@@ -40,7 +40,7 @@ BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(
 def moved(evidence: Evidence) -> Iterator[Statistic]:
     """Calibration variables and first biases against their priors.
 
-    What data move of a healthy variable has the variance prior_sd^2 - sd^2.
+    What data move of a healthy variable has at most the variance prior_sd^2 + sd^2 (`sds_moved`).
     """
     for c in evidence.main.calibration:
         if c.estimated:
@@ -51,7 +51,7 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
         if history is None or evidence.main.kind != "smoothed":
             continue
         mean, sd = prior.state.bias[0][part], prior.bias_sd[part]
-        off = (history.value[0] - mean) / np.sqrt(np.maximum(sd**2 - history.sd[0] ** 2, (1.0 - NARROWED**2) * sd**2))
+        off = (history.value[0] - mean) / np.hypot(sd, history.sd[0])
         worst = int(np.argmax(np.abs(off)))
         yield _moved(
             evidence.start,
@@ -83,9 +83,11 @@ def moved_constant(c: CalibrationEstimate, begin: float, end: float) -> Iterator
 
 
 def sds_moved(value: Array, sd: Array, prior_mean: Array, prior_sd: Array) -> Array:
-    """How far data have moved n constants, in sds of what they do to right ones; 0 where they hardly narrowed them."""
-    narrowed = sd <= NARROWED * prior_sd
-    by_data = np.sqrt(np.where(narrowed, prior_sd**2 - sd**2, np.inf))
+    """How far data have moved n constants, in sds of what they do to right ones; 0 where they hardly narrowed them.
+
+    Without anything considered that has the variance prior sd^2 - sd^2; what is considered adds to it and to sd^2.
+    """
+    by_data = np.where(sd <= NARROWED * prior_sd, np.hypot(prior_sd, sd), np.inf)
     return np.asarray(np.abs(value - prior_mean) / by_data)
 
 
