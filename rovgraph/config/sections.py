@@ -1,11 +1,14 @@
 """The sections of the configuration, and what may stand in them."""
 
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 from pydantic_core import PydanticCustomError
+
+from rovgraph.config.presets import known_preset
 
 Positive = Annotated[float, Field(gt=0)]
 Readmission = Annotated[
@@ -18,6 +21,8 @@ NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
 STAMPED = ("imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "place", "thruster")
 HeadingSource = Literal["mag", "dvl", "ahrs"]
+ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
+DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
 
 
 class Section(BaseModel):
@@ -90,6 +95,9 @@ class Mag(Section):
 class Imu(Section):
     """Inertial unit: mounting and noise."""
 
+    preset: ImuPreset | None = Field(
+        None, description="instrument that fills in what is not stated, see docs/presets.md"
+    )
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="IMU axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the IMU in body axes")
     noise: ImuNoise = ImuNoise()
@@ -102,6 +110,9 @@ class Imu(Section):
 class Dvl(Section):
     """Doppler velocity log: mounting and noise."""
 
+    preset: DvlPreset | None = Field(
+        None, description="instrument that fills in what is not stated, see docs/presets.md"
+    )
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="DVL axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the DVL in body axes")
     velocity_sd_mps: PositiveTriple = Field((0.01, 0.01, 0.01), description="noise of a ping, DVL axes")
