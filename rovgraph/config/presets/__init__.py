@@ -73,12 +73,13 @@ class Preset:
 
 @cache
 def presets() -> Mapping[str, Preset]:
-    """All presets by name, sorted."""
+    """All presets by name, inertial units first."""
     raw: dict[str, dict[str, Any]] = {}
     for file in files(__name__).iterdir():
         if file.name.endswith(".yaml"):
             raw |= YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
-    return {name: _preset(name, raw) for name in sorted(raw)}
+    found = [_preset(name, raw) for name in sorted(raw)]
+    return {p.name: p for p in sorted(found, key=lambda p: KINDS.index(p.kind))}
 
 
 def _preset(name: str, raw: Mapping[str, Mapping[str, Any]]) -> Preset:
