@@ -29,7 +29,15 @@ def check(
 
     settings = load_config(config)
     report = examine(
-        read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s), settings
+        read_log(
+            log,
+            settings.columns,
+            settings.units,
+            settings.imu.mag.calibrated,
+            settings.delay_s,
+            settings.environment.origin,
+        ),
+        settings,
     )
     if as_json:
         typer.echo(json.dumps(_without_nan(asdict(report)), indent=2, allow_nan=False))

@@ -123,7 +123,9 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
     if env.latitude_deg is None and log.origin is not None:
         changes["latitude_deg"] = log.origin[0]
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:
-        raise InputError("environment.earth_rotation needs environment.latitude_deg, as the log has no fix_lat")
+        raise InputError(
+            "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
+        )
     return config.model_copy(update={"environment": env.model_copy(update=changes)}) if changes else config
 
 
