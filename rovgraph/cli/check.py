@@ -69,11 +69,12 @@ def _timing_table(report: "Report") -> "Table":
     from rich.text import Text
 
     table = Table(title=Text(report.source), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading in ("sensor", "count", "Hz", "from [s]", "to [s]", "gap [s]", "at [s]", "jitter [s]", "repeats"):
+    for heading in ("sensor", "count", "Hz", "from\n[s]", "to\n[s]", "gap\n[s]", "at\n[s]", "jitter\n[s]", "repeats"):
         table.add_column(Text(heading), justify="left" if heading == "sensor" else "right", no_wrap=True)
     start = min(t.first for t in report.timings)
     for t in report.timings:
-        numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", f"{t.gap:.3g}")
+        gap = f"{t.gap:.3g}" if t.gap < 1000.0 else f"{t.gap:.0f}"
+        numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", gap)
         table.add_row(t.sensor, str(t.count), *numbers, f"{t.gap_at - start:.1f}", f"{t.jitter:.2g}", str(t.repeats))
     table.caption = f"0 s is {start:.3f} s of the log's clock; gap: the largest, and when"
     return table

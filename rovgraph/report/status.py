@@ -81,7 +81,7 @@ def status(solution: Solution, events: tuple[Event, ...] = ()) -> Table:
     """
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis")
+    table.add_column(overflow="fold")
     for name, text in _rows(solution):
         table.add_row(name, text)
     for event in events:
