@@ -19,26 +19,32 @@ def check(
 ) -> None:
     """Look at a log: sensors, rates, gaps, units, signs, clocks, and what an estimate would make of it."""
     import json
+    import warnings
     from dataclasses import asdict
 
     from rich.console import Console
 
-    from rovgraph.check import examine, refuse
+    from rovgraph.check import Finding, bridge_jumps, examine, refuse
     from rovgraph.config import load_config
+    from rovgraph.estimators.initialise import refusal
     from rovgraph.log import read_log
 
     settings = load_config(config)
-    report = examine(
-        read_log(
-            log,
-            settings.columns,
-            settings.units,
-            settings.imu.mag.calibrated,
-            settings.delay_s,
-            settings.environment.origin,
-        ),
-        settings,
+    dive_log = read_log(
+        log,
+        settings.columns,
+        settings.units,
+        settings.imu.mag.calibrated,
+        settings.delay_s,
+        settings.environment.origin,
     )
+    report = examine(dive_log, settings)
+    if not report.at("error") and refusal(dive_log, settings):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the report has it
+            bridged = bridge_jumps(dive_log, settings)
+        if reason := refusal(bridged, settings):
+            report.findings.append(Finding("smooth", "error", reason))
     if as_json:
         typer.echo(json.dumps(_without_nan(asdict(report)), indent=2, allow_nan=False))
     else:
@@ -46,8 +52,8 @@ def check(
         console.print(_timing_table(report))
         for finding in report.findings:
             _print_finding(console, finding.level, f"{finding.sensor}: {finding.text}")
-        warnings, errors = len(report.at("warning")), len(report.at("error"))
-        console.print(f"{_plural(errors, 'error')}, {_plural(warnings, 'warning')}", style="bold")
+        errors, doubts = len(report.at("error")), len(report.at("warning"))
+        console.print(f"{_plural(errors, 'error')}, {_plural(doubts, 'warning')}", style="bold")
     refuse(report)
 
 

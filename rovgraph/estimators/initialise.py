@@ -28,6 +28,20 @@ START_VELOCITY_SD = 1.0
 ENOUGH_SAMPLES = 100
 
 
+def refusal(log: Log, config: Config) -> str:
+    """Why no estimate can begin, one line; empty where one can.
+
+    Parameters
+    ----------
+    log, config : of `initialise`
+    """
+    try:
+        initialise(log, config)
+    except InputError as error:
+        return str(error).removeprefix(f"{log.source}: ")
+    return ""
+
+
 def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> InitialConditions:
     """Resolve everything that the configuration leaves to the log.
 
