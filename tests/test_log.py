@@ -53,9 +53,7 @@ def test_a_stated_origin_is_where_north_and_east_count_from(tmp_path):
     assert read_quietly(path).origin == (58.301, 14.5)
     bare = write(tmp_path, "time,depth\n1,2\n", "bare.csv")
     assert read_quietly(bare, origin=(58.3, 14.5)).origin == (58.3, 14.5) and read_quietly(bare).origin is None
-    with pytest.raises(
-        InputError, match=r"fixes lie \d+ km from environment.origin_lat_deg"
-    ):
+    with pytest.raises(InputError, match=r"fixes lie \d+ km from environment.origin_lat_deg"):
         read_log(path, origin=(14.5, 58.3))  # the two swapped
 
 
