@@ -34,7 +34,7 @@ class Metrics:
     ----------
     epochs : reference epochs compared
     duration_s : from the first to the last of them
-    coverage : part of the reference's epochs (from ``--from`` on) that were compared
+    coverage : part of the reference's epochs (of ``--from`` to ``--to``) that were compared
     distance_m : length of the reference's track, horizontal
     rms_m, mean_m, max_m : horizontal distance
     max_at_s : time of the largest horizontal distance
@@ -74,7 +74,9 @@ class Metrics:
         return asdict(self)
 
 
-def evaluate(trajectory: Trajectory, reference: Trajectory, start: float = 0.0, align: bool = False) -> Metrics:
+def evaluate(
+    trajectory: Trajectory, reference: Trajectory, start: float = 0.0, align: bool = False, end: float = np.inf
+) -> Metrics:
     """Compare a trajectory with a reference.
 
     Parameters
@@ -83,22 +85,27 @@ def evaluate(trajectory: Trajectory, reference: Trajectory, start: float = 0.0, 
     reference : Trajectory; what it does not know is NaN
     start : leave out what is earlier than this after the trajectory's first epoch [s]
     align : fit the trajectory to the reference first
+    end : leave out what is later than this after the trajectory's first epoch [s]
 
     Raises
     ------
-    InputError : a start before or after the trajectory; fewer than two reference epochs inside the rest of it
+    InputError : a start before or after the trajectory; an end before the start; fewer than two reference epochs
+        inside the rest of it
     """
     if not start >= 0.0:
         raise InputError(f"comparing from {start:g} s on: expected 0 or more after the trajectory's first epoch")
     if (lasts := float(trajectory.time[-1] - trajectory.time[0])) < start:
         raise InputError(f"comparing from {start:g} s on: the trajectory lasts {lasts:.1f} s, nothing of it is left")
-    first = trajectory.time[0] + start
-    wanted = reference.time >= first
+    if not end > start:
+        raise InputError(f"comparing from {start:g} to {end:g} s: the end is not after the start")
+    first, last = trajectory.time[0] + start, trajectory.time[0] + end
+    wanted = (reference.time >= first) & (reference.time <= last)
     common = np.flatnonzero(wanted & (reference.time >= trajectory.time[0]) & (reference.time <= trajectory.time[-1]))
     if len(common) < 2:
+        until = "on" if np.isinf(end) else f"to {last:.1f} s"
         raise InputError(
             f"the reference ({_span(reference)}) has {len(common)} epochs within the trajectory "
-            f"({_span(trajectory)}) from {first:.1f} s on, at least 2 are needed; are both on the same clock?"
+            f"({_span(trajectory)}) from {first:.1f} s {until}, at least 2 are needed; are both on the same clock?"
         )
     truth = reference.take(common)
     estimate = trajectory.at(truth.time)

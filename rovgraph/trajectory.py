@@ -1,8 +1,8 @@
 """A trajectory with its uncertainty, and its files.
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
-v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``. TUM files hold
-``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
+v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; ``lat, lon`` at the end where it is known where
+on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
 """
 
 import warnings
@@ -116,16 +116,33 @@ class Trajectory:
         frame["cov_north_east"] = self.cov_p[:, 0, 1]
         return frame
 
-    def write_csv(self, path: Path, more: bool = False) -> None:
+    def geodetic(self, origin: tuple[float, float]) -> tuple[Array, Array]:
+        """Latitude and longitude [deg], each of shape (n,).
+
+        Parameters
+        ----------
+        origin : latitude and longitude [deg] of north = east = 0
+        """
+        from pymap3d import ned2geodetic
+
+        lat, lon, _ = ned2geodetic(self.p_n[:, 0], self.p_n[:, 1], 0.0, *origin, 0.0)
+        return lat, lon
+
+    def write_csv(self, path: Path, more: bool = False, origin: tuple[float, float] | None = None) -> None:
         """Write the columns of the contract that are known; time to the millisecond's tenth.
 
         Parameters
         ----------
         path : the file
         more : rows for the end of a file that has the same columns
+        origin : latitude and longitude [deg] of north = east = 0, for columns ``lat`` and ``lon``; None = without
         """
         frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
-        write_csv(frame, path, append=more, decimals={"time": 4})
+        decimals = {"time": 4}
+        if origin is not None:
+            frame["lat"], frame["lon"] = self.geodetic(origin)
+            decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
+        write_csv(frame, path, append=more, decimals=decimals)
 
     def write_tum(self, path: Path) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes."""

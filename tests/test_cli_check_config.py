@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from rovgraph import __version__
 from rovgraph.cli import app
 from rovgraph.cli.config import key_tables
 from rovgraph.config import describe, load_config, parse_config
@@ -70,6 +71,29 @@ def test_errors_exit_with_2_after_the_report(run, log, tmp_path):
     assert code == 2
     assert "1 error" in out
     assert err.startswith("error: ") and err.count("\n") == 1
+
+
+def test_what_smooth_would_refuse_is_an_error_of_check(run, log, tmp_path):
+    lame = tmp_path / "lame.csv"
+    lame.write_text("\n".join(",".join(row.split(",")[:8]) for row in log.read_text().splitlines()) + "\n")
+    code, out, err = run("check", lame)
+    assert code == 2 and "1 error" in out and err.count("\n") == 1
+    assert "smooth: neither DVL (dvl_vx, dvl_vy, dvl_vz) nor position fixes" in " ".join(err.split())
+    refused = run("smooth", lame, "--out", tmp_path / "results")[2]
+    assert refused.splitlines()[-1].removeprefix(f"error: {lame}: ") in err
+
+
+def test_the_table_of_check_holds_its_numbers_at_80_columns(run, log, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    rows = log.read_text().splitlines()
+    rows += [f"{4720 + float(row.split(',')[0]):.3f},{row.partition(',')[2]}" for row in rows[1:]]
+    log.write_text("\n".join(rows) + "\n")
+    table = run("check", log)[1].split("ok  ")[0]
+    assert "…" not in table and " 4660 " in table  # the gap, in seconds
+
+
+def test_the_version_is_told(run):
+    assert run("--version") == (0, f"rovgraph {__version__}\n", "")
 
 
 def test_json_is_the_whole_report(run, log):

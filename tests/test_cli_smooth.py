@@ -258,7 +258,7 @@ def test_an_older_results_folder_is_kept_unless_forced(monkeypatch, capsys, tmp_
 def test_a_full_disk_leaves_nothing_and_is_one_line(monkeypatch, capsys, tmp_path, short, config):
     from rovgraph.trajectory import Trajectory
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Trajectory, "write_csv", full)

@@ -153,6 +153,20 @@ def test_command_prints_a_table_with_units(files, monkeypatch, capsys):
     assert "aligned, taken out" in run(monkeypatch, capsys, *files, "--align")[1]
 
 
+def test_to_leaves_out_the_end(files, monkeypatch, capsys):
+    estimate = track()
+    estimate.p_n[150:] += 50.0
+    assert evaluate(estimate, track(), end=74.0).max_m == pytest.approx(0.0)
+    assert evaluate(estimate, track(), start=20.0, end=40.0).epochs == 41
+    assert evaluate(estimate, track(), end=40.0).coverage == 1.0
+    code, out, _ = run(monkeypatch, capsys, *files, "--json", "--from", "20", "--to", "40")
+    assert code == 0 and json.loads(out)["epochs"] == 41
+    for wrong in ("20", "10", "nan"):
+        code, _, err = run(monkeypatch, capsys, *files, "--from", "20", "--to", wrong)
+        assert code == 2 and "the end is not after the start" in err
+    assert "from 20.0 s to 20.1 s" in run(monkeypatch, capsys, *files, "--from", "20", "--to", "20.1")[2]
+
+
 def test_command_prints_json(files, monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, *files, "--json", "--from", "50")
     metrics = json.loads(out)

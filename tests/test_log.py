@@ -31,6 +31,32 @@ def read_quietly(path: Path, **mapping) -> Log:
         return read_log(path, **mapping)
 
 
+def test_a_unit_with_a_sign_turns_the_sign_and_leaves_an_sd(tmp_path):
+    path = write(tmp_path, "time,depth,dvl_vx,dvl_vy,dvl_vz,dvl_sd\n1,-5,100,200,300,10\n")
+    log = read_quietly(path, units={"depth": "-m", "dvl": "cm/s", "dvl_vz": "-cm/s"})
+    assert log["depth"].data.tolist() == [[5.0]]
+    assert log["dvl"].data[0].tolist() == [1.0, 2.0, -3.0, 1.0, 0.1]
+    turned = read_quietly(path, units={"dvl": "-cm/s"})["dvl"].data[0]
+    assert turned.tolist() == [-1.0, -2.0, -3.0, 1.0, 0.1]
+    for unit in ("--m", "-x", "- m"):
+        with pytest.raises(InputError, match=r"units: depth: unknown unit"):
+            read_log(path, units={"depth": unit})
+    with pytest.raises(InputError, match="time does not run backwards"):
+        read_log(path, units={"time": "-s"})
+
+
+def test_a_stated_origin_is_where_north_and_east_count_from(tmp_path):
+    path = write(tmp_path, "time,fix_lat,fix_lon\n1,58.301,14.5\n2,58.302,14.5\n")
+    log = read_quietly(path, origin=(58.3, 14.5))
+    assert log.origin == (58.3, 14.5)
+    assert log["fix"].data[:, :2] == pytest.approx(np.array([[111.4, 0.0], [222.8, 0.0]]), abs=0.2)
+    assert read_quietly(path).origin == (58.301, 14.5)
+    bare = write(tmp_path, "time,depth\n1,2\n", "bare.csv")
+    assert read_quietly(bare, origin=(58.3, 14.5)).origin == (58.3, 14.5) and read_quietly(bare).origin is None
+    with pytest.raises(InputError, match=r"fixes lie \d+ km from environment.origin_lat_deg"):
+        read_log(path, origin=(14.5, 58.3))  # the two swapped
+
+
 def test_rows_of_all_sensors_become_streams_with_their_lines(tmp_path):
     path = write(tmp_path, f"{IMU},dvl_vx,dvl_vy,dvl_vz,depth\n1,1,2,-9.8,4,5,6,,,,\n2,,,,,,,.1,.2,.3,7\n")
     log = read_quietly(path)

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -396,12 +397,34 @@ def test_sensor_counts_count_measurements_not_components():
     assert counts == {"dvl": {"used": 2, "weighted_down": 1, "rejected": 1, "mean_square_normalised": 2.5}}
 
 
+def test_summary_and_trajectories_have_a_place_on_earth_where_the_log_has(dive, written, tmp_path):
+    estimates, log, config, _ = dive
+    summary = write_results(tmp_path, estimates, replace(log, origin=(58.3, 14.5)), config, [], {})
+    assert summary["origin"] == {"lat_deg": 58.3, "lon_deg": 14.5} and written[1]["origin"] is None
+    header = (tmp_path / "trajectory_smoothed.csv").read_text().partition("\n")[0]
+    assert header.endswith(",cov_north_east,lat,lon")
+    assert "lat" not in (written[0] / "trajectory_smoothed.csv").read_text().partition("\n")[0]
+
+
+def test_the_longest_calibration_fits_into_80_columns(dive):
+    entries = [
+        CalibrationEstimate(label, unit, "", True, -0.02433, 0.00011, 0.0, 0.02, verdict)
+        for label, unit in (("dvl_compass_deviation_cos", "rad"), ("current_north", "m/s"))
+        for verdict in ("observable", "unobservable")
+    ]
+    console = Console(width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    console.print(calibration_table([replace(dive[0][0], calibration=entries)]))
+    text = console.export_text()
+    assert "…" not in text and "dvl_compass_deviation_cos °" in text and "unobservable" in text
+    assert all(len(line) <= 80 for line in text.splitlines())
+
+
 def test_tables_say_value_spread_and_prior(written, dive):
     console = Console(width=100, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
     console.print(summary_table(dive[0], written[1]))
     console.print(calibration_table(dive[0]))
     text = console.export_text()
-    assert "5 min 00 s" in text and "dvl_yaw [deg]" in text
+    assert "5 min 00 s" in text and "dvl_yaw °" in text
     for part in ("-21.5 ± 1.9", "-26.0 ± 5.0", "38 %", "97 %", "held"):
         assert part in text
 

@@ -123,6 +123,21 @@ def test_showing_only_keeps_and_a_thread_draws_four_times_a_second(monkeypatch):
     assert drawings[-1] == (True, 999.0)  # the last by close
 
 
+def test_nothing_is_cut_off_at_80_columns():
+    console = Console(file=io.StringIO(), width=80)
+    far = replace(SOLUTION, position=np.array([-12345.678, 12345.678, 1234.5]), position_sd=np.full(3, 0.0123))
+    console.print(status(far, (Event(3.0, "dvl", "clock", "its stamps are late " * 6),)))
+    text = console.file.getvalue()
+    assert "…" not in text and "position" in text and "down 1234.500 ± 0.012 m" in " ".join(text.split())
+
+
+def test_before_the_first_solution_it_says_what_it_waits_for():
+    console = Console(file=io.StringIO(), force_terminal=True, width=80)
+    with StatusLine(console, lambda: "no measurement of an IMU yet; tcp://a: dvl; udp://b: nothing yet"):
+        pass
+    assert "waiting for the first solution: no measurement of an IMU yet; tcp://a: dvl" in console.file.getvalue()
+
+
 def test_the_newest_events_stay_in_sight():
     console = Console(file=io.StringIO(), force_terminal=True, width=100)
     with StatusLine(console) as line:

@@ -4,11 +4,13 @@ import gzip
 
 import numpy as np
 import pandas as pd
+import pymap3d
 import pytest
 from scipy.spatial.transform import Rotation
 
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
+from rovgraph.live.track import TrackFile
 from rovgraph.trajectory import Trajectory, read_trajectory
 
 N = 40
@@ -23,6 +25,30 @@ def trajectory() -> Trajectory:
     cov_p, cov_theta, cov_v = root @ root.swapaxes(-1, -2)
     p_n, v_n = rng.standard_normal((2, N, 3))
     return Trajectory(time, 10 * p_n, matrix_from_rpy(rpy), v_n, cov_p, cov_theta, cov_v)
+
+
+def test_a_place_on_earth_adds_latitude_and_longitude_at_the_end(trajectory, tmp_path):
+    trajectory.write_csv(tmp_path / "plain.csv")
+    trajectory.write_csv(tmp_path / "placed.csv", origin=(58.3, 14.5))
+    plain, placed = (pd.read_csv(tmp_path / name) for name in ("plain.csv", "placed.csv"))
+    assert placed.columns.tolist() == [*plain.columns, "lat", "lon"]
+    pd.testing.assert_frame_equal(placed[plain.columns], plain)
+    north, east, _ = pymap3d.geodetic2ned(placed["lat"], placed["lon"], 0.0, 58.3, 14.5, 0.0)
+    np.testing.assert_allclose(np.column_stack([north, east]), trajectory.p_n[:, :2], atol=2e-4)
+    assert read_trajectory(tmp_path / "placed.csv").p_n == pytest.approx(trajectory.p_n, rel=1e-6)
+
+
+def test_a_growing_track_keeps_the_columns_that_it_began_with(trajectory, tmp_path):
+    halves = trajectory.take(np.arange(20)), trajectory.take(np.arange(20, N))
+    late, early = TrackFile(tmp_path / "late.csv"), TrackFile(tmp_path / "early.csv")
+    for half, origin in zip(halves, (None, (58.3, 14.5)), strict=True):
+        late.add(half, origin)  # the first fix comes after the first rows
+        early.add(half, (58.3, 14.5))
+    assert "lat" not in pd.read_csv(tmp_path / "late.csv") and len(pd.read_csv(tmp_path / "early.csv")) == N
+    again = TrackFile(tmp_path / "early.csv", until=float(trajectory.time[20]))
+    again.add(halves[1], (58.3, 14.5))
+    trajectory.write_csv(tmp_path / "whole.csv", origin=(58.3, 14.5))
+    assert (tmp_path / "early.csv").read_text() == (tmp_path / "whole.csv").read_text()
 
 
 def test_csv_round_trip_keeps_values_and_sds(trajectory, tmp_path):

@@ -19,18 +19,32 @@ def check(
 ) -> None:
     """Look at a log: sensors, rates, gaps, units, signs, clocks, and what an estimate would make of it."""
     import json
+    import warnings
     from dataclasses import asdict
 
     from rich.console import Console
 
-    from rovgraph.check import examine, refuse
+    from rovgraph.check import Finding, bridge_jumps, examine, refuse
     from rovgraph.config import load_config
+    from rovgraph.estimators.initialise import refusal
     from rovgraph.log import read_log
 
     settings = load_config(config)
-    report = examine(
-        read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s), settings
+    dive_log = read_log(
+        log,
+        settings.columns,
+        settings.units,
+        settings.imu.mag.calibrated,
+        settings.delay_s,
+        settings.environment.origin,
     )
+    report = examine(dive_log, settings)
+    if not report.at("error") and refusal(dive_log, settings):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the report has it
+            bridged = bridge_jumps(dive_log, settings)
+        if reason := refusal(bridged, settings):
+            report.findings.append(Finding("smooth", "error", reason))
     if as_json:
         typer.echo(json.dumps(_without_nan(asdict(report)), indent=2, allow_nan=False))
     else:
@@ -38,8 +52,8 @@ def check(
         console.print(_timing_table(report))
         for finding in report.findings:
             _print_finding(console, finding.level, f"{finding.sensor}: {finding.text}")
-        warnings, errors = len(report.at("warning")), len(report.at("error"))
-        console.print(f"{_plural(errors, 'error')}, {_plural(warnings, 'warning')}", style="bold")
+        errors, doubts = len(report.at("error")), len(report.at("warning"))
+        console.print(f"{_plural(errors, 'error')}, {_plural(doubts, 'warning')}", style="bold")
     refuse(report)
 
 
@@ -61,11 +75,12 @@ def _timing_table(report: "Report") -> "Table":
     from rich.text import Text
 
     table = Table(title=Text(report.source), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading in ("sensor", "count", "Hz", "from [s]", "to [s]", "gap [s]", "at [s]", "jitter [s]", "repeats"):
+    for heading in ("sensor", "count", "Hz", "from\n[s]", "to\n[s]", "gap\n[s]", "at\n[s]", "jitter\n[s]", "repeats"):
         table.add_column(Text(heading), justify="left" if heading == "sensor" else "right", no_wrap=True)
     start = min(t.first for t in report.timings)
     for t in report.timings:
-        numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", f"{t.gap:.3g}")
+        gap = f"{t.gap:.3g}" if t.gap < 1000.0 else f"{t.gap:.0f}"
+        numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", gap)
         table.add_row(t.sensor, str(t.count), *numbers, f"{t.gap_at - start:.1f}", f"{t.jitter:.2g}", str(t.repeats))
     table.caption = f"0 s is {start:.3f} s of the log's clock; gap: the largest, and when"
     return table

@@ -112,7 +112,14 @@ def _recorded(log: Path, reference: Path, settings: "Config | None") -> tuple[li
     from rovgraph.studies.runs import Case, Recorded
 
     settings = settings or Config()
-    recorded = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s)
+    recorded = read_log(
+        log,
+        settings.columns,
+        settings.units,
+        settings.imu.mag.calibrated,
+        settings.delay_s,
+        settings.environment.origin,
+    )
     recorded = check.bridge_jumps(recorded, settings)
     check.warn(recorded, settings)
     case = Case(recorded, settings, read_reference(reference))

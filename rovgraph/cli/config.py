@@ -39,13 +39,18 @@ def config(
         Path | None, typer.Argument(help="configuration (YAML); without it all defaults", metavar="[CONFIG]")
     ] = None,
     keys: Annotated[bool, typer.Option("--keys", help="list all keys with default, unit and meaning")] = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="with --keys: as the tables of the manual")] = False,
+    presets: Annotated[
+        bool, typer.Option("--presets", help="list the instruments known by name, with sources")
+    ] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="with --keys or --presets: as in the manual")] = False,
 ) -> None:
     """Print the effective configuration, every key written out; a wrong key is named."""
     from rovgraph.config import load_config
 
     settings = load_config(path)
-    if keys and markdown:
+    if presets:
+        typer.echo(preset_tables() if markdown else "\n".join(_preset_lines()))
+    elif keys and markdown:
         typer.echo(key_tables())
     elif keys:
         _print_keys()
@@ -66,6 +71,40 @@ def key_tables() -> str:
         lines += [f"| `{key}` | {unit} | `{default}` | {meaning} |" for key, unit, default, meaning in rows]
         lines.append("")
     return "\n".join(lines).rstrip("\n")
+
+
+def preset_tables() -> str:
+    """All presets as Markdown, a table per kind: what docs/presets.md holds."""
+    from rovgraph.config.presets import KINDS
+    from rovgraph.config.presets import presets as known
+
+    lines: list[str] = []
+    for kind in KINDS:
+        lines += [
+            f"### {_GROUP_TEXT[kind]}",
+            "",
+            "| preset | instrument | fills in | source and remarks |",
+            "|---|---|---|---|",
+        ]
+        for preset in (p for p in known().values() if p.kind == kind):
+            filled = "<br>".join(f"`{f.key}`: {f.stated}" for f in preset.facts)
+            said = "<br>".join([*dict.fromkeys(f.source for f in preset.facts), *preset.notes])
+            lines.append(f"| `{preset.name}` | {preset.instrument} | {filled} | {said} |")
+        lines.append("")
+    return "\n".join(lines).rstrip("\n")
+
+
+def _preset_lines() -> Iterator[str]:
+    """Presets with what they fill in, each number with its source."""
+    from rovgraph.config.presets import presets as known
+
+    for preset in known().values():
+        yield f"{preset.kind}: {{preset: {preset.name}}}    {preset.instrument}"
+        for fact in preset.facts:
+            value = fact.value if isinstance(fact.value, float) else fact.value[0]
+            yield f"    {fact.key:26} {value:<10.4g} {fact.stated}"
+            yield f"        {fact.source}"
+        yield from (f"    {note}" for note in preset.notes)
 
 
 def _rows() -> Iterator[tuple[str, str, str, str]]:

@@ -13,6 +13,9 @@ def evaluate(
     trajectory: Annotated[Path, typer.Argument(help="CSV of an estimate.", show_default=False)],
     reference: Annotated[Path, typer.Argument(help="CSV with time, north, east and what else it knows.")],
     start: Annotated[float, typer.Option("--from", help="Leave out the first seconds of the trajectory.")] = 0.0,
+    end: Annotated[
+        float | None, typer.Option("--to", help="Leave out what is later than this many seconds.", show_default=False)
+    ] = None,
     align: Annotated[bool, typer.Option("--align", help="Turn and shift the trajectory to fit first.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
@@ -21,11 +24,13 @@ def evaluate(
     Example: rovgraph evaluate results/trajectory_smoothed.csv data/falcon/truth.csv.gz
     """
     import json
+    import math
 
     from rovgraph import evaluate as library
     from rovgraph.trajectory import read_trajectory
 
-    metrics = library.evaluate(read_trajectory(trajectory), library.read_reference(reference), start, align)
+    until = math.inf if end is None else end
+    metrics = library.evaluate(read_trajectory(trajectory), library.read_reference(reference), start, align, until)
     if as_json:
         typer.echo(json.dumps(metrics.as_dict(), indent=2))
     else:

@@ -38,7 +38,14 @@ def observe(
     also = listed(estimate)
     settings = estimating(load_config(config), also)
     check_writable(out, force)
-    dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s)
+    dive_log = read_log(
+        log,
+        settings.columns,
+        settings.units,
+        settings.imu.mag.calibrated,
+        settings.delay_s,
+        settings.environment.origin,
+    )
     dive_log = check.bridge_jumps(dive_log, settings)
     check.warn(dive_log, settings)
     with progress_bar() as progress:

@@ -72,7 +72,7 @@ def online(
     asked_by_signal(session.want_smoothed)
     with ended_by_signals(feed.close):
         try:
-            with StatusLine() as status:
+            with StatusLine(waiting=lambda: navigator.waiting(sources)) as status:
                 session.receivers.append(status.show)
                 if not status.shown:
                     session.receivers.append(_tell)
@@ -87,7 +87,7 @@ def online(
                 files.close()
     if session.solution is None:
         unfinished(out)
-        raise InputError(f"no estimate was made: {navigator.waits_for or 'no measurement of an IMU came'}")
+        raise InputError(f"no estimate was made: {navigator.waiting(sources)}")
     if out is not None:
         finished(out, session, refine)
 

@@ -62,7 +62,14 @@ def smooth(
     warn_of_unused(config, log)
     check_writable(out, force)
     began = time.perf_counter()
-    dive_log = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s)
+    dive_log = read_log(
+        log,
+        settings.columns,
+        settings.units,
+        settings.imu.mag.calibrated,
+        settings.delay_s,
+        settings.environment.origin,
+    )
     dive_log = check.bridge_jumps(dive_log, settings)
     check.warn(dive_log, settings)
     seconds = {"reading": time.perf_counter() - began}

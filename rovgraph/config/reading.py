@@ -13,6 +13,8 @@ from ruamel.yaml.error import YAMLError
 
 from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable, stationary_walk
 from rovgraph.config.error_messages import complaint
+from rovgraph.config.grades import warn_of_mixed_grades
+from rovgraph.config.presets import with_presets
 from rovgraph.config.priors import Calibration, calibration_entry
 from rovgraph.config.registered import add_key, remove_key
 from rovgraph.config.sections import (
@@ -62,6 +64,12 @@ class Config(Section):
         {},
         description="sensor: how much older its measurements are than their stamps, in a log and online; e.g. fix: 2",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_presets(cls, data: Any) -> Any:
+        """What the presets of IMU and DVL state and the configuration does not."""
+        return with_presets(data) if isinstance(data, dict) else data
 
     @model_validator(mode="before")
     @classmethod
@@ -147,12 +155,18 @@ def load_config(path: Path | str | None = None) -> Config:
     InputError : no such file, no YAML, an unknown key (with the nearest known one), a
         value of the wrong kind
     """
-    return Config() if path is None else parse_model(Config, read_yaml(Path(path)), str(path))
+    return Config() if path is None else _parse_config(read_yaml(Path(path)), str(path))
 
 
 def parse_config(text: str, source: str = "configuration") -> Config:
     """Parse YAML text; ``source`` names it in messages."""
-    return parse_model(Config, _parse_yaml(text, source), source)
+    return _parse_config(_parse_yaml(text, source), source)
+
+
+def _parse_config(data: dict[str, Any], source: str) -> Config:
+    config = parse_model(Config, data, source)
+    warn_of_mixed_grades(config.imu, source)
+    return config
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -1,16 +1,20 @@
 """The sections of the configuration, and what may stand in them."""
 
-from typing import Annotated, Literal
+from functools import partial
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
+
+from rovgraph.config.presets import known_preset
 
 Positive = Annotated[float, Field(gt=0)]
 Readmission = Annotated[
     float, Field(gt=0, description="left out for longer than this, it is taken back: a filter then doubts itself")
 ]
+Latitude = Annotated[float, Field(ge=-90, le=90)]
 NotNegative = Annotated[float, Field(ge=0)]
 Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
@@ -18,6 +22,8 @@ NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
 STAMPED = ("imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "place", "thruster")
 HeadingSource = Literal["mag", "dvl", "ahrs"]
+ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
+DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
 
 
 class Section(BaseModel):
@@ -43,9 +49,13 @@ class Environment(Section):
     """Gravity, magnetic field and Earth rate."""
 
     gravity_mps2: Positive = Field(9.81, description="gravity")
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
-        None, description="latitude, for Earth rotation; null = of the first fix_lat"
+    origin_lat_deg: Latitude | None = Field(
+        None, description="latitude of north = east = 0; null = of the first fix_lat, where there is one"
     )
+    origin_lon_deg: Annotated[float, Field(ge=-180, le=360)] | None = Field(
+        None, description="longitude of north = east = 0, east positive"
+    )
+    latitude_deg: Latitude | None = Field(None, description="latitude, for Earth rotation; null = of the origin")
     declination_deg: float = Field(0.0, description="magnetic declination, east positive")
     field_norm: Positive | None = Field(
         None, description="magnitude of the field, log's unit; null = median of the log"
@@ -54,6 +64,18 @@ class Environment(Section):
         None, description="dip of the field, down positive; null = from the log, against gravity"
     )
     earth_rotation: bool = Field(False, description="model the Earth's rotation, which good gyros feel")
+
+    @model_validator(mode="after")
+    def _whole_origin(self) -> Self:
+        if (self.origin_lat_deg is None) != (self.origin_lon_deg is None):
+            raise PydanticCustomError("half", "expected both origin_lat_deg and origin_lon_deg, or neither")
+        return self
+
+    @property
+    def origin(self) -> tuple[float, float] | None:
+        """Latitude and longitude [deg] of north = east = 0, where they are stated."""
+        lat, lon = self.origin_lat_deg, self.origin_lon_deg
+        return None if lat is None or lon is None else (lat, lon)
 
 
 class ImuNoise(Section):
@@ -90,6 +112,9 @@ class Mag(Section):
 class Imu(Section):
     """Inertial unit: mounting and noise."""
 
+    preset: ImuPreset | None = Field(
+        None, description="instrument that fills in what is not stated, see docs/presets.md"
+    )
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="IMU axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the IMU in body axes")
     noise: ImuNoise = ImuNoise()
@@ -102,6 +127,9 @@ class Imu(Section):
 class Dvl(Section):
     """Doppler velocity log: mounting and noise."""
 
+    preset: DvlPreset | None = Field(
+        None, description="instrument that fills in what is not stated, see docs/presets.md"
+    )
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="DVL axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the DVL in body axes")
     velocity_sd_mps: PositiveTriple = Field((0.01, 0.01, 0.01), description="noise of a ping, DVL axes")

@@ -160,6 +160,9 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
             p_n[:2] = here - rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
             sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))
             assumptions.append(f"start position from the first fix, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
+    elif log.origin is not None and not start.model_fields_set & {"north_m", "east_m"}:
+        where = f"latitude {log.origin[0]:.6f}, longitude {log.origin[1]:.6f}"
+        assumptions.append(f"start at the origin, {where}, within {sd[0]:g} m, as the log has no fix")
     if start.down_m is None and "depth" in log:
         depth = log["depth"]
         first = _opening(depth, depth.time[0], WINDOW_S)

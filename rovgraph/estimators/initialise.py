@@ -28,6 +28,20 @@ START_VELOCITY_SD = 1.0
 ENOUGH_SAMPLES = 100
 
 
+def refusal(log: Log, config: Config) -> str:
+    """Why no estimate can begin, one line; empty where one can.
+
+    Parameters
+    ----------
+    log, config : of `initialise`
+    """
+    try:
+        initialise(log, config)
+    except InputError as error:
+        return str(error).removeprefix(f"{log.source}: ")
+    return ""
+
+
 def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> InitialConditions:
     """Resolve everything that the configuration leaves to the log.
 
@@ -123,7 +137,9 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
     if env.latitude_deg is None and log.origin is not None:
         changes["latitude_deg"] = log.origin[0]
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:
-        raise InputError("environment.earth_rotation needs environment.latitude_deg, as the log has no fix_lat")
+        raise InputError(
+            "environment.earth_rotation needs environment.latitude_deg or origin_lat_deg, as the log has no fix_lat"
+        )
     return config.model_copy(update={"environment": env.model_copy(update=changes)}) if changes else config
 
 

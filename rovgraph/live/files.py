@@ -108,7 +108,7 @@ class Files:
             if not file.readline():  # the header alone
                 return None
         if self.anew or self.state is None:
-            return read_log(path)
+            return read_log(path, origin=self.config.environment.origin)
         return log_from_frame(_last_rows(path, self.state["origin"]), str(path))
 
     def note(self, events: Iterable[Event]) -> None:
@@ -123,11 +123,11 @@ class Files:
         except OSError as error:
             self.warnings.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
 
-    def write_smoothed(self, estimate: Estimate) -> None:
-        """Put a smoothed track on disk, in place of an older one."""
+    def write_smoothed(self, estimate: Estimate, origin: tuple[float, float] | None = None) -> None:
+        """Put a smoothed track on disk, in place of an older one; ``origin`` of `Trajectory.write_csv`."""
         path, partial = self.folder / SMOOTHED, self.folder / f".{SMOOTHED}.partial"
         try:
-            estimate.trajectory.write_csv(partial)
+            estimate.trajectory.write_csv(partial, origin=origin)
             partial.replace(path)
         except OSError as error:
             self.warnings.complain(str(path), "disk", f"cannot be written ({error.strerror}); free some space")
@@ -150,7 +150,7 @@ class Files:
             return True
         passed = navigator.passed
         try:
-            self.track.add(engine.trajectory([m.interval for m in passed], [m.known for m in passed]))
+            self.track.add(engine.trajectory([m.interval for m in passed], [m.known for m in passed]), navigator.origin)
         except InputError as error:
             path = str(self.track.path)
             self.warnings.complain(path, "disk", str(error).removeprefix(f"{path}: "))

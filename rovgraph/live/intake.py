@@ -26,11 +26,11 @@ class Intake:
 
     Attributes
     ----------
-    origin : latitude and longitude [deg] of north = east = 0; None until the first fix
+    origin : latitude and longitude [deg] of north = east = 0; None until the first fix, unless it is configured
     """
 
     def __init__(self, config: Config, left_out: Counter[tuple[str, str]]) -> None:
-        self.origin: tuple[float, float] | None = None
+        self.origin = config.environment.origin
         self._delays: dict[str, float] = {str(sensor): delay for sensor, delay in config.delay_s.items()}
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._left_out = left_out

@@ -6,7 +6,7 @@ A message's time is reconciled, its readings are looked at for faults, and go to
 
 import time as host
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -85,6 +85,7 @@ class Navigator:
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
         self._incoherence = Incoherence()
         self._events: list[Event] = []
+        self._heard: dict[str, frozenset[str]] = {}  # source -> sensors, until the dive begins
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
         self._located = bool(self.config.start.model_fields_set & {"north_m", "east_m"})  # where the fixes count from
@@ -104,6 +105,18 @@ class Navigator:
         """Why there is no estimate yet; empty where there is, or while the first seconds go by."""
         return "" if self.engine is not None else self._startup.waits_for
 
+    def waiting(self, sources: Sequence[str]) -> str:
+        """What the first solution waits for, and what each source has said so far; empty once there is an estimate.
+
+        Parameters
+        ----------
+        sources : their URLs
+        """
+        if self.engine is not None:
+            return ""
+        heard = (f"{url}: {', '.join(sorted(self._heard.get(url, ()))) or 'nothing yet'}" for url in sources)
+        return "; ".join([self._startup.expects, *heard])
+
     def take(self, message: Message) -> list[tuple[float, tuple[Reading, ...]]]:
         """Take a message; its readings with their times [s], and none where those cannot be known."""
         time = self.clocks.time(message)
@@ -114,12 +127,20 @@ class Navigator:
             self.left_out[message.source, "impossible stamp"] += 1
             return []
         self._arrival = message.arrival
+        if self.engine is None:
+            self._hear(message)
         rows = list(self._intake.timed(time, message.readings))
         for at, own in rows:
             for reading in own:
                 if (measurement := self._intake.measurement(at, reading)) is not None:
                     self._consider(measurement)
         return rows
+
+    def _hear(self, message: Message) -> None:
+        """Note which sensors a source speaks of; the display's thread reads it, so it is replaced, not changed."""
+        known = self._heard.get(message.source, frozenset())
+        if new := {r.sensor for r in message.readings} - known:
+            self._heard = {**self._heard, message.source: known | new}
 
     def replay(self, log: Log) -> None:
         """Take what had been received before, on the estimator's clock."""

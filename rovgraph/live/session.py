@@ -64,7 +64,7 @@ class Session:
         except InputError as error:
             self.navigator.lose_isam2(str(error))
         else:
-            self.files.write_smoothed(estimate)
+            self.files.write_smoothed(estimate, self.navigator.origin)
 
     def updates(self) -> dict[str, float]:
         """Times that updates of the filter took [ms]."""

@@ -34,6 +34,15 @@ class Startup:
     doubts: list[str] = field(default_factory=list)
     _next: float | None = None
 
+    @property
+    def expects(self) -> str:
+        """What has to come before the dive can begin, or be different."""
+        if self.waits_for:
+            return self.waits_for
+        if self._next is None:
+            return "no measurement of an IMU yet"
+        return f"the first {WINDOW_S + MARGIN_S:g} s of the IMU go by"
+
     def add(self, measurement: Measurement, origin: tuple[float, float] | None) -> InitialConditions | None:
         """Take a measurement; the beginning of the dive, once it is known.
 

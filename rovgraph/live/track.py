@@ -36,13 +36,22 @@ class TrackFile:
             partial.write_text("".join(kept), encoding="utf-8")
             partial.replace(path)
         self._begun = bool(kept)
+        self._on_earth = bool(kept) and kept[0].rstrip().endswith(",lat,lon")
 
-    def add(self, trajectory: Trajectory) -> None:
-        """Add epochs, later than those before: all of them, or where the disk is full none."""
+    def add(self, trajectory: Trajectory, origin: tuple[float, float] | None = None) -> None:
+        """Add epochs, later than those before: all of them, or where the disk is full none.
+
+        Parameters
+        ----------
+        trajectory : the epochs
+        origin : of `Trajectory.write_csv`; a file that was begun without one goes on without
+        """
+        if not self._begun:
+            self._on_earth = origin is not None
         with _one_line(self.path):
             size = self.path.stat().st_size
             try:
-                trajectory.write_csv(self.path, more=self._begun)
+                trajectory.write_csv(self.path, self._begun, origin if self._on_earth else None)
             except OSError:
                 os.truncate(self.path, size)
                 raise

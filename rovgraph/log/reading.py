@@ -32,6 +32,7 @@ from rovgraph.log.units import factors, near_miss, nearest
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
+FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
 ACC_GAP = 0.5  # accelerations further apart are not interpolated [s]
 
 Bools = NDArray[np.bool_]
@@ -44,6 +45,7 @@ def read_log(
     units: Mapping[str, str] | None = None,
     mag: Callable[[Array], Array] | None = None,
     delay_s: Mapping[str, float] | None = None,
+    origin: tuple[float, float] | None = None,
 ) -> Log:
     """Read a log.
 
@@ -56,6 +58,7 @@ def read_log(
         of a configuration); everything that takes the log then sees the field
     delay_s : sensor -> how much older its measurements are than their stamps; the log's times are those of the
         measurements
+    origin : latitude and longitude [deg] of north = east = 0; None = of the first fix_lat, if there is one
 
     Returns
     -------
@@ -69,7 +72,7 @@ def read_log(
     -----
     DataWarning : what was left out or put in order
     """
-    return _assembled(read_table(path), columns or {}, units or {}, mag, delay_s or {})
+    return _assembled(read_table(path), columns or {}, units or {}, mag, delay_s or {}, origin)
 
 
 def log_from_frame(frame: pd.DataFrame, source: str = "log", delay_s: Mapping[str, float] | None = None) -> Log:
@@ -86,7 +89,7 @@ def log_from_frame(frame: pd.DataFrame, source: str = "log", delay_s: Mapping[st
     InputError : a frame that cannot be worked with
     """
     table = Table(source, frame, np.arange(len(frame), dtype=np.int64) + 2)
-    return _assembled(table, {}, {}, None, delay_s or {})
+    return _assembled(table, {}, {}, None, delay_s or {}, None)
 
 
 def _assembled(
@@ -95,6 +98,7 @@ def _assembled(
     units: Mapping[str, str],
     mag: Callable[[Array], Array] | None,
     delay_s: Mapping[str, float],
+    origin: tuple[float, float] | None,
 ) -> Log:
     """The streams of a table."""
     scale = factors(units, table.source)
@@ -102,7 +106,7 @@ def _assembled(
     cells = {name: _finite(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
     cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
     cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
-    origin = _add_local_fixes(cells, line, table.source)
+    origin = _add_local_fixes(cells, line, table.source, origin)
     streams = [_imu(cells, line, table.source)]
     streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
     streams += [_thruster(cells, line, table.source)]
@@ -208,8 +212,10 @@ def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: boo
     return {name: values[order] for name, values in cells.items()}, line[order]
 
 
-def _add_local_fixes(cells: dict[str, Array], line: Lines, source: str) -> tuple[float, float] | None:
-    """Turn latitude and longitude into ``fix_north, fix_east``; the origin is the first fix.
+def _add_local_fixes(
+    cells: dict[str, Array], line: Lines, source: str, origin: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    """Turn latitude and longitude into ``fix_north, fix_east``; unless it is stated, the origin is the first fix.
 
     Returns
     -------
@@ -217,13 +223,13 @@ def _add_local_fixes(cells: dict[str, Array], line: Lines, source: str) -> tuple
 
     Raises
     ------
-    InputError : no angles in degrees
+    InputError : no angles in degrees; further from a stated origin than a flat frame reaches
     """
     if not all(name in cells for name in LAT_LON):
-        return None
+        return origin
     if "fix_north" in cells and "fix_east" in cells:
         _warn(f"{source}: fix_lat and fix_lon are ignored beside fix_north and fix_east")
-        return None
+        return origin
     lat, lon = (cells.pop(name) for name in LAT_LON)
     wild = np.flatnonzero((np.abs(lat) > 90.0) | (np.abs(lon) > 360.0))
     if wild.size:
@@ -238,9 +244,14 @@ def _add_local_fixes(cells: dict[str, Array], line: Lines, source: str) -> tuple
     valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
     cells["fix_north"], cells["fix_east"] = lat * np.nan, lon * np.nan
     if not valid.size:
-        return None
-    origin = float(lat[valid[0]]), float(lon[valid[0]])
+        return origin
+    origin = (float(lat[valid[0]]), float(lon[valid[0]])) if origin is None else origin
     north, east, _ = pymap3d.geodetic2ned(lat[valid], lon[valid], 0.0, *origin, 0.0)
+    if (away := float(np.median(np.hypot(north, east)))) > FARTHEST:
+        raise InputError(
+            f"{source}: fixes lie {away / 1e3:.0f} km from environment.origin_lat_deg, origin_lon_deg = "
+            f"{origin[0]:g}, {origin[1]:g}; correct them, or leave them out for the first fix"
+        )
     cells["fix_north"][valid], cells["fix_east"][valid] = north, east
     return origin
 

@@ -1,7 +1,7 @@
 """Units that a file may use, and names that may be misspelled.
 
 A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns
-(``gyr: deg/s``); everything becomes SI and radians.
+(``gyr: deg/s``); everything becomes SI and radians. A minus before the unit turns the sign (``depth: -m``).
 """
 
 import difflib
@@ -70,18 +70,23 @@ def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
     """
     out: dict[str, float] = {}
     by_group, kinds = groups(), quantities()
-    for key, unit in sorted(units.items(), key=lambda item: item[0] in kinds and item[0] not in by_group):
+    for key, signed in sorted(units.items(), key=lambda item: item[0] in kinds and item[0] not in by_group):
+        unit = signed.removeprefix("-")
         columns = by_group.get(key, (key,) if key in kinds else ())
         if not columns:
             near = nearest(key, [*by_group, *kinds])
             raise InputError(f"{source}: units: {key} is no column or group that has a unit, nearest is {near}")
         known = [unit for c in columns for unit in UNITS[kinds[c]]]
+        if unit != signed and key == "time":
+            raise InputError(f"{source}: units: time: {signed!r} has a sign, and time does not run backwards")
         if unit not in known:
             raise InputError(
-                f"{source}: units: {key}: unknown unit {unit!r}, nearest is {nearest(unit, known)!r}; "
+                f"{source}: units: {key}: unknown unit {signed!r}, nearest is {nearest(unit, known)!r}; "
                 f"known are {', '.join(dict.fromkeys(known))}"
             )
-        out |= {c: UNITS[kinds[c]][unit] for c in columns if unit in UNITS[kinds[c]]}
+        sign = 1.0 if unit == signed else -1.0
+        for column in (c for c in columns if unit in UNITS[kinds[c]]):
+            out[column] = UNITS[kinds[column]][unit] * (1.0 if column.endswith("_sd") else sign)  # an sd has no sign
     return out
 
 

@@ -14,7 +14,7 @@ from rovgraph.config import Config
 from rovgraph.estimators.observability import OBSERVABLE, OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
-from rovgraph.report.units import shown
+from rovgraph.report.units import label_with_unit, shown
 from rovgraph.studies.directions import directions, in_words
 from rovgraph.studies.observability import OTHER_LABELS, Observability
 from rovgraph.studies.plan import Plan
@@ -79,15 +79,23 @@ def words(seen: Observability) -> list[str]:
 
 def observability_table(seen: Observability, title: str) -> Table:
     """A row per component: sd before and after, bits, verdict, and what is missing."""
-    table = Table(title=escape(title), title_justify="left", caption_justify="left", box=SIMPLE_HEAD)
+    table = Table(
+        title=escape(title),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+        padding=0,
+    )
     for heading in ("variable", "prior sd", "sd", "bits", "verdict", "needs"):
-        table.add_column(heading, justify="right" if heading in ("prior sd", "sd", "bits") else "left")
+        numbers = heading in ("prior sd", "sd", "bits")
+        table.add_column(heading, justify="right" if numbers else "left", no_wrap=heading != "needs")
     for i, (label, variable, told) in enumerate(zip(seen.labels, seen.variables, seen.verdicts, strict=True)):
-        factor, unit = shown(variable.unit)
-        tail = f" [{unit}]" if unit != "1" else ""
-        numbers = (f"{factor * seen.prior_sd[i]:.3g}", f"{factor * seen.sd[i]:.3g}", f"{seen.bits[i]:.2f}")
+        factor = shown(variable.unit)[0]
+        name = label_with_unit(label, variable.unit)
+        cells = (f"{factor * seen.prior_sd[i]:.3g}", f"{factor * seen.sd[i]:.3g}", f"{seen.bits[i]:.2f}")
         missing = "" if told == OBSERVABLE else variable.excited_by
-        table.add_row(escape(label + tail), *numbers, told, escape(missing), style="" if told == OBSERVABLE else "bold")
+        table.add_row(escape(name), *cells, told, escape(missing), style="" if told == OBSERVABLE else "bold")
     pairs = ", ".join(f"{a} with {b} {rho:+.2f}" for a, b, rho in seen.correlated()[:TOLD])
     table.caption = f"{seen.joint_bits:.1f} bits in all. Correlations beyond 0.5: {pairs or 'none'}"
     return table

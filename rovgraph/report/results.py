@@ -60,7 +60,7 @@ def write_results(
     """
     estimates = main_first(estimates)
     for estimate in estimates:
-        estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv")
+        estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv", origin=log.origin)
         estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}.tum")
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
@@ -90,6 +90,7 @@ def summarise(
         "log": log.source,
         "verdict": verdict_of(alarms),
         "alarms": [_alarm_numbers(alarm, main.trajectory.time[0]) for alarm in alarms],
+        "origin": None if log.origin is None else {"lat_deg": log.origin[0], "lon_deg": log.origin[1]},
         "start_time_s": main.trajectory.time[0],
         "main_estimate": main.kind,
         **_trajectory_numbers(main.trajectory),

@@ -1,5 +1,6 @@
 """The online mode's display on a terminal: where the vehicle is, and how its sensors are."""
 
+from collections.abc import Callable
 from types import TracebackType
 
 import numpy as np
@@ -28,10 +29,12 @@ class StatusLine:
     Parameters
     ----------
     console : where to draw
+    waiting : says what the first solution waits for
     """
 
-    def __init__(self, console: Console | None = None) -> None:
+    def __init__(self, console: Console | None = None, waiting: Callable[[], str] = str) -> None:
         console = Console(stderr=True) if console is None else console
+        self._waiting = waiting
         self._solution: Solution | None = None
         self._events: tuple[Event, ...] = ()
         self._live = None
@@ -66,9 +69,10 @@ class StatusLine:
 
     def _drawn(self) -> Table | Text:
         solution = self._solution
-        return (
-            Text("waiting for the first solution", style="dim") if solution is None else status(solution, self._events)
-        )
+        if solution is not None:
+            return status(solution, self._events)
+        reason = self._waiting()
+        return Text("waiting for the first solution" + (f": {reason}" if reason else ""), style="dim")
 
 
 def status(solution: Solution, events: tuple[Event, ...] = ()) -> Table:
@@ -81,7 +85,7 @@ def status(solution: Solution, events: tuple[Event, ...] = ()) -> Table:
     """
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
-    table.add_column(no_wrap=True, overflow="ellipsis")
+    table.add_column(overflow="fold")
     for name, text in _rows(solution):
         table.add_row(name, text)
     for event in events:

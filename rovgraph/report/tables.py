@@ -11,7 +11,7 @@ from rich.table import Table
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.estimators.observability import UNOBSERVABLE
 from rovgraph.report.results import main_first, narrowing
-from rovgraph.report.units import plus_minus, shown
+from rovgraph.report.units import label_with_unit, percent, plus_minus, shown
 
 
 def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> Table:
@@ -28,10 +28,11 @@ def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> 
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,
+        show_edge=False,
     )
     table.add_column("")
     for kind in kinds:
-        table.add_column(kind.replace("_", " "), justify="right")
+        table.add_column(kind.replace("_", " "), justify="right", no_wrap=True)
     numbers = [summary["estimates"][kind] for kind in kinds]
     table.add_row("duration", *(duration(n["duration_s"]) for n in numbers))
     table.add_row("distance", *(f"{_number(n['distance_m']):.1f} m" for n in numbers))
@@ -55,15 +56,18 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,
+        show_edge=False,
+        padding=0,
     )
-    for heading in ("variable", "value ± sd", "prior ± sd", "sd narrowed to", "verdict"):
-        table.add_column(heading, justify="left" if heading in ("variable", "verdict") else "right")
+    for heading in ("variable", "value ± sd", "prior ± sd", "left", "verdict"):  # 80 columns hold the longest of each
+        table.add_column(heading, justify="left" if heading in ("variable", "verdict") else "right", no_wrap=True)
     silent = [e for e in main.calibration if not e.estimated and e.value == 0.0 and e.sd == 0.0]
     told = [e for e in main.calibration if e not in silent]
     for entry in sorted(told, key=lambda e: not e.estimated):
-        tail = f" [{shown(entry.unit)[1]}]" if entry.unit != "1" else ""
-        table.add_row(escape(entry.label + tail), *_calibration_cells(entry), style="" if entry.estimated else "dim")
-    notes = [f"held at 0: {', '.join(e.label for e in silent)}"] if silent else []
+        name = label_with_unit(entry.label, entry.unit)
+        table.add_row(escape(name), *_calibration_cells(entry), style="" if entry.estimated else "dim")
+    notes = ["left: sd in percent of the prior's"] if any(e.estimated for e in told) else []
+    notes += [f"held at 0: {', '.join(e.label for e in silent)}"] if silent else []
     if any(e.verdict == UNOBSERVABLE for e in main.calibration):
         notes.append("unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)")
     table.caption = "\n".join(notes) or None
@@ -87,7 +91,7 @@ def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:
     if not entry.estimated:
         return plus_minus(value, sd), "", "considered" if sd > 0.0 else "held", ""
     ratio = narrowing(entry)
-    narrowed = "unknown" if not np.isfinite(ratio) else f"{100 * ratio:.2g} %"
+    narrowed = "unknown" if not np.isfinite(ratio) else percent(ratio)
     return plus_minus(value, sd), plus_minus(mean, prior_sd), narrowed, entry.verdict
 
 

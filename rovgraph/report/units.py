@@ -31,6 +31,25 @@ def plus_minus(value: float, sd: float, unit: str = "") -> str:
     return f"{value:.{digits}f} ± {sd:.{digits}f}{tail}"
 
 
+def label_with_unit(label: str, unit: str) -> str:
+    """A name with the unit that its numbers are shown in, as short as can be.
+
+    >>> label_with_unit("gyr_bias_x", "rad/s"), label_with_unit("dvl_scale", "1")
+    ('gyr_bias_x °/s', 'dvl_scale')
+    """
+    name = shown(unit)[1].replace("deg", "°")
+    return label if unit == "1" else f"{label} {name}"
+
+
+def percent(ratio: float) -> str:
+    """A ratio in percent with two digits, never in powers of ten.
+
+    >>> percent(0.00551), percent(1.04)
+    ('0.55 %', '104 %')
+    """
+    return f"{100 * ratio:.0f} %" if ratio >= 0.0995 else f"{100 * ratio:.2g} %"
+
+
 def key_suffix(unit: str) -> str:
     """The ending of a JSON key or name for a shown unit: ``_deg``, ``_mps2``; "" for a ratio."""
     plain = (

@@ -22,7 +22,9 @@ class NmeaOutput(UdpOutput):
             yield position.encode("ascii")
         else:
             self._complain(
-                "no origin", "latitude and longitude are not known: GGA is not sent; give an origin or a fix"
+                "no origin",
+                "latitude and longitude are not known: GGA is not sent; state environment.origin_lat_deg and "
+                "origin_lon_deg, or give a fix",
             )
         if heading:
             yield heading.encode("ascii")
