@@ -29,6 +29,7 @@ LAYERS = (
     {"estimators", "simulate", "evaluate", "check", "calibrate"},
     {"studies", "live"},
     {"report"},
+    {"api"},
     {"cli"},
 )
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}

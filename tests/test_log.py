@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.log import STREAMS, Log, Stream, read_log
 
@@ -28,7 +29,7 @@ def read_quietly(path: Path, **mapping) -> Log:
     """Read; any warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return read_log(path, **mapping)
+        return read_log(path, Config(**mapping))
 
 
 def test_rows_of_all_sensors_become_streams_with_their_lines(tmp_path):
@@ -164,7 +165,7 @@ def test_foreign_names_and_units_become_ours(tmp_path):
 )
 def test_a_wrong_mapping_names_the_nearest_known(tmp_path, mapping, said):
     with pytest.raises(InputError, match=said):
-        read_log(write(tmp_path, "time,depth\n0,1\n"), **mapping)
+        read_log(write(tmp_path, "time,depth\n0,1\n"), Config(**mapping))
 
 
 @pytest.mark.parametrize("name", ["acx_x", "gyro_x", "ACC_X"])

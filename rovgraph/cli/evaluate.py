@@ -22,10 +22,9 @@ def evaluate(
     """
     import json
 
-    from rovgraph import evaluate as library
-    from rovgraph.trajectory import read_trajectory
+    import rovgraph as rg
 
-    metrics = library.evaluate(read_trajectory(trajectory), library.read_reference(reference), start, align)
+    metrics = rg.evaluate(rg.read_trajectory(trajectory), rg.read_reference(reference), start, align)
     if as_json:
         typer.echo(json.dumps(metrics.as_dict(), indent=2))
     else:

@@ -24,8 +24,7 @@ from rovgraph.live.recorder import Recorder
 from rovgraph.live.solution import Event
 from rovgraph.live.track import TrackFile
 from rovgraph.live.warnings import Warnings
-from rovgraph.log import log_from_frame, read_log
-from rovgraph.log.streams import Log
+from rovgraph.log import Log, read_log
 
 RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
 CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  # of the recording; of the run
@@ -109,7 +108,7 @@ class Files:
                 return None
         if self.anew or self.state is None:
             return read_log(path)
-        return log_from_frame(_last_rows(path, self.state["origin"]), str(path))
+        return Log.from_frame(_last_rows(path, self.state["origin"]), source=str(path))
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""

@@ -14,7 +14,7 @@ import numpy as np
 from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.log import log_from_frame
+from rovgraph.log import Log
 from rovgraph.simulate import CALM, Path, Style, Truth, scenario, simulate
 from rovgraph.studies.manoeuvres import Manoeuvre
 from rovgraph.studies.observability import Observability, examined, joint_bits, solved
@@ -190,7 +190,7 @@ def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: Se
         fix_interval=sensors.fix_interval, ahrs_rate=ahrs,
     )  # fmt: skip
     dive = simulate(path_of(manoeuvre, duration), truth, np.random.default_rng(0))
-    log = log_from_frame(dive.log_frame, str(manoeuvre))
+    log = Log.from_frame(dive.log_frame, source=str(manoeuvre))
     return examined(solved(log, own), own, noisy=False)
 
 
