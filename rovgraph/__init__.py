@@ -101,7 +101,7 @@ _HOMES = {
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
 }
-__all__ = list(_HOMES)  # noqa: PLE0605
+__all__ = list(_HOMES)
 
 
 class _Package(ModuleType):

@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 from dives import Simulated, altered, batch, falcon, incremental, renewed, simulated, started
 
-from rovgraph.check import examine
 from rovgraph.calibration import TABLE, calibration_size
+from rovgraph.check import examine
 from rovgraph.config import Config, describe, parse_config
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate

@@ -31,11 +31,11 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
     return library.read_log(path, config)
 
 
-def warn_of_unused(log: Path | str) -> None:
+def warn_of_unused(*logs: Path | str) -> None:
     """Say that a configuration lies beside a log: forgetting it makes a wrong track, which looks certain."""
-    beside = Path(log).parent / "config.yaml"
-    if beside.is_file():
-        warn(f"{beside} lies beside the log and is not used; give it as the configuration if it is the vehicle's")
+    for beside in (Path(log).parent / "config.yaml" for log in logs):
+        if beside.is_file():
+            warn(f"{beside} lies beside the log and is not used; give it as the configuration if it is the vehicle's")
 
 
 def check(log: Log, config: Config | None = None) -> Report:

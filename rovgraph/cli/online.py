@@ -56,10 +56,8 @@ def online(
     if resume and out is None:
         raise InputError("--resume needs the folder to go on with, --out")
     settings, warnings = configured(config, out, resume), Warnings(_say)
-    if config is None and not resume:
-        for url in sources:
-            if url.startswith("file:"):
-                warn_of_unused(url.removeprefix("file:").partition("?")[0])
+    replayed = [url.removeprefix("file:").partition("?")[0] for url in sources if url.startswith("file:")]
+    warn_of_unused(*(replayed if config is None and not resume else []))
     opened = open_sources(sources, warnings, settings, speed)
     if resume and any(source.pace == 1.0 for source in opened):
         raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
