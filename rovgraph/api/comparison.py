@@ -100,10 +100,8 @@ def compare(
     about: dict[str, Any]
     if scenario is not None:
         runs = [Simulated(scenario, seed, config, duration) for seed in seeds]
-        about, title = (
-            {"scenario": scenario, "seeds": [*seeds], "duration_s": duration},
-            f"{scenario}, {len(seeds)} seeds",
-        )
+        about = {"scenario": scenario, "seeds": [*seeds], "duration_s": duration}
+        title = f"{scenario}, {len(seeds)} seeds"
     else:
         assert log is not None
         assert reference is not None
