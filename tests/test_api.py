@@ -1,6 +1,7 @@
 """The Python entrance: it does what the commands do, to the byte, and refuses what they refuse."""
 
 import ast
+import doctest
 import json
 import shutil
 import subprocess
@@ -115,6 +116,12 @@ assert type(rg.check).__name__ == "function"
 
 def test_the_package_says_that_it_is_typed():
     assert (Path(rg.__file__).parent / "py.typed").is_file()
+
+
+def test_the_example_of_the_manual_runs(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    failed, tried = doctest.testfile(str(Path(__file__).parents[1] / "docs" / "api.md"), module_relative=False)
+    assert tried > 10 and failed == 0
 
 
 # twins
