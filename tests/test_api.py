@@ -314,6 +314,10 @@ BAD_FRAMES = {
         "time holds dates",
     ),
     "durations": (pd.DataFrame({"time": pd.to_timedelta(T, unit="s"), "depth": T}), "time holds durations"),
+    "a mix with complex numbers": (
+        pd.DataFrame({"time": T, "depth": pd.Series([1j, 2.0, None], dtype=object)}),
+        "column depth: '1j' is no number",
+    ),
     "complex numbers": (pd.DataFrame({"time": T, "depth": T + 1j}), "depth holds complex numbers"),
     "a name twice": (pd.DataFrame(np.ones((3, 3)), columns=["time", "depth", "depth"]), "column 'depth' twice"),
     "no rows": (pd.DataFrame({"time": [], "depth": []}), "no rows"),

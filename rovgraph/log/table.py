@@ -10,7 +10,8 @@ import io
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Number
+from decimal import Decimal
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log.streams import label_number
+
+NUMBERS = Real, Decimal, np.bool_  # what a cell of a column of objects may be
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Table:
         if pd.api.types.is_string_dtype(cells):  # the parser leaves blanks around numbers that stand among texts
             cells = cells.where(cells.isna(), cells.astype(str).str.strip()).replace("", None)
         if cells.dtype == object:  # what is neither a number nor a text becomes the text that the message shows
-            cells = cells.map(lambda cell: cell if isinstance(cell, Number) else str(cell), na_action="ignore")
+            cells = cells.map(lambda cell: cell if isinstance(cell, NUMBERS) else str(cell), na_action="ignore")
         values = pd.to_numeric(cells, errors="coerce")
         bad = np.flatnonzero(values.isna() & cells.notna())
         if bad.size:
