@@ -28,7 +28,7 @@ class Result:
     dive : estimates, assumptions, alarms and verdict
     log : as it was estimated, with clocks that go on
     warnings : what was said of the log while it was read and checked, a line each; also issued as `DataWarning`
-    seconds : stage of the work -> wall time [s]
+    seconds : stage of the work -> wall time [s]; the command adds that of reading
     """
 
     dive: Dive
