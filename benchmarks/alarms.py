@@ -13,7 +13,7 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.estimators.dive import smooth
-from rovgraph.log import Log, log_from_frame
+from rovgraph.log import Log
 from rovgraph.simulate import NAMES, Choices, Style, Truth, Waves, scenario, simulate, simulated
 from rovgraph.simulate.named import falcon
 from rovgraph.studies.misalignment.vehicle import GRADES
@@ -37,7 +37,7 @@ def healthy(seeds: int) -> Iterator[tuple[str, Log, Config]]:
         for name in NAMES:
             choices = Choices(disturbances=False, variant={"tank": "calibrated", "stationary": "water"}.get(name))
             dive, config = simulated(name, seed, None, choices)
-            yield f"{name} {seed}", log_from_frame(dive.log_frame), config
+            yield f"{name} {seed}", Log.from_frame(dive.log_frame), config
         for grade, imu in GRADES.items():
             for k, (sensors, truth) in enumerate(SENSORS.items()):
                 path = ("falcon", "lawnmower", "figure8")[(k + seed) % 3]
@@ -48,7 +48,7 @@ def healthy(seeds: int) -> Iterator[tuple[str, Log, Config]]:
                 config = Config.model_validate(data)
                 rng = np.random.default_rng([seed, k, len(grade)])
                 dive = simulate(scenario(path, 240.0, None, LIVELY), Truth(config, **truth), rng)
-                yield f"{path} {grade} {sensors} {seed}", log_from_frame(dive.log_frame), config
+                yield f"{path} {grade} {sensors} {seed}", Log.from_frame(dive.log_frame), config
 
 
 def main() -> None:

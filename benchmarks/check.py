@@ -20,7 +20,7 @@ from fault_campaign.vehicle import configuration, make_vehicle
 from rovgraph.check import Finding, examine
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.log import Log, log_from_frame
+from rovgraph.log import Log
 
 
 def log_of_case(case: Case, seed: int) -> tuple[Log, Config]:
@@ -38,7 +38,7 @@ def log_of_case(case: Case, seed: int) -> tuple[Log, Config]:
     streams, _ = sample(motion, vehicle, rng)
     if case.on_log is not None:
         case.on_log(streams, motion, np.random.default_rng([setting, seed, 1]))
-    return log_from_frame(log_table(streams), f"{case.name} {seed}"), Config.model_validate(config)
+    return Log.from_frame(log_table(streams), source=f"{case.name} {seed}"), Config.model_validate(config)
 
 
 def complaints(log: Log, config: Config) -> list[Finding]:

@@ -13,7 +13,7 @@ from rovgraph.config import Config
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.evaluate import normalised_error
 from rovgraph.geometry import Array
-from rovgraph.log import Log, log_from_frame
+from rovgraph.log import Log
 from rovgraph.simulate import Choices, Dive, simulated
 from rovgraph.studies.estimator_chains import EstimatorSpec, outcomes
 from rovgraph.studies.estimators import ESTIMATORS, select
@@ -40,7 +40,7 @@ def drag(seeds: int) -> None:
     for seed in range(seeds):
         dive, config = simulated("excited", seed)
         truth = np.concatenate([dive.hidden["calibration"][name] for name in DRAG])
-        for estimate in estimates(chosen, log_from_frame(dive.log_frame), config):
+        for estimate in estimates(chosen, Log.from_frame(dive.log_frame), config):
             found = [c for c in estimate.calibration if c.label.startswith("drag")]
             rows.append([[c.value for c in found], [c.sd for c in found], truth])
     values, sd, truth = np.moveaxis(np.array(rows).reshape(seeds, len(chosen), 3, 6), 2, 0)
@@ -62,7 +62,7 @@ def gap(scenario: str, seeds: int, known: float | None) -> None:
         dive, config = simulated(scenario, seed, choices=Choices(dropouts=((begin, end),)))
         if known is not None:
             config = with_drag(config, dive, known, seed)
-        found = estimates([ESTIMATORS[name] for name in names], log_from_frame(dive.log_frame), config)
+        found = estimates([ESTIMATORS[name] for name in names], Log.from_frame(dive.log_frame), config)
         rows.append([_at(dive, estimate, np.array([begin, end])) for estimate in found])
     for name, (error, growth, nees) in zip(names, np.array(rows).mean(axis=0), strict=True):
         print(f"{name:30s} error {error:6.2f} m, growth {growth:6.2f} m, NEES {nees:5.1f}")

@@ -29,7 +29,7 @@ from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.evaluate import read_reference
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, rotate, rpy_from_matrix, transpose
-from rovgraph.log import Log, Stream, log_from_frame, read_log
+from rovgraph.log import Log, Stream, read_log
 from rovgraph.simulate import Dive, Truth, scenario, simulate
 from rovgraph.simulate.files import known
 from rovgraph.simulate.named import falcon
@@ -299,7 +299,7 @@ def make_dive(
 def one_dive(manoeuvre: str, minutes: float, grade: Grade, seed: int) -> Iterator[Row]:
     """Errors of all methods; the misalignments of any number of dives lie evenly between 0 and `LARGEST_DEG`."""
     dive, config, true = make_dive(manoeuvre, minutes, grade, _angles_deg(seed), seed)
-    log = log_from_frame(dive.log_frame)
+    log = Log.from_frame(dive.log_frame)
     for fixes in (False, True):
         given = log if fixes else without(log, "fix")
         estimate = estimated(given, config)
@@ -329,7 +329,7 @@ def arm(seeds: int) -> str:
         found = []
         for seed in range(1, seeds + 1):
             dive, config, true = make_dive("figure8", 5.0, "mti", _angles_deg(seed), seed, together=together)
-            estimate = estimated(without(log_from_frame(dive.log_frame), "fix"), config)
+            estimate = estimated(without(Log.from_frame(dive.log_frame), "fix"), config)
             (sd,) = (float(np.rad2deg(x.sd)) for x in estimate.calibration if x.label == "dvl_yaw")
             found.append((error_deg(mounting(estimate), true)["yaw"], sd))
         error, sds = np.array(found).T
@@ -371,7 +371,7 @@ def check() -> str:
     lines = ["| method | dive | roll | pitch | yaw |", "|---|---|---|---|---|"]
     for manoeuvre in ("figure8", "lawnmower"):
         dive, config, true = make_dive(manoeuvre, 3.0, "mti", (3.0, -2.0, 30.0), 1, noise=False)
-        signal = signals(log_from_frame(dive.log_frame), config, dive.truth, np.zeros(6))
+        signal = signals(Log.from_frame(dive.log_frame), config, dive.truth, np.zeros(6))
         for method, R_bs in (("acc", signal.without_fixes()), ("jck", signal.with_fixes())):
             error = error_deg(R_bs, true)
             numbers = " | ".join(f"{error[angle]:.2f}" for angle in ("roll", "pitch", "yaw"))
@@ -417,7 +417,7 @@ BELIEFS: dict[str, dict[str, Row]] = {
 def recorded(folder: Path) -> str:
     """Yaw of the mounting of a recorded dive by all methods, for the whole of it and its halves."""
     config = load_config(folder / f"{folder.name}.yaml")
-    log = read_log(folder / "log.csv.gz", config.columns, config.units)
+    log = read_log(folder / "log.csv.gz", config)
     log = with_positions(log, read_reference(folder / "reference.csv.gz"))
     begin, end = log["imu"].time[0], log["imu"].time[-1]
     middle = 0.5 * (begin + end)

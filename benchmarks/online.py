@@ -26,7 +26,7 @@ from rovgraph.live.navigator import Navigator
 from rovgraph.live.session import RATE_HZ, Session
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
-from rovgraph.log import Log, log_from_frame, read_log
+from rovgraph.log import Log, read_log
 from rovgraph.simulate import Choices, simulated
 from rovgraph.simulate.named import falcon
 
@@ -83,7 +83,7 @@ def replay(kind: str, seconds: float, seed: int, rate: float) -> Replay:
     rate : solutions a second of the dive
     """
     dive, config = simulated("lawnmower", seed, falcon(), Choices(duration=seconds))
-    log = log_from_frame(dive.log_frame)
+    log = Log.from_frame(dive.log_frame)
     del dive
     navigator = Navigator(config, patient=True, smooth=kind == "isam2", clocks=Clocks(trust=True))
     session = Session(navigator, [], Warnings(), rate)
@@ -120,7 +120,7 @@ def engine(kind: str, seconds: float, seed: int, rate: float) -> None:
 def agreement() -> None:
     """iSAM2's last trajectory against the batch smoother's, on the dive that ships."""
     config = load_config(SHIPPED / "config.yaml")
-    log = read_log(SHIPPED / "log.csv.gz", config.columns, config.units, config.imu.mag.calibrated)
+    log = read_log(SHIPPED / "log.csv.gz", config)
     isam2 = config.model_copy(update={"graph": config.graph.model_copy(update={"solver": "isam2"})})
     a, b = (smooth(log, c, "smoothed").estimates[0].trajectory for c in (config, isam2))
     apart = np.linalg.norm(a.p_n - b.p_n, axis=1).max()
@@ -131,7 +131,7 @@ def agreement() -> None:
 def shuffled(seed: int) -> None:
     """The shipped dive with arrivals shuffled within 300 ms."""
     config = load_config(SHIPPED / "config.yaml")
-    log = read_log(SHIPPED / "log.csv.gz", config.columns, config.units)
+    log = read_log(SHIPPED / "log.csv.gz", config.as_recorded())
     stamps = np.array([m.time for m in log.measurements()])
     order = np.argsort(stamps + np.random.default_rng(seed).uniform(0.0, 0.3, len(stamps)))
     ends = []
@@ -148,7 +148,7 @@ def shuffled(seed: int) -> None:
 def recorded(path: Path, config_path: Path, reference: Path, after: float) -> None:
     """A recorded dive at full speed."""
     config = load_config(config_path)
-    log = read_log(path, config.columns, config.units)
+    log = read_log(path, config.as_recorded())
     navigator = Navigator(config, patient=True, clocks=Clocks(trust=True))
     session = Session(navigator, [], Warnings(), RATE_HZ)
     began = time.perf_counter()

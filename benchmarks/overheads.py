@@ -30,7 +30,7 @@ from rovgraph.live.feed import Feed
 from rovgraph.live.message import Reading
 from rovgraph.live.recorder import Recorder
 from rovgraph.live.sources import open_source
-from rovgraph.log import STREAMS, Log, Stream, log_from_frame, read_log
+from rovgraph.log import STREAMS, Log, Stream, read_log
 from rovgraph.simulate import Choices, simulated
 from rovgraph.simulate.named import falcon
 
@@ -88,7 +88,7 @@ def thesis_filter(folder: Path) -> list[Pair]:
     """Twelve seconds of a dive; and fifteen filters in one pass."""
     dive, config = simulated("lawnmower", 1, falcon(), Choices(duration=120.0))
     frame = dive.log_frame
-    log = log_from_frame(frame[frame["time"] < frame["time"].iloc[0] + 12.0])
+    log = Log.from_frame(frame[frame["time"] < frame["time"].iloc[0] + 12.0])
     pairs = []
     for name in ("4.3a", "4.4a", "4.5"):
         n = length(prepare(FILTERS[name], log, config).places)

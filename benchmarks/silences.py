@@ -15,7 +15,7 @@ from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.evaluate import evaluate, read_reference
 from rovgraph.geometry import log_rotation, transpose
-from rovgraph.log import Log, log_from_frame, read_log
+from rovgraph.log import Log, read_log
 from rovgraph.simulate import Style, Truth, Waves, scenario, simulate
 from rovgraph.simulate.named import falcon
 
@@ -43,7 +43,7 @@ def early(seeds: int) -> None:
         dive = simulate(
             scenario("falcon", 55.0, None, LIVELY), Truth(config, dvl_rate=4.0), np.random.default_rng(seed)
         )
-        log = log_from_frame(dive.log_frame)
+        log = Log.from_frame(dive.log_frame)
         for begin, seconds in EARLY:
             quiet = silenced(log, [(begin, seconds)])
             estimator = ErrorStateFilter(initialise(quiet, config), learn_noise=True)
@@ -65,7 +65,7 @@ def early(seeds: int) -> None:
 
 def recorded(path: Path, config: Config, reference: Path, after: float) -> None:
     """A recorded dive with and without silences."""
-    log = read_log(path, config.columns, config.units, config.imu.mag.calibrated)
+    log = read_log(path, config)
     for silences in ([], RECORDED):
         print(f"silences of {', '.join(f'{s:g}' for _, s in silences) or 'no'} s:")
         for estimate in smooth(silenced(log, silences), config).estimates[:2]:  # not dead reckoning

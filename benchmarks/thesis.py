@@ -26,7 +26,7 @@ from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.thesis import FILTERS, Filter, run_filter
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
-from rovgraph.log import Log, Stream, log_from_frame
+from rovgraph.log import Log, Stream
 from rovgraph.sensors import field_direction
 from rovgraph.simulate import CALM, Choices, Dive, Style, Truth, Waves, lake, scenario, simulate, simulated
 from rovgraph.simulate.files import known
@@ -63,7 +63,7 @@ class Case:
 def case_of(dive: Dive, config: Config, seconds: float) -> Case:
     """The dive until ``seconds``."""
     frame = dive.log_frame[dive.log_frame["time"] <= seconds]
-    return Case(log_from_frame(frame, "dive"), config, dive.truth, dive.hidden["calibration"])
+    return Case(Log.from_frame(frame, source="dive"), config, dive.truth, dive.hidden["calibration"])
 
 
 def driven(name: str, seed: int, seconds: float, **choices: Any) -> Case:

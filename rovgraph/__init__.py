@@ -34,9 +34,97 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph / engine /
+cli / api / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / geometry, workers, fast_csv / errors, process.
 """
 
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from rovgraph.api.comparison import ComparisonResult as ComparisonResult
+    from rovgraph.api.comparison import compare as compare
+    from rovgraph.api.logs import check as check
+    from rovgraph.api.logs import read_log as read_log
+    from rovgraph.api.observability import ObservabilityResult as ObservabilityResult
+    from rovgraph.api.observability import PlanResult as PlanResult
+    from rovgraph.api.observability import observe as observe
+    from rovgraph.api.observability import plan as plan
+    from rovgraph.api.online import Online as Online
+    from rovgraph.api.simulation import SimulatedDive as SimulatedDive
+    from rovgraph.api.simulation import simulate as simulate
+    from rovgraph.api.smoothing import Result as Result
+    from rovgraph.api.smoothing import smooth as smooth
+    from rovgraph.config import Config as Config
+    from rovgraph.config import load_config as load_config
+    from rovgraph.config import parse_config as parse_config
+    from rovgraph.errors import DataWarning as DataWarning
+    from rovgraph.errors import InputError as InputError
+    from rovgraph.evaluate import Metrics as Metrics
+    from rovgraph.evaluate import evaluate as evaluate
+    from rovgraph.evaluate import read_reference as read_reference
+    from rovgraph.log import Log as Log
+    from rovgraph.simulate import Choices as Choices
+    from rovgraph.trajectory import Trajectory as Trajectory
+    from rovgraph.trajectory import read_trajectory as read_trajectory
+
+# name -> the module it is imported from when it is first used, so that importing the package costs nothing
+_HOMES = {
+    "Choices": "simulate",
+    "ComparisonResult": "api.comparison",
+    "Config": "config",
+    "DataWarning": "errors",
+    "InputError": "errors",
+    "Log": "log",
+    "Metrics": "evaluate",
+    "ObservabilityResult": "api.observability",
+    "Online": "api.online",
+    "PlanResult": "api.observability",
+    "Result": "api.smoothing",
+    "SimulatedDive": "api.simulation",
+    "Trajectory": "trajectory",
+    "check": "api.logs",
+    "compare": "api.comparison",
+    "evaluate": "evaluate",
+    "load_config": "config",
+    "observe": "api.observability",
+    "parse_config": "config",
+    "plan": "api.observability",
+    "read_log": "api.logs",
+    "read_reference": "evaluate",
+    "read_trajectory": "trajectory",
+    "simulate": "api.simulation",
+    "smooth": "api.smoothing",
+}
+__all__ = list(_HOMES)
+
+
+class _Package(ModuleType):
+    """This package, whose functions `check`, `evaluate` and `simulate` are not hidden by the modules of these names."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _HOMES and isinstance(value, ModuleType)):  # which the import of a submodule would set
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+if not TYPE_CHECKING:  # or a type checker would believe in every name
+
+    def __getattr__(name: str) -> object:
+        """What `__all__` promises, imported when it is first used."""
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        found = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        globals()[name] = found
+        return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

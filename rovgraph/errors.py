@@ -1,5 +1,13 @@
 """What goes wrong on the user's side, as one clear line."""
 
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+_collecting: ContextVar[list[str] | None] = ContextVar("collecting", default=None)
+
 
 class InputError(Exception):
     """Bad input: the message says what, where and what to do, in one line.
@@ -9,7 +17,31 @@ class InputError(Exception):
 
 
 class DataWarning(UserWarning):
-    """Data that look wrong but can be worked with; issued with ``warnings.warn``."""
+    """Data that look wrong but can be worked with; issued with `warn`."""
+
+
+def warn(text: str) -> None:
+    """Issue a `DataWarning` that points to the caller of the package."""
+    collected = _collecting.get()
+    if collected is not None:
+        collected.append(text)
+    level = 1
+    while sys._getframe(level).f_globals.get("__name__", "").partition(".")[0] == __package__:
+        if sys._getframe(level).f_back is None:
+            break
+        level += 1
+    warnings.warn(text, DataWarning, stacklevel=level + 1)
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """A list that gets the text of every `DataWarning` that is issued within the block."""
+    texts: list[str] = []
+    token = _collecting.set(texts)
+    try:
+        yield texts
+    finally:
+        _collecting.reset(token)
 
 
 def in_one_line(error: BaseException) -> str:

@@ -9,7 +9,6 @@ Consistency uses the normalised error e' P^-1 e of north and east, which is chi-
 two degrees of freedom (mean 2) for an honest P.
 """
 
-import warnings
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array, exp_rotation, rotate, wrap_angle
 from rovgraph.trajectory import Trajectory, parse_trajectory, read_table
 
@@ -229,4 +228,4 @@ def read_reference(path: Path | str) -> Trajectory:
 
 def _warn(path: Path | str, count: int, what: str) -> None:
     if count:
-        warnings.warn(f"{path}: {count} rows {what} were left out", DataWarning, stacklevel=3)
+        warn(f"{path}: {count} rows {what} were left out")

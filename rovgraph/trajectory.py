@@ -5,7 +5,6 @@ v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; ``lat, lo
 on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
 """
 
-import warnings
 import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.errors import InputError, warn
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
 
@@ -53,6 +52,21 @@ class Trajectory:
         """A trajectory without uncertainty, such as a simulator's truth."""
         unknown = np.full((len(time), 3, 3), np.nan)
         return Trajectory(time, p_n, R_nb, v_n, unknown, unknown, unknown)
+
+    @property
+    def position(self) -> Array:
+        """North, east, down [m], shape (n, 3): ``p_n``."""
+        return self.p_n
+
+    @property
+    def velocity(self) -> Array:
+        """Over ground, north, east, down [m/s], shape (n, 3): ``v_n``."""
+        return self.v_n
+
+    @property
+    def covariance(self) -> Array:
+        """Of the position, north, east, down [m^2], shape (n, 3, 3): ``cov_p``."""
+        return self.cov_p
 
     @property
     def rpy(self) -> Array:
@@ -245,7 +259,7 @@ def parse_trajectory(table: pd.DataFrame, source: str) -> Trajectory:
         raise InputError(f"{source}: {len(frame)} rows with time, north and east, at least 2 are needed")
     if len(frame) < len(table):
         count = len(table) - len(frame)
-        warnings.warn(f"{source}: {count} rows without time, north or east were left out", DataWarning, stacklevel=2)
+        warn(f"{source}: {count} rows without time, north or east were left out")
     time = frame["time"].to_numpy(dtype=float)
     back = np.flatnonzero(np.diff(time) <= 0)
     if len(back):

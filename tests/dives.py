@@ -20,7 +20,7 @@ from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, log_rotation, rotate, transpose
-from rovgraph.log import STREAMS, Log, Stream, log_from_frame
+from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
 from rovgraph.trajectory import Trajectory
 
@@ -56,7 +56,7 @@ def merge(into: dict[str, Any], new: Mapping[str, Any]) -> None:
 
 def as_log(frame: pd.DataFrame) -> Log:
     """The streams of a simulated log."""
-    return log_from_frame(frame, "dive.csv")
+    return Log.from_frame(frame, source="dive.csv")
 
 
 def without(log: Log, *sensors: str) -> Log:

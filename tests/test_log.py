@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rovgraph.config import Config
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.log import STREAMS, Log, Stream, read_log
 
@@ -28,7 +29,7 @@ def read_quietly(path: Path, **mapping) -> Log:
     """Read; any warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return read_log(path, **mapping)
+        return read_log(path, Config(**mapping))
 
 
 def test_a_unit_with_a_sign_turns_the_sign_and_leaves_an_sd(tmp_path):
@@ -40,21 +41,24 @@ def test_a_unit_with_a_sign_turns_the_sign_and_leaves_an_sd(tmp_path):
     assert turned.tolist() == [-1.0, -2.0, -3.0, 1.0, 0.1]
     for unit in ("--m", "-x", "- m"):
         with pytest.raises(InputError, match=r"units: depth: unknown unit"):
-            read_log(path, units={"depth": unit})
+            read_log(path, Config(units={"depth": unit}))
     with pytest.raises(InputError, match="time does not run backwards"):
-        read_log(path, units={"time": "-s"})
+        read_log(path, Config(units={"time": "-s"}))
+
+
+ORIGIN = {"origin_lat_deg": 58.3, "origin_lon_deg": 14.5}
 
 
 def test_a_stated_origin_is_where_north_and_east_count_from(tmp_path):
     path = write(tmp_path, "time,fix_lat,fix_lon\n1,58.301,14.5\n2,58.302,14.5\n")
-    log = read_quietly(path, origin=(58.3, 14.5))
+    log = read_quietly(path, environment=ORIGIN)
     assert log.origin == (58.3, 14.5)
     assert log["fix"].data[:, :2] == pytest.approx(np.array([[111.4, 0.0], [222.8, 0.0]]), abs=0.2)
     assert read_quietly(path).origin == (58.301, 14.5)
     bare = write(tmp_path, "time,depth\n1,2\n", "bare.csv")
-    assert read_quietly(bare, origin=(58.3, 14.5)).origin == (58.3, 14.5) and read_quietly(bare).origin is None
+    assert read_quietly(bare, environment=ORIGIN).origin == (58.3, 14.5) and read_quietly(bare).origin is None
     with pytest.raises(InputError, match=r"fixes lie \d+ km from environment.origin_lat_deg"):
-        read_log(path, origin=(14.5, 58.3))  # the two swapped
+        read_log(path, Config(environment={"origin_lat_deg": 14.5, "origin_lon_deg": 58.3}))  # the two swapped
 
 
 def test_rows_of_all_sensors_become_streams_with_their_lines(tmp_path):
@@ -190,7 +194,7 @@ def test_foreign_names_and_units_become_ours(tmp_path):
 )
 def test_a_wrong_mapping_names_the_nearest_known(tmp_path, mapping, said):
     with pytest.raises(InputError, match=said):
-        read_log(write(tmp_path, "time,depth\n0,1\n"), **mapping)
+        read_log(write(tmp_path, "time,depth\n0,1\n"), Config(**mapping))
 
 
 @pytest.mark.parametrize("name", ["acx_x", "gyro_x", "ACC_X"])

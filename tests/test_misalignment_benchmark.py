@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rovgraph.log import log_from_frame, read_log
+from rovgraph.log import Log, read_log
 
 
 @cache
@@ -35,7 +35,7 @@ def test_navlib_recovers_a_known_mounting_from_exact_signals(navlib, yaw):
     """Both methods, in our convention: from the DVL's axes to the body's."""
     turned = (3.0, -2.0, yaw)
     dive, config, true = benchmark().make_dive("figure8", 2.0, "mti", turned, 1, noise=False)
-    signals = benchmark().signals(log_from_frame(dive.log_frame), config, dive.truth, np.zeros(6))
+    signals = benchmark().signals(Log.from_frame(dive.log_frame), config, dive.truth, np.zeros(6))
     for R_bs in (signals.without_fixes(), signals.with_fixes()):
         error = benchmark().error_deg(R_bs, true)
         assert max(map(abs, error.values())) < 0.3, error
@@ -57,7 +57,7 @@ def test_a_log_gets_the_positions_of_a_reference(tmp_path):
     at = dive.truth.at(merged["fix"].time)
     assert len(merged["fix"]) == 61
     np.testing.assert_allclose(merged["fix"].data[:, :2], at.p_n[:, :2], atol=1e-5)
-    assert len(merged["imu"]) == len(log_from_frame(dive.log_frame)["imu"])
+    assert len(merged["imu"]) == len(Log.from_frame(dive.log_frame)["imu"])
 
 
 def test_a_recorded_dive_that_is_absent_is_left_out(tmp_path):

@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 from dives import Simulated, altered, batch, falcon, incremental, renewed, simulated, started
 
-from rovgraph import check
 from rovgraph.calibration import TABLE, calibration_size
+from rovgraph.check import examine
 from rovgraph.config import Config, describe, parse_config
 from rovgraph.errors import InputError
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
@@ -98,7 +98,7 @@ def test_its_derivatives_are_those_of_its_prediction(depth2):
 def test_its_column_is_read_in_any_unit_of_its_quantity(depth2, tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("time,depth2\n0,1200\n1,1300\n")
-    log = read_log(path, units={"depth2": "mm"})
+    log = read_log(path, Config(units={"depth2": "mm"}))
     assert log["depth2"].data.tolist() == [[1.2], [1.3]]
 
 
@@ -143,10 +143,10 @@ def test_its_faults_are_left_out(case):
 
 
 def test_it_is_checked(case):
-    sound = check.examine(case.log, case.config)
+    sound = examine(case.log, case.config)
     assert "depth2" in {timing.sensor for timing in sound.timings}
     assert not [f for f in sound.findings if f.sensor == "depth2" and f.level != "ok"]
-    upside_down = check.examine(altered(case.log, "depth2", -case.log["depth2"].data), case.config)
+    upside_down = examine(altered(case.log, "depth2", -case.log["depth2"].data), case.config)
     assert [f.level for f in upside_down.findings if f.sensor == "depth2" and "mirrored" in f.text] == ["warning"]
 
 

@@ -42,7 +42,7 @@ from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.live.message import Reading
 from rovgraph.live.recorder import Recorder
 from rovgraph.live.sources.json_lines import JsonRow
-from rovgraph.log import Log, log_from_frame, read_log
+from rovgraph.log import Log, read_log
 from rovgraph.log.streams import label_number
 from rovgraph.simulate import Choices, Truth, scenario, simulate
 from rovgraph.simulate import simulated as by_name
@@ -227,7 +227,7 @@ def test_a_false_first_sighting_spoils_none_of_those_that_follow(lost):
     first = frame[frame["place_id"].notna()].iloc[[0]]
     false = first.assign(time=first["time"] + 9.0)  # before the first lap is over
     early = pd.concat([frame[~((frame["place_id"] == first["place_id"].iloc[0]) & (frame["time"] < 20.0))], false])
-    log = log_from_frame(early.sort_values("time", kind="stable", ignore_index=True))
+    log = Log.from_frame(early.sort_values("time", kind="stable", ignore_index=True))
     for estimate in (batch(log, lost.config).solve(), filtered(log, lost.config).solve()):
         rows = of_places(estimate)
         assert (rows["weight"] > 0).sum() >= 2 * (len(log["place"]) - 2)
@@ -368,13 +368,13 @@ def test_names_of_places_may_be_numbers_or_texts(tmp_path, name):
 @pytest.mark.parametrize("sd", [0.0, -1.0])
 def test_an_sd_of_0_or_less_is_taken_as_not_known(sd):
     with pytest.warns(DataWarning, match="place_sd: 1 times 0 or less, taken as not known.* first in line 3"):
-        stream = log_from_frame(table(place_id=[1, 2, 1], place_sd=[0.1, sd, 0.1]))["place"]
+        stream = Log.from_frame(table(place_id=[1, 2, 1], place_sd=[0.1, sd, 0.1]))["place"]
     np.testing.assert_array_equal(stream["place_sd"], [0.1, np.nan, 0.1])
 
 
 def test_an_sd_of_no_place_is_left_out_with_a_warning():
     with pytest.warns(DataWarning, match=r"place: 1 rows partly empty .* first in line 3"):
-        log = log_from_frame(table(place_id=[1, None, 1], place_sd=[0.1, 0.1, np.nan]))
+        log = Log.from_frame(table(place_id=[1, None, 1], place_sd=[0.1, 0.1, np.nan]))
     assert log["place"].time.tolist() == [0.0, 2.0]
 
 

@@ -11,7 +11,7 @@ from rovgraph.config import load_config
 from rovgraph.errors import InputError
 from rovgraph.geometry import cross, rotate, transpose
 from rovgraph.instruments import hydrodynamics
-from rovgraph.log import log_from_frame
+from rovgraph.log import Log
 from rovgraph.simulate import Choices, Dive, Path, falcon, simulated
 from rovgraph.simulate.autopilot import AXES, Autopilot, VelocityControl, hold
 from rovgraph.simulate.driven import CONTROL_S, STEP_S, Craft, _Lag, drive
@@ -178,7 +178,7 @@ def test_allocation_gives_the_force_that_was_asked_for():
 
 def test_signals_are_logged_ten_times_a_second_and_become_a_stream(vattern):
     _, dive = vattern
-    stream = log_from_frame(dive.log_frame)["thruster"]
+    stream = Log.from_frame(dive.log_frame)["thruster"]
     assert stream.columns == tuple(f"thruster_{i}" for i in range(1, 6))
     np.testing.assert_allclose(np.diff(stream.time), CONTROL_S, atol=1e-9)
     assert np.all(np.isfinite(stream.data)) and 20.0 < np.abs(stream.data).max() <= 100.0

@@ -12,7 +12,7 @@ from rovgraph.cli.app import main
 from rovgraph.config import beliefs, load_config
 from rovgraph.geometry import rotate, transpose, wrap_angle
 from rovgraph.instruments import instruments
-from rovgraph.log import log_from_frame, read_log
+from rovgraph.log import Log, read_log
 from rovgraph.sensors import field_direction
 from rovgraph.simulate import NAMES, Choices, Truth, falcon, lake, scenario, simulate, simulated
 from rovgraph.simulate.files import write_log
@@ -99,7 +99,7 @@ def test_on_land_the_fans_line_stands_in_the_accelerometer(ashore):
 
 
 def test_on_land_the_dvl_has_no_bottom_and_there_is_no_depth(ashore):
-    log = log_from_frame(ashore.log_frame)
+    log = Log.from_frame(ashore.log_frame)
     assert np.all(log["dvl"]["dvl_valid"] == 0) and "depth" not in log
     assert np.ptp(ashore.truth.p_n, axis=0).max() < 1e-9
 
@@ -231,7 +231,7 @@ def test_units_own_attitude_errs_slowly_and_by_its_sd():
 
 def test_frame_in_memory_is_the_log_that_is_written(lakes, tmp_path):
     write_log(lakes[0].log_frame, tmp_path / "log.csv")
-    memory, file = log_from_frame(lakes[0].log_frame), read_log(tmp_path / "log.csv")
+    memory, file = Log.from_frame(lakes[0].log_frame), read_log(tmp_path / "log.csv")
     assert memory.sensors == file.sensors and "thruster" in file
     for sensor in memory.sensors:
         np.testing.assert_allclose(memory[sensor].time, file[sensor].time, atol=1e-9)

@@ -856,7 +856,7 @@ def test_real_log_of_a_slow_mti_is_within_what_its_compass_allows(name):
 def real_log() -> tuple[Config, Log]:
     """The first 400 s."""
     config = load_config(ICTINEU / "ictineu.yaml")
-    log = read_log(ICTINEU / "log.csv.gz", config.columns, config.units)
+    log = read_log(ICTINEU / "log.csv.gz", config)
     return config, kept(log, "imu", log["imu"].time < log["imu"].time[0] + 400.0)
 
 

@@ -21,9 +21,7 @@ from rovgraph.simulate.files import write_log
 
 def read(log: str, config: str) -> tuple[Log, Config]:
     settings = load_config(Path(config))
-    return read_log(
-        Path(log), settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s
-    ), settings
+    return read_log(Path(log), settings), settings
 
 
 def filtered(*files: str) -> float:

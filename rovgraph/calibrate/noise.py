@@ -5,7 +5,6 @@ from the Allan deviation with lines and waves taken out, standard deviations of 
 scatter without them. What the log is too short to show is left out, and said.
 """
 
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +16,7 @@ from rovgraph.calibrate.piece import Piece, digits
 from rovgraph.calibrate.spectrum import Spectrum, quietened, spectrum
 from rovgraph.calibrate.stillness import require_still
 from rovgraph.config import Config
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log import Log, Stream
 
@@ -169,11 +168,9 @@ def _without_gaps(stream: Stream, source: str) -> Stream:
     parts = np.split(np.arange(len(stream)), cuts)
     longest = max(parts, key=len)
     at = stream.time[cuts[0] - 1] - stream.time[0]
-    warnings.warn(
+    warn(
         f"{source}: {stream.sensor}: {cuts.size} gaps, the first after {at:.0f} s; "
-        f"the longest part without one is taken, {stream.time[longest[-1]] - stream.time[longest[0]]:.0f} s",
-        DataWarning,
-        stacklevel=3,
+        f"the longest part without one is taken, {stream.time[longest[-1]] - stream.time[longest[0]]:.0f} s"
     )
     return _part(stream, longest)
 

@@ -5,7 +5,6 @@ that go on to work with the log. A check takes a log and a configuration and yie
 findings; it knows nothing of other checks.
 """
 
-import warnings
 from collections.abc import Callable, Iterator
 
 from rovgraph.check.agreement import headings, vertical
@@ -19,7 +18,8 @@ from rovgraph.check.places import places
 from rovgraph.check.times import overlap, presence, regularity, timing
 from rovgraph.check.values import angles, frozen_imu, gravity, own, turn_rates
 from rovgraph.config import Config
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.errors import InputError
+from rovgraph.errors import warn as issue_warning
 from rovgraph.log import Log
 from rovgraph.sensors import Level
 
@@ -68,7 +68,7 @@ def warn(log: Log, config: Config | None = None) -> None:
     """
     report = examine(log, config)
     for finding in report.at("warning"):
-        warnings.warn(f"{report.source}: {finding.sensor}: {finding.text}", DataWarning, stacklevel=2)
+        issue_warning(f"{report.source}: {finding.sensor}: {finding.text}")
     refuse(report)
 
 

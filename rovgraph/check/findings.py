@@ -1,8 +1,8 @@
 """What a check has to say, and helpers that the checks share."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,20 @@ class Report:
     def at(self, level: Level) -> list[Finding]:
         """Findings of one level."""
         return [f for f in self.findings if f.level == level]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON; what is not known is None."""
+        known: dict[str, Any] = _without_nan(asdict(self))
+        return known
+
+
+def _without_nan(value: object) -> Any:
+    """NaN as None, which JSON has."""
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and value != value else value
 
 
 def repeats(values: Array) -> NDArray[np.bool_]:

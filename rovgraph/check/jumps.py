@@ -4,7 +4,6 @@ A clock that is set leaves a gap in the stamps of the instrument that it belongs
 known, and the gap says whose clock it is, the later stamps are put back by the difference (`bridge_jumps`).
 """
 
-import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from rovgraph.check.findings import Finding, since, valid_pings
 from rovgraph.check.inertial import inertial_motion
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config
-from rovgraph.errors import DataWarning
+from rovgraph.errors import warn
 from rovgraph.log import Log, Stream
 
 ENOUGH_PINGS = 50
@@ -137,12 +136,10 @@ def bridge_jumps(log: Log, config: Config) -> Log:
             break
         streams = {name: _put_back(stream, jump) for name, stream in log.streams.items()}
         shifted = [name for name, stream in streams.items() if stream is not log[name]]
-        warnings.warn(
+        warn(
             f"{log.source}: the {NAMES[jump.sensor]}'s clock jumps by {jump.by:+.2f} s (sd {jump.sd:.2f} s) between "
             f"{since(log, jump.before)} and {since(log, jump.after)}: bridged, stamps of {', '.join(shifted)} "
-            "from there on are put back by as much",
-            DataWarning,
-            stacklevel=2,
+            "from there on are put back by as much"
         )
         log = replace(log, streams=streams)
     return log

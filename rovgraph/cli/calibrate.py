@@ -48,9 +48,7 @@ def magnetometer(
 
     check_writable(out, force)
     settings = load_config(config)
-    found = calibrate_magnetometer(
-        read_log(log, settings.columns, settings.units, delay_s=settings.delay_s), settings, method.value
-    )
+    found = calibrate_magnetometer(read_log(log, settings.with_raw_magnetometer()), settings, method.value)
     with results_folder(out, force) as folder:
         write_magnetometer(folder, found, settings)
     console = Console()
@@ -74,7 +72,7 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
 
     check_writable(out, force)
     settings = load_config(config)
-    recorded = read_log(log, settings.columns, settings.units, settings.imu.mag.calibrated, settings.delay_s)
+    recorded = read_log(log, settings)
     found = calibrate_noise(recorded, settings)
     with results_folder(out, force) as folder:
         write_noise(folder, found, settings)

@@ -19,34 +19,16 @@ def check(
 ) -> None:
     """Look at a log: sensors, rates, gaps, units, signs, clocks, and what an estimate would make of it."""
     import json
-    import warnings
-    from dataclasses import asdict
 
     from rich.console import Console
 
-    from rovgraph.check import Finding, bridge_jumps, examine, refuse
-    from rovgraph.config import load_config
-    from rovgraph.estimators.initialise import refusal
-    from rovgraph.log import read_log
+    import rovgraph as rg
+    from rovgraph.check import refuse
 
-    settings = load_config(config)
-    dive_log = read_log(
-        log,
-        settings.columns,
-        settings.units,
-        settings.imu.mag.calibrated,
-        settings.delay_s,
-        settings.environment.origin,
-    )
-    report = examine(dive_log, settings)
-    if not report.at("error") and refusal(dive_log, settings):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the report has it
-            bridged = bridge_jumps(dive_log, settings)
-        if reason := refusal(bridged, settings):
-            report.findings.append(Finding("smooth", "error", reason))
+    settings = None if config is None else rg.load_config(config)
+    report = rg.check(rg.read_log(log, settings), settings)
     if as_json:
-        typer.echo(json.dumps(_without_nan(asdict(report)), indent=2, allow_nan=False))
+        typer.echo(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:
         console = Console()
         console.print(_timing_table(report))
@@ -84,12 +66,3 @@ def _timing_table(report: "Report") -> "Table":
         table.add_row(t.sensor, str(t.count), *numbers, f"{t.gap_at - start:.1f}", f"{t.jitter:.2g}", str(t.repeats))
     table.caption = f"0 s is {start:.3f} s of the log's clock; gap: the largest, and when"
     return table
-
-
-def _without_nan(value: object) -> object:
-    """NaN as null, which JSON has."""
-    if isinstance(value, dict):
-        return {k: _without_nan(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(v) for v in value]
-    return None if isinstance(value, float) and value != value else value

@@ -26,11 +26,10 @@ def evaluate(
     import json
     import math
 
-    from rovgraph import evaluate as library
-    from rovgraph.trajectory import read_trajectory
+    import rovgraph as rg
 
     until = math.inf if end is None else end
-    metrics = library.evaluate(read_trajectory(trajectory), library.read_reference(reference), start, align, until)
+    metrics = rg.evaluate(rg.read_trajectory(trajectory), rg.read_reference(reference), start, align, until)
     if as_json:
         typer.echo(json.dumps(metrics.as_dict(), indent=2))
     else:

@@ -23,36 +23,20 @@ def observe(
     """
     from rich.console import Console
 
-    from rovgraph import check
+    import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
-    from rovgraph.config import load_config
-    from rovgraph.log import read_log
-    from rovgraph.report.figure_observability import draw_observability
-    from rovgraph.report.folder import check_writable, results_folder
-    from rovgraph.report.observability import observability_table, words, write_observability
+    from rovgraph.report.folder import check_writable
+    from rovgraph.report.observability import observability_table, words
     from rovgraph.studies.choices import listed
-    from rovgraph.studies.observability import estimating
-    from rovgraph.studies.observability import observe as library
 
     out = Path("observed-" + log.name.split(".")[0]) if out is None else out
-    also = listed(estimate)
-    settings = estimating(load_config(config), also)
+    settings = None if config is None else rg.load_config(config)
     check_writable(out, force)
-    dive_log = read_log(
-        log,
-        settings.columns,
-        settings.units,
-        settings.imu.mag.calibrated,
-        settings.delay_s,
-        settings.environment.origin,
-    )
-    dive_log = check.bridge_jumps(dive_log, settings)
-    check.warn(dive_log, settings)
+    dive_log = rg.read_log(log, settings)
     with progress_bar() as progress:
-        seen = library(dive_log, settings, also, progress)
-    with results_folder(out, force) as folder:
-        draw_observability(folder, seen)
-        write_observability(folder, seen, settings, {"log": str(log), "estimate": also})
+        result = rg.observe(dive_log, settings, listed(estimate), progress)
+    result.save(out, force)
+    seen = result.observability
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)

@@ -39,7 +39,7 @@ def online(
     """
     import sys
 
-    from rovgraph.cli.beside import warn_of_unused
+    from rovgraph.api.logs import warn_of_unused
     from rovgraph.cli.ending import asked_by_signal, ended_by_signals
     from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
     from rovgraph.errors import InputError
@@ -56,7 +56,8 @@ def online(
     if resume and out is None:
         raise InputError("--resume needs the folder to go on with, --out")
     settings, warnings = configured(config, out, resume), Warnings(_say)
-    warn_of_unused(config, *(url for url in sources if url.startswith("file:") and not resume))
+    replayed = [url.removeprefix("file:").partition("?")[0] for url in sources if url.startswith("file:")]
+    warn_of_unused(*(replayed if config is None and not resume else []))
     opened = open_sources(sources, warnings, settings, speed)
     if resume and any(source.pace == 1.0 for source in opened):
         raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")

@@ -23,8 +23,8 @@ def plan(
         str | None, typer.Option(help="calibration variables to estimate too, separated by commas")
     ] = None,
     fix_interval: Annotated[float | None, typer.Option(help="between position fixes [s]; default: none")] = None,
-    imu_rate: Annotated[float, typer.Option(min=5.0, max=1000.0, help="of the IMU [Hz]")] = 100.0,
-    dvl_rate: Annotated[float, typer.Option(min=0.1, max=50.0, help="of the DVL's pings [Hz]")] = 5.6,
+    imu_rate: Annotated[float, typer.Option(help="of the IMU, 5 to 1000 [Hz]")] = 100.0,
+    dvl_rate: Annotated[float, typer.Option(help="of the DVL's pings, 0.1 to 50 [Hz]")] = 5.6,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
 ) -> None:
     """Rank manoeuvres by what they would show of the calibration, before any is made.
@@ -33,39 +33,19 @@ def plan(
     """
     from rich.console import Console
 
+    import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
-    from rovgraph.config import load_config
-    from rovgraph.errors import InputError
-    from rovgraph.report.figure_plan import draw_plan
-    from rovgraph.report.folder import check_writable, results_folder
-    from rovgraph.report.observability import plan_table, write_plan
-    from rovgraph.studies.choices import goals, listed, read_known
-    from rovgraph.studies.manoeuvres import manoeuvres as chosen
-    from rovgraph.studies.observability import estimating
+    from rovgraph.report.folder import check_writable
+    from rovgraph.report.observability import plan_table
+    from rovgraph.studies.choices import goals, listed
     from rovgraph.studies.plan import Sensors
-    from rovgraph.studies.plan import plan as library
 
     check_writable(out, force)
-    if fix_interval is not None and not fix_interval > 0.0:
-        raise InputError(f"--fix-interval {fix_interval}: more than 0 s is expected")
-    wanted, also = goals(goal or []), listed(estimate)
-    settings = estimating(load_config(config), also)
-    candidates = chosen(listed(manoeuvres) or None, duration)
-    before = None if known is None else read_known(known)
+    sensors, wanted = Sensors(imu_rate, dvl_rate, fix_interval), goals(goal or [])
+    settings, chosen = rg.load_config(config), listed(manoeuvres)
     with progress_bar() as progress:
-        result = library(
-            settings,
-            candidates,
-            duration,
-            before,
-            wanted,
-            Sensors(imu_rate, dvl_rate, fix_interval),
-            lambda done: progress("manoeuvres", done),
-        )
-    about = {"duration_s": duration, "known": None if known is None else str(known), "fix_interval_s": fix_interval}
-    with results_folder(out, force) as folder:
-        draw_plan(folder, result)
-        write_plan(folder, result, settings, about)
+        result = rg.plan(settings, wanted, known, duration, chosen, listed(estimate), sensors, progress)
+    result.save(out, force)
     console = Console()
-    console.print(plan_table(result, f"manoeuvres of {duration:g} s"))
+    console.print(plan_table(result.plan, f"manoeuvres of {duration:g} s"))
     console.print(f"results in {out}", highlight=False, markup=False)

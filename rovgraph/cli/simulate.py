@@ -1,14 +1,12 @@
 """``rovgraph simulate``: a dive whose truth is known."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    from rovgraph.simulate import Dive
-
-LIMIT_S = 6 * 3600.0  # of a dive's duration: beyond it the log outgrows the memory
+    from rovgraph import SimulatedDive
 
 
 def simulate(
@@ -64,52 +62,26 @@ def simulate(
 
     Example: rovgraph simulate vattern --seed 7 --out dive
     """
-    from rovgraph import simulate as library
-    from rovgraph.config import load_config
-    from rovgraph.errors import InputError
-    from rovgraph.report.folder import STAMP, check_writable, results_folder
-    from rovgraph.simulate.files import figures, write_dive
+    import rovgraph as rg
+    from rovgraph.report.folder import check_writable
 
     check_writable(out, force)
-    if duration is not None and duration > LIMIT_S:
-        raise InputError(f"duration of {duration} s: at most {LIMIT_S:.0f} s")
-    given = None if config is None else load_config(config)
-    choices = library.Choices(
+    given = None if config is None else rg.load_config(config)
+    choices = rg.Choices(
         duration=duration,
         speed=speed,
         variant=variant,
         current=current,
         disturbances=disturbances,
         outliers=outliers,
-        dropouts=tuple(_interval(text) for text in dropout or ()),
-        places=tuple(_place(text) for text in place or ()),
+        dropouts=tuple(_pair(text) for text in dropout or ()),
+        places=tuple(_pair(text) for text in place or ()),
         false_places=false_places,
         noise=noise,
     )
-    dive, believed = library.simulated(scenario, seed, given, choices)
-    with results_folder(out, force) as folder:
-        write_dive(folder, dive, believed, {**STAMP, "scenario": scenario, "seed": seed, **choices.told()})
-    _show(out, scenario, seed, figures(dive), dive)
-
-
-def _interval(text: str) -> tuple[float, float]:
-    """From and to [s] of ``FROM:TO``."""
-    from rovgraph.errors import InputError
-
-    interval = _pair(text)
-    if not 0.0 <= interval[0] < interval[1]:
-        raise InputError(f"--dropout {text}: two times in seconds are expected, as 100:130")
-    return interval
-
-
-def _place(text: str) -> tuple[float, float]:
-    """North and east [m] of ``NORTH:EAST``."""
-    from rovgraph.errors import InputError
-
-    place = _pair(text)
-    if not all(abs(x) < float("inf") for x in place):
-        raise InputError(f"--place {text}: north and east in metres are expected, as 10:-5")
-    return place
+    dive = rg.simulate(scenario, given, seed, choices)
+    dive.save(out, force)
+    _show(out, dive)
 
 
 def _pair(text: str) -> tuple[float, float]:
@@ -121,16 +93,17 @@ def _pair(text: str) -> tuple[float, float]:
         return float("nan"), float("nan")
 
 
-def _show(out: Path, scenario: str, seed: int, figures: dict[str, Any], dive: "Dive") -> None:
+def _show(out: Path, dive: "SimulatedDive") -> None:
     """The table that the command prints."""
     from rich.console import Console
     from rich.table import Table
 
+    figures = dive.figures
     table = Table("", "", title=f"Simulated dive in {out}", show_header=False)
-    table.add_row("scenario, seed", f"{scenario}, {seed}")
+    table.add_row("scenario, seed", f"{dive.scenario}, {dive.seed}")
     table.add_row("duration, distance", f"{figures['duration_s']:.1f} s, {figures['distance_m']:.1f} m")
     table.add_row("extent", "{:.1f} m north, {:.1f} m east, {:.1f} m depth".format(*figures["extent_m"]))
     for sensor, count in figures["measurements"].items():
         table.add_row(sensor, f"{count} measurements")
-    table.add_row("log", f"{len(dive.log_frame)} rows in log.csv")
+    table.add_row("log", f"{len(dive.dive.log_frame)} rows in log.csv")
     Console().print(table)

@@ -45,54 +45,29 @@ def smooth(
 
     from rich.console import Console
 
-    from rovgraph import check
-    from rovgraph.cli.beside import warn_of_unused
+    import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
-    from rovgraph.config import load_config
-    from rovgraph.estimators.dive import smooth as smooth_dive
-    from rovgraph.log import read_log
-    from rovgraph.report.folder import check_writable, results_folder
-    from rovgraph.report.results import write_results
+    from rovgraph.report.folder import check_writable
     from rovgraph.report.tables import calibration_table, summary_table
 
     out = Path("results-" + log.name.split(".")[0]) if out is None else out
-    settings = load_config(config)
-    if engine is not None:
-        settings = settings.model_copy(update={"graph": settings.graph.model_copy(update={"solver": engine.value})})
-    warn_of_unused(config, log)
+    settings = None if config is None else rg.load_config(config)
     check_writable(out, force)
     began = time.perf_counter()
-    dive_log = read_log(
-        log,
-        settings.columns,
-        settings.units,
-        settings.imu.mag.calibrated,
-        settings.delay_s,
-        settings.environment.origin,
-    )
-    dive_log = check.bridge_jumps(dive_log, settings)
-    check.warn(dive_log, settings)
-    seconds = {"reading": time.perf_counter() - began}
+    dive_log = rg.read_log(log, settings)
+    read = time.perf_counter()
     with progress_bar() as progress:
-        dive = smooth_dive(dive_log, settings, estimate.value, progress)
-    seconds["estimating"] = time.perf_counter() - began - seconds["reading"]
-    assumptions = dive.assumptions
-    with results_folder(out, force) as folder:
-        if figures:
-            from rovgraph.report.figures import draw_figures
-
-            draw_figures(folder, dive.estimates, dive_log, dive.beginning.config)
-        seconds["total"] = time.perf_counter() - began
-        config_used = dive.beginning.config
-        summary = write_results(folder, dive.estimates, dive_log, config_used, assumptions, seconds, dive.alarms)
+        result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
+    result.seconds["reading"] = read - began
+    summary = result.save(out, force, figures)
     console = Console()
-    console.print(f"verdict: {dive.verdict}", style=VERDICT_STYLE[dive.verdict], highlight=False)
-    for alarm in dive.alarms:
+    console.print(f"verdict: {result.verdict}", style=VERDICT_STYLE[result.verdict], highlight=False)
+    for alarm in result.alarms:
         console.print(f"{alarm.severity}: {alarm.text}", highlight=False, markup=False, soft_wrap=True)
-    console.print(summary_table(dive.estimates, summary))
-    console.print(calibration_table(dive.estimates))
-    for line in assumptions:
+    console.print(summary_table(result.dive.estimates, summary))
+    console.print(calibration_table(result.dive.estimates))
+    for line in result.assumptions:
         console.print(f"assumed: {line}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
-    if strict and dive.verdict != "trusted":
+    if strict and result.verdict != "trusted":
         raise typer.Exit(NOT_TRUSTED)

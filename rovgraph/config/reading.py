@@ -26,6 +26,7 @@ from rovgraph.config.sections import (
     Graph,
     Heading,
     Imu,
+    Mag,
     Online,
     Place,
     Section,
@@ -89,6 +90,14 @@ class Config(Section):
     def to_yaml(self) -> str:
         """The effective configuration, every key written out."""
         return yaml_text(self.model_dump(mode="json"))
+
+    def with_raw_magnetometer(self) -> "Config":
+        """The same without a calibration of the magnetometer: its samples are what they are."""
+        return self.model_copy(update={"imu": self.imu.model_copy(update={"mag": Mag()})})
+
+    def as_recorded(self) -> "Config":
+        """The same for a log whose samples and stamps are taken as they are: without delays, too."""
+        return self.with_raw_magnetometer().model_copy(update={"delay_s": {}})
 
 
 def register_settings(sensor: str, settings: type[SensorSettings], calibration: Sequence[Variable]) -> None:

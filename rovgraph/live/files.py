@@ -4,7 +4,7 @@ import io
 import json
 import time as host
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,7 @@ from rovgraph.live.recorder import Recorder
 from rovgraph.live.solution import Event
 from rovgraph.live.track import TrackFile
 from rovgraph.live.warnings import Warnings
-from rovgraph.log import log_from_frame, read_log
-from rovgraph.log.streams import Log
+from rovgraph.log import Log, read_log
 
 RECORDING, TRACK, CHECKPOINT = "received.csv", "trajectory_filtered.csv", "checkpoint"
 CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  # of the recording; of the run
@@ -108,8 +107,9 @@ class Files:
             if not file.readline():  # the header alone
                 return None
         if self.anew or self.state is None:
-            return read_log(path, origin=self.config.environment.origin)
-        return log_from_frame(_last_rows(path, self.state["origin"]), str(path))
+            # recorded under rovgraph's own names, in SI
+            return replace(read_log(path, Config(environment=self.config.environment)), config=None)
+        return Log.from_frame(_last_rows(path, self.state["origin"]), source=str(path))
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep events."""

@@ -16,8 +16,7 @@ from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding
 from rovgraph.check.fixes import track
 from rovgraph.config import Config
-from rovgraph.log import Log, Measurement
-from rovgraph.log.streams import gathered
+from rovgraph.log import Log, Measurement, gathered
 
 WINDOW_S = 300.0  # of motion that is compared
 FIRST_S = 60.0  # of motion, before which nothing is compared

@@ -98,21 +98,29 @@ class Session:
             self._work_off(feed)
         if files is not None:
             files.keep(navigator, now=True)
-        navigator.finish()
-        self._send()
+        self.end()
         if files is not None:
             files.finish(navigator)
             self.write_smoothed()
 
+    def step(self, message: Message | None) -> None:
+        """Take a message, or None where nothing came for a while, and send a solution if one is due."""
+        if message is None:
+            self._wait()
+        elif not self._known(message):
+            self._take(message)
+        if self.navigator.engine is not None and self.navigator.time >= self._due:
+            self._send()
+
+    def end(self) -> None:
+        """No more messages: take what is held back, and send a last solution."""
+        self.navigator.finish()
+        self._send()
+
     def _work_off(self, feed: Iterable[Message | None]) -> None:
         navigator, files = self.navigator, self.files
         for message in feed:
-            if message is None:
-                self._wait()
-            elif not self._known(message):
-                self._take(message)
-            if navigator.engine is not None and navigator.time >= self._due:
-                self._send()
+            self.step(message)
             if files is not None:
                 files.keep(navigator)
             if self._wanted:

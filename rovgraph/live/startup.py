@@ -9,8 +9,7 @@ from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.fixed_lag import place
 from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
 from rovgraph.estimators.initialise import initialise
-from rovgraph.log import Measurement
-from rovgraph.log.streams import gathered
+from rovgraph.log import Measurement, gathered
 from rovgraph.sensors import SENSORS
 
 MARGIN_S = 0.5  # beyond the window, for data that come late

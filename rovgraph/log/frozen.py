@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, rotate
-from rovgraph.log.streams import Log, Stream
+from rovgraph.log.log import Log
+from rovgraph.log.streams import Stream
 
 MIN_REPEATS = 5  # measurements, times as many as the sensor usually repeats
 MIN_SECONDS = 3.0

@@ -3,17 +3,15 @@
 What can be repaired is repaired and said in a `DataWarning`; what cannot is an `InputError`.
 """
 
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pymap3d
 from numpy.typing import NDArray
 
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.config import Config
+from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log.streams import (
     LABEL,
@@ -21,13 +19,12 @@ from rovgraph.log.streams import (
     RECEIVED,
     STREAMS,
     THRUSTER,
-    Log,
     Stream,
     all_columns,
     is_column,
     is_optional,
 )
-from rovgraph.log.table import Table, read_table
+from rovgraph.log.table import Table
 from rovgraph.log.units import factors, near_miss, nearest
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
@@ -39,89 +36,40 @@ Bools = NDArray[np.bool_]
 Lines = NDArray[np.int64]
 
 
-def read_log(
-    path: Path | str,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    mag: Callable[[Array], Array] | None = None,
-    delay_s: Mapping[str, float] | None = None,
-    origin: tuple[float, float] | None = None,
-) -> Log:
-    """Read a log.
-
-    Parameters
-    ----------
-    path : CSV, gzipped CSV or Parquet
-    columns : rovgraph's name -> the log's name, where they differ
-    units : column or group of columns -> unit, where it is not SI
-    mag : the magnetometer's calibration, from samples to field, both of shape (n, 3) (`Mag.calibrated`
-        of a configuration); everything that takes the log then sees the field
-    delay_s : sensor -> how much older its measurements are than their stamps; the log's times are those of the
-        measurements
-    origin : latitude and longitude [deg] of north = east = 0; None = of the first fix_lat, if there is one
+def read_streams(table: Table, config: Config) -> tuple[dict[str, Stream], tuple[float, float] | None]:
+    """The streams of a table, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
 
     Returns
     -------
-    Log
+    streams : sensor -> Stream, only those that the table has
+    origin : latitude and longitude [deg] of north = east = 0, or None
 
     Raises
     ------
-    InputError : a file that cannot be worked with
+    InputError : a table that cannot be worked with
 
     Warns
     -----
     DataWarning : what was left out or put in order
     """
-    return _assembled(read_table(path), columns or {}, units or {}, mag, delay_s or {}, origin)
-
-
-def log_from_frame(frame: pd.DataFrame, source: str = "log", delay_s: Mapping[str, float] | None = None) -> Log:
-    """A log that is in memory already, as `read_log` would read it from a file.
-
-    Parameters
-    ----------
-    frame : columns of a log under rovgraph's names, in SI
-    source : name for messages
-    delay_s : of `read_log`
-
-    Raises
-    ------
-    InputError : a frame that cannot be worked with
-    """
-    table = Table(source, frame, np.arange(len(frame), dtype=np.int64) + 2)
-    return _assembled(table, {}, {}, None, delay_s or {}, None)
-
-
-def _assembled(
-    table: Table,
-    columns: Mapping[str, str],
-    units: Mapping[str, str],
-    mag: Callable[[Array], Array] | None,
-    delay_s: Mapping[str, float],
-    origin: tuple[float, float] | None,
-) -> Log:
-    """The streams of a table."""
+    columns, units = config.columns, config.units
     scale = factors(units, table.source)
     names = _names(table, columns)
     cells = {name: _finite(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
     cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
     cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
-    origin = _add_local_fixes(cells, line, table.source, origin)
+    origin = _add_local_fixes(cells, line, table.source, config.environment.origin)
     streams = [_imu(cells, line, table.source)]
     streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
     streams += [_thruster(cells, line, table.source)]
     found = {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}
     if not found:
         raise InputError(f"{table.source}: no measurement of any sensor in it; {_found(table.names)}")
-    if mag is not None and "mag" in found:
-        found["mag"] = replace(found["mag"], data=mag(found["mag"].data))
-    for sensor in delay_s.keys() & found.keys():
-        found[sensor] = replace(found[sensor], time=found[sensor].time - delay_s[sensor])
-    return Log(table.source, found, origin)
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, DataWarning, stacklevel=3)
+    if "mag" in found:
+        found["mag"] = replace(found["mag"], data=config.imu.mag.calibrated(found["mag"].data))
+    for sensor in config.delay_s.keys() & found.keys():
+        found[sensor] = replace(found[sensor], time=found[sensor].time - config.delay_s[sensor])
+    return found, origin
 
 
 def _found(names: Sequence[str]) -> str:
@@ -155,7 +103,7 @@ def _names(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
     for name in table.names:
         meant = None if name in taken else near_miss(name, names)
         if meant:
-            _warn(f"{table.source}: column {name!r} is ignored; if it is {meant}, rename it or map it under columns")
+            warn(f"{table.source}: column {name!r} is ignored; if it is {meant}, rename it or map it under columns")
     return names
 
 
@@ -164,7 +112,7 @@ def _finite(table: Table, name: str, source: str) -> Array:
     values = table.labels(source) if name == LABEL else table.numbers(source)
     infinite = np.flatnonzero(np.isinf(values))
     if infinite.size:
-        _warn(
+        warn(
             f"{table.source}: column {name}: {infinite.size} infinite, taken as missing; "
             f"first in line {table.line[infinite[0]]}"
         )
@@ -192,7 +140,7 @@ def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: boo
     if timeless.any():
         if timeless.all():
             raise InputError(f"{source}: column time is empty, expected seconds in every row")
-        _warn(f"{source}: {timeless.sum()} rows without time left out, first in line {line[np.argmax(timeless)]}")
+        warn(f"{source}: {timeless.sum()} rows without time left out, first in line {line[np.argmax(timeless)]}")
         cells, line = {name: values[~timeless] for name, values in cells.items()}, line[~timeless]
     time = cells["time"]
     latest = np.maximum.accumulate(time)
@@ -207,7 +155,7 @@ def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: boo
             f"expected steps back of at most {limit:g} s; was the clock set, or are two dives in one file? Split it"
         )
     if not by_arrival:
-        _warn(f"{source}: {late.size} rows behind the time before them, put in order; first in line {line[late[0]]}")
+        warn(f"{source}: {late.size} rows behind the time before them, put in order; first in line {line[late[0]]}")
     order = np.argsort(time, kind="stable")
     return {name: values[order] for name, values in cells.items()}, line[order]
 
@@ -228,7 +176,7 @@ def _add_local_fixes(
     if not all(name in cells for name in LAT_LON):
         return origin
     if "fix_north" in cells and "fix_east" in cells:
-        _warn(f"{source}: fix_lat and fix_lon are ignored beside fix_north and fix_east")
+        warn(f"{source}: fix_lat and fix_lon are ignored beside fix_north and fix_east")
         return origin
     lat, lon = (cells.pop(name) for name in LAT_LON)
     wild = np.flatnonzero((np.abs(lat) > 90.0) | (np.abs(lon) > 360.0))
@@ -239,7 +187,7 @@ def _add_local_fixes(
         )
     unset = (lat == 0.0) & (lon == 0.0)
     if unset.any():
-        _warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0, no fix; left out")
+        warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0, no fix; left out")
         lat[unset] = np.nan
     valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
     cells["fix_north"], cells["fix_east"] = lat * np.nan, lon * np.nan
@@ -271,7 +219,7 @@ def _select(
     if absent:
         if len(absent) < len(required):
             present = [c for c in required if c in cells]
-            _warn(f"{source}: {sensor} is left out: the log has {', '.join(present)} and no {', '.join(absent)}")
+            warn(f"{source}: {sensor} is left out: the log has {', '.join(present)} and no {', '.join(absent)}")
         return None
     data = np.column_stack([cells.get(c, np.full(len(line), np.nan)) for c in columns])
     filled = ~np.isnan(data[:, [columns.index(c) for c in required]])
@@ -284,7 +232,7 @@ def _select(
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
     if partly.any():
-        _warn(
+        warn(
             f"{source}: {sensor}: {partly.sum()} rows partly empty and left out, expected "
             f"{', '.join(required)} together; first in line {line[np.argmax(partly)]}"
         )
@@ -310,7 +258,7 @@ def _known_sd(column: str, sd: Array, line: Lines, source: str) -> None:
     """An sd of 0 or -1, as many instruments write it that do not know, becomes NaN."""
     unknown = sd <= 0.0
     if unknown.any():
-        _warn(
+        warn(
             f"{source}: {column}: {unknown.sum()} times 0 or less, taken as not known; "
             f"the configuration's sd holds there; first in line {line[np.argmax(unknown)]}"
         )
@@ -344,7 +292,7 @@ def _imu(cells: dict[str, Array], line: Lines, source: str) -> Stream | None:
     if len(present) < 6:
         if present:
             absent = [c for c in columns if c not in cells]
-            _warn(f"{source}: imu is left out: the log has {', '.join(present)} and no {', '.join(absent)}")
+            warn(f"{source}: imu is left out: the log has {', '.join(present)} and no {', '.join(absent)}")
         return None
     acc_gyr = (_select(name, part, cells, line, source) for name, part in (("acc", columns[:3]), ("gyr", columns[3:])))
     (acc, with_acc), (gyr, with_gyr) = (part for part in acc_gyr if part is not None)
@@ -357,7 +305,7 @@ def _imu(cells: dict[str, Array], line: Lines, source: str) -> Stream | None:
     else:
         lost = np.flatnonzero(alone)
     if lost.size:
-        _warn(
+        warn(
             f"{source}: imu: {lost.size} rows with a rate and no acceleration near, left out; "
             f"first in line {line[rows[lost[0]]]}"
         )
@@ -394,5 +342,5 @@ def _distinct_times(stream: Stream, source: str) -> Stream:
     for which, what in ((same, "repeated exactly, left out"), (again & ~same, "at the time of another, first kept")):
         if which.any():
             line = stream.row[np.argmax(which)]
-            _warn(f"{source}: {stream.sensor}: {which.sum()} measurements {what}; first in line {line}")
+            warn(f"{source}: {stream.sensor}: {which.sum()} measurements {what}; first in line {line}")
     return stream.take(~again)

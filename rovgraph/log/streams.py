@@ -115,45 +115,6 @@ class Stream:
         return Stream(self.sensor, self.columns, self.time[index], self.data[index], self.row[index])
 
 
-@dataclass(frozen=True)
-class Log:
-    """A dive as recorded.
-
-    Attributes
-    ----------
-    source : file name, for messages
-    streams : sensor -> Stream, only those that the log has
-    origin : latitude and longitude [deg] of north = east = 0, or None
-    """
-
-    source: str
-    streams: Mapping[str, Stream]
-    origin: tuple[float, float] | None = None
-
-    def __contains__(self, sensor: str) -> bool:
-        return sensor in self.streams
-
-    def __getitem__(self, sensor: str) -> Stream:
-        return self.streams[sensor]
-
-    @property
-    def sensors(self) -> set[str]:
-        return set(self.streams)
-
-    def measurements(self) -> Iterator[Measurement]:
-        """All measurements in the order of time; at equal times the IMU comes first, then the DVL.
-
-        So a ping makes its keyframe before what was measured together with it is attached.
-        """
-        streams = in_precedence(self.streams.values())
-        if not streams:
-            return
-        which, index, time = arrivals(streams)
-        names, data, rows = [s.sensor for s in streams], [s.data for s in streams], [s.row.tolist() for s in streams]
-        for t, k, i in zip(time.tolist(), which.tolist(), index.tolist(), strict=True):
-            yield Measurement(t, names[k], data[k][i], rows[k][i])
-
-
 def in_precedence(streams: Iterable[Stream]) -> list[Stream]:
     """Streams in the order of their measurements of one time."""
     return sorted(streams, key=lambda s: precedence(s.sensor))
@@ -172,19 +133,6 @@ def arrivals(streams: Sequence[Stream]) -> tuple[NDArray[np.int64], NDArray[np.i
     index = np.concatenate([np.arange(len(s)) for s in streams])
     order = np.argsort(time, kind="stable")
     return which[order], index[order], time[order]
-
-
-def gathered(measurements: Iterable[Measurement], source: str, origin: tuple[float, float] | None = None) -> Log:
-    """A log of measurements in the order of time: the inverse of `Log.measurements`."""
-    rows: dict[str, list[Measurement]] = {}
-    for m in measurements:
-        rows.setdefault(m.sensor, []).append(m)
-    streams = {}
-    for sensor, own in rows.items():
-        columns = STREAMS.get(sensor) or tuple(f"thruster_{k + 1}" for k in range(len(own[0].values)))
-        time, line = np.array([m.time for m in own]), np.array([m.row for m in own], dtype=np.int64)
-        streams[sensor] = Stream(sensor, columns, time, np.array([m.values for m in own]), line)
-    return Log(source, streams, origin)
 
 
 def precedence(sensor: str) -> int:

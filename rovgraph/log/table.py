@@ -7,19 +7,23 @@ expected and what to do.
 import csv
 import gzip
 import io
-import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log.streams import label_number
+
+NUMBERS = Real, Decimal, np.bool_  # what a cell of a column of objects may be
 
 
 @dataclass(frozen=True)
@@ -49,11 +53,13 @@ class Table:
         InputError : a cell that is no number
         """
         cells = self.frame[name]
+        if held := _no_numbers(cells):
+            raise InputError(f"{self.source}: column {name} holds {held}, expected numbers; write it in seconds")
         if pd.api.types.is_string_dtype(cells):  # the parser leaves blanks around numbers that stand among texts
             cells = cells.where(cells.isna(), cells.astype(str).str.strip()).replace("", None)
-        values = pd.to_numeric(cells, errors="coerce") if not pd.api.types.is_datetime64_any_dtype(cells) else None
-        if values is None:
-            raise InputError(f"{self.source}: column {name} holds dates, expected numbers; write it in seconds")
+        if cells.dtype == object:  # what is neither a number nor a text becomes the text that the message shows
+            cells = cells.map(lambda cell: cell if isinstance(cell, NUMBERS) else str(cell), na_action="ignore")
+        values = pd.to_numeric(cells, errors="coerce")
         bad = np.flatnonzero(values.isna() & cells.notna())
         if bad.size:
             cell = _shortened(repr(str(cells.iloc[bad[0]])), 30)
@@ -85,9 +91,55 @@ def read_table(path: Path | str) -> Table:
         frame, line = _parquet(content, str(path))
     else:
         frame, line = _csv(content, str(path))
-    if not len(frame):
-        raise InputError(f"{path}: has a header and no rows below it, expected one row per measurement")
+    _check_rows(frame, str(path))
     return Table(str(path), frame, line)
+
+
+def table_of_frame(frame: pd.DataFrame, source: str) -> Table:
+    """The table of a data frame; its rows count as lines of a file, the first as line 2.
+
+    Raises
+    ------
+    InputError : no data frame, no row in it, a name that stands there twice
+    """
+    if not isinstance(frame, pd.DataFrame):
+        raise InputError(
+            f"{source}: is a {type(frame).__name__}, expected a pandas DataFrame with the columns of a log"
+        )
+    names = [str(name).strip() for name in frame.columns]
+    _check_names(names, source)
+    _check_rows(frame, source)
+    return Table(source, frame.set_axis(names, axis="columns"), np.arange(len(frame), dtype=np.int64) + 2)
+
+
+def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source: str) -> Table:
+    """One table of some that have a time each, in the order of time.
+
+    Parameters
+    ----------
+    tables : column -> array_like, shape (n,)
+    time : name of the column that orders them; a step back within one of them stays one
+
+    Raises
+    ------
+    InputError : columns that are no arrays of one dimension and the same length; or as `table_of_frame`
+    """
+    frames = []
+    for table in tables:
+        arrays = {name: np.asarray(values) for name, values in table.items()}
+        for name, values in arrays.items():
+            if values.ndim != 1:
+                raise InputError(f"{source}: column {name} has shape {values.shape}, expected one number per row")
+        lengths = {len(values) for values in arrays.values()}
+        if len(lengths) > 1:
+            told = ", ".join(f"{name} {len(values)}" for name, values in arrays.items())
+            raise InputError(f"{source}: columns of different length ({_shortened(told, 200)}), expected one")
+        frames.append(table_of_frame(pd.DataFrame(arrays), source).frame)
+    merged = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
+    if len(frames) > 1 and all(time in frame for frame in frames):
+        latest = [np.fmax.accumulate(Table(source, frame, frame.index.to_numpy()).numbers(time)) for frame in frames]
+        merged = merged.iloc[np.argsort(np.concatenate(latest), kind="stable")]
+    return table_of_frame(merged, source)
 
 
 def _content(path: Path) -> bytes:
@@ -186,10 +238,29 @@ def _header(content: bytes, source: str) -> list[str]:
             f"{source}: line 1 has {names.count('')} columns without a name, as spreadsheets leave empty ones; "
             "delete them, or name them"
         )
+    _check_names(names, source)
+    return names
+
+
+def _check_names(names: Sequence[str], source: str) -> None:
     twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
     if twice is not None:
         raise InputError(f"{source}: line 1 has the column {twice!r} twice, expected each name once; rename one")
-    return names
+
+
+def _check_rows(frame: pd.DataFrame, source: str) -> None:
+    if not len(frame):
+        raise InputError(f"{source}: has a header and no rows below it, expected one row per measurement")
+
+
+def _no_numbers(cells: "pd.Series[Any]") -> str:
+    """What a column holds that pandas would turn into numbers of some unit; empty where it holds none."""
+    kind = pd.api.types.infer_dtype(cells, skipna=True)
+    if kind.startswith(("datetime", "date")):
+        return "dates"
+    return {"timedelta": "durations", "timedelta64": "durations", "period": "dates", "complex": "complex numbers"}.get(
+        kind, ""
+    )
 
 
 def _without_torn_end(content: bytes, width: int, source: str) -> bytes:
@@ -197,7 +268,7 @@ def _without_torn_end(content: bytes, width: int, source: str) -> bytes:
     begin, count = content.rfind(b"\n") + 1, content.count(b"\n")
     last = content[begin:]
     if last.strip() and count > 1 and last.count(b",") + 1 < width:
-        warnings.warn(f"{source}: line {count + 1}, the last, is cut off and left out", DataWarning, stacklevel=2)
+        warn(f"{source}: line {count + 1}, the last, is cut off and left out")
         return content[:begin]
     return content
 

@@ -10,12 +10,11 @@ import json
 import os
 import secrets
 import shutil
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 from rovgraph import __version__
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.errors import InputError, warn
 
 SUMMARY = "summary.json"
 STAMP = {"program": "rovgraph", "version": __version__}  # in every summary: the folder is ours
@@ -129,7 +128,7 @@ def _install(new: Path, final: Path, force: bool) -> None:
         raise
     _remove(old)
     if old.exists():
-        warnings.warn(f"{old} holds the replaced results and could not be removed", DataWarning, stacklevel=2)
+        warn(f"{old} holds the replaced results and could not be removed")
 
 
 def _remove(folder: Path) -> None:

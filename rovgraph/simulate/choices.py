@@ -1,12 +1,13 @@
 """What a person may choose of a simulated dive beside its scenario and seed."""
 
 from dataclasses import dataclass, fields
-from math import hypot
+from math import hypot, isfinite
 from typing import Any
 
 from rovgraph.errors import InputError
 
 CURRENT_MAX = 1.0  # that may be chosen [m/s]
+DURATION_MAX = 6 * 3600.0  # beyond it the log outgrows the memory [s]
 EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances", "places", "false_places"})
 
 
@@ -38,6 +39,22 @@ class Choices:
     places: tuple[tuple[float, float], ...] = ()
     false_places: float = 0.0
     noise: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what no scenario can give.
+
+        Raises
+        ------
+        InputError : a duration, a time without bottom lock or a place that is none
+        """
+        if self.duration is not None and self.duration > DURATION_MAX:
+            raise InputError(f"duration of {self.duration} s: at most {DURATION_MAX:.0f} s")
+        for first, last in self.dropouts:
+            if not 0.0 <= first < last:
+                raise InputError(f"dropout {first:g}:{last:g}: two times in seconds are expected, as 100:130")
+        for north, east in self.places:
+            if not (isfinite(north) and isfinite(east)):
+                raise InputError(f"place {north:g}:{east:g}: north and east in metres are expected, as 10:-5")
 
     def told(self) -> dict[str, Any]:
         """What ``summary.json`` says: the common ones always, the others where something was chosen."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.config import Config, Mag
+from rovgraph.config import Config
 from rovgraph.sensors import SENSORS
 from rovgraph.simulate.dive import Dive
 
@@ -64,8 +64,7 @@ def known(dive: Dive, config: Config) -> Config:
     """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
     start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
-    imu = config.imu.model_copy(update={"mag": Mag()})
-    return config.model_copy(update={"start": start, "columns": {}, "units": {}, "delay_s": {}, "imu": imu})
+    return config.as_recorded().model_copy(update={"start": start, "columns": {}, "units": {}})
 
 
 def secrets(dive: Dive) -> dict[str, Any]:

@@ -49,6 +49,8 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
         near = difflib.get_close_matches(name, NAMES, 1)
         hint = f", did you mean {near[0]}?" if near else ""
         raise InputError(f"unknown scenario {name!r}{hint} (known: {', '.join(sorted(NAMES))})")
+    if seed < 0:
+        raise InputError(f"seed {seed}: 0 or more is expected")
     if name in DRIVEN:
         driven = DRIVEN[name]
         choices.require(name, driven.choices, driven.variants)

@@ -8,7 +8,6 @@ itself, so for more than one machine there is Dask, and nothing of it is repeate
 
 import contextlib
 import logging
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import rovgraph
-from rovgraph.errors import DataWarning, InputError
+from rovgraph.errors import InputError, warn
 from rovgraph.workers import cores, starting, workers
 
 Task = TypeVar("Task")
@@ -92,7 +91,7 @@ class _Work:
     def _killed(self, at_hand: list[int]) -> list[int]:
         """A pool takes tasks in their order, so the first of the lost ones were at hand."""
         message = "a worker process was killed (out of memory?); what it had at hand is made again"
-        warnings.warn(message, DataWarning, stacklevel=4)
+        warn(message)
         if len(at_hand) == 1:
             self._failed(at_hand[0], RuntimeError("its process was killed again and again (out of memory?)"))
         return at_hand

@@ -14,12 +14,13 @@ import numpy as np
 from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.log import log_from_frame
+from rovgraph.log import Log
 from rovgraph.simulate import CALM, Path, Style, Truth, scenario, simulate
 from rovgraph.studies.manoeuvres import Manoeuvre
 from rovgraph.studies.observability import Observability, examined, joint_bits, solved
 from rovgraph.workers import cores, in_workers
 
+IMU_HZ, DVL_HZ = (5.0, 1000.0), (0.1, 50.0)  # rates that can be planned with
 MOST_COLUMNS = 6  # of a table, where no goal says what matters
 
 
@@ -36,6 +37,19 @@ class Sensors:
     imu_rate: float = 100.0
     dvl_rate: float = 5.6
     fix_interval: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what no sensor does.
+
+        Raises
+        ------
+        InputError : a rate or an interval out of bounds
+        """
+        for name, rate, (least, most) in (("IMU", self.imu_rate, IMU_HZ), ("DVL", self.dvl_rate, DVL_HZ)):
+            if not least <= rate <= most:
+                raise InputError(f"{name} rate of {rate:g} Hz: between {least:g} and {most:g} Hz are expected")
+        if self.fix_interval is not None and not self.fix_interval > 0.0:
+            raise InputError(f"fix interval of {self.fix_interval} s: more than 0 s is expected")
 
 
 @dataclass(frozen=True)
@@ -190,7 +204,7 @@ def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: Se
         fix_interval=sensors.fix_interval, ahrs_rate=ahrs,
     )  # fmt: skip
     dive = simulate(path_of(manoeuvre, duration), truth, np.random.default_rng(0))
-    log = log_from_frame(dive.log_frame, str(manoeuvre))
+    log = Log.from_frame(dive.log_frame, source=str(manoeuvre))
     return examined(solved(log, own), own, noisy=False)
 
 

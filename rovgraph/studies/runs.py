@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.log import Log, log_from_frame
+from rovgraph.log import Log
 from rovgraph.log.frozen import without_frozen
 from rovgraph.simulate import Choices, simulated
 from rovgraph.trajectory import Trajectory
@@ -89,4 +89,4 @@ class Simulated:
         dive, config = simulated(self.scenario, self.seed, self.config, Choices(duration=self.duration))
         step = max(round(1.0 / (REFERENCE_RATE * float(np.median(np.diff(dive.truth.time))))), 1)
         yaw = float(dive.hidden["calibration"]["dvl_yaw"][0])
-        return Case(log_from_frame(dive.log_frame, self.name), config, dive.truth.every(step), yaw)
+        return Case(Log.from_frame(dive.log_frame, source=self.name), config, dive.truth.every(step), yaw)

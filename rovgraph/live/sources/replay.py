@@ -76,7 +76,7 @@ def log_replay(url: str, path: str, config: Config, pace: float) -> LogReplay:
     ------
     InputError : a file that cannot be worked with
     """
-    return LogReplay(url, read_log(path, config.columns, config.units), pace)
+    return LogReplay(url, read_log(path, config.as_recorded()), pace)
 
 
 def _geodetic(log: Log) -> dict[int, Array]:

@@ -14,7 +14,7 @@ from rovgraph.errors import in_one_line
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.evaluate import evaluate
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.log import log_from_frame
+from rovgraph.log import Log
 from rovgraph.simulate import CALM, Dive, Style, Truth, scenario, simulate
 from rovgraph.simulate.files import known
 from rovgraph.studies.estimator_chains import EstimatorSpec, Outcome, outcomes
@@ -136,7 +136,7 @@ class _Run:
         return dive, known(dive, config)
 
     def _log(self, dive: Dive) -> Any:
-        return log_from_frame(dive.log_frame, f"cell {self.task.cell.id}, run {self.task.run}")
+        return Log.from_frame(dive.log_frame, source=f"cell {self.task.cell.id}, run {self.task.run}")
 
     def _asked(self) -> dict[str, EstimatorSpec]:
         """Estimators that the study wants, what shares its keyframes side by side."""

@@ -1,0 +1,137 @@
+"""Estimators against each other: what ``rovgraph compare`` does."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from rovgraph.api.logs import given, prepared
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.estimators.dive import Progress, no_progress
+from rovgraph.log import Log
+from rovgraph.studies import compare as library
+from rovgraph.studies.compare import Comparison
+from rovgraph.studies.estimators import select
+from rovgraph.studies.runs import Case, Recorded, Run, Simulated
+from rovgraph.trajectory import Trajectory
+
+SEEDS = range(1, 31)
+THESIS = "vattern"  # the scenario of the thesis, whose numbers are shown beside ours
+
+
+@dataclass(frozen=True)
+class ComparisonResult:
+    """Errors, consistency and cost of each estimator.
+
+    Attributes
+    ----------
+    comparison : all tables; docs/compare.md describes their columns
+    title : what was compared on
+    thesis : the thesis has numbers for it
+    about : what it was made of, for ``summary.json``
+    """
+
+    comparison: Comparison
+    title: str
+    thesis: bool
+    about: dict[str, Any]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row per estimator."""
+        return self.comparison.table
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph compare`` (docs/compare.md), all of it or nothing.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.comparison import write_comparison
+        from rovgraph.report.figure_compare import draw_comparison
+        from rovgraph.report.folder import results_folder
+
+        with results_folder(Path(path), force) as folder:
+            draw_comparison(folder, self.comparison, self.title, self.thesis)
+            write_comparison(folder, self.comparison, self.about)
+
+
+def compare(
+    log: Log | None = None,
+    config: Config | None = None,
+    reference: Trajectory | None = None,
+    scenario: str | None = None,
+    seeds: Sequence[int] = SEEDS,
+    duration: float | None = None,
+    estimators: Sequence[str] | None = None,
+    jobs: int | None = None,
+    progress: Progress = no_progress,
+) -> ComparisonResult:
+    """Run estimators on a log with its reference, or on many simulated dives.
+
+    Parameters
+    ----------
+    log : as read with the configuration
+    config : what is believed of vehicle and sensors; None = all defaults, or the scenario's own
+    reference : what the log's estimates are compared with
+    scenario : simulate dives of this one instead of a log
+    seeds : of the simulated dives
+    duration : of a simulated dive [s]; None = the scenario's own
+    estimators : names or patterns, as "graph-*"; None = all that need no thrusters
+    jobs : processes; None = one per core
+    progress : called now and then with what is being done, and how far it is from 0 to 1
+
+    Raises
+    ------
+    InputError : neither or both of log and scenario, no such estimator, a log that cannot be worked with
+
+    Warns
+    -----
+    DataWarning : whatever looks wrong
+    """
+    select(estimators)
+    require_one(log, reference, scenario, seeds, duration)
+    runs: list[Run]
+    about: dict[str, Any]
+    if scenario is not None:
+        runs = [Simulated(scenario, seed, config, duration) for seed in seeds]
+        about = {"scenario": scenario, "seeds": [*seeds], "duration_s": duration}
+        title = f"{scenario}, {len(seeds)} seeds"
+    else:
+        assert log is not None
+        assert reference is not None
+        config, title = given(log, config), Path(log.source).name
+        runs, about = [Recorded(title, Case(prepared(log, config), config, reference))], {"log": log.source}
+    began = time.perf_counter()
+    comparison = library.compare(runs, estimators, jobs, lambda done: progress("comparing", done))
+    about["seconds"] = time.perf_counter() - began
+    return ComparisonResult(comparison, title, scenario == THESIS, about)
+
+
+def require_one(
+    log: object, reference: object, scenario: str | None, seeds: Sequence[int], duration: float | None
+) -> None:
+    """Either a log with its reference, or a scenario.
+
+    Raises
+    ------
+    InputError : anything else
+    """
+    if (log is None) == (scenario is None):
+        raise InputError("compare wants either a log with its reference, or a scenario to simulate")
+    if scenario is not None:
+        if reference is not None:
+            raise InputError("a reference goes with a log; a simulated dive has its own")
+        if not len(seeds):
+            raise InputError("seeds: at least 1 is expected")
+        return
+    if duration is not None:
+        raise InputError("a duration goes with a scenario; a log has its own")
+    if reference is None:
+        source = log.source if isinstance(log, Log) else log
+        raise InputError(f"{source}: a reference (CSV with time, north, east) is needed to compare with")

@@ -1,0 +1,99 @@
+"""A log on its way into an estimate: read with a configuration, checked, its clocks bridged."""
+
+import warnings
+from pathlib import Path
+
+from rovgraph import log as library
+from rovgraph.check import Finding, Report, bridge_jumps, examine
+from rovgraph.check import warn as warn_of_findings
+from rovgraph.config import Config
+from rovgraph.errors import InputError, warn
+from rovgraph.estimators.initialise import refusal
+from rovgraph.log import Log
+
+
+def read_log(path: Path | str, config: Config | None = None) -> Log:
+    """Read a log (docs/log-format.md) with the columns, units and delays of a configuration.
+
+    Parameters
+    ----------
+    path : CSV, gzipped CSV or Parquet
+    config : None = rovgraph's own columns, in SI
+
+    Raises
+    ------
+    InputError : a file that cannot be worked with
+
+    Warns
+    -----
+    DataWarning : what was left out or put in order; a configuration that lies beside the log and was not given
+    """
+    if config is None:
+        warn_of_unused(path)
+    return library.read_log(path, config)
+
+
+def warn_of_unused(*logs: Path | str) -> None:
+    """Say that a configuration lies beside a log: forgetting it makes a wrong track, which looks certain."""
+    for beside in (Path(log).parent / "config.yaml" for log in logs):
+        if beside.is_file():
+            warn(f"{beside} lies beside the log and is not used; give it as the configuration if it is the vehicle's")
+
+
+def check(log: Log, config: Config | None = None) -> Report:
+    """Look at a log: is it sane, and what would an estimate make of it (docs/check.md)?
+
+    Parameters
+    ----------
+    log : as read with the configuration
+    config : what is believed of the vehicle; None = all defaults
+
+    Returns
+    -------
+    Report : ``.findings`` with ``level`` "ok", "warning" or "error", ``.timings`` of each sensor, ``.as_dict()``
+
+    Raises
+    ------
+    InputError : a log that was read with other columns
+    """
+    config = given(log, config)
+    report = examine(log, config)
+    if not report.at("error") and refusal(log, config):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the report has it
+            bridged = bridge_jumps(log, config)
+        if reason := refusal(bridged, config):
+            report.findings.append(Finding("smooth", "error", reason))
+    return report
+
+
+def prepared(log: Log, config: Config) -> Log:
+    """A log as every estimate takes it: checked, with clocks that go on.
+
+    Raises
+    ------
+    InputError : a log that was read with other columns, or that an estimate cannot work with
+
+    Warns
+    -----
+    DataWarning : whatever looks wrong
+    """
+    log = bridge_jumps(log, given(log, config))
+    warn_of_findings(log, config)
+    return log
+
+
+def given(log: Log, config: Config | None) -> Config:
+    """The configuration that belongs to a log, all defaults where none is given.
+
+    Raises
+    ------
+    InputError : these are not a log and a configuration, or the log was read with another one's columns
+    """
+    if not isinstance(log, Log):
+        raise InputError(f"log: expected a Log, as read_log or Log.from_frame gives it, found a {type(log).__name__}")
+    config = Config() if config is None else config
+    if not isinstance(config, Config):
+        raise InputError(f"config: expected a Config, as load_config gives it, found a {type(config).__name__}")
+    log.require_read_with(config)
+    return config

@@ -1,0 +1,158 @@
+"""What of the calibration can be known: what ``rovgraph observe`` and ``rovgraph plan`` do."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rovgraph.api.logs import given, prepared
+from rovgraph.config import Config
+from rovgraph.errors import collected_warnings
+from rovgraph.estimators.dive import Progress, no_progress
+from rovgraph.log import Log
+from rovgraph.studies import observability as library
+from rovgraph.studies.choices import read_known
+from rovgraph.studies.manoeuvres import manoeuvres as chosen
+from rovgraph.studies.observability import Observability, estimating
+from rovgraph.studies.plan import Known, Plan, Sensors
+from rovgraph.studies.plan import plan as ranked
+
+DURATION_S = 120.0  # of a manoeuvre
+USUAL = Sensors()
+
+
+@dataclass(frozen=True)
+class ObservabilityResult:
+    """What a dive shows of its calibration.
+
+    Attributes
+    ----------
+    observability : sd before and after, correlations, and when the dive showed it
+    config : what was believed, and estimated
+    warnings : what was said of the log, a line each
+    about : what it was made of, for ``summary.json``
+    """
+
+    observability: Observability
+    config: Config
+    warnings: tuple[str, ...]
+    about: Mapping[str, Any]
+
+    @property
+    def verdicts(self) -> Mapping[str, str]:
+        """Label of each component -> observable, weak or unobservable."""
+        return dict(zip(self.observability.labels, self.observability.verdicts, strict=True))
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph observe`` (docs/observability.md), all of it or nothing.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.figure_observability import draw_observability
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.observability import write_observability
+
+        with results_folder(Path(path), force) as folder:
+            draw_observability(folder, self.observability)
+            write_observability(folder, self.observability, self.config, self.about)
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """Manoeuvres, ranked by what they would show.
+
+    Attributes
+    ----------
+    plan : the manoeuvres, the best first
+    config : what is believed of the vehicle
+    about : what it was made of, for ``summary.json``
+    """
+
+    plan: Plan
+    config: Config
+    about: Mapping[str, Any]
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph plan`` (docs/observability.md), all of it or nothing.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.figure_plan import draw_plan
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.observability import write_plan
+
+        with results_folder(Path(path), force) as folder:
+            draw_plan(folder, self.plan)
+            write_plan(folder, self.plan, self.config, self.about)
+
+
+def observe(
+    log: Log, config: Config | None = None, estimate: Sequence[str] = (), progress: Progress = no_progress
+) -> ObservabilityResult:
+    """What a dive shows of every calibration variable, when it did, and what is missing.
+
+    Parameters
+    ----------
+    log : as read with the configuration
+    config : what is believed of vehicle and sensors; None = all defaults
+    estimate : calibration variables to estimate beside those of the configuration
+    progress : called now and then with what is being done, and how far it is from 0 to 1
+
+    Raises
+    ------
+    InputError : an unknown variable, one whose sensor is not in use, none at all; a log that cannot be worked with
+
+    Warns
+    -----
+    DataWarning : whatever looks wrong
+    """
+    config = estimating(given(log, config), estimate)
+    with collected_warnings() as texts:
+        log = prepared(log, config)
+        seen = library.observe(log, config, estimate, progress)
+    about = {"log": log.source, "estimate": [*estimate]}
+    return ObservabilityResult(seen, config, (*log.warnings, *texts), about)
+
+
+def plan(
+    config: Config | None = None,
+    goals: Mapping[str, float] | None = None,
+    known: ObservabilityResult | Path | str | None = None,
+    duration: float = DURATION_S,
+    manoeuvres: Sequence[str] | None = None,
+    estimate: Sequence[str] = (),
+    sensors: Sensors = USUAL,
+    progress: Progress = no_progress,
+) -> PlanResult:
+    """Rank manoeuvres by what they would show of the calibration, before any is made.
+
+    Parameters
+    ----------
+    config : what is believed of vehicle and sensors; None = all defaults
+    goals : label of a component -> sd that is wanted, radians and SI
+    known : of a dive before, or its ``observability.json``; None = nothing is known
+    duration : of each manoeuvre [s]
+    manoeuvres : scenarios, as "circle" or "circle@0.3" (m/s); None = all
+    estimate : calibration variables to estimate beside those of the configuration
+    sensors : how often they measure
+    progress : called now and then with what is being done, and how far it is from 0 to 1
+
+    Raises
+    ------
+    InputError : no such manoeuvre or variable, nothing to estimate, a goal for what is not estimated
+    """
+    config = estimating(Config() if config is None else config, estimate)
+    candidates = chosen(manoeuvres or None, duration)
+    before: Known | None
+    if isinstance(known, ObservabilityResult):
+        seen, source = known.observability, known.about["log"]
+        before = Known(seen.labels, seen.covariance, seen.prior_sd)
+    else:
+        before, source = (None, None) if known is None else (read_known(Path(known)), str(known))
+    result = ranked(config, candidates, duration, before, goals, sensors, lambda done: progress("manoeuvres", done))
+    about = {"duration_s": duration, "known": source, "fix_interval_s": sensors.fix_interval}
+    return PlanResult(result, config, about)

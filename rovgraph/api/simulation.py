@@ -1,0 +1,78 @@
+"""A dive whose truth is known: what ``rovgraph simulate`` does."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from rovgraph.config import Config
+from rovgraph.log import Log
+from rovgraph.simulate import Choices, Dive, simulated
+from rovgraph.simulate.files import figures, write_dive
+from rovgraph.trajectory import Trajectory
+
+OWN = Choices()
+
+
+@dataclass(frozen=True)
+class SimulatedDive:
+    """A simulated dive, what an estimator may know of it and what it may not.
+
+    Attributes
+    ----------
+    scenario, seed, choices : what it was made of
+    dive : everything, hidden values too
+    config : what an estimator may know
+    """
+
+    scenario: str
+    seed: int
+    choices: Choices
+    dive: Dive
+    config: Config
+
+    @cached_property
+    def log(self) -> Log:
+        """What the vehicle recorded; the log that `save` writes has fewer digits."""
+        return Log.from_frame(self.dive.log_frame, self.config, f"{self.scenario} {self.seed}")
+
+    @property
+    def truth(self) -> Trajectory:
+        """Where it really was."""
+        return self.dive.truth
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Length of the dive and number of measurements of each sensor."""
+        return figures(self.dive)
+
+    def save(self, path: Path | str, force: bool = False) -> None:
+        """Write the folder of ``rovgraph simulate`` (docs/simulation.md), all of it or nothing.
+
+        Raises
+        ------
+        InputError : the folder exists and ``force`` is not given, or cannot be written
+        """
+        from rovgraph.report.folder import STAMP, results_folder
+
+        with results_folder(Path(path), force) as folder:
+            told = {**STAMP, "scenario": self.scenario, "seed": self.seed, **self.choices.told()}
+            write_dive(folder, self.dive, self.config, told)
+
+
+def simulate(scenario: str, config: Config | None = None, seed: int = 1, choices: Choices = OWN) -> SimulatedDive:
+    """Simulate a dive.
+
+    Parameters
+    ----------
+    scenario : such as "lawnmower" or "vattern" (docs/simulation.md)
+    config : of vehicle and sensors; None = the thesis's Falcon where thrusters drive, all defaults elsewhere
+    seed : the same one gives the same dive, 0 or more
+    choices : duration, speed, current and so on, where they are not the scenario's own
+
+    Raises
+    ------
+    InputError : no such scenario, or a choice that it does not have
+    """
+    dive, believed = simulated(scenario, seed, config, choices)
+    return SimulatedDive(scenario, seed, choices, dive, believed)

@@ -1,0 +1,182 @@
+"""The track of a dive: what ``rovgraph smooth`` does."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rovgraph.api.logs import given, prepared
+from rovgraph.config import Config
+from rovgraph.errors import InputError, collected_warnings
+from rovgraph.estimators import dive as library
+from rovgraph.estimators.alarms import Alarm, Verdict
+from rovgraph.estimators.dive import Dive, Progress, no_progress
+from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
+from rovgraph.log import Log
+
+ENGINES = ("batch", "isam2")
+ESTIMATES = ("smoothed", "filtered", "both")
+
+
+@dataclass(frozen=True)
+class Result:
+    """The estimates of a dive, and what is to be thought of them.
+
+    Attributes
+    ----------
+    dive : estimates, assumptions, alarms and verdict
+    log : as it was estimated, with clocks that go on
+    warnings : what was said of the log while it was read and checked, a line each; also issued as `DataWarning`
+    seconds : stage of the work -> wall time [s]; the command adds that of reading
+    """
+
+    dive: Dive
+    log: Log
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+
+    @property
+    def smoothed(self) -> Estimate:
+        """From the whole dive, the best for every moment.
+
+        Raises
+        ------
+        InputError : it was not asked for
+        """
+        return self._estimate("smoothed")
+
+    @property
+    def filtered(self) -> Estimate:
+        """What could have been known at each moment.
+
+        Raises
+        ------
+        InputError : it was not asked for
+        """
+        return self._estimate("filtered")
+
+    @property
+    def dead_reckoning(self) -> Estimate:
+        """What the estimates are to be better than."""
+        return self._estimate("dead_reckoning")
+
+    @property
+    def main(self) -> Estimate:
+        """The smoothed estimate, or the filtered one where that alone was asked for."""
+        return self.dive.estimates[0]
+
+    @property
+    def calibration(self) -> Mapping[str, CalibrationEstimate]:
+        """Label of each scalar component -> what the main estimate says of it: value, sd, prior, verdict; SI."""
+        return {entry.label: entry for entry in self.main.calibration}
+
+    @property
+    def verdict(self) -> Verdict:
+        """trusted, doubtful or wrong."""
+        return self.dive.verdict
+
+    @property
+    def alarms(self) -> Sequence[Alarm]:
+        """What the estimates say against themselves, the worst first; ``.text`` has cause and remedy."""
+        return self.dive.alarms
+
+    @property
+    def assumptions(self) -> Sequence[str]:
+        """What neither log nor configuration told, a line each."""
+        return self.dive.assumptions
+
+    @property
+    def config(self) -> Config:
+        """The effective configuration."""
+        return self.dive.beginning.config
+
+    def save(self, path: Path | str, force: bool = False, figures: bool = True) -> dict[str, Any]:
+        """Write the results folder of ``rovgraph smooth`` (docs/results.md), all of it or nothing.
+
+        Parameters
+        ----------
+        path : the folder to make
+        force : replace an older results folder
+        figures : draw them
+
+        Returns
+        -------
+        dict : what ``summary.json`` holds
+
+        Raises
+        ------
+        InputError : the folder exists, or cannot be written
+        """
+        from rovgraph.report.folder import results_folder
+        from rovgraph.report.results import write_results
+
+        began = time.perf_counter()
+        with results_folder(Path(path), force) as folder:
+            if figures:
+                from rovgraph.report.figures import draw_figures  # loads matplotlib
+
+                draw_figures(folder, self.dive.estimates, self.log, self.config)
+            seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
+            return write_results(
+                folder, self.dive.estimates, self.log, self.config, [*self.assumptions], seconds, self.alarms
+            )
+
+    def _estimate(self, kind: str) -> Estimate:
+        found = next((estimate for estimate in self.dive.estimates if estimate.kind == kind), None)
+        if found is None:
+            made = ", ".join(estimate.kind for estimate in self.dive.estimates)
+            raise InputError(f"{self.log.source}: the {kind} estimate was not asked for; there are {made}")
+        return found
+
+
+def smooth(
+    log: Log,
+    config: Config | None = None,
+    estimate: str = "both",
+    engine: str | None = None,
+    progress: Progress = no_progress,
+) -> Result:
+    """Estimate the track of a dive and everything that was calibrated on the way, as ``rovgraph smooth`` does.
+
+    Parameters
+    ----------
+    log : as read with the configuration
+    config : what is believed of vehicle and sensors; None = all defaults
+    estimate : "smoothed", "filtered" or "both"
+    engine : "batch", or "isam2" for both from one pass; None = the configuration's ``graph.solver``
+    progress : called now and then with what is being done, and how far it is from 0 to 1
+
+    Raises
+    ------
+    InputError : a log that cannot be worked with, that was read with other columns, or that does not determine
+        some variable
+
+    Warns
+    -----
+    DataWarning : whatever looks wrong
+    """
+    if estimate not in ESTIMATES:
+        raise InputError(f"estimate {estimate!r}: expected {', '.join(ESTIMATES)}")
+    config = with_engine(given(log, config), engine)
+    began = time.perf_counter()
+    with collected_warnings() as texts:
+        log = prepared(log, config)
+        checked = time.perf_counter()
+        dive = library.smooth(log, config, estimate, progress)
+    seconds = {"checking": checked - began, "estimating": time.perf_counter() - checked}
+    return Result(dive, log, (*log.warnings, *texts), seconds)
+
+
+def with_engine(config: Config, engine: str | None) -> Config:
+    """A configuration that is solved by an engine; None = its own.
+
+    Raises
+    ------
+    InputError : no such engine
+    """
+    if engine is None:
+        return config
+    if engine not in ENGINES:
+        raise InputError(f"engine {engine!r}: expected {', '.join(ENGINES)}")
+    return config.model_copy(update={"graph": config.graph.model_copy(update={"solver": engine})})

@@ -1,0 +1,161 @@
+"""What a dive has recorded, from a file, a data frame or arrays."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError, collected_warnings
+from rovgraph.log.reading import read_streams
+from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
+from rovgraph.log.table import Table, read_table, table_of_arrays, table_of_frame
+
+
+@dataclass(frozen=True)
+class Log:
+    """A dive as recorded.
+
+    Attributes
+    ----------
+    source : file name, for messages
+    streams : sensor -> Stream, only those that the log has
+    origin : latitude and longitude [deg] of north = east = 0, or None
+    config : whose columns, units, delays and magnetometer's calibration it was read with; None where the
+        streams were made otherwise
+    warnings : what was left out or put in order when it was read
+    """
+
+    source: str
+    streams: Mapping[str, Stream]
+    origin: tuple[float, float] | None = None
+    config: Config | None = None
+    warnings: tuple[str, ...] = ()
+
+    @staticmethod
+    def from_frame(frame: pd.DataFrame, config: Config | None = None, source: str = "log") -> "Log":
+        """A log that is in memory already, as `read_log` would read it from a file.
+
+        Parameters
+        ----------
+        frame : columns of a log (docs/log-format.md), one row per event; the index is ignored
+        config : for the frame's columns, units, delays and magnetometer's calibration
+        source : name for messages
+
+        Raises
+        ------
+        InputError : a frame that cannot be worked with; lines are counted as in a file, the first row is line 2
+
+        Warns
+        -----
+        DataWarning : what was left out or put in order
+        """
+        return _log(table_of_frame(frame, source), config)
+
+    @staticmethod
+    def from_arrays(*tables: Mapping[str, ArrayLike], config: Config | None = None, source: str = "log") -> "Log":
+        """A log of arrays.
+
+        Parameters
+        ----------
+        tables : column -> array_like, shape (n,), ``time`` among them; as many as there are clocks or rates
+        config, source : of `from_frame`
+
+        Raises
+        ------
+        InputError : arrays of different length, or as `from_frame`
+        """
+        time = "time" if config is None else config.columns.get("time", "time")
+        return _log(table_of_arrays(tables, time, source), config)
+
+    def __contains__(self, sensor: str) -> bool:
+        return sensor in self.streams
+
+    def __getitem__(self, sensor: str) -> Stream:
+        return self.streams[sensor]
+
+    @property
+    def sensors(self) -> set[str]:
+        return set(self.streams)
+
+    def require_read_with(self, config: Config) -> None:
+        """See that it was read with a configuration's columns, units, delays and magnetometer's calibration.
+
+        Raises
+        ------
+        InputError : it was read with others
+        """
+        if self.config is None:
+            return
+        for key in ("columns", "units", "delay_s", "imu.mag", "environment.origin"):
+            if _entry(self.config, key) != _entry(config, key):
+                raise InputError(
+                    f"{self.source}: was read with another {key} than that of the configuration; "
+                    "read it with this configuration"
+                )
+
+    def measurements(self) -> Iterator[Measurement]:
+        """All measurements in the order of time; at equal times the IMU comes first, then the DVL.
+
+        So a ping makes its keyframe before what was measured together with it is attached.
+        """
+        streams = in_precedence(self.streams.values())
+        if not streams:
+            return
+        which, index, time = arrivals(streams)
+        names, data, rows = [s.sensor for s in streams], [s.data for s in streams], [s.row.tolist() for s in streams]
+        for t, k, i in zip(time.tolist(), which.tolist(), index.tolist(), strict=True):
+            yield Measurement(t, names[k], data[k][i], rows[k][i])
+
+
+def read_log(path: Path | str, config: Config | None = None) -> Log:
+    """Read a log.
+
+    Parameters
+    ----------
+    path : CSV, gzipped CSV or Parquet
+    config : for the log's columns, units and delays, and the magnetometer's calibration: times are those of the
+        measurements, and everything that takes the log sees the field
+
+    Raises
+    ------
+    InputError : a file that cannot be worked with
+
+    Warns
+    -----
+    DataWarning : what was left out or put in order
+    """
+    with collected_warnings() as texts:
+        table = read_table(path)
+    return _log(table, config, texts)
+
+
+def _log(table: Table, config: Config | None, before: Iterable[str] = ()) -> Log:
+    """A log of a table, with what was warned of ``before`` and while its streams were made."""
+    config = Config() if config is None else config
+    with collected_warnings() as texts:
+        streams, origin = read_streams(table, config)
+    return Log(table.source, streams, origin, config, (*before, *texts))
+
+
+def _entry(config: Config, key: str) -> object:
+    entry: object = config
+    for name in key.split("."):
+        entry = getattr(entry, name)
+    return entry
+
+
+def gathered(measurements: Iterable[Measurement], source: str, origin: tuple[float, float] | None = None) -> Log:
+    """A log of measurements in the order of time: the inverse of `Log.measurements`."""
+    rows: dict[str, list[Measurement]] = {}
+    for m in measurements:
+        rows.setdefault(m.sensor, []).append(m)
+    streams = {}
+    for sensor, own in rows.items():
+        columns = STREAMS.get(sensor) or tuple(f"thruster_{k + 1}" for k in range(len(own[0][2])))
+        time, line = np.array([m.time for m in own]), np.array([m.row for m in own], dtype=np.int64)
+        streams[sensor] = Stream(sensor, columns, time, np.array([values for _, _, values, _ in own]), line)
+    return Log(source, streams, origin)

@@ -1,0 +1,391 @@
+"""The Python entrance: it does what the commands do, to the byte, and refuses what they refuse."""
+
+import ast
+import doctest
+import json
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import rovgraph as rg
+from rovgraph.cli.app import main
+
+SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
+IMU = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Run the console script, give its exit code."""
+    monkeypatch.setattr(sys, "argv", ["rovgraph", *map(str, arguments)])
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # the command sets its own
+    with warnings.catch_warnings():
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+    return 0
+
+
+def without_times(summary: Path) -> dict[str, object]:
+    content = json.loads(summary.read_text(encoding="utf-8"))
+    del content["seconds"]
+    return content
+
+
+def same_files(one: Path, other: Path) -> None:
+    """Two folders hold the same bytes, but for the times that the work took."""
+    names = sorted(path.name for path in one.iterdir())
+    assert names == sorted(path.name for path in other.iterdir()) and names
+    for name in names:
+        if name == "summary.json" and "seconds" in json.loads((one / name).read_text(encoding="utf-8")):
+            assert without_times(one / name) == without_times(other / name)
+        else:
+            assert (one / name).read_bytes() == (other / name).read_bytes(), name
+
+
+@pytest.fixture(scope="module")
+def short() -> pd.DataFrame:
+    """The first 60 s of the dive that ships."""
+    frame = pd.read_csv(SHIPPED / "log.csv.gz")
+    return frame[frame["time"] <= frame["time"].iloc[0] + 60.0]
+
+
+@pytest.fixture(scope="module")
+def config() -> rg.Config:
+    return rg.load_config(SHIPPED / "config.yaml")
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory, short: pd.DataFrame) -> Path:
+    """A log with a DVL that hangs for ten seconds, a doubled row and a cell that is infinite."""
+    frame = short.copy()
+    begin = frame["time"].iloc[0]
+    hung = frame["time"].between(begin + 30.0, begin + 40.0) & frame["dvl_vx"].notna()
+    frame.loc[hung, ["dvl_vx", "dvl_vy", "dvl_vz"]] = frame.loc[hung, ["dvl_vx", "dvl_vy", "dvl_vz"]].iloc[0].to_numpy()
+    frame.loc[frame.index[1000], "gyr_x"] = np.inf
+    path = tmp_path_factory.mktemp("faulty") / "log.csv"
+    pd.concat([frame, frame.iloc[[-1]]]).to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(faulty: Path, config: rg.Config) -> rg.Result:
+    with pytest.warns(rg.DataWarning):
+        return rg.smooth(rg.read_log(faulty, config), config)
+
+
+# the promise
+
+
+def test_every_promised_name_is_there_and_the_type_checker_knows_the_same():
+    tree = ast.parse(Path(rg.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    typed = {
+        alias.name: statement.module
+        for statement in block.body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+    }
+    assert typed == {name: f"rovgraph.{home}" for name, home in rg._HOMES.items()}
+    assert all(callable(getattr(rg, name)) for name in rg.__all__)
+    assert set(rg.__all__) <= set(dir(rg))
+    with pytest.raises(AttributeError, match="smoth"):
+        _ = rg.smoth
+
+
+def test_a_function_is_not_hidden_by_the_module_of_its_name_whichever_is_imported_first():
+    code = """
+import rovgraph.check, rovgraph.evaluate, rovgraph.simulate
+import rovgraph as rg
+from rovgraph.check import examine
+from rovgraph import check
+assert check is rg.check and examine is not check
+assert all(type(f).__name__ == "function" for f in (rg.check, rg.evaluate, rg.simulate))
+import rovgraph.check
+assert type(rg.check).__name__ == "function"
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (Path(rg.__file__).parent / "py.typed").is_file()
+
+
+def test_the_example_of_the_manual_runs(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    failed, tried = doctest.testfile(str(Path(__file__).parents[1] / "docs" / "api.md"), module_relative=False)
+    assert tried > 10 and failed == 0
+
+
+# twins
+
+
+def test_smooth_writes_what_the_command_writes(monkeypatch, capsys, tmp_path, faulty, result):
+    assert command(monkeypatch, "smooth", faulty, "-c", SHIPPED / "config.yaml", "-o", tmp_path / "command") == 0
+    said = capsys.readouterr()
+    summary = result.save(tmp_path / "twin")
+    same_files(tmp_path / "command", tmp_path / "twin")
+    assert summary["verdict"] == result.verdict
+    assert said.out.startswith(f"verdict: {result.verdict}\n")
+    assert list(result.warnings) == [
+        line.removeprefix("warning: ") for line in said.err.splitlines() if line.startswith("warning: ")
+    ]
+    assert len(result.warnings) >= 2
+
+
+@pytest.mark.parametrize("engine", ["batch", "isam2"])
+def test_one_estimate_of_an_engine_is_that_of_the_command(monkeypatch, tmp_path, short, engine):
+    log = tmp_path / "log.csv"
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
+    options = ["--engine", engine, "--estimate", "smoothed", "--no-figures"]
+    assert command(monkeypatch, "smooth", log, *options, "-o", tmp_path / "command") == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rg.DataWarning)
+        twin = rg.smooth(rg.read_log(log), estimate="smoothed", engine=engine)
+    twin.save(tmp_path / "twin", figures=False)
+    same_files(tmp_path / "command", tmp_path / "twin")
+    with pytest.raises(rg.InputError, match="filtered estimate was not asked for"):
+        _ = twin.filtered
+
+
+def test_check_finds_what_the_command_finds(monkeypatch, capsys, faulty, config):
+    assert command(monkeypatch, "check", faulty, "-c", SHIPPED / "config.yaml", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    with pytest.warns(rg.DataWarning):
+        report = rg.check(rg.read_log(faulty, config), config)
+    assert json.loads(json.dumps(report.as_dict())) == said
+    assert report.at("warning")
+
+
+def test_evaluate_measures_what_the_command_measures(monkeypatch, capsys, tmp_path, result):
+    result.save(tmp_path / "dive", figures=False)
+    track = tmp_path / "dive" / "trajectory_smoothed.csv"
+    reference = SHIPPED / "truth.csv.gz"
+    assert command(monkeypatch, "evaluate", track, reference, "--from", 10, "--align", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    twin = rg.evaluate(rg.read_trajectory(track), rg.read_reference(reference), 10.0, True)
+    assert json.loads(json.dumps(twin.as_dict())) == said
+    assert rg.evaluate(result.smoothed.trajectory, rg.read_reference(reference)).rms_m < 0.5
+
+
+def test_simulate_writes_what_the_command_writes(monkeypatch, tmp_path):
+    arguments = ["--seed", 3, "--duration", 60, "--dropout", "20:30", "--place", "10:-5", "--out", tmp_path / "command"]
+    assert command(monkeypatch, "simulate", "lawnmower", *arguments) == 0
+    choices = rg.Choices(duration=60.0, dropouts=((20.0, 30.0),), places=((10.0, -5.0),))
+    dive = rg.simulate("lawnmower", seed=3, choices=choices)
+    dive.save(tmp_path / "twin")
+    same_files(tmp_path / "command", tmp_path / "twin")
+    assert len(dive.log["dvl"]) == len(rg.read_log(tmp_path / "twin" / "log.csv", dive.config)["dvl"])
+
+
+def test_observe_writes_what_the_command_writes(monkeypatch, tmp_path, short, config):
+    log = tmp_path / "log.csv"
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
+    options = ["-c", SHIPPED / "config.yaml", "--estimate", "dvl_scale", "-o", tmp_path / "command"]
+    assert command(monkeypatch, "observe", log, *options) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rg.DataWarning)
+        seen = rg.observe(rg.read_log(log, config), config, ["dvl_scale"])
+    seen.save(tmp_path / "twin")
+    same_files(tmp_path / "command", tmp_path / "twin")
+    assert "dvl_scale" in seen.verdicts
+
+
+def test_online_gives_the_solutions_of_the_command(monkeypatch, capfd, tmp_path, short, config):
+    """A late DVL and a magnetometer with hard iron: what a log is corrected by is neither lost nor done twice."""
+    corrected = config.model_copy(
+        update={
+            "delay_s": {"dvl": 0.25},
+            "imu": config.imu.model_copy(update={"mag": config.imu.mag.model_copy(update={"centre": (0.1, 0.0, 0.0)})}),
+        }
+    )
+    log, settings = tmp_path / "log.csv", tmp_path / "settings.yaml"
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
+    settings.write_text(corrected.to_yaml(), encoding="utf-8")
+    assert command(monkeypatch, "online", f"file:{log}", "-c", settings, "--speed", "max", "--output", "-") == 0
+    said = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    solutions = list(rg.Online(corrected).replay(rg.read_log(log, corrected)))
+    assert [s.time for s in solutions] == pytest.approx([row["time"] for row in said], abs=1e-5)
+    assert len(said) > 10
+    track = np.array([[row["north"], row["east"], row["down"], row["north_sd"]] for row in said])
+    assert np.array([[*s.position, s.position_sd[0]] for s in solutions]) == pytest.approx(track, rel=1e-5, abs=1e-6)
+
+
+# results
+
+
+def test_a_result_has_track_calibration_and_covariance(result):
+    track = result.smoothed.trajectory
+    n = len(track)
+    assert track.position.shape == track.velocity.shape == track.rpy.shape == (n, 3)
+    assert track.covariance.shape == (n, 3, 3)
+    assert list(track.to_frame().columns[:4]) == ["time", "north", "east", "down"]
+    assert track.to_frame()["north"].to_numpy() == pytest.approx(track.position[:, 0])
+    yaw = result.calibration["dvl_yaw"]
+    assert 0.0 < yaw.sd < yaw.prior_sd and yaw.verdict
+    assert abs(yaw.value - yaw.prior_mean) < 5 * yaw.prior_sd
+    assert result.config.name and result.dead_reckoning.kind == "dead_reckoning"
+
+
+def test_progress_is_told(short, config):
+    told: list[tuple[str, float]] = []
+    log = rg.Log.from_frame(short[short["time"] < short["time"].iloc[0] + 20.0], config)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rg.DataWarning)
+        rg.smooth(log, config, progress=lambda what, done: told.append((what, done)))
+    assert {"filtering", "smoothing"} <= {what for what, _ in told}
+    assert all(0.0 <= done <= 1.0 for _, done in told)
+
+
+def test_a_saved_folder_is_kept_unless_forced(tmp_path, result):
+    result.save(tmp_path / "dive", figures=False)
+    with pytest.raises(rg.InputError, match="exists"):
+        result.save(tmp_path / "dive", figures=False)
+    result.save(tmp_path / "dive", force=True, figures=False)
+
+
+def test_a_warning_points_to_the_line_that_asked(faulty, config):
+    with pytest.warns(rg.DataWarning) as caught:
+        log = rg.read_log(faulty, config)
+    assert {warning.filename for warning in caught} == {__file__}
+    assert [str(warning.message) for warning in caught] == list(log.warnings)
+
+
+def test_a_configuration_beside_the_log_that_is_not_given_is_pointed_out(tmp_path, short):
+    shutil.copy(SHIPPED / "config.yaml", tmp_path / "config.yaml")
+    short.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.warns(rg.DataWarning, match="lies beside the log and is not used"):
+        rg.read_log(tmp_path / "log.csv")
+
+
+# logs in memory
+
+
+def test_a_frame_gives_the_log_that_its_file_gives(tmp_path, short, config):
+    short.to_csv(tmp_path / "log.csv", index=False)
+    file = rg.read_log(tmp_path / "log.csv", config)
+    memory = rg.Log.from_frame(pd.read_csv(tmp_path / "log.csv"), config)
+    assert file.sensors == memory.sensors
+    for sensor in file.sensors:
+        np.testing.assert_array_equal(file[sensor].time, memory[sensor].time)
+        np.testing.assert_array_equal(file[sensor].data, memory[sensor].data)
+        np.testing.assert_array_equal(file[sensor].row, memory[sensor].row)
+
+
+def test_arrays_of_several_rates_become_one_log(short, config):
+    tables = []
+    for columns in (IMU, ("dvl_vx", "dvl_vy", "dvl_vz"), ("mag_x", "mag_y", "mag_z")):
+        rows = short.dropna(subset=list(columns))
+        tables.append({name: rows[name].to_numpy() for name in ("time", *columns)})
+    log, whole = rg.Log.from_arrays(*tables, config=config), rg.Log.from_frame(short, config)
+    for sensor in ("imu", "mag"):
+        np.testing.assert_array_equal(log[sensor].time, whole[sensor].time)
+        np.testing.assert_array_equal(log[sensor].data, whole[sensor].data)
+
+
+def test_arrays_are_mapped_by_the_configurations_columns_and_units():
+    config = rg.parse_config("columns: {time: t, depth: d}\nunits: {time: ms, depth: cm}")
+    log = rg.Log.from_arrays({"t": [0, 2000], "d": [100.0, 300.0]}, {"t": [1000], "d": [200.0]}, config=config)
+    assert log["depth"].time.tolist() == [0.0, 1.0, 2.0]
+    assert log["depth"].data[:, 0].tolist() == [1.0, 2.0, 3.0]
+
+
+T = np.arange(3.0)
+BAD_FRAMES = {
+    "no time": (pd.DataFrame({"depth": T}), "no column time"),
+    "a time in the index": (pd.DataFrame({"depth": T}, index=pd.Index(T, name="time")), "no column time"),
+    "text": (pd.DataFrame({"time": T, "depth": ["1", "deep", "2"]}), "line 3, column depth: 'deep' is no number"),
+    "lists": (pd.DataFrame({"time": T, "depth": [[1], [2], [3]]}), r"column depth: '\[1\]' is no number"),
+    "mixed objects": (pd.DataFrame({"time": T, "depth": [1.0, {}, None]}), "column depth: '{}' is no number"),
+    "dates": (pd.DataFrame({"time": pd.date_range("2024-01-01", periods=3), "depth": T}), "time holds dates"),
+    "time zones": (
+        pd.DataFrame({"time": pd.date_range("2024-01-01", periods=3, tz="Europe/Oslo"), "depth": T}),
+        "column time holds dates, expected numbers; write it in seconds",
+    ),
+    "dates as objects": (
+        pd.DataFrame({"time": pd.Series([*pd.date_range("2024-01-01", periods=3)], dtype=object), "depth": T}),
+        "time holds dates",
+    ),
+    "durations": (pd.DataFrame({"time": pd.to_timedelta(T, unit="s"), "depth": T}), "time holds durations"),
+    "a mix with complex numbers": (
+        pd.DataFrame({"time": T, "depth": pd.Series([1j, 2.0, None], dtype=object)}),
+        "column depth: '1j' is no number",
+    ),
+    "complex numbers": (pd.DataFrame({"time": T, "depth": T + 1j}), "depth holds complex numbers"),
+    "a name twice": (pd.DataFrame(np.ones((3, 3)), columns=["time", "depth", "depth"]), "column 'depth' twice"),
+    "no rows": (pd.DataFrame({"time": [], "depth": []}), "no rows"),
+    "no sensor": (pd.DataFrame({"time": T, "temperature": T}), "no measurement of any sensor"),
+    "numbered columns": (pd.DataFrame(np.ones((3, 2))), "no column time"),
+    "no frame": ([1.0, 2.0], "is a list, expected a pandas DataFrame"),
+}
+
+
+@pytest.mark.parametrize(("frame", "said"), BAD_FRAMES.values(), ids=BAD_FRAMES)
+def test_a_frame_that_is_no_log_is_refused_in_one_line(frame, said):
+    with pytest.raises(rg.InputError, match=said) as caught:
+        rg.Log.from_frame(frame)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("case", ["no time", "text", "a name twice", "no rows", "no sensor"])
+def test_a_frame_is_refused_with_the_words_that_the_command_has_for_its_file(monkeypatch, capsys, tmp_path, case):
+    frame, path = BAD_FRAMES[case][0], tmp_path / "log.csv"
+    frame.to_csv(path, index=False)
+    assert command(monkeypatch, "smooth", path, "-o", tmp_path / "out") == 2
+    said = capsys.readouterr().err.strip()
+    with pytest.raises(rg.InputError) as caught:
+        rg.Log.from_frame(frame, source=str(path))
+    assert said == f"error: {caught.value}"
+
+
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        ([{"time": T, "depth": T[:2]}], r"columns of different length \(time 3, depth 2\)"),
+        ([{"time": T, "depth": np.ones((3, 1))}], r"column depth has shape \(3, 1\)"),
+        ([{"time": T, "depth": 1.0}], r"column depth has shape \(\)"),
+        ([{"time": T, "depth": T}, {"dvl_vx": T}], "rows without time"),
+        ([], "no rows"),
+    ],
+)
+def test_arrays_that_are_no_log_are_refused_or_warned_of(tables, said):
+    with pytest.raises((rg.InputError, rg.DataWarning), match=said), warnings.catch_warnings():
+        warnings.simplefilter("error", rg.DataWarning)
+        rg.Log.from_arrays(*tables)
+
+
+@pytest.mark.parametrize(
+    "text", ["units: {gyr: deg/s}", "columns: {depth: acc_x}", "delay_s: {dvl: 1}", "imu: {mag: {centre: [1, 0, 0]}}"]
+)
+def test_a_log_is_not_used_with_a_configuration_that_reads_it_otherwise(short, text):
+    log, other = rg.Log.from_frame(short), rg.parse_config(text)
+    for use in (rg.smooth, rg.check, rg.observe, lambda log, config: next(rg.Online(config).replay(log))):
+        with pytest.raises(rg.InputError, match=r"was read with another .*; read it with this configuration"):
+            use(log, other)
+
+
+def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
+    log = rg.Log.from_frame(short)
+    with pytest.raises(rg.InputError, match="expected a Log"):
+        rg.smooth("log.csv")
+    with pytest.raises(rg.InputError, match="expected a Config"):
+        rg.smooth(log, "vehicle.yaml")
+    with pytest.raises(rg.InputError, match="estimate 'best': expected smoothed"):
+        rg.smooth(log, estimate="best")
+    with pytest.raises(rg.InputError, match="engine 'fast': expected batch"):
+        rg.smooth(log, engine="fast")
+    with pytest.raises(rg.InputError, match="engine 'batch': expected fixed-lag"):
+        rg.Online(engine="batch")
+    with pytest.raises(rg.InputError, match="seed -1"):
+        rg.simulate("circle", seed=-1)
+    with pytest.raises(rg.InputError, match="at most 21600"):
+        rg.Choices(duration=1e5)
+    with pytest.raises(rg.InputError, match="compare wants either a log"):
+        rg.compare()
