@@ -1,4 +1,4 @@
-"""What is considered, online: it stays in the uncertainty when a sensor joins, and when the filter goes on from iSAM2."""
+"""What is considered, online: it stays in the sd when a sensor joins, and when the filter goes on from iSAM2."""
 
 from collections.abc import Callable
 
