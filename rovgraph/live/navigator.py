@@ -312,6 +312,7 @@ class Navigator:
 
     def _go_on_with(self, engine: FixedLag) -> FixedLag:
         self.engine = engine
+        self._incoherence.forget()
         if self._reinitialisations is not None:
             self._reinitialisations.again()
         return engine
