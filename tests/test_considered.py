@@ -165,10 +165,17 @@ def test_errors_are_as_large_as_stated_where_instruments_are_not_exact_and_large
     assert (boastful[:, 0] > high).all()
 
 
-@pytest.mark.parametrize("name", ["dvl_time_offset", "current"])
+@pytest.mark.parametrize("name", ["dvl_time_offset", "current", "fix_error"])
 def test_what_moves_stamps_or_walks_cannot_be_considered(name):
     with pytest.raises(InputError, match=rf"calibration\.{name}\.estimate"):
         parse_config(f"calibration: {{{name}: {{estimate: considered}}}}")
+
+
+@pytest.mark.parametrize("changes", ["walk_deg: 0.1", "time_constant_s: 20"])
+def test_a_walk_of_what_is_considered_is_refused_and_not_passed_over(changes):
+    with pytest.raises(InputError, match=rf"calibration\.dvl_yaw.*{changes.split(':')[0]}"):
+        parse_config(f"calibration: {{dvl_yaw: {{{changes}}}}}")
+    assert parse_config(f"calibration: {{dvl_yaw: {{estimate: true, {changes}}}}}")
 
 
 def test_a_word_that_is_none_is_refused():

@@ -1,11 +1,13 @@
 """Noise that the configuration does not state: it is found, said and applied, and healthy dives have none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from dives import altered, changed, falcon, simulated, true_at
+from dives import altered, batch, changed, falcon, simulated, true_at
 
-from rovgraph.calibration import TABLE
-from rovgraph.engine.lasting import LASTING
+from rovgraph.calibration import TABLE, stationary_walk
+from rovgraph.engine.lasting import LASTING, find_lasting
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.unstated_noise import noise_factor
 from rovgraph.simulate.files import known
@@ -81,6 +83,18 @@ def test_a_healthy_dive_is_solved_as_before():
     dive, plain = (smooth(case.log, c, "smoothed") for c in (config, changed(config, graph={"find_noise": False})))
     assert "noise_found" not in dive.estimates[0].summary
     np.testing.assert_array_equal(dive.estimates[0].trajectory.p_n, plain.estimates[0].trajectory.p_n)
+
+
+def test_an_error_of_next_to_nothing_explains_nothing_where_the_dive_has_shown_what_was_considered():
+    """A considered constant that is estimated stays so in the dive with the error, and is no part of its gain."""
+    considered = {name: {"estimate": "considered"} for name, v in TABLE.items() if v.considered}
+    case = simulated(falcon(calibration=considered), 60.0, seed=1, **SHORT)
+    best = batch(case.log, case.config).optimum()
+    assert {*best.unknowns.estimated} & {*considered}
+    known = best.beliefs["dvl_error"]
+    with_error = best.unknowns.with_lasting(replace(known, estimate=True, walk=stationary_walk(1e-5, 30.0)))
+    assert {*best.unknowns.estimated} < {*with_error.estimated} and with_error.considered == best.unknowns.considered
+    assert find_lasting(best) == []
 
 
 def test_noise_three_times_what_is_stated_is_found_and_believed():

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, create_model
+from pydantic import BaseModel, BeforeValidator, Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Variable
@@ -14,8 +14,9 @@ from rovgraph.config.sections import NotNegative, Positive, Section
 
 
 def considerable(variable: Variable) -> bool:
-    """Whether it can be considered: what walks, or moves stamps, is estimated or exact."""
-    return variable.walk == 0.0 and not variable.name.endswith("_time_offset")
+    """Whether it can be considered: what walks, lasts for a while, or moves stamps, is estimated or exact."""
+    constant = variable.walk == 0.0 and not np.isfinite(variable.time_constant)
+    return constant and not variable.name.endswith("_time_offset")
 
 
 def _components(dim: int) -> Callable[[Any], Any]:
@@ -36,6 +37,15 @@ def _estimate(value: Any) -> Any:
     if not isinstance(value, bool) and value != CONSIDERED:
         raise PydanticCustomError("estimate", "expected true, false or considered")
     return value
+
+
+def _constant(entry: Any) -> Any:
+    """Refuses what is considered and changes."""
+    if entry.estimate == CONSIDERED:
+        for key, value in ((key, getattr(entry, key)) for key in type(entry).model_fields):
+            if key.startswith(("walk", "time_constant")) and value:
+                raise PydanticCustomError("constant", f"expected estimate: true or false beside {key}")
+    return entry
 
 
 def _is_number(value: Any) -> bool:
@@ -74,8 +84,14 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
             ),
         ),
     }
+    checks: dict[str, Any] = {"constant": model_validator(mode="after")(_constant)}
     entry = create_model(
-        f"Calibration_{variable.name}", __base__=Section, __module__=__name__, __doc__=variable.about, **fields
+        f"Calibration_{variable.name}",
+        __base__=Section,
+        __module__=__name__,
+        __doc__=variable.about,
+        __validators__=checks,
+        **fields,
     )
     globals()[entry.__name__] = entry  # where pickle looks for it
     return entry

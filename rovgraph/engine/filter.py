@@ -34,6 +34,9 @@ from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.engine.remembered_places import (
     RememberedPlace,
+    columns,
+    common,
+    extended,
     moved,
     nearest,
     seen_at,
@@ -110,6 +113,7 @@ class FilterEngine:
         before : the keyframe before, or at the first `start`
         gates : renewed in place
         """
+        assert len(before.L) == self.layout.width - self.layout.size  # kernels do not check where they write
         processed: list[ProcessedMeasurement] = []
         departed = transition = None
         predicted = before
@@ -217,6 +221,14 @@ class FilterEngine:
         delta, basis = np.empty(size), np.eye(size)
         difference(some.x, some.c, other.x, other.c, *self.layout.coordinates, delta, basis)
         return delta, basis
+
+    def considering(self, known: Gaussian, other: Gaussian) -> Gaussian:
+        """An estimate in which all is exact that is considered, with the part that this has in another close by."""
+        size, (_, basis) = self.layout.size, self.local(known, other)
+        ours, theirs, _ = common(known.places, other.places)
+        B = np.zeros((len(known.P), len(other.L)))
+        B[columns(size, ours)] = extended(basis, size + PLACE_DIM * len(ours)) @ other.B[columns(size, theirs)]
+        return replace(known, B=B, L=other.L)
 
     def _align(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
         """The keyframe before an interval; where its attitude is poorly known, with the one it is corrected to."""

@@ -25,7 +25,6 @@ from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import Gates, Solution, minimise
 from rovgraph.engine.measurements import Block
-from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.state import State
 
@@ -192,8 +191,7 @@ def _with(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
     """The chain with an error that lasts among its unknowns; one of infinite time constant is constant."""
     walk = stationary_walk(sd, time_constant)
     believed = replace(chain.beliefs[name], estimate=True, sd=sd, walk=walk, time_constant=time_constant)
-    beliefs = {**chain.beliefs, name: believed}
-    return replace(chain, beliefs=beliefs, unknowns=unknowns(beliefs, chain.rows.used))
+    return replace(chain, beliefs={**chain.beliefs, name: believed}, unknowns=chain.unknowns.with_lasting(believed))
 
 
 def _linear(chain: Chain, point: State, gates: Gates) -> float:

@@ -54,6 +54,14 @@ class Unknowns:
         kept = self.of(name for name in self.estimated if name not in more)
         return replace(kept, considered=(*self.considered, *more))
 
+    def with_lasting(self, belief: Belief) -> "Unknowns":
+        """An error that lasts estimated, too, behind the others."""
+        name, lasting = belief.variable.name, {n: s for n, s in self.time_constants.items() if n in self.walks}
+        if np.isfinite(belief.time_constant):
+            lasting[name] = belief.time_constant
+        left = tuple(n for n in self.considered if n != name)
+        return replace(self, walks={**self.walks, name: belief.walk}, considered=left, time_constants=lasting)
+
     def walked(self, name: str, seconds: ArrayLike) -> tuple[Array, Array]:
         """How one that walks moves in a time: `rovgraph.calibration.walked`."""
         return walked(self.walks[name], self.time_constants.get(name, np.inf), seconds)

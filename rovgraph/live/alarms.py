@@ -166,7 +166,7 @@ class LiveAlarms:
 
     def _constants(self, known: Gaussian, engine: FilterEngine, time: float) -> Iterator[Statistic]:
         """Of the calibration that is estimated, and of the gyro's bias."""
-        sd, columns = np.sqrt(np.diagonal(known.P)), engine.layout.columns
+        sd, columns = np.sqrt(np.diagonal(known.covariance)), engine.layout.columns
         for name in engine.unknowns.estimated:
             belief, variable = engine.beliefs[name], TABLE[name]
             values, own, prior_sd = known.c[LAYOUT[name]], sd[columns[name]], np.full(variable.dim, belief.sd)

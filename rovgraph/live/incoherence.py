@@ -48,6 +48,10 @@ class Incoherence:
         while self._recent[0].interval.time < mark.interval.time - WITHIN_S - REJECTED_S:
             self._recent.popleft()
 
+    def forget(self) -> None:
+        """Another filter goes on, with another state: keyframes that have passed are none of its own."""
+        self._recent.clear()
+
     def step(self, engine: FixedLag) -> Stretch | None:
         """After a keyframe: leave the DVL out where it is rejected too often, and return that time if it is new."""
         newest = engine.marks[-1]

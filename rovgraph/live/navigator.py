@@ -333,6 +333,7 @@ class Navigator:
 
     def _go_on_with(self, engine: FixedLag) -> FixedLag:
         self.engine = engine
+        self._incoherence.forget()
         if self._reinitialisations is not None:
             self._reinitialisations.again()
         return engine
@@ -341,7 +342,7 @@ class Navigator:
         """Have the filter go on from iSAM2's newest keyframe."""
         newest = self.passed[-1]
         if isam2.updated == newest.interval.index:
-            engine.adopt_passed(isam2.known, newest.gates)
+            engine.adopt_passed(engine.filter.considering(isam2.known, newest.known), newest.gates)
             self._adopted = isam2.updated
 
     def _pass(self, mark: FilterSnapshot) -> None:

@@ -295,12 +295,16 @@ class FixedLag:
 
 def _taken_over(old: FilterEngine, new: FilterEngine, known: Gaussian) -> Gaussian:
     """An estimate as a filter with more calibration has it: of what the other did not know, the prior."""
+    start, size = new.start(), (old.layout.size, new.layout.size)
     names = old.layout.columns
     at_old, at_new = (np.concatenate([np.r_[f.layout.columns[name]] for name in names]) for f in (old, new))
-    more = len(known.P) - old.layout.size  # places that are remembered
-    P = np.zeros((new.layout.size + more, new.layout.size + more))
-    P[: new.layout.size, : new.layout.size] = new.start().P
-    at_old = np.append(at_old, old.layout.size + np.arange(more))
-    at_new = np.append(at_new, new.layout.size + np.arange(more))
+    considered = at_new[at_old >= size[0]] - size[1]
+    more = np.arange(len(known.P) - size[0])  # places that are remembered
+    at_old, at_new = (np.append(at[at_old < size[0]], n + more) for at, n in ((at_old, size[0]), (at_new, size[1])))
+    P = np.zeros((size[1] + len(more), size[1] + len(more)))
+    P[: size[1], : size[1]] = start.P
     P[np.ix_(at_new, at_new)] = known.P[np.ix_(at_old, at_old)]
-    return Gaussian(known.x, known.c, P, known.places)
+    B, L = np.zeros((len(P), len(start.L))), start.L
+    B[np.ix_(at_new, considered)] = known.B[at_old]
+    L[np.ix_(considered, considered)] = known.L
+    return Gaussian(known.x, known.c, P, known.places, B, L)
