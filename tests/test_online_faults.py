@@ -100,6 +100,17 @@ def test_a_dvl_that_locks_onto_something_else_for_a_minute_is_left_out_and_the_s
     assert flight.sd_at(80.0) > 10.0 * flight.sd_at(29.0)
 
 
+def test_a_dvl_that_is_left_out_as_incoherent_stays_so_after_a_crash(case):
+    flight = flown(case, lambda m: [m] if m.time < 20.0 else [])
+    flight.navigator._incoherence.restore([18.0, 40.0, 40.0])
+    after = navigator(case)
+    after.restore(flight.navigator.state())
+    for m in case.log.measurements():
+        if 20.0 < m.time < 30.0:
+            after.take(message(m))
+    assert after.left_out["dvl", "incoherent"] > 30
+
+
 def test_a_magnetometer_alone_contradicts_a_heading_that_is_stated_wrongly_and_is_believed_after_a_minute():
     case = simulated(falcon(heading={"sources": ["mag"]}), 80.0, 1, imu_rate=50.0, dvl_rate=4.0)
     heading = float(np.rad2deg(case.truth.rpy[0, 2]))

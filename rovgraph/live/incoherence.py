@@ -9,6 +9,7 @@ and alarms say so.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from rovgraph.engine.gauss_newton import Stretch
@@ -51,6 +52,15 @@ class Incoherence:
     def forget(self) -> None:
         """Another filter goes on, with another state: keyframes that have passed are none of its own."""
         self._recent.clear()
+
+    def state(self) -> list[float]:
+        """From when to when it is left out, and the rejections before [s], as plain values."""
+        return [self._begin, self._end, *self._rejections]
+
+    def restore(self, state: Sequence[float]) -> None:
+        """Go on from where another stood."""
+        self._begin, self._end = state[:2]
+        self._rejections.extend(state[2:])
 
     def step(self, engine: FixedLag) -> Stretch | None:
         """After a keyframe: leave the DVL out where it is rejected too often, and return that time if it is new."""
