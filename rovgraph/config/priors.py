@@ -40,8 +40,8 @@ def _estimate(value: Any) -> Any:
 
 
 def _constant(entry: Any) -> Any:
-    """Refuses what is considered and changes."""
-    if entry.estimate == CONSIDERED:
+    """Refuses what is said to be considered and to change; a walk of what is not estimated has no effect."""
+    if entry.estimate == CONSIDERED and "estimate" in entry.model_fields_set:
         for key, value in ((key, getattr(entry, key)) for key in type(entry).model_fields):
             if key.startswith(("walk", "time_constant")) and value:
                 raise PydanticCustomError("constant", f"expected estimate: true or false beside {key}")
