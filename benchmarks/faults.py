@@ -46,7 +46,9 @@ dives without the fault do not count.
 dives, others are issue trackers of drivers, autopilots and navigation software.
 
 Some faults leave no trace in a log: a heading that is off by a constant where there are no fixes, and a depth that is \
-off by a constant. Wider priors are the only defence against those.
+off by a constant. Wider priors are the only defence against those. An IMU that is mounted otherwise than stated is \
+another: the body's axes are those of the IMU as stated, so heading and `dvl_yaw` are off by its error, and the track \
+is not.
 
 Run the campaign whenever the estimator changes. `--cases` takes some of them, `--jobs` sets the number of \
 processes, `--json` writes all figures, `--keep` goes on with a campaign that was interrupted, \
