@@ -358,6 +358,7 @@ def test_default_configuration_needs_no_tuning_for_a_dive_it_knows_nothing_of():
     assert rms(position_errors(estimate.trajectory, case)) < 0.1 * case.truth.distance
 
 
+@pytest.mark.slow
 def test_benchmark_runs_and_both_solvers_find_the_same_cost():
     done = subprocess.run(
         [sys.executable, BENCHMARK, "--seconds", "35", "--long", "40"], capture_output=True, text=True, timeout=120

@@ -26,6 +26,7 @@ def engine(monkeypatch):
     return engine
 
 
+@pytest.mark.slow
 def test_a_row_of_this_checkout_is_measured_and_a_missing_log_is_said(tmp_path):
     found = rows("engine.py", "--quick", "--no-base", "--rows", "filter", "ictineu", "--ictineu", str(tmp_path))
     (name, base, now, *_), left_out = found

@@ -51,7 +51,8 @@ def test_a_biased_stretch_of_the_dvl_is_found_and_taken_out(case):
     assert abs(stretch.end - begin - BIASED_S) < 3.0
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_with_a_biased_stretch_the_track_is_as_good_as_without_its_pings(seed):
     case = simulated(falcon(), 200.0, seed)
     log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
@@ -131,6 +132,7 @@ def test_a_healthy_dive_is_solved_once(case, monkeypatch):
     assert (best.solution.stretches, best.solution.runner_up) == ((), np.inf)
 
 
+@pytest.mark.slow
 def test_chain_and_graph_take_out_the_same_stretch():
     case = simulated(falcon(), 120.0, 2, dvl_rate=3.0, imu_rate=50.0)
     smoother = batch(BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log), case.config)

@@ -105,7 +105,10 @@ def shown(best: Optimum) -> list[str]:
     """What is considered and the dive shows, so that it is better estimated."""
     if not best.unknowns.considered:
         return []
-    return [name for name, ratio in best.relative_sd().items() if (ratio < OBSERVABLE_BELOW).all()]
+    limit = dict.fromkeys(SPURIOUSLY_OBSERVABLE, DOUBTFUL_ABOVE)
+    if "fix" in best.blocks:
+        limit["dvl_scale"] = OBSERVABLE_BELOW  # fixes show it, which noise does not feign
+    return [name for name, ratio in best.relative_sd().items() if (ratio < limit.get(name, OBSERVABLE_BELOW)).all()]
 
 
 def spuriously_observable(unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
