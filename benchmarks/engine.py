@@ -106,17 +106,21 @@ class Bench:
     seeds: int
     runs: int
 
+    def falcon(self, checkout: Checkout) -> tuple[Path, Path]:
+        """Log of the dive that ships, and its configuration with the keys that a checkout knows."""
+        return self._falcon_log, checkout.root / "data" / "falcon" / "config.yaml"
+
     @cached_property
-    def falcon(self) -> tuple[Path, Path]:
-        """Log and configuration of the dive that ships; of its first 30 s."""
+    def _falcon_log(self) -> Path:
+        """All of it, or its first 30 s."""
         if not self.quick:
-            return SHIPPED / "log.csv.gz", SHIPPED / "config.yaml"
+            return SHIPPED / "log.csv.gz"
         path = self.folder / "falcon.csv"
         with gzip.open(SHIPPED / "log.csv.gz", "rt") as log:
             header = next(log)
             place = header.strip().split(",").index("time")
             path.write_text(header + "".join(line for line in log if float(line.split(",")[place]) < 30.0))
-        return path, SHIPPED / "config.yaml"
+        return path
 
     @property
     def hour(self) -> int:
@@ -139,17 +143,17 @@ class Bench:
 
 
 def filter_falcon(bench: Bench) -> Iterator[Line]:
-    base, now = bench.both(lambda checkout: checkout.drive("filter", *bench.falcon))
+    base, now = bench.both(lambda checkout: checkout.drive("filter", *bench.falcon(checkout)))
     yield Line("filter of data/falcon", "s", base, now, times_less(40))
 
 
 def smoother_falcon(bench: Bench) -> Iterator[Line]:
-    base, now = bench.both(lambda checkout: checkout.drive("smoother", *bench.falcon))
+    base, now = bench.both(lambda checkout: checkout.drive("smoother", *bench.falcon(checkout)))
     yield Line("assemble, optimum and marginals of data/falcon", "s", base, now, times_less(12))
 
 
 def isam2_falcon(bench: Bench) -> Iterator[Line]:
-    base, now = bench.both(lambda checkout: checkout.drive("isam2", *bench.falcon))
+    base, now = bench.both(lambda checkout: checkout.drive("isam2", *bench.falcon(checkout)))
     yield Line("data/falcon with iSAM2, estimating", "s", base, now, times_less(10))
 
 
@@ -162,7 +166,7 @@ def chain(bench: Bench) -> Iterator[Line]:
 
 
 def falcon(bench: Bench) -> Iterator[Line]:
-    base, now = bench.both(lambda checkout: bench.smooth(checkout, *bench.falcon, "--no-figures")[0])
+    base, now = bench.both(lambda checkout: bench.smooth(checkout, *bench.falcon(checkout), "--no-figures")[0])
     yield Line("data/falcon, whole command without figures", "s", base, now, times_less(5))
 
 
