@@ -18,16 +18,24 @@ from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.estimators.alarms import Evidence, statistics
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import BatchSmoother, smoothed
 from rovgraph.estimators.thesis import FILTERS, FilterJob, run_filters
 from rovgraph.estimators.thesis.processes import length
 from rovgraph.estimators.thesis.setup import prepare
+from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.checkpoint import write_checkpoint
+from rovgraph.live.clocks import Clocks
 from rovgraph.live.feed import Feed
-from rovgraph.live.message import Reading
+from rovgraph.live.message import Message, Reading
+from rovgraph.live.navigator import Navigator
 from rovgraph.live.recorder import Recorder
 from rovgraph.live.sources import open_source
 from rovgraph.log import STREAMS, Log, Stream, read_log
@@ -179,7 +187,44 @@ def replay(folder: Path) -> list[Pair]:
     ]  # fmt: skip
 
 
+def alarms(folder: Path) -> list[Pair]:
+    """The verdict on a dive, and its alarms while it goes on."""
+    dive, config = simulated("lawnmower", 1, falcon(), Choices(duration=120.0))
+    log = Log.from_frame(dive.log_frame)
+    smoother = BatchSmoother(initialise(log, config))
+    smoother.take(log)
+    best = smoother.optimum()
+    assert isinstance(best, ChainOptimum)
+    evidence = Evidence(smoother.beginning, [smoothed(best, smoother.beginning)], best.intervals, best, [])
+    messages = [Message("log", m.time, m.time, (Reading(m.sensor, m.values),)) for m in log.measurements()]
+    keyframes: list[tuple[Any, ...]] = []
+
+    class Kept(LiveAlarms):
+        """Keeps what it is given."""
+
+        def passed(self, *given: Any) -> None:
+            keyframes.append(given)
+            super().passed(*given)
+
+    def estimate(alarms: LiveAlarms) -> None:
+        navigator = Navigator(config, patient=True, clocks=Clocks(trust=True), alarms=alarms)
+        drain(map(navigator.take, messages))
+
+    def look(alarms: LiveAlarms) -> None:
+        for given in keyframes:
+            alarms.passed(*given)
+
+    estimate(Kept())
+    return [
+        Pair("statistics of 120 s", "one elimination of the chain", lambda: statistics(evidence),
+             lambda: best.chain.eliminate(best.state, best.solution.gates), 8.0),
+        Pair("live alarms of 120 s", "the live estimate with them", lambda: look(LiveAlarms()),
+             lambda: estimate(LiveAlarms()), 0.05),
+    ]  # fmt: skip
+
+
 ROWS = {
+    "alarms": alarms,
     "filter": thesis_filter,
     "log": log_reading,
     "recorder": recorder,
