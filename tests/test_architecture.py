@@ -26,7 +26,7 @@ LAYERS = (
     {"instruments"},
     {"engine"},
     {"graph"},
-    {"estimators", "simulate", "evaluate", "check", "calibrate"},
+    {"estimators", "simulate", "evaluate", "check", "calibrate", "interchange"},
     {"studies", "live"},
     {"report"},
     {"api"},

@@ -1,0 +1,153 @@
+"""Native formats, recognised by their content: one module each, registered here or by an entry point.
+
+A package of its own adds a format with an entry point of the group ``rovgraph.formats`` that names a `Format`.
+"""
+
+import gzip
+import importlib
+import shutil
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Protocol
+
+from rovgraph.errors import InputError, in_one_line, warn
+from rovgraph.interchange.recording import Recording
+
+HEAD = 65536  # bytes of a file that a format is recognised by
+LIKELY = 0.5  # confidence from which a file is taken to be of a format
+OWN: tuple[str, ...] = ()  # modules of this package, each with a `FORMAT`
+GROUP = "rovgraph.formats"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a user may say of how files are read.
+
+    Attributes
+    ----------
+    choose : sensor -> instance, message or topic that feeds it, where a file has several
+    progress : called with the bytes read so far and those of the file
+    """
+
+    choose: Mapping[str, str] = field(default_factory=dict)
+    progress: Callable[[int, int], None] = lambda done, total: None
+
+
+class Format(Protocol):
+    """A native format.
+
+    Attributes
+    ----------
+    name : short, for options and messages, such as "dataflash"
+    title : for people, such as "ArduPilot DataFlash log"
+    extra : the extra of this package that its reader needs ("" = none)
+    """
+
+    name: str
+    title: str
+    extra: str
+
+    def recognise(self, path: Path, head: bytes) -> float:
+        """How sure it is, 0 to 1, that a file is of this format, by its first `HEAD` bytes; it reads no more.
+
+        A directory, as some bags are, has the head b"".
+        """
+
+    def read(self, path: Path, options: Options) -> Recording:
+        """Everything in the file that a log can hold, and an account of the rest.
+
+        Raises
+        ------
+        InputError : nothing in it can be used; what is in part damaged is read in part, and counted
+        """
+
+
+@cache
+def formats() -> tuple[Format, ...]:
+    """All formats: this package's own, then those of entry points; one that cannot be loaded is a warning."""
+    found: list[Format] = [importlib.import_module(f"{__package__}.{name}").FORMAT for name in OWN]
+    for entry in entry_points(group=GROUP):
+        try:
+            found.append(entry.load())
+        except Exception as error:  # whatever another package does
+            warn(f"format {entry.name} of {entry.value} cannot be loaded and is left out ({in_one_line(error)})")
+    return tuple(found)
+
+
+def recognise(path: Path) -> Format | None:
+    """The format that a file is most likely of, None where none is likely.
+
+    Parameters
+    ----------
+    path : not compressed; see `unpacked`
+    """
+    head = _head(path)
+    sure = {format_.name: format_.recognise(path, head) for format_ in formats()}
+    best = max(formats(), key=lambda format_: sure[format_.name], default=None)
+    return best if best is not None and sure[best.name] >= LIKELY else None
+
+
+def read_recording(path: Path | str, options: Options | None = None) -> Recording:
+    """Read a file, or a bag that is a directory, of any format that is known, gzipped or not.
+
+    Raises
+    ------
+    InputError : no such file, an unknown format, a reader that is not installed, nothing that can be used in it
+    """
+    options = Options() if options is None else options
+    with unpacked(Path(path)) as plain:
+        if (format_ := recognise(plain)) is None:
+            known = ", ".join(each.title for each in formats())
+            raise InputError(f"{path}: is in no format that is known; expected a log (CSV, Parquet) or one of: {known}")
+        try:
+            return format_.read(plain, options)
+        except ImportError as error:
+            missing = (error.name or "").partition(".")[0]
+            raise InputError(
+                f"{path}: reading a {format_.title} needs {missing}; install it with: "
+                f"pip install 'rovgraph[{format_.extra}]'"
+            ) from None
+        except InputError as error:
+            raise InputError(str(error).replace(str(plain), str(path))) from None
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """The file itself, or a copy without gzip's compression that is there within the block.
+
+    Raises
+    ------
+    InputError : no such file, empty, damaged compression
+    """
+    head = _head(path)
+    if not head and not path.is_dir():
+        raise InputError(f"{path}: is empty, expected a recording")
+    if not head.startswith(b"\x1f\x8b"):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / path.name.removesuffix(".gz")
+        try:
+            with gzip.open(path) as packed, plain.open("wb") as out:
+                shutil.copyfileobj(packed, out, 1 << 20)
+        except (EOFError, zlib.error, gzip.BadGzipFile):
+            raise InputError(f"{path}: gzip data are damaged or cut off; copy the file again") from None
+        yield plain
+
+
+def _head(path: Path) -> bytes:
+    if path.is_dir():
+        return b""
+    try:
+        with path.open("rb") as file:
+            return file.read(HEAD)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the name") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None

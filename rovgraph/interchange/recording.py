@@ -1,0 +1,98 @@
+"""What one native file holds, before clocks are joined: channels of a log, and an account of the rest.
+
+A reader (`rovgraph.interchange.formats.Format`) turns a file into a `Recording`. Times stay on the file's own
+clocks, units become SI and radians, vectors stay in the instrument's axes: what these are is said in words
+(`Channel.frame`) and as a piece of configuration (`Recording.settings`), never mended by a sign in code.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rovgraph.geometry import Array
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A clock that stamps some of a file's channels.
+
+    Attributes
+    ----------
+    name : such as "autopilot's boot time", for the report
+    unix_offset : what its stamps lack of Unix time [s]; 0 = they are Unix time; None = not known
+    offset_sd : how well that is known [s]
+    source : how it was found, such as "GPS week and milliseconds"; "" where it is not known
+    """
+
+    name: str
+    unix_offset: float | None = None
+    offset_sd: float = 0.0
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Measurements of one sensor, as columns of a log (docs/log-format.md).
+
+    Attributes
+    ----------
+    sensor : name of its stream in a log ("imu", "dvl", "depth", ...)
+    columns : column -> ndarray, shape (n,), SI and radians, ``time`` [s] among them; NaN = not valid
+    source : where in the file it comes from, such as "IMU instance 0: AccX, AccY, AccZ, GyrX, GyrY, GyrZ"
+    frame : the axes of its values, in words; "" for scalars
+    clock : name of the `Clock` that stamps it
+    received : when each row arrived, on the clock ``receiver``, ndarray, shape (n,); None = not recorded
+    receiver : name of the `Clock` of ``received``
+    """
+
+    sensor: str
+    columns: Mapping[str, Array]
+    source: str
+    frame: str = ""
+    clock: str = ""
+    received: Array | None = None
+    receiver: str = ""
+
+
+@dataclass(frozen=True)
+class Left:
+    """Messages, records or topics of a file that are not in the log.
+
+    Attributes
+    ----------
+    name : as the file calls them
+    count : how many there are
+    reason : why they were left
+    """
+
+    name: str
+    count: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A native file as channels of a log.
+
+    Attributes
+    ----------
+    path : the file, as given
+    format : name of the format that it is in
+    channels : what goes into the log; several of one sensor are alternatives, the preferred one first
+    clocks : name -> Clock, of every channel's clock
+    left : what the file holds beside that
+    settings : configuration that the file knows (mountings, lever arms, declination, ...), nested as in YAML
+    notes : assumptions and what was found on the way, a sentence each
+    warnings : what looks wrong, a sentence each
+    tables : other tables that are worth keeping (name -> column -> ndarray), such as the DVL's beams
+    """
+
+    path: str
+    format: str
+    channels: tuple[Channel, ...]
+    clocks: Mapping[str, Clock]
+    left: tuple[Left, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    tables: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
