@@ -73,6 +73,10 @@ def _scaled(data: Array, _: Array) -> None:
     data[:, 3:] *= 1.005
 
 
+def _warmed_up(data: Array, time: Array) -> None:
+    data[:, 3:] += np.deg2rad([0.2, -0.3, 0.4]) * (1.0 - np.exp(-time / 90.0))[:, None]
+
+
 def late(sensor: str, seconds: float) -> Callable[[Log], Log]:
     def breaks(log: Log) -> Log:
         stream = log[sensor]
@@ -96,4 +100,5 @@ BROKEN: dict[str, Broken] = {
     "DVL noise three times as stated": Broken(changed_data("dvl", _noisier)),
     "fixes 8 m off for a minute": Broken(changed_data("fix", _offset(0, 8.0, 60.0)), {"fix_interval": 2.0}),
     "gyro scale 0.5 %": Broken(changed_data("imu", _scaled)),
+    "gyro warms up": Broken(changed_data("imu", _warmed_up)),
 }

@@ -50,6 +50,7 @@ SAID = {
     "DVL noise three times as stated": ("doubtful", "too large", "raise dvl.velocity_sd_mps"),
     "fixes 8 m off for a minute": ("doubtful", "lasting", "fix: residuals of north last"),
     "gyro scale 0.5 %": ("doubtful", "held", "estimate calibration.gyr_scale"),
+    "gyro warms up": ("doubtful", "bias drift", "raise imu.noise.gyr_walk"),
 }
 
 

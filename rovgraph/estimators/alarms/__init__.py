@@ -28,6 +28,7 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     residuals.too_small,
     residuals.lasting,
     motion.imu,
+    motion.bias_drift,
     motion.estimates,
     constants.halves,
 )

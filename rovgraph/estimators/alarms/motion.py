@@ -17,6 +17,10 @@ IMU_S = 20.0  # over which errors of the IMU last that are no noise
 IMU, IMU_BADLY = 3.0, 50.0  # variance of means over that time, 1 for noise
 # of a motion's residual: what people call it, columns, and the signal behind it
 PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slice(6, 9), "acc"))
+# end of the dive against its start, in sds of the bias's walk; smoothing keeps what is not seen near its start
+DRIFT, LARGE_DRIFT = 4.0, 30.0
+# a bias's history, columns of a motion's residual, what people call it, its unit, and how many of them make one
+BIASES = (("acc_bias", slice(9, 12), "acc", "m/s2", 1.0), ("gyr_bias", slice(12, 15), "gyr", "deg/s", np.rad2deg(1.0)))
 JUMP, LARGE_JUMP = 40.0, 100.0  # squared, in joint sds
 SETTLED_S = 10.0  # from which on the filter is asked
 COARSE = 300  # epochs at which both are compared
@@ -55,6 +59,32 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
                 f"its noise allows, most at {evidence.since(begin):.0f} s",
                 f"check imu.mount_rpy_deg and the compasses, estimate calibration.{key}_scale or raise imu.noise.{key}",
             )
+
+
+def bias_drift(evidence: Evidence) -> Iterator[Statistic]:
+    """How far the IMU's biases went from start to end, in sds of their walks: a gyro that warms up goes too far."""
+    if evidence.optimum is None or len(evidence.intervals) < 3:
+        return
+    r, time = _motion_residuals(evidence), np.array([i.time for i in evidence.intervals])
+    share = np.sqrt(np.diff(time) / (time[-1] - time[0]))  # whitened steps become parts of the way
+    for name, columns, key, unit, factor in BIASES:
+        gone = np.abs(share @ r[:, columns])
+        axis, history = int(np.argmax(gone)), evidence.main.history.get(name)
+        if history is None:
+            continue
+        first, last = factor * history.value[0, axis], factor * history.value[-1, axis]
+        yield Statistic(
+            "bias drift",
+            "imu",
+            evidence.start,
+            evidence.end,
+            float(gone[axis]),
+            DRIFT,
+            LARGE_DRIFT,
+            f"{history.labels[axis]} drifts from {first:.2g} to {last:.2g} {unit} during the dive, {gone[axis]:.0f} sd "
+            f"of what imu.noise.{key}_walk allows",
+            f"let the IMU warm up before the dive, or raise imu.noise.{key}_walk",
+        )
 
 
 def _motion_residuals(evidence: Evidence) -> Array:
