@@ -12,9 +12,8 @@ from rovgraph.estimators.alarms.evidence import Evidence
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import EARTH_RATE, Array
 
-# Of the 25 components of a dive one is beyond 3 sds in every fifteenth healthy dive, beyond 5 in one of 70000;
-# what is not linear in them makes up for the difference.
-MOVED, FAR_MOVED = 5.0, 10.0  # sds
+# Of the 25 components of a dive one is beyond 3 sds in every fifteenth healthy dive, beyond 4 in one of 600.
+MOVED, FAR_MOVED = 4.0, 10.0  # sds
 NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
 HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
 # errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
@@ -205,7 +204,7 @@ def _key_of(name: str) -> str:
     if name in TIME_OFFSETS:
         return f"the clock that stamps {_sensor_of(name)}"
     if name.endswith("_offset") and name != "depth_offset":
-        return "environment.declination_deg and the compass's mounting"
+        return "environment.declination_deg, the compass's mounting, and the ship's heading where fixes come from a ship"
     if name in ("hard_iron", "soft_iron", "field_scale", "field_dip", "mag_deviation"):
         return "the magnetometer's calibration (rovgraph calibrate magnetometer)"
     return f"calibration.{name}"
