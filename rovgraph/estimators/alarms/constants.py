@@ -204,7 +204,7 @@ def _key_of(name: str) -> str:
     if name in TIME_OFFSETS:
         return f"the clock that stamps {_sensor_of(name)}"
     if name.endswith("_offset") and name != "depth_offset":
-        return "environment.declination_deg, the compass's mounting, and the ship's heading where fixes come from a ship"
+        return "environment.declination_deg, the compass's mounting, and the ship's heading if fixes come from a ship"
     if name in ("hard_iron", "soft_iron", "field_scale", "field_dip", "mag_deviation"):
         return "the magnetometer's calibration (rovgraph calibrate magnetometer)"
     return f"calibration.{name}"
