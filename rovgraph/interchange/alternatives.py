@@ -1,39 +1,32 @@
-"""Several channels of one sensor: which comes first."""
+"""Several sources of one sensor's measurements: which comes first."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.recording import Channel
 
 
-def preferred_first(
-    path: Path, channels: Sequence[tuple[str, Channel]], choose: Mapping[str, str]
-) -> tuple[Channel, ...]:
-    """Channels with what a user chose in front of its alternatives.
+def preferred_first(path: Path, sensor: str, labels: Sequence[str], choose: Mapping[str, str]) -> list[str]:
+    """Sources of a sensor with what a user chose in front.
 
     Parameters
     ----------
     path : of the file, for messages
-    channels : label and channel, the preferred one of each sensor first; a label is a message and, where there are
-        several, its instance, such as "IMU 1"
-    choose : sensor -> a label, or its last word where that is an instance
+    sensor : name of its stream in a log
+    labels : a message and, where there are several, its instance, such as "IMU 1"; the best first
+    choose : sensor -> a label, or its instance alone
 
     Raises
     ------
-    InputError : none of a sensor's channels is called so
+    InputError : none is called so
     """
-    for sensor, wanted in choose.items():
-        labels = [label for label, channel in channels if channel.sensor == sensor]
-        if labels and not any(_means(wanted, label) for label in labels):
-            raise InputError(f"{path}: {sensor} cannot come from {wanted!r}; choose one of: {', '.join(labels)}")
-    return tuple(c for label, c in sorted(channels, key=lambda each: not _chosen(*each, choose)))
-
-
-def _chosen(label: str, channel: Channel, choose: Mapping[str, str]) -> bool:
-    return channel.sensor in choose and _means(choose[channel.sensor], label)
+    wanted = choose.get(sensor)
+    if wanted is None or not labels:
+        return list(labels)
+    if not any(_means(wanted, label) for label in labels):
+        raise InputError(f"{path}: {sensor} cannot come from {wanted!r}; choose one of: {', '.join(labels)}")
+    return sorted(labels, key=lambda label: not _means(wanted, label))
 
 
 def _means(wanted: str, label: str) -> bool:
-    name, _, instance = label.partition(" ")
-    return wanted.casefold() in (label.casefold(), instance or name.casefold())
+    return wanted.casefold() in (label.casefold(), label.rpartition(" ")[2].casefold())

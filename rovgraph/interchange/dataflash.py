@@ -1,0 +1,289 @@
+"""ArduPilot's own logs, DataFlash ``.BIN``: what a vehicle with ArduSub records on board."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.interchange import dataflash_channels as channels
+from rovgraph.interchange.alternatives import preferred_first
+from rovgraph.interchange.dataflash_channels import CLOCK, Findings, Source
+from rovgraph.interchange.dataflash_messages import FMT, HEAD, Contents, Messages, read_messages, texts
+from rovgraph.interchange.formats import Options
+from rovgraph.interchange.rates import too_slow
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+
+GPS_EPOCH, WEEK_S = 315_964_800, 604_800  # in Unix time [s]
+LEAP_S = 18  # by which UTC is behind GPS, since 2017
+RTC_SD_S = {0: 0.2, 1: 1.0, 2: 2.0}  # by where the clock was set from: GPS, a ground station, a battery
+GPS_SD_S = 0.2  # a fix reaches the autopilot so late
+RESET_S = 1.0  # boot time that goes back further is another boot
+
+
+VELOCITY_ESTIMATE_AXES = (
+    "the DVL's velocities come as vision speed estimates, by definition along north, east and down; those of the "
+    "BlueOS DVL extension are along the vehicle's axes, which is assumed"
+)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Messages that a sensor's measurements come from.
+
+    Attributes
+    ----------
+    sensor : name of its stream in a log
+    names : of the messages; where a log has one message per instance, in the order of instances
+    channel : makes a channel of one instance
+    required, optional : fields
+    """
+
+    sensor: str
+    names: tuple[str, ...]
+    channel: Callable[[Source], Channel | None]
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+
+
+_IMU = ("AccX", "AccY", "AccZ", "GyrX", "GyrY", "GyrZ")
+_OFFSETS = ("OfsX", "OfsY", "OfsZ", "MOX", "MOY", "MOZ")
+KINDS = (
+    Kind("imu", ("IMU", "IMU2", "IMU3"), channels.imu, _IMU, ("GH", "AH")),
+    Kind("mag", ("MAG", "MAG2", "MAG3"), channels.magnetometer, ("MagX", "MagY", "MagZ"), ("Health", "S", *_OFFSETS)),
+    Kind("ahrs", ("ATT",), channels.attitude, ("Roll", "Pitch", "Yaw")),
+    Kind("ahrs", ("AHR2",), channels.attitude, ("Roll", "Pitch", "Yaw")),
+    Kind("depth", ("BARO", "BAR2", "BAR3"), channels.barometer, ("Press",), ("SMS",)),
+    Kind("dvl", ("VISO",), channels.odometry, ("dt", "PosDX", "PosDY", "PosDZ"), ("conf",)),
+    Kind("dvl", ("VISV",), channels.velocity_estimate, ("VX", "VY", "VZ")),
+    Kind("dvl_altitude", ("RFND",), channels.rangefinder, ("Dist", "Orient"), ("Stat", "Status")),
+    Kind("fix", ("GPS", "GPS2"), channels.fixes, ("Status", "GMS", "GWk", "HDop", "Lat", "Lng")),
+    Kind("thruster", ("RCOU",), channels.thrusters, (), tuple(f"C{k}" for k in range(1, 15))),
+)
+INSTANCE = ("I", "Instance")
+_WANTED = {name: ("TimeUS", *kind.required, *kind.optional, *INSTANCE) for kind in KINDS for name in kind.names} | {
+    "PARM": ("Name", "Value"),
+    "MSG": ("TimeUS", "Message"),
+    "RTC": ("TimeUS", "Epoch", "SourceType"),
+}
+
+
+class DataFlash:
+    """The format; see `rovgraph.interchange.formats.Format`."""
+
+    name = "dataflash"
+    title = "ArduPilot DataFlash log (.BIN)"
+    extra = ""
+
+    def recognise(self, path: Path, head: bytes) -> float:
+        first = HEAD + bytes([FMT])
+        return 1.0 if head.startswith(first) else 0.7 if head.count(first) >= 3 else 0.0
+
+    def read(self, path: Path, options: Options) -> Recording:
+        contents = read_messages(path, _WANTED, options.progress)
+        findings = Findings()
+        messages = _one_boot(contents.messages, findings)
+        parameters = _parameters(messages.pop("PARM", None), findings)
+        made = _channels(path, messages, parameters, findings, options.choose)
+        if not made:
+            raise InputError(f"{path}: holds no measurement of a sensor ({_summary(contents)}); copy the file again")
+        _describe(contents, messages, made, findings)
+        settings = _settings(made, parameters, findings)
+        return Recording(
+            str(path),
+            self.name,
+            tuple(made),
+            {CLOCK: _clock(messages)},
+            _left(contents, findings),
+            settings,
+            tuple(findings.notes),
+            tuple(findings.warnings),
+        )
+
+
+FORMAT = DataFlash()
+
+
+def _one_boot(messages: Mapping[str, Messages], findings: Findings) -> dict[str, Messages]:
+    """The longest part of the log in which time goes on, by the messages that are most frequent."""
+    timed = [m for m in messages.values() if "TimeUS" in m]
+    if not timed:
+        return dict(messages)
+    densest = max(timed, key=len)
+    order = np.argsort(densest.place, kind="stable")
+    time = densest.value("TimeUS")[order] * (1.0 if densest.units["TimeUS"] else 1e-6)
+    back = np.flatnonzero(np.diff(time) < -RESET_S) + 1
+    if not len(back):
+        return dict(messages)
+    bounds = np.array([0, *back, len(time)])
+    longest = int(np.argmax(np.diff(bounds)))
+    first = 0 if longest == 0 else int(densest.place[order[bounds[longest]]])
+    end = np.inf if longest == len(back) else int(densest.place[order[bounds[longest + 1]]])
+    findings.warnings.append(
+        f"the autopilot's clock went back {len(back)} times, so it was started anew; the longest part is read, "
+        f"{np.diff(bounds).max() / len(time):.0%} of the log"
+    )
+    kept = {"PARM": messages["PARM"]} if "PARM" in messages else {}
+    for name, m in messages.items():
+        within: NDArray[np.bool_] = (m.place >= first) & (m.place < end)
+        if name not in kept and within.any():
+            kept[name] = m.take(within)
+    return kept
+
+
+def _parameters(messages: Messages | None, findings: Findings) -> dict[str, float]:
+    """The autopilot's parameters as they were first; a calibration during the dive repeats some."""
+    if messages is None:
+        findings.warnings.append("the log holds no parameters: declination, surface pressure and motors are not known")
+        return {}
+    first: dict[str, float] = {}
+    changed = {}
+    for name, value in zip(texts(messages.fields["Name"]), messages.fields["Value"].tolist(), strict=True):
+        if first.setdefault(name, value) != value:
+            changed[name] = value
+    primary = int(first.get("BARO_PRIMARY", 0)) + 1
+    used = {"COMPASS_DEC", "BARO_PRIMARY", "BARO_SPEC_GRAV", "BARO_GND_PRESS", f"BARO{primary}_GND_PRESS"}
+    for name, value in ((name, value) for name, value in changed.items() if name in used):
+        findings.notes.append(f"{name} changes from {first[name]:.6g} to {value:.6g} in the log; the first is used")
+    return first
+
+
+def _channels(
+    path: Path,
+    messages: Mapping[str, Messages],
+    parameters: Mapping[str, float],
+    findings: Findings,
+    choose: Mapping[str, str],
+) -> list[Channel]:
+    """Channels of all sensors, the preferred one of each first; what is said of the others is left out."""
+    by_sensor: dict[str, dict[str, tuple[Kind, Source]]] = {}
+    for kind in KINDS:
+        found = _sources(kind, messages, parameters, findings)
+        by_sensor.setdefault(kind.sensor, {}).update((s.label, (kind, s)) for s in found)
+    made = []
+    for sensor, sources in by_sensor.items():
+        labels = _depths_first(list(sources), sources, parameters, findings) if sensor == "depth" else list(sources)
+        for place, label in enumerate(preferred_first(path, sensor, labels, choose)):
+            kind, source = sources[label]
+            channel = kind.channel(source if place == 0 else source.quietly())
+            if channel is not None and len(channel.columns["time"]):
+                made.append(channel)
+    return made
+
+
+def _sources(
+    kind: Kind, messages: Mapping[str, Messages], parameters: Mapping[str, float], findings: Findings
+) -> list[Source]:
+    """Instances of a kind of messages, in their order."""
+    found = []
+    for number, name in enumerate(kind.names):
+        if (all_ := messages.get(name)) is None:
+            continue
+        if lacking := [f for f in ("TimeUS", *kind.required) if f not in all_]:
+            findings.left[name, f"its format has no field {', '.join(lacking)}"] = len(all_)
+            continue
+        numbers = next((all_.fields[f] for f in INSTANCE if f in all_), None)
+        known = [number] if numbers is None else np.unique(numbers).tolist()
+        for instance in known:
+            label = name if numbers is None else f"{name} {instance}"
+            part = all_ if len(known) == 1 else all_.take(numbers == instance)
+            found.append(Source(name, part, parameters, findings, label, int(instance)))
+    return found
+
+
+def _depths_first(
+    labels: list[str], sources: Mapping[str, tuple[Kind, Source]], parameters: Mapping[str, float], findings: Findings
+) -> list[str]:
+    """Barometers, that of the sea first: the primary one, or the one whose pressure varies most."""
+    primary = parameters.get("BARO_PRIMARY")
+    named = [label for label in labels if sources[label][1].instance == primary]
+    if named or len(labels) < 2:
+        return sorted(labels, key=lambda label: label not in named)
+    spread = {label: float(np.nanstd(sources[label][1].raw("Press"))) for label in labels}
+    best = max(labels, key=spread.__getitem__)
+    findings.warnings.append(
+        f"no parameter says which of {', '.join(labels)} is in the water: {best} is taken, whose pressure varies most"
+    )
+    return sorted(labels, key=lambda label: label != best)
+
+
+def _describe(contents: Contents, messages: Mapping[str, Messages], made: list[Channel], findings: Findings) -> None:
+    """Say what the log is, and what looks wrong with it."""
+    if (said := messages.get("MSG")) is not None and "Message" in said:
+        firmware = next((text for text in texts(said.fields["Message"]) if text.startswith("Ardu")), None)
+        findings.notes.extend([] if firmware is None else [f"firmware: {firmware}"])
+    if contents.damaged:
+        findings.warnings.append(
+            f"{contents.damaged_bytes} bytes in {contents.damaged} places are no messages and are skipped"
+        )
+    if findings.undeclared:
+        fields = ", ".join(sorted(findings.undeclared))
+        findings.notes.append(f"the log declares no unit of {fields}; those of ArduPilot's documentation are taken")
+    imu = next((c for c in made if c.sensor == "imu"), None)
+    if imu is None:
+        findings.warnings.append("no IMU in the log; set the autopilot's LOG_BITMASK to record it")
+    else:
+        findings.warnings += too_slow(imu.columns["time"], imu.source, "set the autopilot's LOG_BITMASK to fast IMU")
+    dvl = next((c for c in made if c.sensor == "dvl"), None)
+    if dvl is not None and dvl.source.startswith("VISV"):
+        findings.warnings.append(VELOCITY_ESTIMATE_AXES)
+
+
+def _settings(made: list[Channel], parameters: Mapping[str, float], findings: Findings) -> dict[str, Any]:
+    """What the log knows of a configuration."""
+    sensors = {channel.sensor: channel for channel in reversed(made)}  # the first of each
+    settings: dict[str, Any] = {}
+    for sensor, prefix in (("imu", "INS_POS1"), ("dvl", "VISO_POS")):
+        if sensor in sensors:
+            lever = [parameters.get(f"{prefix}_{axis}", 0.0) for axis in "XYZ"]
+            settings[sensor] = {"mount_rpy_deg": [0.0, 0.0, 0.0]} | ({"lever_arm_m": lever} if any(lever) else {})
+    if "COMPASS_DEC" in parameters:
+        declination = round(float(np.rad2deg(parameters["COMPASS_DEC"])), 3)
+        findings.settings.setdefault("environment", {})["declination_deg"] = declination
+    elif "ahrs" in sensors:
+        findings.warnings.append("the log knows no declination, so ahrs_yaw is from true north: mag and ahrs disagree")
+    return settings | findings.settings
+
+
+def _clock(messages: Mapping[str, Messages]) -> Clock:
+    """Boot time against UTC, by the autopilot's own clock or by its satellite receiver."""
+    rtc, gps = messages.get("RTC"), messages.get("GPS")
+    if rtc is not None and "Epoch" in rtc and "SourceType" in rtc:
+        rtc = rtc.take(np.isin(rtc.fields["SourceType"], list(RTC_SD_S)))
+        if len(rtc):
+            boot, unix = (rtc.fields[name][-1] * 1e-6 for name in ("TimeUS", "Epoch"))
+            kind = int(rtc.fields["SourceType"][-1])
+            return Clock(CLOCK, float(unix - boot), RTC_SD_S[kind], f"RTC, source {kind}")
+    if gps is not None and all(name in gps for name in ("Status", "GMS", "GWk")):
+        gps = gps.take((gps.fields["Status"] >= channels.FIX_3D) & (gps.fields["GWk"] > 0))
+        if len(gps):
+            unix = GPS_EPOCH + WEEK_S * gps.fields["GWk"].astype(float) + 1e-3 * gps.fields["GMS"] - LEAP_S
+            offset = float(np.max(unix - gps.fields["TimeUS"] * 1e-6))  # the message that came with the least delay
+            return Clock(CLOCK, offset, GPS_SD_S, "GPS week and milliseconds")
+    return Clock(CLOCK)
+
+
+_DESCRIBING = {"FMT", "FMTU", "UNIT", "MULT", "PARM", "MSG"}
+_REASONS = {
+    "VISP": "a position that a companion computed, no measurement",
+    "GPA": "of the accuracy of fixes, HDop is used",
+    "ACC": "raw samples, IMU is used",
+    "GYR": "raw samples, IMU is used",
+}
+
+
+def _left(contents: Contents, findings: Findings) -> tuple[Left, ...]:
+    """What the log holds beside measurements, and measurements that were refused."""
+    used = {name for kind in KINDS for name in kind.names} | _DESCRIBING | {"RTC"}
+    others = [
+        Left(n, k, _REASONS.get(n, "no measurement")) for n, k in sorted(contents.counts.items()) if n not in used
+    ]
+    return (*(Left(name, count, why) for (name, why), count in findings.left.items()), *others)
+
+
+def _summary(contents: Contents) -> str:
+    total = sum(contents.counts.values())
+    return f"{total} messages of {len(contents.counts)} kinds, {contents.damaged_bytes} bytes damaged"
