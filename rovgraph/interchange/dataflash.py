@@ -1,18 +1,18 @@
 """ArduPilot's own logs, DataFlash ``.BIN``: what a vehicle with ArduSub records on board."""
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.interchange import dataflash_channels as channels
 from rovgraph.interchange.alternatives import preferred_first
 from rovgraph.interchange.dataflash_channels import CLOCK, Findings, Source
-from rovgraph.interchange.dataflash_messages import FMT, HEAD, Contents, Messages, read_messages, texts
+from rovgraph.interchange.dataflash_messages import FMT, HEAD, INSTANCE, Contents, Messages, read_messages, texts
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.rates import too_slow
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
@@ -63,7 +63,6 @@ KINDS = (
     Kind("fix", ("GPS", "GPS2"), channels.fixes, ("Status", "GMS", "GWk", "HDop", "Lat", "Lng")),
     Kind("thruster", ("RCOU",), channels.thrusters, (), tuple(f"C{k}" for k in range(1, 15))),
 )
-INSTANCE = ("I", "Instance")
 _WANTED = {name: ("TimeUS", *kind.required, *kind.optional, *INSTANCE) for kind in KINDS for name in kind.names} | {
     "PARM": ("Name", "Value"),
     "MSG": ("TimeUS", "Message"),
@@ -83,20 +82,24 @@ class DataFlash:
         return 1.0 if head.startswith(first) else 0.7 if head.count(first) >= 3 else 0.0
 
     def read(self, path: Path, options: Options) -> Recording:
-        contents = read_messages(path, _WANTED, options.progress)
+        contents = read_messages(path, _WANTED, {"IMU": _imu_instance(options.choose)}, options.progress)
         findings = Findings()
+        _count_other_imus(path, contents, findings)
         messages = _one_boot(contents.messages, findings)
         parameters = _parameters(messages.pop("PARM", None), findings)
+        clock = _clock(messages)
+        firmware = _firmware(messages.pop("MSG", None))
         made = _channels(path, messages, parameters, findings, options.choose)
         if not made:
             raise InputError(f"{path}: holds no measurement of a sensor ({_summary(contents)}); copy the file again")
-        _describe(contents, messages, made, findings)
+        findings.notes[:0] = firmware
+        _describe(contents, made, findings)
         settings = _settings(made, parameters, findings)
         return Recording(
             str(path),
             self.name,
             tuple(made),
-            {CLOCK: _clock(messages)},
+            {CLOCK: clock},
             _left(contents, findings),
             settings,
             tuple(findings.notes),
@@ -107,28 +110,49 @@ class DataFlash:
 FORMAT = DataFlash()
 
 
-def _one_boot(messages: Mapping[str, Messages], findings: Findings) -> dict[str, Messages]:
+def _imu_instance(choose: Mapping[str, str]) -> int | None:
+    """The IMU that is read, None = the first: one alone, since they may fill most of a log."""
+    wanted = choose.get("imu", "").rpartition(" ")[2]
+    return int(wanted) if wanted.isdecimal() else None
+
+
+def _count_other_imus(path: Path, contents: Contents, findings: Findings) -> None:
+    """Say which other IMUs there are.
+
+    Raises
+    ------
+    InputError : that which was chosen is not there
+    """
+    known = ", ".join(f"IMU {k}" for k in sorted(contents.instances.get("IMU", ())))
+    kept = len(contents.messages.get("IMU", ()))
+    if known and not kept:
+        raise InputError(f"{path}: the imu that was chosen is not there; choose one of: {known}")
+    if others := contents.counts["IMU"] - kept:
+        findings.left["IMU", f"of another instance; choose one of: {known}"] = others
+
+
+def _one_boot(messages: dict[str, Messages], findings: Findings) -> dict[str, Messages]:
     """The longest part of the log in which time goes on, by the messages that are most frequent."""
     timed = [m for m in messages.values() if "TimeUS" in m]
     if not timed:
-        return dict(messages)
+        return messages
     densest = max(timed, key=len)
     order = np.argsort(densest.place, kind="stable")
     time = densest.value("TimeUS")[order] * (1.0 if densest.units["TimeUS"] else 1e-6)
     back = np.flatnonzero(np.diff(time) < -RESET_S) + 1
     if not len(back):
-        return dict(messages)
+        return messages
     bounds = np.array([0, *back, len(time)])
     longest = int(np.argmax(np.diff(bounds)))
     first = 0 if longest == 0 else int(densest.place[order[bounds[longest]]])
-    end = np.inf if longest == len(back) else int(densest.place[order[bounds[longest + 1]]])
+    end = sys.maxsize if longest == len(back) else int(densest.place[order[bounds[longest + 1]]])
     findings.warnings.append(
         f"the autopilot's clock went back {len(back)} times, so it was started anew; the longest part is read, "
         f"{np.diff(bounds).max() / len(time):.0%} of the log"
     )
     kept = {"PARM": messages["PARM"]} if "PARM" in messages else {}
     for name, m in messages.items():
-        within: NDArray[np.bool_] = (m.place >= first) & (m.place < end)
+        within = np.asarray((m.place >= first) & (m.place < end))
         if name not in kept and within.any():
             kept[name] = m.take(within)
     return kept
@@ -153,21 +177,24 @@ def _parameters(messages: Messages | None, findings: Findings) -> dict[str, floa
 
 def _channels(
     path: Path,
-    messages: Mapping[str, Messages],
+    messages: dict[str, Messages],
     parameters: Mapping[str, float],
     findings: Findings,
     choose: Mapping[str, str],
 ) -> list[Channel]:
-    """Channels of all sensors, the preferred one of each first; what is said of the others is left out."""
-    by_sensor: dict[str, dict[str, tuple[Kind, Source]]] = {}
-    for kind in KINDS:
-        found = _sources(kind, messages, parameters, findings)
-        by_sensor.setdefault(kind.sensor, {}).update((s.label, (kind, s)) for s in found)
+    """Channels of all sensors, the preferred one of each first; what is said of the others is left out.
+
+    Messages are forgotten where they have become channels, so that a long log is in memory once.
+    """
     made = []
-    for sensor, sources in by_sensor.items():
-        labels = _depths_first(list(sources), sources, parameters, findings) if sensor == "depth" else list(sources)
+    for sensor in dict.fromkeys(kind.sensor for kind in KINDS):
+        sources: dict[str, tuple[Kind, Source]] = {}
+        for kind in KINDS:
+            if kind.sensor == sensor:
+                sources |= {s.label: (kind, s) for s in _sources(kind, messages, parameters, findings)}
+        labels = _sea_first(sources, parameters, findings) if sensor == "depth" else list(sources)
         for place, label in enumerate(preferred_first(path, sensor, labels, choose)):
-            kind, source = sources[label]
+            kind, source = sources.pop(label)
             channel = kind.channel(source if place == 0 else source.quietly())
             if channel is not None and len(channel.columns["time"]):
                 made.append(channel)
@@ -175,12 +202,12 @@ def _channels(
 
 
 def _sources(
-    kind: Kind, messages: Mapping[str, Messages], parameters: Mapping[str, float], findings: Findings
+    kind: Kind, messages: dict[str, Messages], parameters: Mapping[str, float], findings: Findings
 ) -> list[Source]:
     """Instances of a kind of messages, in their order."""
     found = []
     for number, name in enumerate(kind.names):
-        if (all_ := messages.get(name)) is None:
+        if (all_ := messages.pop(name, None)) is None:
             continue
         if lacking := [f for f in ("TimeUS", *kind.required) if f not in all_]:
             findings.left[name, f"its format has no field {', '.join(lacking)}"] = len(all_)
@@ -194,10 +221,11 @@ def _sources(
     return found
 
 
-def _depths_first(
-    labels: list[str], sources: Mapping[str, tuple[Kind, Source]], parameters: Mapping[str, float], findings: Findings
+def _sea_first(
+    sources: Mapping[str, tuple[Kind, Source]], parameters: Mapping[str, float], findings: Findings
 ) -> list[str]:
     """Barometers, that of the sea first: the primary one, or the one whose pressure varies most."""
+    labels = list(sources)
     primary = parameters.get("BARO_PRIMARY")
     named = [label for label in labels if sources[label][1].instance == primary]
     if named or len(labels) < 2:
@@ -210,11 +238,14 @@ def _depths_first(
     return sorted(labels, key=lambda label: label != best)
 
 
-def _describe(contents: Contents, messages: Mapping[str, Messages], made: list[Channel], findings: Findings) -> None:
-    """Say what the log is, and what looks wrong with it."""
-    if (said := messages.get("MSG")) is not None and "Message" in said:
-        firmware = next((text for text in texts(said.fields["Message"]) if text.startswith("Ardu")), None)
-        findings.notes.extend([] if firmware is None else [f"firmware: {firmware}"])
+def _firmware(messages: Messages | None) -> list[str]:
+    """A note of what wrote the log."""
+    said = [] if messages is None else texts(messages.fields["Message"])
+    return [f"firmware: {text}" for text in said if text.startswith("Ardu")][:1]
+
+
+def _describe(contents: Contents, made: list[Channel], findings: Findings) -> None:
+    """Say what looks wrong with the log."""
     if contents.damaged:
         findings.warnings.append(
             f"{contents.damaged_bytes} bytes in {contents.damaged} places are no messages and are skipped"

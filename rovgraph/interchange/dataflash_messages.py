@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from rovgraph.geometry import Array
 HEAD = b"\xa3\x95"
 FMT = 128  # type of the message that defines all others, itself too
 ENDINGS = (HEAD, HEAD[:1], b"")  # what may follow a message: the next one, or the end of the file
+INSTANCE = ("I", "Instance")  # fields that say which of several sensors it is
 BLOCK = 1 << 22  # bytes walked at a time
 
 _FMT = struct.Struct("<BB4s16s64s")
@@ -97,7 +99,7 @@ class Messages:
         """A field in its unit, shape (n,)."""
         return np.asarray(self.fields[name] * self.multipliers[name], dtype=float)
 
-    def take(self, index: NDArray[np.bool_]) -> "Messages":
+    def take(self, index: NDArray[Any]) -> "Messages":
         """Some of them, by a mask."""
         return Messages({k: v[index] for k, v in self.fields.items()}, self.place[index], self.units, self.multipliers)
 
@@ -110,18 +112,23 @@ class Contents:
     ----------
     messages : name -> Messages, those that were wanted and are there
     counts : name -> how many there are, of all
+    instances : name -> instances that there are, of those of which one was wanted
     damaged : stretches of bytes that are no message
     damaged_bytes : bytes in them, without a message that the end of the file cuts off
     """
 
     messages: dict[str, Messages]
     counts: Counter[str]
+    instances: Mapping[str, set[int]]
     damaged: int
     damaged_bytes: int
 
 
 def read_messages(
-    path: Path, wanted: Mapping[str, Collection[str]], progress: Callable[[int, int], None] = lambda done, total: None
+    path: Path,
+    wanted: Mapping[str, Collection[str]],
+    only: Mapping[str, int | None] = MappingProxyType({}),
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Contents:
     """Read a log.
 
@@ -129,9 +136,10 @@ def read_messages(
     ----------
     path : of the log, not compressed
     wanted : name of a message -> its fields that are wanted; those that its format lacks are not in the answer
+    only : name of a message -> the one instance that is wanted, None = the first; without it all are
     progress : called with the bytes read and those of the file
     """
-    walk = _Walk({**wanted, **_DEFINING})
+    walk = _Walk({**wanted, **_DEFINING}, only)
     total, rest, start = path.stat().st_size, b"", 0
     with path.open("rb") as file:
         while block := file.read(BLOCK):
@@ -152,8 +160,10 @@ class _Walk:
     places : of those of each type, within the block
     """
 
-    def __init__(self, wanted: Mapping[str, Collection[str]]) -> None:
+    def __init__(self, wanted: Mapping[str, Collection[str]], only: Mapping[str, int | None]) -> None:
         self._wanted = wanted
+        self._only = dict(only)
+        self._instances: dict[str, set[int]] = {}
         self._formats: dict[int, MessageFormat] = {}
         self._rows: dict[str, list[NDArray[Any]]] = {}
         self._row_places: dict[str, list[NDArray[np.int64]]] = {}
@@ -227,12 +237,22 @@ class _Walk:
             if form is not None and (names := self._fields(form)):
                 index = np.array(places)
                 rows = raw[index[:, None] + np.arange(3, form.length)].view(form.dtype)[:, 0]
+                if form.name in self._only and (numbers := instances(rows)) is not None:
+                    chosen = self._choose(form.name, numbers)
+                    rows, index = rows[chosen], index[chosen]
                 kept = np.empty(len(rows), dtype=[(n, form.dtype[n]) for n in names])
                 for name in names:
                     kept[name] = rows[name]
                 self._rows.setdefault(form.name, []).append(kept)
                 self._row_places.setdefault(form.name, []).append(index + start)
             places.clear()
+
+    def _choose(self, name: str, numbers: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which rows are of the instance that is wanted."""
+        self._instances.setdefault(name, set()).update(np.unique(numbers).tolist())
+        if self._only[name] is None:
+            self._only[name] = int(numbers[0])
+        return np.asarray(numbers == self._only[name])
 
     def _fields(self, form: MessageFormat) -> list[str]:
         return [n for n in self._wanted.get(form.name, ()) if n in form.multipliers]
@@ -241,11 +261,13 @@ class _Walk:
         """All that was walked."""
         found = {}
         for name in list(self._rows):
-            rows = np.concatenate(self._rows.pop(name))
-            place = np.concatenate(self._row_places.pop(name))
-            found[name] = Messages({n: np.ascontiguousarray(rows[n]) for n in rows.dtype.names or ()}, place)
+            rows, place = self._rows.pop(name), np.concatenate(self._row_places.pop(name))
+            fields: dict[str, NDArray[Any]] = {
+                n: np.concatenate([part[n] for part in rows]) for n in rows[0].dtype.names or ()
+            }
+            found[name] = Messages(fields, place)
         self._give_units(found)
-        return Contents(found, self._counts, self._damaged, self._damaged_bytes)
+        return Contents(found, self._counts, self._instances, self._damaged, self._damaged_bytes)
 
     def _give_units(self, found: dict[str, Messages]) -> None:
         """Units and multipliers by the log's own tables; a format character's multiplier goes before them."""
@@ -263,6 +285,11 @@ class _Walk:
                 known = scales.get(ord(scale), 0.0) if label and scale not in (b"", b"?") else 0.0
                 messages.units[name] = label
                 messages.multipliers[name] = implied if implied != 1.0 or not known else float(known)
+
+
+def instances(rows: NDArray[Any]) -> NDArray[Any] | None:
+    """Of which instance rows of messages are, shape (n,); None where their format knows none."""
+    return next((rows[name] for name in INSTANCE if name in (rows.dtype.names or ())), None)
 
 
 def _declared(of_kind: Messages) -> dict[int, tuple[bytes, bytes]]:
