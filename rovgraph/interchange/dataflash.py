@@ -289,7 +289,7 @@ def _clock(messages: Mapping[str, Messages]) -> Clock:
             kind = int(rtc.fields["SourceType"][-1])
             return Clock(CLOCK, float(unix - boot), RTC_SD_S[kind], f"RTC, source {kind}")
     if gps is not None and all(name in gps for name in ("Status", "GMS", "GWk")):
-        gps = gps.take((gps.fields["Status"] >= channels.FIX_3D) & (gps.fields["GWk"] > 0))
+        gps = gps.take(np.logical_and(gps.fields["Status"] >= channels.FIX_3D, gps.fields["GWk"] > 0))
         if len(gps):
             unix = GPS_EPOCH + WEEK_S * gps.fields["GWk"].astype(float) + 1e-3 * gps.fields["GMS"] - LEAP_S
             offset = float(np.max(unix - gps.fields["TimeUS"] * 1e-6))  # the message that came with the least delay
