@@ -1,33 +1,26 @@
 """ArduPilot's own logs, DataFlash ``.BIN``: what a vehicle with ArduSub records on board."""
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.interchange import dataflash_channels as channels
 from rovgraph.interchange.alternatives import preferred_first
-from rovgraph.interchange.dataflash_channels import CLOCK, Findings, Source
+from rovgraph.interchange.ardupilot import CLOCK, SPEED_ESTIMATE_AXES, settings
+from rovgraph.interchange.dataflash_channels import Findings, Source
 from rovgraph.interchange.dataflash_messages import FMT, HEAD, INSTANCE, Contents, Messages, read_messages, texts
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.rates import too_slow
+from rovgraph.interchange.receiver import longest_boot
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 
 GPS_EPOCH, WEEK_S = 315_964_800, 604_800  # in Unix time [s]
 LEAP_S = 18  # by which UTC is behind GPS, since 2017
 RTC_SD_S = {0: 0.2, 1: 1.0, 2: 2.0}  # by where the clock was set from: GPS, a ground station, a battery
 GPS_SD_S = 0.2  # a fix reaches the autopilot so late
-RESET_S = 1.0  # boot time that goes back further is another boot
-
-
-VELOCITY_ESTIMATE_AXES = (
-    "the DVL's velocities come as vision speed estimates, by definition along north, east and down; those of the "
-    "BlueOS DVL extension are along the vehicle's axes, which is assumed"
-)
 
 
 @dataclass(frozen=True)
@@ -61,7 +54,7 @@ KINDS = (
     Kind("dvl", ("VISV",), channels.velocity_estimate, ("VX", "VY", "VZ")),
     Kind("dvl_altitude", ("RFND",), channels.rangefinder, ("Dist", "Orient"), ("Stat", "Status")),
     Kind("fix", ("GPS", "GPS2"), channels.fixes, ("Status", "GMS", "GWk", "HDop", "Lat", "Lng")),
-    Kind("thruster", ("RCOU",), channels.thrusters, (), tuple(f"C{k}" for k in range(1, 15))),
+    Kind("thruster", ("RCOU",), channels.drive, (), tuple(f"C{k}" for k in range(1, 15))),
 )
 _WANTED = {name: ("TimeUS", *kind.required, *kind.optional, *INSTANCE) for kind in KINDS for name in kind.names} | {
     "PARM": ("Name", "Value"),
@@ -94,16 +87,17 @@ class DataFlash:
             raise InputError(f"{path}: holds no measurement of a sensor ({_summary(contents)}); copy the file again")
         findings.notes[:0] = firmware
         _describe(contents, made, findings)
-        settings = _settings(made, parameters, findings)
+        known, unknown = settings({channel.sensor for channel in made}, parameters)
+        environment = known.get("environment", {}) | findings.environment
         return Recording(
             str(path),
             self.name,
             tuple(made),
             {CLOCK: clock},
             _left(contents, findings),
-            settings,
+            known | ({"environment": environment} if environment else {}),
             tuple(findings.notes),
-            tuple(findings.warnings),
+            (*findings.warnings, *unknown),
         )
 
 
@@ -139,20 +133,13 @@ def _one_boot(messages: dict[str, Messages], findings: Findings) -> dict[str, Me
     densest = max(timed, key=len)
     order = np.argsort(densest.place, kind="stable")
     time = densest.value("TimeUS")[order] * (1.0 if densest.units["TimeUS"] else 1e-6)
-    back = np.flatnonzero(np.diff(time) < -RESET_S) + 1
-    if not len(back):
+    first, end, resets = longest_boot(densest.place[order], time)
+    if not resets:
         return messages
-    bounds = np.array([0, *back, len(time)])
-    longest = int(np.argmax(np.diff(bounds)))
-    first = 0 if longest == 0 else int(densest.place[order[bounds[longest]]])
-    end = sys.maxsize if longest == len(back) else int(densest.place[order[bounds[longest + 1]]])
-    findings.warnings.append(
-        f"the autopilot's clock went back {len(back)} times, so it was started anew; the longest part is read, "
-        f"{np.diff(bounds).max() / len(time):.0%} of the log"
-    )
+    findings.warnings.append(f"the autopilot was started anew {resets} times in the log; the longest run is read")
     kept = {"PARM": messages["PARM"]} if "PARM" in messages else {}
     for name, m in messages.items():
-        within = np.asarray((m.place >= first) & (m.place < end))
+        within = np.logical_and(m.place >= first, m.place < end)
         if name not in kept and within.any():
             kept[name] = m.take(within)
     return kept
@@ -212,12 +199,14 @@ def _sources(
         if lacking := [f for f in ("TimeUS", *kind.required) if f not in all_]:
             findings.left[name, f"its format has no field {', '.join(lacking)}"] = len(all_)
             continue
-        numbers = next((all_.fields[f] for f in INSTANCE if f in all_), None)
-        known = [number] if numbers is None else np.unique(numbers).tolist()
-        for instance in known:
-            label = name if numbers is None else f"{name} {instance}"
-            part = all_ if len(known) == 1 else all_.take(numbers == instance)
-            found.append(Source(name, part, parameters, findings, label, int(instance)))
+        field = next((f for f in INSTANCE if f in all_), None)
+        if field is None:
+            found.append(Source(name, all_, parameters, findings, name, number))
+            continue
+        numbers = all_.fields[field]
+        for instance in np.unique(numbers).tolist():
+            part = all_.take(np.equal(numbers, instance))
+            found.append(Source(name, part, parameters, findings, f"{name} {instance}", instance))
     return found
 
 
@@ -257,26 +246,11 @@ def _describe(contents: Contents, made: list[Channel], findings: Findings) -> No
     if imu is None:
         findings.warnings.append("no IMU in the log; set the autopilot's LOG_BITMASK to record it")
     else:
-        findings.warnings += too_slow(imu.columns["time"], imu.source, "set the autopilot's LOG_BITMASK to fast IMU")
+        remedy = "set the autopilot's LOG_BITMASK to fast IMU"
+        findings.warnings += too_slow(imu.columns["time"], imu.source.partition(":")[0], remedy)
     dvl = next((c for c in made if c.sensor == "dvl"), None)
     if dvl is not None and dvl.source.startswith("VISV"):
-        findings.warnings.append(VELOCITY_ESTIMATE_AXES)
-
-
-def _settings(made: list[Channel], parameters: Mapping[str, float], findings: Findings) -> dict[str, Any]:
-    """What the log knows of a configuration."""
-    sensors = {channel.sensor: channel for channel in reversed(made)}  # the first of each
-    settings: dict[str, Any] = {}
-    for sensor, prefix in (("imu", "INS_POS1"), ("dvl", "VISO_POS")):
-        if sensor in sensors:
-            lever = [parameters.get(f"{prefix}_{axis}", 0.0) for axis in "XYZ"]
-            settings[sensor] = {"mount_rpy_deg": [0.0, 0.0, 0.0]} | ({"lever_arm_m": lever} if any(lever) else {})
-    if "COMPASS_DEC" in parameters:
-        declination = round(float(np.rad2deg(parameters["COMPASS_DEC"])), 3)
-        findings.settings.setdefault("environment", {})["declination_deg"] = declination
-    elif "ahrs" in sensors:
-        findings.warnings.append("the log knows no declination, so ahrs_yaw is from true north: mag and ahrs disagree")
-    return settings | findings.settings
+        findings.warnings.append(SPEED_ESTIMATE_AXES)
 
 
 def _clock(messages: Mapping[str, Messages]) -> Clock:

@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, wrap_angle
+from rovgraph.interchange.ardupilot import BODY, CLOCK, MAGNETIC, declination, depth_of, thrusters
 from rovgraph.interchange.dataflash_messages import Messages
-from rovgraph.interchange.fixes import RANGE_SD_M, new_fixes, one_point
-from rovgraph.interchange.pressure import FRESH, depth, surface_pressure
+from rovgraph.interchange.fixes import ONE_POINT, RANGE_SD_M, new_fixes, one_point
 from rovgraph.interchange.recording import Channel
 
-CLOCK = "autopilot's boot time"
-BODY = "vehicle: forward, starboard, down"
 EARTH_FIELD_UT = 20.0, 70.0  # magnitudes that the Earth's field has anywhere [uT]
-MOTOR_1 = 33  # SERVOn_FUNCTION of the first thruster
 DOWN, GOOD = 25, 4  # a rangefinder's orientation and status
 FIX_3D = 3
 LATE_S = 1.0  # a sample's own stamp is at most so much before its message
@@ -52,14 +49,14 @@ class Findings:
     ----------
     notes, warnings : a sentence each
     undeclared : fields without a unit in the log
-    settings : of the configuration
+    environment : of the configuration
     left : number of messages that were left, by name and reason
     """
 
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     undeclared: set[str] = field(default_factory=set)
-    settings: dict[str, dict[str, object]] = field(default_factory=dict)
+    environment: dict[str, float] = field(default_factory=dict)
     left: Counter[tuple[str, str]] = field(default_factory=Counter)
 
 
@@ -167,27 +164,20 @@ def _median(values: Array) -> float:
 
 def attitude(source: Source) -> Channel | None:
     """ATT, AHR2: the autopilot's attitude; its heading is true, a log's is magnetic."""
-    declination = source.parameters.get("COMPASS_DEC", 0.0)
     columns = {
         "time": source.time(),
         "ahrs_roll": source.si("Roll", np.pi / 180.0),
         "ahrs_pitch": source.si("Pitch", np.pi / 180.0),
-        "ahrs_yaw": wrap_angle(source.si("Yaw", np.pi / 180.0) - declination),
+        "ahrs_yaw": wrap_angle(source.si("Yaw", np.pi / 180.0) - declination(source.parameters)),
     }
-    return source.channel("ahrs", columns, "Roll, Pitch, Yaw", "vehicle relative to magnetic north, east, down")
+    return source.channel("ahrs", columns, "Roll, Pitch, Yaw", MAGNETIC)
 
 
 def barometer(source: Source) -> Channel | None:
     """BARO: depth from pressure."""
-    names = [f"BARO{source.instance + 1}_GND_PRESS", *(["BARO_GND_PRESS"] if source.instance == 0 else [])]
-    stated = next((source.parameters[name] for name in names if name in source.parameters), None)
-    pressure = source.si("Press")
-    surface, found, good = surface_pressure(stated, pressure)
-    density = FRESH * source.parameters.get("BARO_SPEC_GRAV", 1.0)
-    said = f"{source.label}: surface pressure {surface / 100.0:.1f} hPa ({found}), water of {density:.0f} kg/m3"
+    found, said, good = depth_of(source.instance, source.si("Press"), source.parameters, source.label)
     (source.findings.notes if good else source.findings.warnings).append(said)
-    columns = {"time": source.time("SMS", 1e-3), "depth": depth(pressure, surface, density)}
-    return source.channel("depth", columns, "Press")
+    return source.channel("depth", {"time": source.time("SMS", 1e-3), "depth": found}, "Press")
 
 
 def rangefinder(source: Source) -> Channel | None:
@@ -241,12 +231,8 @@ def fixes(source: Source) -> Channel | None:
     source = source.where(source.raw("Status") >= FIX_3D, "no fix in three dimensions")
     lat, lon = source.si("Lat"), source.si("Lng")
     if (point := one_point(lat, lon)) is not None:
-        source.findings.warnings.append(
-            f"{source.label}: all {len(lat)} fixes are of one point, which no receiver does; "
-            "it is taken as the origin of the dive, not as fixes"
-        )
-        origin = {"origin_lat_deg": point[0], "origin_lon_deg": point[1]}
-        source.findings.settings.setdefault("environment", {}).update(origin)
+        source.findings.warnings.append(f"{source.label}: {ONE_POINT}")
+        source.findings.environment |= {"origin_lat_deg": point[0], "origin_lon_deg": point[1]}
         source.where(np.zeros(len(lat), dtype=bool), "one point that repeats")
         return None
     source = source.where(new_fixes(source.raw("GMS"), lat, lon), "nowhere on Earth, or the one before repeated")
@@ -255,14 +241,13 @@ def fixes(source: Source) -> Channel | None:
     return source.channel("fix", columns, "Lat, Lng; sd 3 m times HDop")
 
 
-def thrusters(source: Source) -> Channel | None:
-    """RCOU: pulse widths to the drive signal, -1 to 1; an output without pulses drives nothing."""
-    outputs = {}
-    for name in source.messages.fields:
-        motor = int(source.parameters.get(f"SERVO{name.removeprefix('C')}_FUNCTION", 0)) - MOTOR_1 + 1
-        if 1 <= motor <= 8:
-            outputs[motor] = source.raw(name)
-    if not outputs or sorted(outputs) != list(range(1, len(outputs) + 1)):
+def drive(source: Source) -> Channel | None:
+    """RCOU: pulse widths of the outputs."""
+    outputs = {int(name[1:]): source.raw(name) for name in source.messages.fields if name[1:].isdecimal()}
+    columns = thrusters(outputs, source.parameters)
+    if not columns:
+        source.where(
+            np.zeros(len(source.messages), dtype=bool), "no SERVOn_FUNCTION says which motor each output drives"
+        )
         return None
-    columns = {f"thruster_{m}": np.where(outputs[m] > 0, (outputs[m] - 1500.0) / 400.0, 0.0) for m in sorted(outputs)}
-    return source.channel("thruster", {"time": source.time(), **columns}, f"outputs of motors 1 to {len(outputs)}")
+    return source.channel("thruster", {"time": source.time(), **columns}, f"outputs of motors 1 to {len(columns)}")

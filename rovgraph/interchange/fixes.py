@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array
 
 RANGE_SD_M = 3.0  # of a satellite's range; with the dilution of precision that of a fix
+ONE_POINT = "all fixes are of one point, which no receiver does: the origin of the dive, and no fixes"
 FEW = 10  # fixes of one point that may be a vehicle at rest
 
 
