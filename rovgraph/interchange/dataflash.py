@@ -147,7 +147,7 @@ def _one_boot(messages: dict[str, Messages], findings: Findings) -> dict[str, Me
 
 def _parameters(messages: Messages | None, findings: Findings) -> dict[str, float]:
     """The autopilot's parameters as they were first; a calibration during the dive repeats some."""
-    if messages is None:
+    if messages is None or "Name" not in messages or "Value" not in messages:
         findings.warnings.append("the log holds no parameters: declination, surface pressure and motors are not known")
         return {}
     first: dict[str, float] = {}
@@ -229,7 +229,7 @@ def _sea_first(
 
 def _firmware(messages: Messages | None) -> list[str]:
     """A note of what wrote the log."""
-    said = [] if messages is None else texts(messages.fields["Message"])
+    said = [] if messages is None or "Message" not in messages else texts(messages.fields["Message"])
     return [f"firmware: {text}" for text in said if text.startswith("Ardu")][:1]
 
 

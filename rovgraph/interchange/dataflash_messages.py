@@ -271,7 +271,11 @@ class _Walk:
 
     def _give_units(self, found: dict[str, Messages]) -> None:
         """Units and multipliers by the log's own tables; a format character's multiplier goes before them."""
-        units, factors, of_kind = (found.pop(name, None) for name in _DEFINING)
+        tables = {name: found.pop(name, None) for name in _DEFINING}
+        units, factors, of_kind = (
+            table if table is not None and all(name in table for name in _DEFINING[of]) else None
+            for of, table in tables.items()
+        )
         labels = {} if units is None else dict(zip(units.fields["Id"], texts(units.fields["Label"]), strict=True))
         scales = {} if factors is None else dict(zip(factors.fields["Id"], factors.fields["Mult"], strict=True))
         declared = {} if of_kind is None else _declared(of_kind)
