@@ -168,8 +168,11 @@ def as_json(message: Any, system: int = 1, component: int = 1) -> tuple[str, byt
     """Topic and content of a message as BlueOS records it: names of enumerations, no extensions."""
     fields = message.to_dict()
     name = fields.pop("mavpackettype")
-    for key in ("h_acc", "v_acc", "vel_acc", "hdg_acc", "yaw", "alt_ellipsoid", "id", "temperature"):
-        fields.pop(key, None)
+    if name == "GPS_RAW_INT":
+        for key in ("h_acc", "v_acc", "vel_acc", "hdg_acc", "yaw", "alt_ellipsoid"):
+            del fields[key]
+    if "type" in fields:
+        fields["mavtype"] = fields.pop("type")
     if "fix_type" in fields:
         fields["fix_type"] = {"type": mavlink.enums["GPS_FIX_TYPE"][fields["fix_type"]].name}
     if "orientation" in fields:
