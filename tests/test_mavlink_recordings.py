@@ -169,6 +169,12 @@ def test_a_fast_imu_is_taken_as_it_is(tmp_path):
     )
 
 
+def test_a_field_that_no_place_has_is_warned_of(tmp_path):
+    strong = mavlink.MAVLink_raw_imu_message(10_000_000, 0, 0, -1000, 0, 0, 0, 2000, 0, 0)
+    recording = read(written(in_time(attitudes(), [(10.0, strong, (1, 1))])), tmp_path)
+    assert any("200 uT is nowhere on Earth" in warning for warning in recording.warnings)
+
+
 def test_an_imu_of_zeros_is_none(tmp_path):
     recording = read(written(in_time(attitudes(), raw_imus(50, zeros=True))), tmp_path)
     assert all(channel.sensor != "imu" for channel in recording.channels)

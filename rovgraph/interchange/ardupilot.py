@@ -14,6 +14,7 @@ from rovgraph.interchange.pressure import FRESH, depth, surface_pressure
 CLOCK = "autopilot's boot time"
 BODY = "vehicle: forward, starboard, down"
 MAGNETIC = "vehicle relative to magnetic north, east, down"
+EARTH_FIELD_UT = 20.0, 70.0  # magnitudes that the Earth's field has anywhere [uT]
 MOTOR_1, MOTORS = 33, 8  # SERVOn_FUNCTION of the first thruster, and how many there are
 NEUTRAL_US, SPAN_US = 1500.0, 400.0  # pulse widths of rest, and from there to full thrust
 SPEED_ESTIMATE_AXES = (

@@ -153,7 +153,7 @@ def _parameters(messages: Messages | None, findings: Findings) -> dict[str, floa
     first: dict[str, float] = {}
     changed = {}
     for name, value in zip(texts(messages.fields["Name"]), messages.fields["Value"].tolist(), strict=True):
-        if first.setdefault(name, value) != value:
+        if np.isfinite(value) and first.setdefault(name, value) != value:
             changed[name] = value
     primary = int(first.get("BARO_PRIMARY", 0)) + 1
     used = {"COMPASS_DEC", "BARO_PRIMARY", "BARO_SPEC_GRAV", "BARO_GND_PRESS", f"BARO{primary}_GND_PRESS"}
@@ -219,7 +219,7 @@ def _sea_first(
     named = [label for label in labels if sources[label][1].instance == primary]
     if named or len(labels) < 2:
         return sorted(labels, key=lambda label: label not in named)
-    spread = {label: float(np.nanstd(sources[label][1].raw("Press"))) for label in labels}
+    spread = {label: float(np.nan_to_num(sources[label][1].si("Press")).std()) for label in labels}
     best = max(labels, key=spread.__getitem__)
     findings.warnings.append(
         f"no parameter says which of {', '.join(labels)} is in the water: {best} is taken, whose pressure varies most"
@@ -256,17 +256,17 @@ def _describe(contents: Contents, made: list[Channel], findings: Findings) -> No
 def _clock(messages: Mapping[str, Messages]) -> Clock:
     """Boot time against UTC, by the autopilot's own clock or by its satellite receiver."""
     rtc, gps = messages.get("RTC"), messages.get("GPS")
-    if rtc is not None and "Epoch" in rtc and "SourceType" in rtc:
+    if rtc is not None and all(name in rtc for name in ("TimeUS", "Epoch", "SourceType")):
         rtc = rtc.take(np.isin(rtc.fields["SourceType"], list(RTC_SD_S)))
         if len(rtc):
             boot, unix = (rtc.fields[name][-1] * 1e-6 for name in ("TimeUS", "Epoch"))
             kind = int(rtc.fields["SourceType"][-1])
             return Clock(CLOCK, float(unix - boot), RTC_SD_S[kind], f"RTC, source {kind}")
-    if gps is not None and all(name in gps for name in ("Status", "GMS", "GWk")):
+    if gps is not None and all(name in gps for name in ("TimeUS", "Status", "GMS", "GWk")):
         gps = gps.take(np.logical_and(gps.fields["Status"] >= channels.FIX_3D, gps.fields["GWk"] > 0))
         if len(gps):
             unix = GPS_EPOCH + WEEK_S * gps.fields["GWk"].astype(float) + 1e-3 * gps.fields["GMS"] - LEAP_S
-            offset = float(np.max(unix - gps.fields["TimeUS"] * 1e-6))  # the message that came with the least delay
+            offset = float(np.median(unix - gps.fields["TimeUS"] * 1e-6))
             return Clock(CLOCK, offset, GPS_SD_S, "GPS week and milliseconds")
     return Clock(CLOCK)
 

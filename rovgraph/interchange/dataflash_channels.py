@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, wrap_angle
-from rovgraph.interchange.ardupilot import BODY, CLOCK, MAGNETIC, declination, depth_of, thrusters
+from rovgraph.interchange.ardupilot import BODY, CLOCK, EARTH_FIELD_UT, MAGNETIC, declination, depth_of, thrusters
 from rovgraph.interchange.dataflash_messages import Messages
 from rovgraph.interchange.fixes import ONE_POINT, RANGE_SD_M, new_fixes, one_point
 from rovgraph.interchange.recording import Channel
 
-EARTH_FIELD_UT = 20.0, 70.0  # magnitudes that the Earth's field has anywhere [uT]
 DOWN, GOOD = 25, 4  # a rangefinder's orientation and status
 FIX_3D = 3
 LATE_S = 1.0  # a sample's own stamp is at most so much before its message
@@ -98,7 +97,9 @@ class Source:
         factor = _SI.get(self.messages.units[field_])
         if factor is None:
             self.findings.undeclared.add(f"{self.name}.{field_}")
-        return self.messages.value(field_) * (documented if factor is None else factor)
+        with np.errstate(over="ignore", invalid="ignore"):  # damaged values
+            values = self.messages.value(field_) * (documented if factor is None else factor)
+        return np.where(np.isfinite(values), values, np.nan)
 
     def time(self, own: str = "", documented: float = 1e-6) -> Array:
         """Stamps [s], shape (n,): of a sample's own stamp, a counter of 32 bits, where there is one."""
@@ -182,8 +183,10 @@ def barometer(source: Source) -> Channel | None:
 
 def rangefinder(source: Source) -> Channel | None:
     """RFND: altitude of one that looks down."""
-    status = next(name for name in ("Stat", "Status") if name in source)
-    source = source.where((source.raw("Orient") == DOWN) & (source.raw(status) == GOOD), "not downwards, or no echo")
+    good = source.raw("Orient") == DOWN
+    for status in ("Stat", "Status"):
+        good &= source.raw(status) == GOOD if status in source else True
+    source = source.where(good, "not downwards, or no echo")
     return source.channel("dvl_altitude", {"time": source.time(), "dvl_altitude": source.si("Dist")}, "Dist")
 
 

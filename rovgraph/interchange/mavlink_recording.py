@@ -12,6 +12,7 @@ from rovgraph.interchange.alternatives import preferred_first
 from rovgraph.interchange.ardupilot import (
     BODY,
     CLOCK,
+    EARTH_FIELD_UT,
     MAGNETIC,
     SPEED_ESTIMATE_AXES,
     declination,
@@ -136,7 +137,7 @@ class _Vehicle:
         """Channels of all sensors, the preferred one of each first."""
         makers = {
             "imu": (self._imus(), self._plain),
-            "mag": (self._own("mag"), self._plain),
+            "mag": (self._own("mag"), self._field),
             "ahrs": (self._own("ahrs"), self._attitude),
             "depth": (self._pressures(), self._depth),
             "dvl": (self._anyones("dvl"), self._velocity),
@@ -215,6 +216,15 @@ class _Vehicle:
 
     def _plain(self, sensor: str, rows: Rows) -> Iterator[Channel]:
         yield self._channel(sensor, rows, rows.columns, "" if sensor == "dvl_altitude" else BODY)
+
+    def _field(self, sensor: str, rows: Rows) -> Iterator[Channel]:
+        magnitude = float(np.median(np.linalg.norm(np.column_stack(list(rows.columns.values())), axis=1)))
+        low, high = EARTH_FIELD_UT
+        if not low <= magnitude <= high:
+            self.warnings.append(
+                f"{rows.name}: a field of {magnitude:.0f} uT is nowhere on Earth; calibrate the compass"
+            )
+        yield self._channel(sensor, rows, rows.columns, BODY)
 
     def _attitude(self, sensor: str, rows: Rows) -> Iterator[Channel]:
         """The autopilot's heading is true, a log's is magnetic."""

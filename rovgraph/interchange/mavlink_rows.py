@@ -1,5 +1,6 @@
 """What recorded MAVLink messages said, as arrays."""
 
+import math
 from array import array
 from collections import Counter
 from collections.abc import Sequence
@@ -99,10 +100,10 @@ class Gatherer:
         self._taken += 1
         if name in OF_PARAMETERS:
             known = self.parameters.setdefault(sender, {})
-            if name == "PARAM_VALUE":
-                known.setdefault(message.param_id, float(message.param_value))
-            else:
-                known.setdefault("COMPASS_DEC", float(message.mag_declination))
+            parameter = name == "PARAM_VALUE"
+            value = float(message.param_value if parameter else message.mag_declination)
+            if math.isfinite(value):
+                known.setdefault(message.param_id if parameter else "COMPASS_DEC", value)
             return
         stamp = 1e-6 * usec(message) or np.nan
         for said in READERS[name](message):
