@@ -1,8 +1,4 @@
-"""MAVLink: what an autopilot tells of its sensors.
-
-Sources: the message definitions at https://mavlink.io/en/messages/common.html; units of RAW_IMU
-as ArduPilot fills it.
-"""
+"""MAVLink, live: what an autopilot tells of its sensors; `rovgraph.interchange.mavlink` reads the messages."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -12,22 +8,14 @@ from typing import Any
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.errors import InputError
 from rovgraph.geometry import wrap_angle
+from rovgraph.interchange.mavlink import IMUS, PRESSURES, READERS, UNIX_USEC, usec
+from rovgraph.interchange.mavlink_frames import Frames, dialect
 from rovgraph.live.message import GEODETIC, Message, Reading
-from rovgraph.live.sources.mavlink_frames import Frames
 from rovgraph.live.sources.preferred import Preferred
 from rovgraph.live.sources.source import Chunk, Notify
 
-IMUS = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")  # best first
-MILLI_G = 9.80665e-3  # [m/s2]
-MICROTESLA = {"milligauss": 0.1, "gauss": 100.0}
-UNIX_USEC = 1e15  # times above this, in microseconds, are since 1970, those below since the start
-RANGE_SD_M = 3.0  # of a satellite's range; with the dilution of precision that of a fix
-NO_HDOP = 65535
 VEHICLE_COMPONENT = 1
-
-_ACC, _GYR, _MAG = (tuple(f"{axis}{kind}" for axis in "xyz") for kind in ("acc", "gyro", "mag"))
 
 
 @dataclass(frozen=True)
@@ -70,18 +58,17 @@ class MavlinkDecoder:
         self._url = url
         self._notify = notify
         self._options = options
-        self._frames = Frames(_dialect(), notify)
+        self._frames = Frames(dialect(), notify)
         self._system = options.system
         self._surface = options.surface
         self._density_gravity = options.density * config.environment.gravity_mps2
         self._declination = np.deg2rad(config.environment.declination_deg)
         self._imus = Preferred(IMUS if options.imu is None else (options.imu,), notify)
         self._fix_time: int | None = None
-        pressure = "SCALED_PRESSURE" + (str(options.pressure) if options.pressure > 1 else "")
         self._read: dict[str, Callable[[Any, float], Message | None]] = {
             **dict.fromkeys(IMUS, self._imu),
             "ATTITUDE": self._attitude,
-            pressure: self._pressure,
+            PRESSURES[options.pressure - 1]: self._pressure,
             "GPS_RAW_INT": self._fix,
             "VISION_POSITION_DELTA": self._velocity,
         }
@@ -124,42 +111,38 @@ class MavlinkDecoder:
 
     def _imu(self, message: Any, arrival: float) -> Message | None:
         kind = message.get_type()
-        found = _highres_imu(message) if kind == "HIGHRES_IMU" else _scaled_imu(message)
+        found = [Reading(sensor, np.array(values)) for sensor, values in READERS[kind](message)]
         if not any(r.sensor == "imu" for r in found) or not self._imus.takes(kind, arrival):
             return None
-        usec = 1e3 * message.time_boot_ms if kind == "SCALED_IMU2" else message.time_usec
-        return self._said_usec(arrival, usec, *found)
+        return self._said_usec(arrival, usec(message), *found)
 
     def _attitude(self, message: Any, arrival: float) -> Message | None:
-        yaw = float(wrap_angle(message.yaw - self._declination))  # from true to magnetic north, as a compass has it
-        attitude = Reading("ahrs", np.array([yaw, message.roll, message.pitch]))
-        return self._said(arrival, 1e-3 * message.time_boot_ms, attitude)
+        yaw, roll, pitch = READERS["ATTITUDE"](message)[0].values
+        magnetic = float(wrap_angle(yaw - self._declination))  # from true to magnetic north, as a compass has it
+        return self._said_usec(arrival, usec(message), Reading("ahrs", np.array([magnetic, roll, pitch])))
 
     def _pressure(self, message: Any, arrival: float) -> Message | None:
         if self._surface is None and math.isfinite(message.press_abs):
             self._surface = message.press_abs
             self._notify("surface", f"the first pressure, {message.press_abs:.1f} hPa, is taken as that at the surface")
         depth = 100.0 * (message.press_abs - (self._surface or math.nan)) / self._density_gravity
-        return self._said(arrival, 1e-3 * message.time_boot_ms, Reading("depth", np.array([depth])))
+        return self._said_usec(arrival, usec(message), Reading("depth", np.array([depth])))
 
     def _fix(self, message: Any, arrival: float) -> Message | None:
-        if message.fix_type < 3 or message.time_usec == self._fix_time != 0 or message.lat == message.lon == 0:
+        found = READERS["GPS_RAW_INT"](message)
+        if not found or message.time_usec == self._fix_time != 0:
             return None
         self._fix_time = message.time_usec
-        if abs(message.lat) > 90e7 or abs(message.lon) > 180e7:
+        lat, lon, _ = found[0].values
+        if abs(lat) > 90.0 or abs(lon) > 180.0:
             self._notify("out of range", "a fix that is nowhere on Earth is left out")
             return None
-        fix = np.array([1e-7 * message.lat, 1e-7 * message.lon, _fix_sd(message)])
-        return self._said_usec(arrival, message.time_usec, Reading(GEODETIC, fix))
+        return self._said_usec(arrival, usec(message), Reading(GEODETIC, np.array(found[0].values)))
 
     def _velocity(self, message: Any, arrival: float) -> Message | None:
-        """Mean velocity over an interval, which is that of its middle."""
-        velocity, valid = np.full(3, np.nan), message.confidence > 0.0 and message.time_delta_usec > 0
-        if valid:
-            velocity = np.array(message.position_delta) / (1e-6 * message.time_delta_usec)
-        middle = max(0.0, message.time_usec - 0.5 * message.time_delta_usec)
+        found = Reading("dvl", np.array([*READERS["VISION_POSITION_DELTA"](message)[0].values, np.nan]))
         sender = "" if self._from_autopilot(message) else f" of {message.get_srcSystem()}/{message.get_srcComponent()}"
-        return self._said_usec(arrival, middle, Reading("dvl", np.array([*velocity, valid, np.nan])), sender=sender)
+        return self._said_usec(arrival, usec(message), found, sender=sender)
 
 
 _REQUIRED = {"imu": 6, "mag": 3, "ahrs": 3, "dvl": 4, "depth": 1, GEODETIC: 2}
@@ -169,36 +152,3 @@ def _whole(reading: Reading) -> bool:
     """Whether everything that is required is finite; a ping without bottom lock needs no velocity."""
     lost = reading.sensor == "dvl" and reading.values[3] == 0.0
     return lost or bool(np.isfinite(reading.values[: _REQUIRED[reading.sensor]]).all())
-
-
-def _scaled_imu(message: Any) -> list[Reading]:
-    """Of RAW_IMU or SCALED_IMU2, mg, mrad/s and mgauss; a sensor that is not there says zeros."""
-    acc, gyr, mag = (np.array([getattr(message, n) for n in names], dtype=float) for names in (_ACC, _GYR, _MAG))
-    found = [Reading("imu", np.concatenate([MILLI_G * acc, 1e-3 * gyr]))] if acc.any() else []
-    return found + ([Reading("mag", MICROTESLA["milligauss"] * mag)] if mag.any() else [])
-
-
-def _highres_imu(message: Any) -> list[Reading]:
-    """Of HIGHRES_IMU, SI and gauss: what it says is new."""
-    found = []
-    if message.fields_updated & 0x03F == 0x03F:
-        found.append(Reading("imu", np.array([getattr(message, n) for n in _ACC + _GYR], dtype=float)))
-    if message.fields_updated & 0x1C0 == 0x1C0:
-        mag = np.array([getattr(message, n) for n in _MAG], dtype=float)
-        found.append(Reading("mag", MICROTESLA["gauss"] * mag))
-    return found
-
-
-def _fix_sd(message: Any) -> float:
-    """Of a fix, north and east: the receiver's own, else by its dilution of precision, else NaN [m]."""
-    if getattr(message, "h_acc", 0) > 0:
-        return 1e-3 * float(message.h_acc)
-    return RANGE_SD_M * 1e-2 * message.eph if 0 < message.eph < NO_HDOP else math.nan
-
-
-def _dialect() -> Any:
-    try:
-        from pymavlink.dialects.v20 import ardupilotmega
-    except ImportError:
-        raise InputError("mavlink: needs pymavlink; install it with: pip install 'rovgraph[online]'") from None
-    return ardupilotmega

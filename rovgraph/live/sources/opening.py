@@ -8,11 +8,12 @@ from pathlib import Path
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
+from rovgraph.interchange.mavlink import IMUS
 from rovgraph.live.sources import waterlinked
 from rovgraph.live.sources.address import LOOPBACK, Address, one_of, parse_address, positive, whole
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.links import SerialLink, StandardInput, TcpLink, UdpLink
-from rovgraph.live.sources.mavlink import IMUS, MavlinkDecoder, Options
+from rovgraph.live.sources.mavlink import MavlinkDecoder, Options
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.recordings import FileLink, TelemetryLog
 from rovgraph.live.sources.replay import LogReplay, log_replay, refuse_other_epochs

@@ -7,13 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rovgraph.errors import InputError
-from rovgraph.live.sources.mavlink_frames import MARKERS, frame_length
+from rovgraph.interchange.mavlink_frames import frames_with_times
 from rovgraph.live.sources.source import Chunk
 
 BLOCK = 1 << 16  # bytes read at a time
-TIME = 8  # bytes of a time in a telemetry log: microseconds since 1970, big-endian
-EARLIEST, LATEST = 946_684_800.0, 4_102_444_800.0  # 2000 and 2100, seconds since 1970
-JUMP_S = 60.0  # a message's time alone may not be further off than this
 
 
 def read_file(path: Path) -> bytes:
@@ -60,42 +57,4 @@ class TelemetryLog:
 
 def timed_frames(content: bytes) -> Iterator[Chunk]:
     """Frames of a telemetry log; what stands between them and is none comes as a chunk too."""
-    start = lost = 0
-    arrival = 0.0
-    while start + TIME < len(content):
-        if not _begins(content, start):
-            start += 1
-            continue
-        end = start + TIME + (frame_length(content, start + TIME) or len(content))
-        if end < len(content) and not _begins(content, end) and _begins_within(content, start + 1, end):
-            start += 1  # a time and a marker by chance, or a frame that lost bytes
-            continue
-        time = _arrival(content, start, end, arrival)
-        if lost < start:
-            yield Chunk(content[lost:start], arrival or time, fresh=True)
-        arrival = time
-        yield Chunk(content[start + TIME : end], arrival, fresh=True)
-        start = lost = end
-    if lost < len(content):
-        yield Chunk(content[lost:], arrival, fresh=True)
-
-
-def _arrival(content: bytes, start: int, end: int, before: float) -> float:
-    """The time of a frame [s]; that of the one before it where neither that nor the next is near."""
-    time = _time(content, start)
-    near = [before] + ([_time(content, end)] if _begins(content, end) else [])
-    return time if not before or min(abs(time - other) for other in near) < JUMP_S else before
-
-
-def _time(content: bytes, start: int) -> float:
-    return 1e-6 * int.from_bytes(content[start : start + TIME], "big")
-
-
-def _begins(content: bytes, start: int) -> bool:
-    """Whether a time and the beginning of a frame may stand here."""
-    marker = content[start + TIME : start + TIME + 1]
-    return marker in MARKERS and EARLIEST < _time(content, start) < LATEST
-
-
-def _begins_within(content: bytes, start: int, end: int) -> bool:
-    return any(_begins(content, at) for at in range(start, end))
+    return (Chunk(data, time, fresh=True) for data, time in frames_with_times(content))

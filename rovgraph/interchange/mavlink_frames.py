@@ -1,18 +1,36 @@
-"""MAVLink frames in a stream of bytes.
+"""MAVLink frames, in a stream of bytes and in telemetry logs.
 
 A frame begins with a marker and its length; behind a byte that only looks like a marker, the
-search goes on with the next byte, so that noise costs no good frame.
+search goes on with the next byte, so that noise costs no good frame. In a telemetry log (``.tlog``) a time stands
+before each frame.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from rovgraph.live.sources.source import Notify
+from rovgraph.errors import InputError
 
 V1, V2 = 0xFE, 0xFD
 MARKERS = (bytes([V1]), bytes([V2]))
 SIGNED = 0x01
 SIGNATURE = 13  # bytes
+TIME = 8  # bytes of a time in a telemetry log: microseconds since 1970, big-endian
+EARLIEST, LATEST = 946_684_800.0, 4_102_444_800.0  # 2000 and 2100, seconds since 1970
+JUMP_S = 60.0  # a message's time alone may not be further off than this
+
+
+def dialect() -> Any:
+    """ArduPilot's messages.
+
+    Raises
+    ------
+    InputError : pymavlink is not installed
+    """
+    try:
+        from pymavlink.dialects.v20 import ardupilotmega
+    except ImportError:
+        raise InputError("mavlink: needs pymavlink; install it with: pip install 'rovgraph[online]'") from None
+    return ardupilotmega
 
 
 def frame_length(data: bytes | bytearray, start: int) -> int | None:
@@ -34,7 +52,7 @@ class Frames:
     notify : takes warnings; "bad data" once per stretch of bytes that is no message
     """
 
-    def __init__(self, mavlink: Any, notify: Notify) -> None:
+    def __init__(self, mavlink: Any, notify: Callable[[str, str], None]) -> None:
         self._parser = mavlink.MAVLink(None)
         self._notify = notify
         self._rest = bytearray()
@@ -91,3 +109,46 @@ class Frames:
         if self._sane:
             self._notify("bad data", "bytes that are no message, skipped; a wrong baud rate, or a noisy line?")
         self._sane = False
+
+
+def frames_with_times(content: bytes) -> Iterator[tuple[bytes, float]]:
+    """Frames of a telemetry log with the times of their arrival [s]; what stands between them comes too."""
+    start = lost = 0
+    arrival = 0.0
+    while start + TIME < len(content):
+        if not begins(content, start):
+            start += 1
+            continue
+        end = start + TIME + (frame_length(content, start + TIME) or len(content))
+        if end < len(content) and not begins(content, end) and _begins_within(content, start + 1, end):
+            start += 1  # a time and a marker by chance, or a frame that lost bytes
+            continue
+        time = _arrival(content, start, end, arrival)
+        if lost < start:
+            yield content[lost:start], arrival or time
+        arrival = time
+        yield content[start + TIME : end], arrival
+        start = lost = end
+    if lost < len(content):
+        yield content[lost:], arrival
+
+
+def _arrival(content: bytes, start: int, end: int, before: float) -> float:
+    """The time of a frame [s]; that of the one before it where neither that nor the next is near."""
+    time = _time(content, start)
+    near = [before] + ([_time(content, end)] if begins(content, end) else [])
+    return time if not before or min(abs(time - other) for other in near) < JUMP_S else before
+
+
+def _time(content: bytes, start: int) -> float:
+    return 1e-6 * int.from_bytes(content[start : start + TIME], "big")
+
+
+def begins(content: bytes, start: int) -> bool:
+    """Whether a time and the beginning of a frame may stand here."""
+    marker = content[start + TIME : start + TIME + 1]
+    return marker in MARKERS and EARLIEST < _time(content, start) < LATEST
+
+
+def _begins_within(content: bytes, start: int, end: int) -> bool:
+    return any(begins(content, at) for at in range(start, end))

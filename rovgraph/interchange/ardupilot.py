@@ -1,0 +1,87 @@
+"""What ArduPilot's parameters say of its sensors, for its own logs and for MAVLink.
+
+Parameters: https://ardupilot.org/sub/docs/parameters.html.
+"""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+
+from rovgraph.geometry import Array
+from rovgraph.interchange.pressure import FRESH, depth, surface_pressure
+
+CLOCK = "autopilot's boot time"
+BODY = "vehicle: forward, starboard, down"
+MAGNETIC = "vehicle relative to magnetic north, east, down"
+EARTH_FIELD_UT = 20.0, 70.0  # magnitudes that the Earth's field has anywhere [uT]
+MOTOR_1, MOTORS = 33, 8  # SERVOn_FUNCTION of the first thruster, and how many there are
+NEUTRAL_US, SPAN_US = 1500.0, 400.0  # pulse widths of rest, and from there to full thrust
+SPEED_ESTIMATE_AXES = (
+    "the DVL's velocities come as vision speed estimates, by definition along north, east and down; those of the "
+    "BlueOS DVL extension are along the vehicle's axes, which is assumed"
+)
+
+
+def declination(parameters: Mapping[str, float]) -> float:
+    """Magnetic declination that the autopilot's heading includes [rad]; 0 where it is not known."""
+    return parameters.get("COMPASS_DEC", 0.0)
+
+
+def depth_of(instance: int, pressure: Array, parameters: Mapping[str, float], label: str) -> tuple[Array, str, bool]:
+    """Depth of a pressure sensor.
+
+    Parameters
+    ----------
+    instance : of the barometer, from 0
+    pressure : ndarray, shape (n,) [Pa]
+    parameters : of the autopilot
+    label : of the sensor, for people
+
+    Returns
+    -------
+    depth, ndarray, shape (n,) [m]; what it rests on, for people; whether that is the autopilot's own word
+    """
+    names = [f"BARO{instance + 1}_GND_PRESS", *(["BARO_GND_PRESS"] if instance == 0 else [])]
+    stated = next((parameters[name] for name in names if name in parameters), None)
+    surface, found, good = surface_pressure(stated, pressure)
+    density = FRESH * parameters.get("BARO_SPEC_GRAV", 1.0)
+    water = f"water of {density:.0f} kg/m3" + ("" if "BARO_SPEC_GRAV" in parameters else " for want of BARO_SPEC_GRAV")
+    said = f"{label}: surface pressure {surface / 100.0:.1f} hPa ({found}), {water}"
+    return depth(pressure, surface, density), said, good and "BARO_SPEC_GRAV" in parameters
+
+
+def thrusters(outputs: Mapping[int, Array], parameters: Mapping[str, float]) -> dict[str, Array]:
+    """Drive signals, -1 to 1, of the outputs that drive motors 1, 2, ...; {} where parameters do not say which.
+
+    Parameters
+    ----------
+    outputs : number of the output -> ndarray, shape (n,), pulse widths [us]; one without pulses drives nothing
+    """
+    motors = {}
+    for number, width in outputs.items():
+        motor = int(parameters.get(f"SERVO{number}_FUNCTION", 0)) - MOTOR_1 + 1
+        if 1 <= motor <= MOTORS:
+            motors[motor] = np.where(width > 0.0, (width - NEUTRAL_US) / SPAN_US, 0.0)
+    if sorted(motors) != list(range(1, len(motors) + 1)):
+        return {}
+    return {f"thruster_{motor}": motors[motor] for motor in sorted(motors)}
+
+
+def settings(sensors: Collection[str], parameters: Mapping[str, float]) -> tuple[dict[str, Any], list[str]]:
+    """What parameters say of a configuration, and warnings.
+
+    Parameters
+    ----------
+    sensors : those that a file has
+    """
+    found: dict[str, Any] = {}
+    for sensor, prefix in (("imu", "INS_POS1"), ("dvl", "VISO_POS")):
+        if sensor in sensors:
+            lever = [round(parameters.get(f"{prefix}_{axis}", 0.0), 4) for axis in "XYZ"]
+            found[sensor] = {"mount_rpy_deg": [0.0, 0.0, 0.0]} | ({"lever_arm_m": lever} if any(lever) else {})
+    if "COMPASS_DEC" in parameters:
+        found["environment"] = {"declination_deg": round(float(np.rad2deg(declination(parameters))), 3)}
+        return found, []
+    unknown = "the autopilot's declination is not in the file: ahrs_yaw is from true north, state it for the others"
+    return found, [unknown] if "ahrs" in sensors else []
