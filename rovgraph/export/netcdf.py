@@ -32,8 +32,8 @@ def write(track: Track, path: Path, options: Options) -> None:
             variables[name] = ("time", degrees, {"standard_name": name, "units": f"degrees_{axis}"})
     for k, (name, standard) in enumerate(ANGLES.items()):
         variables[name] = ("time", np.rad2deg(t.rpy[:, k]), {"standard_name": standard, "units": "degree"})
-    for k, (name, words) in enumerate(SPEEDS.items()):
-        variables[name] = ("time", t.v_n[:, k], {"long_name": words, "units": "m s-1"})
+    for k, (name, long_name) in enumerate(SPEEDS.items()):
+        variables[name] = ("time", t.v_n[:, k], {"long_name": long_name, "units": "m s-1"})
     sds = {
         **dict(zip(("north", "east", "depth"), t.p_sd.T, strict=True)),
         **dict(zip(ANGLES, np.rad2deg(t.rpy_sd).T, strict=True)),
@@ -46,11 +46,10 @@ def write(track: Track, path: Path, options: Options) -> None:
             variables[name][2]["ancillary_variables"] = f"{name}_sd"
     since = "seconds since 1970-01-01 00:00:00" if track.has_utc else "s"
     time = ("time", t.time, {"standard_name": "time", "units": since, "axis": "T"})
-    trajectory = ((), track.name, {"cf_role": "trajectory_id"})
     title = {"Conventions": "CF-1.11", "featureType": "trajectory", "title": f"{track.name}, {track.estimate}"}
-    dataset = xr.Dataset(
-        {**variables, "trajectory": trajectory}, {"time": time}, {**title, "source": f"rovgraph {__version__}"}
-    )
+    title["source"] = f"rovgraph {__version__}"
+    dataset = xr.Dataset(variables, {"time": time}, title)
+    dataset["trajectory"] = ((), track.name, {"cf_role": "trajectory_id"})
     dataset.to_netcdf(path, engine="h5netcdf", encoding={"time": {"_FillValue": None}})
 
 

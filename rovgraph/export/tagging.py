@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.export.points import point_table
@@ -32,7 +33,7 @@ class Tagged:
     """
 
     frame: pd.DataFrame
-    inside: Array
+    inside: NDArray[np.bool_]
     time: Array
 
 
@@ -87,14 +88,15 @@ def _seconds(times: pd.Series, track: Track) -> Array:
     wrong = np.flatnonzero(dates.isna() & (times.astype(str).str.strip() != ""))
     if len(wrong):
         raise InputError(
-            f"column {times.name}: row {wrong[0] + 1} is {str(times.iloc[wrong[0]])[:30]!r}, expected seconds or a date "
+            f"column {times.name}: row {wrong[0] + 1} is {str(times.iloc[wrong[0]])[:30]!r}, expected seconds or a date"
+                " "
             "such as 2026-05-01T09:30:00Z"
         )
     if not track.has_utc:
         raise InputError(
             f"column {times.name}: holds dates, and the dive's time is no Unix time; give seconds of the dive's clock"
         )
-    return (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float)
+    return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), dtype=float)
 
 
 def geotag(tagged: Tagged, track: Track, files: Sequence[Path], folder: Path) -> int:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -30,7 +31,7 @@ class Fixes:
 
     time: Array
     position: Array
-    used: Array
+    used: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ class Track:
         """
         if not self.has_utc:
             raise InputError(
-                f"{self.name}: its time begins at {self.trajectory.time[0]:g} s, which is no Unix time, and this format "
-                "needs one; add the Unix time of 0 s to the log's times (or give it as --unix-offset)"
+                f"{self.name}: its time begins at {self.trajectory.time[0]:g} s, which is no Unix time, and this "
+                "format needs one; add the Unix time of 0 s to the log's times (or give it as --unix-offset)"
             )
         return pd.to_datetime(np.round(self.trajectory.time * 1e6).astype(np.int64), unit="us", utc=True)
 
