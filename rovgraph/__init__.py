@@ -35,7 +35,8 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 Layers (imports go downwards only)
 ----------------------------------
 cli / api / report, export / studies, live /
-estimators, simulate, evaluate, check, calibrate, interchange / graph / engine / instruments / log / sensors / config, trajectory / vehicle /
+estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
+instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / geometry, workers, fast_csv / errors, process.
 """
 

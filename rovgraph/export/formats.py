@@ -34,6 +34,10 @@ class Options:
     rate: float | None = None
     crs: str | None = None
 
+    def rate_or(self, usual: float) -> float:
+        """The rate asked for, or a format's own [Hz]."""
+        return usual if self.rate is None else self.rate
+
 
 @dataclass(frozen=True)
 class ExportFormat:

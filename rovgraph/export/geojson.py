@@ -18,7 +18,7 @@ Feature = dict[str, Any]
 
 def write(track: Track, path: Path, options: Options) -> None:
     """A feature collection; ``kind`` of each feature is track, point, ellipse or fix."""
-    points = track.at_rate(options.rate or SHOWN_HZ)
+    points = track.at_rate(options.rate_or(SHOWN_HZ))
     features = [_line(track), *_points(points), *_ellipses(points), *_fixes(track)]
     collection = {"type": "FeatureCollection", "name": track.name, "features": features}
     path.write_text(json.dumps(collection, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")

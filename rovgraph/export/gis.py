@@ -26,7 +26,7 @@ def write_layer(track: Track, path: Path, options: Options, driver: str) -> None
     import pyogrio.raw
     import shapely
 
-    shown = track.at_rate(options.rate or SHOWN_HZ)
+    shown = track.at_rate(options.rate_or(SHOWN_HZ))
     table = point_table(shown)
     x, y, crs = projected(table["lon"].to_numpy(), table["lat"].to_numpy(), options.crs)
     points = shapely.to_wkb(shapely.points(np.column_stack([x, y, -table["depth"].fillna(0.0)])))

@@ -11,7 +11,7 @@ def write(track: Track, path: Path, options: Options) -> None:
     """A track; with time where that is known."""
     import gpxpy.gpx
 
-    shown = track.at_rate(options.rate or SHOWN_HZ)
+    shown = track.at_rate(options.rate_or(SHOWN_HZ))
     gpx = gpxpy.gpx.GPX()
     gpx.creator = "rovgraph"
     line = gpxpy.gpx.GPXTrack(name=f"{track.name}, {track.estimate}")

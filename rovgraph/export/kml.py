@@ -21,7 +21,7 @@ def document(track: Track, options: Options) -> "simplekml.Kml":
     import simplekml
 
     kml = simplekml.Kml(name=f"{track.name}, {track.estimate}")
-    shown = track.at_rate(options.rate or SHOWN_HZ)
+    shown = track.at_rate(options.rate_or(SHOWN_HZ))
     lat, lon = shown.lat_lon
     height = np.nan_to_num(-shown.trajectory.p_n[:, 2])
     coordinates = np.column_stack([lon.round(9), lat.round(9), height.round(4)]).tolist()

@@ -50,7 +50,7 @@ def write(track: Track, path: Path, options: Options) -> None:
     title["source"] = f"rovgraph {__version__}"
     dataset = xr.Dataset(variables, {"time": time}, title)
     dataset["trajectory"] = ((), track.name, {"cf_role": "trajectory_id"})
-    dataset.to_netcdf(path, engine="h5netcdf", encoding={"time": {"_FillValue": None}})
+    dataset.to_netcdf(path, engine="scipy", format="NETCDF3_64BIT", encoding={"time": {"_FillValue": None}})
 
 
 FORMATS = (ExportFormat("netcdf", "NetCDF (CF)", ".nc", write, "netcdf"),)

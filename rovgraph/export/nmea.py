@@ -12,7 +12,7 @@ from rovgraph.live.outputs.nmea import course_sentence, heading_sentence, positi
 
 def write(track: Track, path: Path, options: Options) -> None:
     """Sentences with the time of day, UTC where the dive's time is Unix time."""
-    shown = track.at_rate(options.rate or SHOWN_HZ)
+    shown = track.at_rate(options.rate_or(SHOWN_HZ))
     t = shown.trajectory
     sd = np.hypot(t.p_sd[:, 0], t.p_sd[:, 1])
     rows = np.column_stack([t.time, *shown.lat_lon, t.p_n[:, 2], sd, t.rpy[:, 2], t.v_n[:, :2]]).tolist()

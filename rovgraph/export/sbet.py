@@ -28,8 +28,9 @@ def week_seconds(unix: np.ndarray) -> np.ndarray:
 
 
 def write(track: Track, path: Path, options: Options) -> None:
-    """Records at 100 Hz or the rate asked for: radians, metres, m/s; wander angle 0, so x is north and y east.
+    """A folder with sbet.out, records at 100 Hz or the rate asked for, and smrmsg.out.
 
+    Radians, metres, m/s; the wander angle is 0, so x is north and y east.
     Accelerations and angular rates are 0: a trajectory does not hold them. RMS errors of angles are arc minutes.
 
     Raises
@@ -37,16 +38,17 @@ def write(track: Track, path: Path, options: Options) -> None:
     InputError : no origin, no Unix time
     """
     _ = track.utc  # or it is refused
-    shown = track.at_rate(options.rate or RATE)
+    shown = track.at_rate(options.rate_or(RATE))
     t = shown.trajectory
     lat, lon = shown.lat_lon
     record = np.zeros((len(t), len(NAMES)), dtype="<f8")
     record[:, 0] = week_seconds(t.time)
     record[:, 1:4] = np.column_stack([np.deg2rad(lat), np.deg2rad(lon), -t.p_n[:, 2]])
     record[:, 4:7], record[:, 7:10] = t.v_n, t.rpy
-    path.write_bytes(record.tobytes())
+    path.mkdir()
+    (path / "sbet.out").write_bytes(record.tobytes())
     errors = np.column_stack([record[:, 0], t.p_sd, t.v_sd, np.rad2deg(t.rpy_sd) * 60.0]).astype("<f8")
-    (path.parent / "smrmsg.out").write_bytes(errors.tobytes())
+    (path / "smrmsg.out").write_bytes(errors.tobytes())
 
 
-FORMATS = (ExportFormat("sbet", "SBET", ".sbet", write),)
+FORMATS = (ExportFormat("sbet", "SBET", "", write),)

@@ -12,7 +12,7 @@ from rovgraph.export.track import Track
 
 def write(track: Track, path: Path, options: Options) -> None:
     """One subtitle a second, or at the rate asked for."""
-    rate = options.rate or SHOWN_HZ
+    rate = options.rate_or(SHOWN_HZ)
     shown, start = track.at_rate(rate), track.trajectory.time[0]
     t = shown.trajectory
     where = _places(shown)

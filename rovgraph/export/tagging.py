@@ -89,7 +89,7 @@ def _seconds(times: pd.Series, track: Track) -> Array:
     if len(wrong):
         raise InputError(
             f"column {times.name}: row {wrong[0] + 1} is {str(times.iloc[wrong[0]])[:30]!r}, expected seconds or a date"
-                " "
+            " "
             "such as 2026-05-01T09:30:00Z"
         )
     if not track.has_utc:
