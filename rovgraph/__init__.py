@@ -34,7 +34,8 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / report / studies, live / estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
+cli / api / report, export / studies, live /
+estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / geometry, workers, fast_csv / errors, process.
 """
@@ -49,6 +50,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from rovgraph.api.comparison import ComparisonResult as ComparisonResult
     from rovgraph.api.comparison import compare as compare
+    from rovgraph.api.exporting import export as export
+    from rovgraph.api.exporting import tag as tag
     from rovgraph.api.logs import check as check
     from rovgraph.api.logs import read_log as read_log
     from rovgraph.api.observability import ObservabilityResult as ObservabilityResult
@@ -91,6 +94,7 @@ _HOMES = {
     "check": "api.logs",
     "compare": "api.comparison",
     "evaluate": "evaluate",
+    "export": "api.exporting",
     "load_config": "config",
     "observe": "api.observability",
     "parse_config": "config",
@@ -100,12 +104,13 @@ _HOMES = {
     "read_trajectory": "trajectory",
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
+    "tag": "api.exporting",
 }
 __all__ = list(_HOMES)
 
 
 class _Package(ModuleType):
-    """This package, whose functions `check`, `evaluate` and `simulate` are not hidden by the modules of these names."""
+    """This package, whose functions `check`, `export` and others are not hidden by the modules of these names."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _HOMES and isinstance(value, ModuleType)):  # which the import of a submodule would set

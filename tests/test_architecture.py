@@ -28,7 +28,7 @@ LAYERS = (
     {"graph"},
     {"estimators", "simulate", "evaluate", "check", "calibrate", "interchange"},
     {"studies", "live"},
-    {"report"},
+    {"report", "export"},
     {"api"},
     {"cli"},
 )

@@ -91,7 +91,15 @@ class Result:
         """The effective configuration."""
         return self.dive.beginning.config
 
-    def save(self, path: Path | str, force: bool = False, figures: bool = True) -> dict[str, Any]:
+    def export(self, out: Path | str, to: str | Sequence[str], **options: Any) -> list[Path]:
+        """Write the track in formats that others open: `rovgraph.export`, which says what the options are."""
+        from rovgraph.api.exporting import export
+
+        return export(self, to, out, **options)
+
+    def save(
+        self, path: Path | str, force: bool = False, figures: bool = True, export: Sequence[str] = ()
+    ) -> dict[str, Any]:
         """Write the results folder of ``rovgraph smooth`` (docs/results.md), all of it or nothing.
 
         Parameters
@@ -99,6 +107,7 @@ class Result:
         path : the folder to make
         force : replace an older results folder
         figures : draw them
+        export : formats that the track is written in too
 
         Returns
         -------
@@ -106,7 +115,7 @@ class Result:
 
         Raises
         ------
-        InputError : the folder exists, or cannot be written
+        InputError : the folder exists, or cannot be written; as `rovgraph.export`
         """
         from rovgraph.report.folder import results_folder
         from rovgraph.report.results import write_results
@@ -117,6 +126,8 @@ class Result:
                 from rovgraph.report.figures import draw_figures  # loads matplotlib
 
                 draw_figures(folder, self.dive.estimates, self.log, self.config)
+            if export:
+                self.export(folder, export)
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
             return write_results(
                 folder, self.dive.estimates, self.log, self.config, [*self.assumptions], seconds, self.alarms

@@ -17,12 +17,14 @@ from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
 from rovgraph.cli.evaluate import evaluate
+from rovgraph.cli.export import export
 from rovgraph.cli.observe import observe
 from rovgraph.cli.online import online
 from rovgraph.cli.plan import plan
 from rovgraph.cli.simulate import simulate
 from rovgraph.cli.smooth import smooth
 from rovgraph.cli.study import study
+from rovgraph.cli.tag import tag
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.process import be_frugal
 
@@ -50,7 +52,7 @@ def _of_all_commands(
     pass
 
 
-for _command in (smooth, online, evaluate, compare, observe, plan, check, config, simulate):
+for _command in (smooth, online, export, tag, evaluate, compare, observe, plan, check, config, simulate):
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(study, name="study")

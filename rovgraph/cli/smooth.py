@@ -35,6 +35,10 @@ def smooth(
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
+    export: Annotated[
+        list[str] | None,
+        typer.Option(help="also write the track as kml, geojson, ... (docs/export.md); may be repeated"),
+    ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
 ) -> None:
     """Estimate the track of a dive and everything that was calibrated on the way.
@@ -47,11 +51,13 @@ def smooth(
 
     import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
+    from rovgraph.export import known_formats
     from rovgraph.report.folder import check_writable
     from rovgraph.report.tables import calibration_table, summary_table
 
     out = Path("results-" + log.name.split(".")[0]) if out is None else out
     settings = None if config is None else rg.load_config(config)
+    known_formats(export or [])
     check_writable(out, force)
     began = time.perf_counter()
     dive_log = rg.read_log(log, settings)
@@ -59,7 +65,7 @@ def smooth(
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
-    summary = result.save(out, force, figures)
+    summary = result.save(out, force, figures, export or [])
     console = Console()
     console.print(f"verdict: {result.verdict}", style=VERDICT_STYLE[result.verdict], highlight=False)
     for alarm in result.alarms:

@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences for chart plotters: GGA (position) and HDT (true heading)."""
+"""NMEA 0183 sentences for chart plotters: GGA (position), HDT (true heading) and VTG (course and speed)."""
 
 import math
 from collections.abc import Iterator
@@ -11,6 +11,7 @@ from rovgraph.live.solution import Solution
 
 TALKER = "GP"  # what the oldest plotter understands
 ESTIMATED = 6  # quality of a GGA: dead reckoning
+KNOT = 1852.0 / 3600.0  # [m/s]
 
 
 class NmeaOutput(UdpOutput):
@@ -31,19 +32,36 @@ class NmeaOutput(UdpOutput):
 
 
 def gga(solution: Solution) -> str:
-    """Position, with quality 6 (estimated); "" where it is not known.
-
-    Time is that of day, UTC where the solution's time counts from 1970; the altitude is that
-    over the surface, negative in a dive. The geoid stays empty, dilution where the sd is not known.
-    """
-    lat, lon, down = solution.latitude, solution.longitude, float(solution.position[2])
-    if lat is None or lon is None or not all(map(math.isfinite, (lat, lon, down, solution.time))):
+    """Position of a solution, see `position_sentence`; "" where it is not known."""
+    if solution.latitude is None or solution.longitude is None:
         return ""
-    day = round(solution.time * 100) % 8_640_000  # [0.01 s], so that 59.999 s does not become 60.00
+    sd = math.hypot(*solution.position_sd[:2].tolist())
+    return position_sentence(solution.time, solution.latitude, solution.longitude, float(solution.position[2]), sd)
+
+
+def hdt(solution: Solution) -> str:
+    """True heading of a solution, see `heading_sentence`."""
+    return heading_sentence(float(solution.rpy[2]))
+
+
+def position_sentence(time: float, lat: float, lon: float, down: float, sd: float) -> str:
+    """GGA with quality 6 (estimated); "" where anything but the sd is not known.
+
+    Time is that of day, UTC where it counts from 1970; the altitude is that over the surface, negative in a dive.
+    The geoid stays empty, dilution where the sd is not known.
+
+    Parameters
+    ----------
+    time : [s]
+    lat, lon : [deg]
+    down, sd : depth and horizontal sd [m]
+    """
+    if not all(map(math.isfinite, (lat, lon, down, time))):
+        return ""
+    day = round(time * 100) % 8_640_000  # [0.01 s], so that 59.999 s does not become 60.00
     clock = f"{day // 360_000:02d}{day // 6000 % 60:02d}{day % 6000 / 100:05.2f}"
     lon = (lon + 180.0) % 360.0 - 180.0
     north_south, east_west = "N" if lat >= 0 else "S", "E" if lon >= 0 else "W"
-    sd = math.hypot(*solution.position_sd[:2].tolist())
     hdop = f"{min(dilution(sd), 99.9):.1f}" if math.isfinite(sd) else ""
     fields = (
         f"{clock},{_degrees_minutes(lat, 2)},{north_south},{_degrees_minutes(lon, 3)},{east_west},"
@@ -52,12 +70,24 @@ def gga(solution: Solution) -> str:
     return _sentence(f"{TALKER}GGA,{fields}")
 
 
-def hdt(solution: Solution) -> str:
-    """True heading, clockwise from north in [0, 360) degrees; "" where it is not known."""
-    yaw = float(solution.rpy[2])
+def heading_sentence(yaw: float) -> str:
+    """HDT of a heading [rad], clockwise from north in [0, 360) degrees; "" where it is not known."""
     if not math.isfinite(yaw):
         return ""
-    return _sentence(f"{TALKER}HDT,{round(math.degrees(yaw), 2) % 360.0:.2f},T")
+    return _sentence(f"{TALKER}HDT,{_bearing(yaw)},T")
+
+
+def course_sentence(v_north: float, v_east: float) -> str:
+    """VTG of a velocity over ground [m/s]; "" where it is not known."""
+    if not (math.isfinite(v_north) and math.isfinite(v_east)):
+        return ""
+    speed = math.hypot(v_north, v_east)
+    course = _bearing(math.atan2(v_east, v_north))
+    return _sentence(f"{TALKER}VTG,{course},T,,M,{speed / KNOT:.2f},N,{3.6 * speed:.2f},K,E")
+
+
+def _bearing(angle: float) -> str:
+    return f"{round(math.degrees(angle), 2) % 360.0:.2f}"
 
 
 def _degrees_minutes(angle: float, digits: int) -> str:

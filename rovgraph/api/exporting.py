@@ -1,0 +1,130 @@
+"""A track as files that others open, and at the times of other tables: ``rovgraph export`` and ``rovgraph tag``."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from rovgraph.api.smoothing import Result
+from rovgraph.errors import InputError
+from rovgraph.export import Options, Tagged, Track, fixes_of, read_track, write_track
+from rovgraph.export import tag as tag_table
+from rovgraph.export.tagging import geotag
+from rovgraph.export.track import ESTIMATES
+
+
+def export(
+    results: Result | Path | str,
+    to: str | Sequence[str],
+    out: Path | str | None = None,
+    estimate: str | None = None,
+    rate: float | None = None,
+    crs: str | None = None,
+    unix_offset: float = 0.0,
+    force: bool = False,
+) -> list[Path]:
+    """Write the track of a dive in formats that others open (docs/export.md).
+
+    Parameters
+    ----------
+    results : of `smooth`, or a results folder
+    to : name of a format, or several
+    out : folder to write into; None = the results folder
+    estimate : "smoothed", "filtered" or "dead_reckoning"; None = the best there is
+    rate : of points [Hz]; None = each format's own
+    crs : coordinates of GeoPackage and shapefile, such as "EPSG:25832" or "utm"
+    unix_offset : Unix time of the log's time 0 [s]
+    force : replace files of that name
+
+    Returns
+    -------
+    list of Path : what was written
+
+    Raises
+    ------
+    InputError : an unknown format, a library that is not installed, an origin or a Unix time that a format needs and
+        the dive does not have, a file that is there
+    """
+    if out is None and isinstance(results, Result):
+        raise InputError("out: expected a folder to write into, since these results are in none")
+    folder = Path(results) if out is None and not isinstance(results, Result) else Path(str(out))
+    track = track_of(results, estimate).shifted(unix_offset)
+    return write_track(track, [to] if isinstance(to, str) else to, folder, Options(rate, crs), force)
+
+
+def tag(
+    table: Path | str,
+    results: Result | Path | str,
+    out: Path | str,
+    time: str = "time",
+    offset: float = 0.0,
+    estimate: str | None = None,
+    exif: str | None = None,
+    force: bool = False,
+) -> Tagged:
+    """Add the vehicle's place at each row of a table: photos, sonar pings, samples.
+
+    Parameters
+    ----------
+    table : CSV with a column of times
+    results : of `smooth`, or a results folder
+    out : CSV to write
+    time : name of that column
+    offset : what is added to the table's times [s]
+    estimate : as of `export`
+    exif : name of a column of JPEGs, relative to the table; copies with their place in EXIF go beside ``out``, into a
+        folder of its name with ``_photos``
+    force : replace files of that name
+
+    Raises
+    ------
+    InputError : a table that cannot be worked with, no row within the dive, no origin for EXIF
+    """
+    table, out = Path(table), Path(out)
+    photos = out.with_name(f"{out.stem}_photos")
+    for target in (out, photos) if exif else (out,):
+        if target.exists() and not force:
+            raise InputError(f"{target} exists; choose another --out or give --force")
+    try:
+        frame = pd.read_csv(table, skipinitialspace=True, dtype=str, keep_default_na=False)  # cells stay as they are
+    except FileNotFoundError:
+        raise InputError(f"{table}: no such file; check the name") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{table}: cannot be read as CSV ({(str(error).splitlines() or [''])[0]})") from None
+    if exif is not None and exif not in frame:
+        raise InputError(f"{table}: column {exif} is not in it; it has {', '.join(map(str, frame.columns[:12]))}")
+    track = track_of(results, estimate)
+    try:
+        tagged = tag_table(frame, track, time, offset)
+    except InputError as error:
+        raise InputError(f"{table}: {error}") from None
+    if exif is not None:
+        try:
+            geotag(tagged, track, [table.parent / str(name) for name in frame[exif]], photos)
+        except ImportError:
+            raise InputError("tagging photos needs piexif; install it with: pip install 'rovgraph[maps]'") from None
+    partial = out.with_name(f".{out.name}.partial")
+    try:
+        tagged.frame.to_csv(partial, index=False)
+        partial.replace(out)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror or error}); choose another --out") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return tagged
+
+
+def track_of(results: Result | Path | str, estimate: str | None = None) -> Track:
+    """A track to be exported.
+
+    Raises
+    ------
+    InputError : not that estimate, no results folder
+    """
+    if not isinstance(results, Result):
+        return read_track(results, estimate)
+    if estimate not in (None, *ESTIMATES):
+        raise InputError(f"estimate {estimate!r}: expected {', '.join(ESTIMATES)}")
+    chosen = results.main if estimate is None else getattr(results, estimate)
+    name = results.config.name or Path(results.log.source).name
+    return Track(name, chosen.kind, chosen.trajectory, results.log.origin, fixes_of(results.main.residuals))

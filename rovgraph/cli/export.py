@@ -1,0 +1,45 @@
+"""``rovgraph export``: a track as files that others open."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def export(
+    results: Annotated[Path, typer.Argument(help="results folder of smooth or online", metavar="RESULTS")],
+    to: Annotated[
+        list[str] | None, typer.Option(help="format, as kml; may be repeated. Without it, formats are listed")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="folder; default: the results folder")] = None,
+    estimate: Annotated[
+        str | None, typer.Option(help="smoothed, filtered or dead_reckoning; default: the best there is")
+    ] = None,
+    rate: Annotated[float | None, typer.Option(help="points a second; default: the format's own")] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="coordinates of gpkg and shp, as EPSG:25832, or utm; default: lat, lon")
+    ] = None,
+    unix_offset: Annotated[
+        float, typer.Option(help="Unix time of the log's time 0, in seconds, where a format needs it")
+    ] = 0.0,
+    force: Annotated[bool, typer.Option("--force", help="replace files of that name")] = False,
+) -> None:
+    """Write a track as KML, GeoJSON, GPX, GeoPackage, NMEA, ROS 2 bag, NetCDF, SBET, subtitles and more.
+
+    Example: rovgraph export results --to kml --to geojson
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    import rovgraph as rg
+    from rovgraph.export import export_formats
+
+    console = Console()
+    if not to:
+        table = Table("--to", "format", "needs")
+        for each in export_formats().values():
+            table.add_row(each.name, each.title, f"rovgraph\\[{each.extra}]" if each.extra else "")
+        console.print(table)
+        return
+    for path in rg.export(results, to, out, estimate, rate, crs, unix_offset, force):
+        console.print(f"written: {path}", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,34 @@
+"""``rovgraph tag``: where the vehicle was at the times of another table."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def tag(
+    table: Annotated[Path, typer.Argument(help="CSV with a column of times", metavar="TABLE")],
+    results: Annotated[Path, typer.Argument(help="results folder of smooth or online", metavar="RESULTS")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write", show_default=False)],
+    time: Annotated[str, typer.Option(help="column of times: seconds of the log's clock, or dates")] = "time",
+    offset: Annotated[float, typer.Option(help="seconds to add to the table's times")] = 0.0,
+    estimate: Annotated[
+        str | None, typer.Option(help="smoothed, filtered or dead_reckoning; default: the best there is")
+    ] = None,
+    exif: Annotated[
+        str | None, typer.Option(help="column of JPEG files; copies get their place in EXIF", metavar="COLUMN")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace files of that name")] = False,
+) -> None:
+    """Add position, attitude and their sd to photos, sonar pings or samples.
+
+    Example: rovgraph tag photos.csv results --time taken --out placed.csv
+    """
+    from rich.console import Console
+
+    import rovgraph as rg
+
+    tagged = rg.tag(table, results, out, time, offset, estimate, exif, force)
+    inside, rows = int(tagged.inside.sum()), len(tagged.inside)
+    outside = f", {rows - inside} outside the dive" if inside < rows else ""
+    Console().print(f"{inside} of {rows} rows placed{outside}: {out}", highlight=False, markup=False, soft_wrap=True)

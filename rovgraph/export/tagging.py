@@ -1,0 +1,159 @@
+"""Where the vehicle was at the times of another table: photos, sonar pings, samples.
+
+Between keyframes position is interpolated along a line and attitude along the shortest arc (slerp). Keyframes are a
+fraction of a second apart, so what an acceleration of 0.1 m/s2 bends within 0.2 s is half a millimetre.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.export.points import point_table
+from rovgraph.export.track import Track
+from rovgraph.geometry import Array
+
+PLACED = "rov_"  # begins the names of columns that are added
+
+
+@dataclass(frozen=True)
+class Tagged:
+    """A table with the vehicle's place at each row.
+
+    Attributes
+    ----------
+    frame : the table, with columns ``rov_north``, ``rov_east``, ``rov_depth`` [m], ``rov_lat``, ``rov_lon`` [deg] where
+        known, ``rov_heading``, ``rov_pitch``, ``rov_roll`` [deg], ``rov_speed`` [m/s], and ``_sd`` of them
+    inside : ndarray of bool, shape (n,), False = outside the dive, and those columns are empty
+    time : ndarray, shape (n,), on the track's clock [s]
+    """
+
+    frame: pd.DataFrame
+    inside: NDArray[np.bool_]
+    time: Array
+
+
+def tag(table: pd.DataFrame, track: Track, column: str = "time", offset: float = 0.0) -> Tagged:
+    """Add the vehicle's place at each row's time.
+
+    Parameters
+    ----------
+    table : any columns
+    column : of times, in seconds of the track's clock, or dates (UTC where they do not say) if that is Unix time
+    offset : what is added to the table's times, to come to the track's [s]
+
+    Raises
+    ------
+    InputError : no such column, times that cannot be read, no row within the dive
+    """
+    if column not in table:
+        raise InputError(f"column {column} is not in the table; it has {', '.join(map(str, table.columns[:12]))}")
+    t = track.trajectory
+    time = _seconds(table[column], track) + offset
+    inside = (time >= t.time[0]) & (time <= t.time[-1])
+    if not inside.any():
+        raise InputError(
+            f"column {column}: its times, {np.nanmin(time):.1f} to {np.nanmax(time):.1f} s, are all outside the dive, "
+            f"{t.time[0]:.1f} to {t.time[-1]:.1f} s; state the difference of the clocks as an offset"
+        )
+    own = Track(track.name, track.estimate, t.at(np.sort(time[inside])), track.origin)
+    order = np.argsort(np.argsort(time[inside], kind="stable"), kind="stable")
+    placed = _columns(own).iloc[order].set_axis(table.index[inside])
+    frame = table.join(placed.add_prefix(PLACED))
+    return Tagged(frame, inside, time)
+
+
+def _columns(track: Track) -> pd.DataFrame:
+    t = track.trajectory
+    if track.origin is not None:
+        table = point_table(track)
+    else:
+        known = Track(track.name, track.estimate, t, (0.0, 0.0))  # any place: lat and lon are not taken
+        table = point_table(known).drop(columns=["lat", "lon"])
+    table = table.drop(columns=["time", "utc", "cov_north_east"], errors="ignore")
+    table.insert(0, "north", t.p_n[:, 0].round(4))
+    table.insert(1, "east", t.p_n[:, 1].round(4))
+    return table
+
+
+def _seconds(times: pd.Series, track: Track) -> Array:
+    numbers = pd.to_numeric(times, errors="coerce")
+    if numbers[times.astype(str).str.strip() != ""].notna().all():  # a row without a time is outside the dive
+        return numbers.to_numpy(float)
+    dates = pd.to_datetime(times.astype(str), utc=True, errors="coerce", format="ISO8601")
+    wrong = np.flatnonzero(dates.isna() & (times.astype(str).str.strip() != ""))
+    if len(wrong):
+        raise InputError(
+            f"column {times.name}: row {wrong[0] + 1} is {str(times.iloc[wrong[0]])[:30]!r}, expected seconds or a date"
+            " "
+            "such as 2026-05-01T09:30:00Z"
+        )
+    if not track.has_utc:
+        raise InputError(
+            f"column {times.name}: holds dates, and the dive's time is no Unix time; give seconds of the dive's clock"
+        )
+    return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), dtype=float)
+
+
+def geotag(tagged: Tagged, track: Track, files: Sequence[Path], folder: Path) -> int:
+    """Copy JPEGs with latitude, longitude, depth and heading in their EXIF; the pixels stay as they are.
+
+    Parameters
+    ----------
+    files : of each row
+    folder : to make the copies in; must not hold them yet
+
+    Returns
+    -------
+    int : how many were written; photos outside the dive are left out
+
+    Raises
+    ------
+    InputError : no origin, a photo that is not there or is no JPEG
+    """
+    import piexif
+
+    at = track.trajectory.at(tagged.time)
+    lat, lon = Track(track.name, track.estimate, at, track.origin).lat_lon
+    chosen = np.flatnonzero(tagged.inside).tolist()
+    for k in chosen:
+        if not files[k].is_file():
+            raise InputError(f"{files[k]}: no such photo; names in the table are relative to its folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in chosen:
+        try:
+            exif = piexif.load(str(files[k]))
+            exif["GPS"] = _gps(float(lat[k]), float(lon[k]), float(at.p_n[k, 2]), float(np.rad2deg(at.rpy[k, 2])))
+            piexif.insert(piexif.dump(exif), str(files[k]), str(folder / files[k].name))
+        except (piexif.InvalidImageDataError, ValueError) as error:
+            raise InputError(f"{files[k]}: is no JPEG that can be tagged ({str(error).splitlines()[0]})") from None
+    return len(chosen)
+
+
+def _gps(lat: float, lon: float, depth: float, heading: float) -> dict[int, object]:
+    import piexif
+
+    below = 1 if depth > 0.0 else 0
+    return {
+        piexif.GPSIFD.GPSVersionID: (2, 3, 0, 0),
+        piexif.GPSIFD.GPSLatitudeRef: "N" if lat >= 0.0 else "S",
+        piexif.GPSIFD.GPSLatitude: _sexagesimal(abs(lat)),
+        piexif.GPSIFD.GPSLongitudeRef: "E" if lon >= 0.0 else "W",
+        piexif.GPSIFD.GPSLongitude: _sexagesimal(abs(lon)),
+        piexif.GPSIFD.GPSAltitudeRef: below,
+        piexif.GPSIFD.GPSAltitude: (round(1000.0 * abs(depth)), 1000),
+        piexif.GPSIFD.GPSImgDirectionRef: "T",
+        piexif.GPSIFD.GPSImgDirection: (round(100.0 * (heading % 360.0)), 100),
+        piexif.GPSIFD.GPSMapDatum: "WGS-84",
+    }
+
+
+def _sexagesimal(angle: float) -> tuple[tuple[int, int], ...]:
+    """Degrees, minutes and seconds to a thousandth of a millimetre, as EXIF's fractions."""
+    parts = round(angle * 3600.0 * 100_000)
+    minutes, seconds = divmod(parts, 60 * 100_000)
+    return (minutes // 60, 1), (minutes % 60, 1), (seconds, 100_000)

@@ -1,0 +1,353 @@
+"""Every exported file is opened by another library than the one that wrote it, and shows the same positions."""
+
+import json
+import re
+import zipfile
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import rovgraph as rg
+from rovgraph.cli.app import main
+from rovgraph.export import ExportFormat, Fixes, Options, Track, export_formats, tag, write_track
+from rovgraph.export import formats as registry
+from rovgraph.export.sbet import GPS_EPOCH, LEAP_SECONDS, NAMES, WEEK
+from rovgraph.geometry import Array, matrix_from_rpy
+from rovgraph.trajectory import Trajectory
+
+ORIGIN = (42.05, 3.12)
+BEGAN = 1_771_000_000.0  # Unix time
+WITHIN_M = 0.01
+NAME = 'Taucher <1> & "Möwe" </script>'
+
+
+def circle(start: float = BEGAN, seconds: float = 60.0) -> Trajectory:
+    """A turn of 20 m radius in 60 s, heading along it, 2 m deeper at its end, less certain with time."""
+    time = np.round(start + np.arange(0.0, seconds + 0.1, 0.2), 4)
+    turn = 2.0 * np.pi * (time - start) / 60.0
+    p = np.column_stack([20.0 * np.sin(turn), 20.0 * (1.0 - np.cos(turn)), 3.0 + 2.0 * (time - start) / seconds])
+    rate = 2.0 * np.pi / 60.0
+    v = np.column_stack([20.0 * rate * np.cos(turn), 20.0 * rate * np.sin(turn), np.full(len(time), 2.0 / seconds)])
+    R = matrix_from_rpy(np.column_stack([np.full(len(time), 0.05), np.full(len(time), -0.1), turn]))
+    grow = (0.1 + 0.01 * (time - start))[:, None, None] ** 2
+    P = grow * np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.1]])
+    return Trajectory(time, p, R, v, P, 1e-4 * grow * np.eye(3), 0.01 * grow * np.eye(3))
+
+
+def track(origin: tuple[float, float] | None = ORIGIN, start: float = BEGAN) -> Track:
+    time = start + np.array([10.0, 20.0, 30.0])
+    fixes = Fixes(time, np.array([[17.0, 10.0], [17.0, 30.0], [90.0, 90.0]]), np.array([True, True, False]))
+    return Track(NAME, "smoothed", circle(start), origin, fixes)
+
+
+def written(name: str, folder, options: Options | None = None, of: Track | None = None):
+    (path,) = write_track(of or track(), [name], folder, options or Options())
+    return path
+
+
+def off(lat: Array, lon: Array, time: Array, of: Track | None = None) -> float:
+    """The largest distance of places from the truth at their times [m]."""
+    from pymap3d import geodetic2ned
+
+    at = (of or track()).trajectory.at(np.asarray(time, float))
+    north, east, _ = geodetic2ned(np.asarray(lat), np.asarray(lon), 0.0, *ORIGIN, 0.0)
+    return float(np.hypot(north - at.p_n[:, 0], east - at.p_n[:, 1]).max())
+
+
+def test_geojson_has_the_track_points_with_sds_ellipses_and_fixes(tmp_path):
+    pyogrio = pytest.importorskip("pyogrio.raw")
+    path = written("geojson", tmp_path)
+    features = json.loads(path.read_text(encoding="utf-8"))["features"]
+    kinds = pd.Series([f["properties"]["kind"] for f in features]).value_counts()
+    assert (kinds["track"], kinds["point"], kinds["fix"]) == (1, 61, 3) and kinds["ellipse"] > 50
+    assert features[0]["properties"]["name"] == NAME
+    points = [f for f in features if f["properties"]["kind"] == "point"]
+    lon, lat, up = np.array([f["geometry"]["coordinates"] for f in points]).T
+    time = np.array([f["properties"]["time"] for f in points])
+    assert off(lat, lon, time) < WITHIN_M
+    assert np.abs(up + circle().at(time).p_n[:, 2]).max() < WITHIN_M
+    assert points[30]["properties"]["heading"] == pytest.approx(180.0, abs=0.1)
+    info, *_ = pyogrio.read(path)
+    assert "heading_sd" in info["fields"]
+
+
+def test_an_ellipse_of_geojson_is_the_one_of_95_percent(tmp_path):
+    features = json.loads(written("geojson", tmp_path).read_text(encoding="utf-8"))["features"]
+    last = [f for f in features if f["properties"]["kind"] == "ellipse"][-1]
+    from pymap3d import geodetic2ned
+
+    lon, lat = np.array(last["geometry"]["coordinates"][0]).T
+    north, east, _ = geodetic2ned(lat, lon, 0.0, *ORIGIN, 0.0)
+    t = circle()
+    d = np.column_stack([north, east]) - t.p_n[-1, :2]
+    square = np.einsum("ni,ij,nj->n", d, np.linalg.inv(t.cov_p[-1, :2, :2]), d)
+    assert square == pytest.approx(5.991, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["kml", "kmz"])
+def test_kml_is_well_formed_and_moves_with_time(tmp_path, name):
+    etree = pytest.importorskip("lxml.etree")
+    pytest.importorskip("simplekml")
+    path = written(name, tmp_path)
+    text = path.read_bytes() if name == "kml" else zipfile.ZipFile(path).read("doc.kml")
+    root = etree.fromstring(text)
+    space = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
+    when = pd.to_datetime([e.text for e in root.findall(".//k:when", space)])
+    place = np.array([e.text.split() for e in root.findall(".//gx:coord", space)], float)
+    seconds = (when - pd.Timestamp(0, tz="UTC")).total_seconds().to_numpy()
+    assert off(place[:, 1], place[:, 0], seconds) < WITHIN_M
+    assert root.find(".//k:Document/k:name", space).text == f"{NAME}, smoothed"
+    assert len(root.findall(".//k:Point", space)) == 3 and len(root.findall(".//k:Polygon", space)) > 50
+
+
+def test_kml_without_unix_time_is_a_plain_line(tmp_path):
+    etree = pytest.importorskip("lxml.etree")
+    pytest.importorskip("simplekml")
+    root = etree.fromstring(written("kml", tmp_path, of=track(start=0.0)).read_bytes())
+    assert not root.findall(".//{*}when") and len(root.find(".//{*}LineString/{*}coordinates").text.split()) == 61
+
+
+def test_gpx_is_read_back_by_gdal(tmp_path):
+    pyogrio, shapely = pytest.importorskip("pyogrio.raw"), pytest.importorskip("shapely")
+    pytest.importorskip("gpxpy")
+    info, _, geometry, fields = pyogrio.read(written("gpx", tmp_path), layer="track_points")
+    points = shapely.from_wkb(geometry)
+    elapsed = BEGAN + np.arange(61.0)
+    assert off(shapely.get_y(points), shapely.get_x(points), elapsed) < WITHIN_M
+    stamps = pd.to_datetime(fields[list(info["fields"]).index("time")].astype(str), utc=True)
+    assert (stamps[0] - pd.Timestamp(0, tz="UTC")).total_seconds() == pytest.approx(BEGAN)
+
+
+@pytest.mark.parametrize("name", ["gpkg", "shp"])
+@pytest.mark.parametrize("crs", [None, "utm", "EPSG:25831"])
+def test_a_gis_layer_is_where_the_track_is_in_any_coordinates(tmp_path, name, crs):
+    geopandas = pytest.importorskip("geopandas")
+    pytest.importorskip("pyogrio")
+    path = written(name, tmp_path, Options(crs=crs))
+    layer = geopandas.read_file(path if name == "gpkg" else path / "track.shp")
+    assert str(layer.crs.to_epsg()) == {None: "4326", "utm": "32631", "EPSG:25831": "25831"}[crs]
+    degrees = layer.to_crs(4326).geometry
+    assert off(degrees.y, degrees.x, layer["time"]) < WITHIN_M
+    assert layer["heading_sd"].iloc[-1] > 0.0
+
+
+def test_nmea_is_read_back_to_two_centimetres(tmp_path):
+    pynmea2 = pytest.importorskip("pynmea2")
+    lines = written("nmea", tmp_path, Options(rate=2.0)).read_text(encoding="ascii").split()
+    sentences = [pynmea2.parse(line, check=True) for line in lines]
+    gga = [s for s in sentences if s.sentence_type == "GGA"]
+    assert len(gga) == 121 and {s.sentence_type for s in sentences} == {"GGA", "HDT", "VTG"}
+    elapsed = BEGAN + 0.5 * np.arange(121)
+    assert off([s.latitude for s in gga], [s.longitude for s in gga], elapsed) < 0.02
+    vtg = next(s for s in sentences[180:] if s.sentence_type == "VTG")
+    assert float(vtg.spd_over_grnd_kmph) == pytest.approx(3.6 * 20.0 * 2.0 * np.pi / 60.0, abs=0.02)
+
+
+def test_tum_and_kitti_have_the_same_poses(tmp_path):
+    tum = np.loadtxt(written("tum", tmp_path))
+    kitti = np.loadtxt(written("kitti", tmp_path)).reshape(-1, 3, 4)
+    t = circle()
+    assert tum[:, 0] == pytest.approx(t.time, abs=1e-4)
+    assert np.abs(tum[:, 1:4] - t.p_n).max() < 1e-6
+    assert np.abs(kitti[:, :, 3] - t.p_n).max() < 1e-6
+    assert np.abs(kitti[:, :, :3] - t.R_nb).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["rosbag2", "mcap"])
+def test_a_ros_bag_has_odometry_by_rep_103(tmp_path, name):
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    from rosbags.typesys import Stores, get_typestore
+
+    found: dict[str, list] = {}
+    with highlevel.AnyReader([written(name, tmp_path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        for connection, stamp, raw in bag.messages():
+            found.setdefault(connection.topic, []).append((stamp, bag.deserialize(raw, connection.msgtype)))
+    t = circle()
+    assert {topic: len(rows) for topic, rows in found.items()} == {
+        "/path": 1, "/odometry": len(t), "/tf": len(t), "/fix": len(t),
+    }  # fmt: skip
+    stamp, message = found["/odometry"][75]  # a quarter of the turn: heading east
+    assert stamp == round(t.time[75] * 1e9)
+    p, q, v = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
+    assert (p.x, p.y, p.z) == pytest.approx((t.p_n[75, 1], t.p_n[75, 0], -t.p_n[75, 2]))
+    yaw = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
+    assert yaw == pytest.approx(0.0, abs=1e-6)  # in ROS east is 0, counted anticlockwise
+    assert v.x > 2.0 and abs(v.y) < 0.05
+    P = message.pose.covariance.reshape(6, 6)
+    assert P[0, 0] == pytest.approx(t.cov_p[75, 1, 1]) and P[0, 1] == pytest.approx(t.cov_p[75, 0, 1])
+    fixes = [m for _, m in found["/fix"]]
+    assert off([m.latitude for m in fixes], [m.longitude for m in fixes], t.time) < WITHIN_M
+
+
+def test_netcdf_has_units_and_sds_as_cf_wants_them(tmp_path):
+    netcdf = pytest.importorskip("netCDF4")
+    pytest.importorskip("xarray")
+    with netcdf.Dataset(written("netcdf", tmp_path)) as file:
+        assert file.featureType == "trajectory" and str(file["trajectory"][...]) == NAME
+        assert off(file["latitude"][:], file["longitude"][:], file["time"][:]) < WITHIN_M
+        assert file["time"].units.startswith("seconds since 1970")
+        assert file["depth"].ancillary_variables == "depth_sd"
+        assert file["yaw_sd"][-1] > 0.0
+
+
+def test_sbet_has_17_doubles_a_record_and_gps_seconds_of_the_week(tmp_path):
+    path = written("sbet", tmp_path)
+    record = np.fromfile(path / "sbet.out", dtype=[(name, "<f8") for name in NAMES])
+    time = record["time"] + np.floor((BEGAN - GPS_EPOCH + LEAP_SECONDS) / WEEK) * WEEK + GPS_EPOCH - LEAP_SECONDS
+    assert len(record) == 6001 and 0.0 <= record["time"][0] < WEEK
+    assert off(np.rad2deg(record["latitude"]), np.rad2deg(record["longitude"]), time) < WITHIN_M
+    assert record["heading"][3000] == pytest.approx(np.pi, abs=1e-3)
+    errors = np.fromfile(path / "smrmsg.out", dtype="<f8").reshape(-1, 10)
+    assert errors[-1, 1] == pytest.approx(circle().p_sd[-1, 0])
+
+
+def test_subtitles_follow_the_video_of_the_dive(tmp_path):
+    blocks = written("srt", tmp_path, of=track(None)).read_text(encoding="utf-8").strip().split("\n\n")
+    number, stamp, place, attitude, utc = blocks[30].split("\n")
+    assert (number, stamp) == ("31", "00:00:30,000 --> 00:00:31,000")
+    assert place.startswith("N 0.0 m  E 40.0 m ±") and attitude == "heading 180°  depth 4.0 m"
+    assert re.fullmatch(r"2026-02-13 \d\d:\d\d:\d\d UTC", utc)
+
+
+@pytest.mark.parametrize("name", ["geojson", "kml", "gpx", "gpkg", "nmea", "sbet"])
+def test_a_dive_of_unknown_place_is_refused_with_what_to_do_and_nothing_is_written(tmp_path, name):
+    with pytest.raises(rg.InputError, match=r"state environment\.origin_lat_deg"):
+        written(name, tmp_path, of=track(None))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_needs_utc_says_so(tmp_path):
+    with pytest.raises(rg.InputError, match="no Unix time"):
+        written("sbet", tmp_path, of=track(start=5.0))
+    assert not list(tmp_path.iterdir())
+    assert (written("sbet", tmp_path, of=track(start=5.0).shifted(BEGAN)) / "sbet.out").stat().st_size > 0
+
+
+def test_bad_names_and_rates_and_files_that_are_there_are_refused(tmp_path):
+    with pytest.raises(rg.InputError, match="is no format, nearest is geojson"):
+        written("geojsn", tmp_path)
+    with pytest.raises(rg.InputError, match="rate 0: expected one above 0"):
+        written("gpx", tmp_path, Options(rate=0.0))
+    with pytest.raises(rg.InputError, match="crs 'EPSG:1': is not known"):
+        written("gpkg", tmp_path, Options(crs="EPSG:1"))
+    written("tum", tmp_path)
+    with pytest.raises(rg.InputError, match="exists; choose another --out or give --force"):
+        written("tum", tmp_path)
+
+
+def test_an_estimate_without_sds_is_exported_all_the_same(tmp_path):
+    t = circle()
+    bare = Track("bare", "dead_reckoning", Trajectory.certain(t.time, t.p_n, t.R_nb, t.v_n), ORIGIN)
+    for name in export_formats():
+        written(name, tmp_path / name, of=bare)
+    features = json.loads((tmp_path / "geojson" / "track_dead_reckoning.geojson").read_text(encoding="utf-8"))
+    assert {f["properties"]["kind"] for f in features["features"]} == {"track", "point"}
+
+
+def test_a_format_of_another_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
+    class Entry:
+        name, value = "toy", "toy:FORMAT"
+
+        def load(self):
+            return ExportFormat("toy", "toy", ".toy", lambda track, path, options: path.write_text("toy") and None)
+
+    class Broken(Entry):
+        def load(self):
+            raise ImportError("no module named nonsense")
+
+    monkeypatch.setattr(registry, "entry_points", lambda group: [Entry(), Broken()])
+    registry.export_formats.cache_clear()
+    try:
+        with pytest.warns(rg.DataWarning, match="cannot be loaded"):
+            path = written("toy", tmp_path)
+        assert path.read_text() == "toy"
+    finally:
+        registry.export_formats.cache_clear()
+
+
+def test_tables_get_the_place_at_each_rows_time():
+    table = pd.DataFrame({"file": ["b", "a", "c"], "taken": [BEGAN + 30.0, BEGAN + 15.1, BEGAN + 300.0]})
+    tagged = tag(table, track(), "taken")
+    assert tagged.inside.tolist() == [True, True, False]
+    frame, truth = tagged.frame, circle().at(np.array([BEGAN + 30.0, BEGAN + 15.1]))
+    assert list(frame["file"]) == ["b", "a", "c"]
+    assert frame[["rov_north", "rov_east"]].iloc[:2].to_numpy() == pytest.approx(truth.p_n[:, :2], abs=1e-3)
+    assert frame["rov_heading"].iloc[0] == pytest.approx(180.0, abs=0.01) and np.isnan(frame["rov_lat"].iloc[2])
+    later = tag(table.assign(taken=table["taken"] - 7.0), track(), "taken", offset=7.0).frame
+    assert later["rov_north"].iloc[0] == frame["rov_north"].iloc[0]
+
+
+def test_dates_are_times_too_where_the_dive_has_unix_time():
+    table = pd.DataFrame({"time": pd.to_datetime([BEGAN + 30.0], unit="s", utc=True).strftime("%Y-%m-%dT%H:%M:%SZ")})
+    assert tag(table, track()).frame["rov_east"].iloc[0] == pytest.approx(40.0, abs=1e-3)
+    with pytest.raises(rg.InputError, match="holds dates, and the dive's time is no Unix time"):
+        tag(table, track(start=0.0))
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "words"),
+    [
+        ({"t": [1.0]}, "time", "column time is not in the table; it has t"),
+        ({"time": ["noon"]}, "time", "row 1 is 'noon', expected seconds or a date"),
+        ({"time": [1.0, 2.0]}, "time", "are all outside the dive"),
+    ],
+)
+def test_tables_that_cannot_be_placed_say_why(table, column, words):
+    with pytest.raises(rg.InputError, match=words):
+        tag(pd.DataFrame(table), track(), column)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """A results folder of a short dive, exported as it was smoothed."""
+    out = tmp_path_factory.mktemp("results")
+    config = rg.parse_config(f"environment: {{origin_lat_deg: {ORIGIN[0]}, origin_lon_deg: {ORIGIN[1]}}}")
+    dive = rg.simulate("circle", config, 1, rg.Choices(duration=40.0))
+    dive.save(out / "dive")
+    return out
+
+
+def test_commands_write_what_the_library_does(results, monkeypatch, capsys):
+    monkeypatch.chdir(results)
+    smooth = ["smooth", "dive/log.csv", "-c", "dive/config.yaml", "-o", "out", "--no-figures", "--export", "geojson"]
+    for arguments in (
+        smooth,
+        ["export", "out", "--to", "tum", "--to", "geojson", "--out", "maps"],
+        ["tag", "out/trajectory_filtered.csv", "out", "--out", "placed.csv"],
+    ):
+        monkeypatch.setattr("sys.argv", ["rovgraph", *arguments])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code == 0
+    rg.export("out", ["tum", "geojson"], out="library")
+    for name in ("track_smoothed.tum", "track_smoothed.geojson"):
+        assert (results / "maps" / name).read_bytes() == (results / "library" / name).read_bytes()
+    assert (results / "out" / "track_smoothed.geojson").stat().st_size > 0
+    placed, smoothed = pd.read_csv("placed.csv"), pd.read_csv("out/trajectory_smoothed.csv")
+    assert placed["rov_north"].to_numpy() == pytest.approx(smoothed["north"].to_numpy(), abs=1e-3)
+
+
+def test_photos_get_their_place_in_exif_and_keep_their_pixels(results, tmp_path):
+    piexif, image = pytest.importorskip("piexif"), pytest.importorskip("PIL.Image")
+    t = rg.read_trajectory(results / "dive" / "truth.csv")
+    for name in ("1.jpg", "2.jpg"):
+        image.new("RGB", (8, 8), (10, 200, 30)).save(tmp_path / name)
+    (tmp_path / "photos.csv").write_text(f"time,file\n{t.time[50]},1.jpg\n{t.time[-1] + 60.0},2.jpg\n")
+    folder = _smoothed(results)
+    tagged = rg.tag(tmp_path / "photos.csv", folder, tmp_path / "placed.csv", exif="file")
+    assert [p.name for p in (tmp_path / "placed_photos").iterdir()] == ["1.jpg"]
+    gps = piexif.load(str(tmp_path / "placed_photos" / "1.jpg"))["GPS"]
+    lat, lon = (sum(a / b / 60.0**k for k, (a, b) in enumerate(gps[key])) for key in (2, 4))
+    assert (lat, lon) == pytest.approx((tagged.frame["rov_lat"][0], tagged.frame["rov_lon"][0]), abs=1e-8)
+    assert image.open(tmp_path / "placed_photos" / "1.jpg").getpixel((4, 4)) == image.open(tmp_path / "1.jpg").getpixel(
+        (4, 4)
+    )
+
+
+def _smoothed(results):
+    log, config = results / "dive" / "log.csv", rg.load_config(results / "dive" / "config.yaml")
+    folder = results / "exif"
+    if not folder.exists():
+        rg.smooth(rg.read_log(log, config), config).save(folder, figures=False)
+    return folder
