@@ -463,6 +463,11 @@ def stationary_walk(sd: float, time_constant: float) -> float:
     return float(sd * np.sqrt(2.0 / time_constant))
 
 
+def stationary_sd(walk: float, time_constant: float) -> float:
+    """The standard deviation that a random walk keeps a first-order Gauss-Markov process at [unit]."""
+    return float(walk * np.sqrt(0.5 * time_constant))
+
+
 def walked(walk: ArrayLike, time_constant: ArrayLike, seconds: ArrayLike) -> tuple[Array, Array]:
     """A first-order Gauss-Markov process after a time (Gelb 1974, 3.8), of infinite time constant a random walk.
 

@@ -7,10 +7,12 @@ import pytest
 from dives import altered, batch, changed, falcon, simulated, true_at
 
 from rovgraph.calibration import TABLE, stationary_walk
+from rovgraph.engine.chain import Chain
 from rovgraph.engine.lasting import LASTING, find_lasting
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.unstated_noise import noise_factor
 from rovgraph.simulate.files import known
+from rovgraph.state import POSE
 
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0, "start_error": True}
 ERROR = {"estimate": True, "sd": 1.5, "time_constant_s": 20.0}
@@ -85,6 +87,18 @@ def test_a_healthy_dive_is_solved_as_before():
     np.testing.assert_array_equal(dive.estimates[0].trajectory.p_n, plain.estimates[0].trajectory.p_n)
 
 
+def test_search_costs_one_elimination_of_a_healthy_dive_and_few_of_others(monkeypatch):
+    calls, eliminate = [], Chain.eliminate
+    monkeypatch.setattr(Chain, "eliminate", lambda *a, **b: (calls.append(1), eliminate(*a, **b))[1])
+    for calibration, most in (({}, 1), ({"fix_error": ERROR}, 50)):
+        case, config = with_fixes(seed=1, **calibration)
+        best = batch(case.log, config).optimum()
+        best.covariances(POSE)
+        calls.clear()
+        assert bool(find_lasting(best)) == bool(calibration)
+        assert 0 < len(calls) <= most
+
+
 def test_an_error_of_next_to_nothing_explains_nothing_where_the_dive_has_shown_what_was_considered():
     """A considered constant that is estimated stays so in the dive with the error, and is no part of its gain."""
     considered = {name: {"estimate": "considered"} for name, v in TABLE.items() if v.considered}
@@ -95,6 +109,8 @@ def test_an_error_of_next_to_nothing_explains_nothing_where_the_dive_has_shown_w
     with_error = best.unknowns.with_lasting(replace(known, estimate=True, walk=stationary_walk(1e-5, 30.0)))
     assert {*best.unknowns.estimated} < {*with_error.estimated} and with_error.considered == best.unknowns.considered
     assert find_lasting(best) == []
+    root = best.chain.eliminate(best.state, best.solution.gates)
+    assert best.linear == pytest.approx((root.log_determinant(), root.left), rel=1e-9)
 
 
 def test_noise_three_times_what_is_stated_is_found_and_believed():

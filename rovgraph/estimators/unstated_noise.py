@@ -50,6 +50,11 @@ class UnstatedNoise:
     values: Any
     text: str
 
+    @property
+    def lasts(self) -> bool:
+        """An error that lasts; those are found all at once, after all white noise."""
+        return self.key.startswith("calibration.")
+
 
 def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> list[UnstatedNoise]:
     """What the residuals of a dive say of its noise; white noise goes first, as errors that last stand out of it.
