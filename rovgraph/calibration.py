@@ -75,6 +75,7 @@ class Variable:
 
 
 CONSIDERED = "considered"  # neither estimated nor exact
+AUTO = "auto"  # an error that lasts: estimated where a smoothed dive shows it, else exact
 
 _DEG = float(np.deg2rad(1.0))
 _ONE = ("",)

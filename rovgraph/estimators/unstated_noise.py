@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BaseModel
 from scipy.special import chdtri
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
@@ -72,8 +72,8 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
     larger = [found for sensor in best.blocks if (found := _larger(best, sensor, config)) is not None]
     if larger:
         return larger
-    said = [name for name in LASTING.values() if "estimate" in getattr(config.calibration, name).model_fields_set]
-    errors = find_lasting(best, said)
+    stated = [name for name in LASTING.values() if getattr(config.calibration, name).estimate != AUTO]
+    errors = find_lasting(best, stated)
     # a score test's figure z is worth z^2 / 2 of log likelihood
     return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
 
