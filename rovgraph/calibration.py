@@ -69,6 +69,11 @@ class Variable:
         return self.unit == "rad"
 
     @property
+    def time_offset(self) -> bool:
+        """How late a sensor's stamps are."""
+        return self.name.endswith(_TIME_OFFSET)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """Names of the scalar components, such as ``hard_iron_x``."""
         return tuple(self.name + c for c in self.components)
@@ -77,13 +82,13 @@ class Variable:
 CONSIDERED = "considered"  # neither estimated nor exact
 AUTO = "auto"  # an error that lasts: estimated where a smoothed dive shows it, else exact
 
+_TIME_OFFSET = "_time_offset"
 _DEG = float(np.deg2rad(1.0))
 _ONE = ("",)
 _XYZ = ("_x", "_y", "_z")
 _CURVE = ("_sin", "_cos")
 _SYMMETRIC = ("_xx", "_yy", "_zz", "_xy", "_xz", "_yz")
 _DVL = ("dvl", "dvl_water")
-_LATE = ": what it measured was valid that long before its stamp"
 
 
 def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "") -> tuple[Variable, Variable]:
@@ -126,6 +131,14 @@ def _compass_error(prefix: str, letter: str, sensor: str, whose: str) -> Variabl
         "the gyro, over its time constant",
         time_constant=60.0,
     )
+
+
+def _time_offset(
+    prefix: str, letter: str, sd: float, sensors: tuple[str, ...], whose: str, excited_by: str
+) -> Variable:
+    """How late the stamps of a sensor are."""
+    about = f"how late {whose}: what it measured was valid that long before its stamp"
+    return Variable(prefix + _TIME_OFFSET, letter, _ONE, "s", sd, sensors, about, excited_by)
 
 
 STATE_LETTERS = frozenset("xvbn")  # of the graph's other variables
@@ -189,39 +202,21 @@ TABLE: dict[str, Variable] = {
             "turning: yaw for forward and starboard, roll and pitch for down",
             considered=True,
         ),
-        Variable(
-            "dvl_time_offset",
-            "t",
-            _ONE,
-            "s",
-            0.1,
-            (*_DVL, "dvl_heading"),
-            "how late the DVL's stamps are" + _LATE,
-            "starts, stops and turns; waves",
-        ),
+        _time_offset("dvl", "t", 0.1, (*_DVL, "dvl_heading"), "the DVL's stamps are", "starts, stops and turns; waves"),
         *_compass("dvl_compass", "de", "dvl_heading", "the DVL's compass"),
         *_compass("ahrs", "af", "ahrs", "the IMU's own heading"),
-        Variable(
-            "ahrs_time_offset",
+        _time_offset(
+            "ahrs",
             "A",
-            _ONE,
-            "s",
-            0.05,  # what a fusing filter and one period of a message at 10 Hz add to a compass
+            0.05,
             ("ahrs",),
-            "how late the stamps of the IMU's own heading are" + _LATE,
+            "the stamps of the IMU's own heading are",
             "turning in both senses, against the gyro",
-        ),
+        ),  # what a fusing filter and one period of a message at 10 Hz add to a compass
         *_compass("mag", "mg", "mag", "the magnetometer's heading", " beside its hard iron"),
-        Variable(
-            "mag_time_offset",
-            "M",
-            _ONE,
-            "s",
-            0.05,  # a period at 20 Hz
-            ("mag",),
-            "how late the magnetometer's stamps are" + _LATE,
-            "turning in both senses, against the gyro",
-        ),
+        _time_offset(
+            "mag", "M", 0.05, ("mag",), "the magnetometer's stamps are", "turning in both senses, against the gyro"
+        ),  # a period at 20 Hz
         Variable(
             "hard_iron",
             "h",
@@ -308,26 +303,22 @@ TABLE: dict[str, Variable] = {
             "large changes of depth, against a DVL whose scale is known",
             considered=True,
         ),
-        Variable(
-            "depth_time_offset",
+        _time_offset(
+            "depth",
             "Z",
-            _ONE,
-            "s",
-            0.1,  # a pressure sensor's averaging and one period of a message at 10 Hz
+            0.1,
             ("depth",),
-            "how late the depth sensor's stamps are" + _LATE,
+            "the depth sensor's stamps are",
             "diving and waves, against the vertical velocity of a DVL",
-        ),
-        Variable(
-            "fix_time_offset",
+        ),  # a pressure sensor's averaging and one period of a message at 10 Hz
+        _time_offset(
+            "fix",
             "F",
-            _ONE,
-            "s",
-            0.3,  # 200 m of sound through water both ways; a receiver of GPS at 5 Hz has less
+            0.3,
             ("fix",),
-            "how late the stamps of fixes are" + _LATE,
+            "the stamps of fixes are",
             "legs in several directions, against a DVL and a heading",
-        ),
+        ),  # 200 m of sound through water both ways; a receiver of GPS at 5 Hz has less
         Variable(
             "drag_linear",
             "j",

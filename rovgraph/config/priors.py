@@ -16,7 +16,7 @@ from rovgraph.config.sections import NotNegative, Positive, Section
 def considerable(variable: Variable) -> bool:
     """Whether it can be considered: what walks, lasts for a while, or moves stamps, is estimated or exact."""
     constant = variable.walk == 0.0 and not np.isfinite(variable.time_constant)
-    return constant and not variable.name.endswith("_time_offset")
+    return constant and not variable.time_offset
 
 
 def _components(dim: int) -> Callable[[Any], Any]:

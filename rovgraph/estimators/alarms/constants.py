@@ -32,7 +32,7 @@ DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
 FEELS_THE_EARTH = 10.0  # sds
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
-TIME_OFFSETS = tuple(name for name in TABLE if name.endswith("_time_offset"))
+TIME_OFFSETS = tuple(name for name, variable in TABLE.items() if variable.time_offset)
 RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm", "gyr_scale", *TIME_OFFSETS)
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
 
