@@ -208,11 +208,11 @@ TABLE: dict[str, Variable] = {
         _time_offset(
             "ahrs",
             "A",
-            0.05,
+            0.05,  # what a fusing filter and one period of a message at 10 Hz add to a compass
             ("ahrs",),
             "the stamps of the IMU's own heading are",
             "turning in both senses, against the gyro",
-        ),  # what a fusing filter and one period of a message at 10 Hz add to a compass
+        ),
         *_compass("mag", "mg", "mag", "the magnetometer's heading", " beside its hard iron"),
         _time_offset(
             "mag", "M", 0.05, ("mag",), "the magnetometer's stamps are", "turning in both senses, against the gyro"
@@ -306,19 +306,19 @@ TABLE: dict[str, Variable] = {
         _time_offset(
             "depth",
             "Z",
-            0.1,
+            0.1,  # a pressure sensor's averaging and one period of a message at 10 Hz
             ("depth",),
             "the depth sensor's stamps are",
             "diving and waves, against the vertical velocity of a DVL",
-        ),  # a pressure sensor's averaging and one period of a message at 10 Hz
+        ),
         _time_offset(
             "fix",
             "F",
-            0.3,
+            0.3,  # 200 m of sound through water both ways; a receiver of GPS at 5 Hz has less
             ("fix",),
             "the stamps of fixes are",
             "legs in several directions, against a DVL and a heading",
-        ),  # 200 m of sound through water both ways; a receiver of GPS at 5 Hz has less
+        ),
         Variable(
             "drag_linear",
             "j",
