@@ -19,7 +19,6 @@ it is.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rovgraph.geometry import Array
 
@@ -448,34 +447,3 @@ class Belief:
     walk: float = 0.0
     considered: bool = False
     time_constant: float = np.inf
-
-
-def stationary_walk(sd: float, time_constant: float) -> float:
-    """The random walk that keeps a first-order Gauss-Markov process at a standard deviation [unit per root second]."""
-    return float(sd * np.sqrt(2.0 / time_constant))
-
-
-def stationary_sd(walk: float, time_constant: float) -> float:
-    """The standard deviation that a random walk keeps a first-order Gauss-Markov process at [unit]."""
-    return float(walk * np.sqrt(0.5 * time_constant))
-
-
-def walked(walk: ArrayLike, time_constant: ArrayLike, seconds: ArrayLike) -> tuple[Array, Array]:
-    """A first-order Gauss-Markov process after a time (Gelb 1974, 3.8), of infinite time constant a random walk.
-
-        x(t + dt) - mean = exp(-dt / T) (x(t) - mean) + w,  var w = walk^2 T / 2 (1 - exp(-2 dt / T))
-
-    Parameters
-    ----------
-    walk, time_constant, seconds : array_like that broadcast [unit per root second], [s], [s]
-
-    Returns
-    -------
-    kept : exp(-dt / T)
-    sd : of w
-    """
-    q, T, dt = np.broadcast_arrays(np.asarray(walk, float), np.asarray(time_constant, float), seconds)
-    lasting = np.isfinite(T)
-    finite = np.where(lasting, T, 1.0)
-    kept = np.where(lasting, np.exp(-dt / finite), 1.0)
-    return kept, q * np.sqrt(np.where(lasting, -0.5 * finite * np.expm1(-2.0 * dt / finite), dt))

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from dives import altered, batch, changed, falcon, simulated, true_at
 
-from rovgraph.calibration import TABLE, stationary_walk
+from rovgraph.calibration import TABLE
 from rovgraph.config import parse_config
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.lasting import LASTING, find_lasting
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.unstated_noise import noise_factor
+from rovgraph.gauss_markov import stationary_walk
 from rovgraph.simulate.files import known
 from rovgraph.state import POSE
 

@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, minimize
 
-from rovgraph.calibration import TABLE, stationary_sd, stationary_walk
+from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import Solution, minimise
 from rovgraph.engine.measurements import Block
+from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
 from rovgraph.state import State
 

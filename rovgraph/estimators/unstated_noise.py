@@ -25,6 +25,8 @@ from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
 from rovgraph.estimators.alarms import Alarm
 from rovgraph.estimators.alarms.residuals import SD_KEY
+from rovgraph.geometry import Array
+from rovgraph.units import behind, shown
 
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
 ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
@@ -109,7 +111,7 @@ def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | 
     return UnstatedNoise(sensor, key, value, text)
 
 
-def noise_factor(r: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+def noise_factor(r: Array) -> float | None:
     """How many times larger the white noise of n normalised residuals is, shape (n, dim); None = too few."""
     if len(r) <= ENOUGH:
         return None
@@ -126,10 +128,10 @@ def _is_stated(best: ChainOptimum, sensor: str) -> bool:
 
 def _lasting(error: LastingError, config: Config) -> UnstatedNoise:
     variable = TABLE[error.variable]
-    unit, shown = (np.rad2deg(1.0), "degrees") if variable.angular else (1.0, variable.unit)
-    sd, seconds = float(unit * error.sd), float(error.time_constant)
+    factor, unit = shown(variable.unit)
+    sd, seconds = factor * error.sd, float(error.time_constant)
     values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd, "time_constant_s": seconds}
-    size = f"{100.0 * sd:.2g} % of the velocity" if shown == "1" else f"{sd:.2g} {shown}"
+    size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"
     text = (
         f"{error.sensor}: its errors are correlated over {seconds:.0f} s with an sd of {size}; "
         f"they are estimated (calibration.{error.variable})"
