@@ -37,7 +37,7 @@ Layers (imports go downwards only)
 cli / api / report, export / studies, live /
 estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
-state, calibration, thesis / kernels / geometry, workers, fast_csv / errors, process.
+state, calibration, thesis / kernels / gauss_markov, units / geometry, workers, fast_csv / errors, process.
 """
 
 import importlib

@@ -19,7 +19,6 @@ it is.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rovgraph.geometry import Array
 
@@ -69,20 +68,26 @@ class Variable:
         return self.unit == "rad"
 
     @property
+    def time_offset(self) -> bool:
+        """How late a sensor's stamps are."""
+        return self.name.endswith(_TIME_OFFSET)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """Names of the scalar components, such as ``hard_iron_x``."""
         return tuple(self.name + c for c in self.components)
 
 
 CONSIDERED = "considered"  # neither estimated nor exact
+AUTO = "auto"  # an error that lasts: estimated where a smoothed dive shows it, else exact
 
+_TIME_OFFSET = "_time_offset"
 _DEG = float(np.deg2rad(1.0))
 _ONE = ("",)
 _XYZ = ("_x", "_y", "_z")
 _CURVE = ("_sin", "_cos")
 _SYMMETRIC = ("_xx", "_yy", "_zz", "_xy", "_xz", "_yz")
 _DVL = ("dvl", "dvl_water")
-_LATE = ": what it measured was valid that long before its stamp"
 
 
 def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "") -> tuple[Variable, Variable]:
@@ -125,6 +130,14 @@ def _compass_error(prefix: str, letter: str, sensor: str, whose: str) -> Variabl
         "the gyro, over its time constant",
         time_constant=60.0,
     )
+
+
+def _time_offset(
+    prefix: str, letter: str, sd: float, sensors: tuple[str, ...], whose: str, excited_by: str
+) -> Variable:
+    """How late the stamps of a sensor are."""
+    about = f"how late {whose}: what it measured was valid that long before its stamp"
+    return Variable(prefix + _TIME_OFFSET, letter, _ONE, "s", sd, sensors, about, excited_by)
 
 
 STATE_LETTERS = frozenset("xvbn")  # of the graph's other variables
@@ -188,39 +201,21 @@ TABLE: dict[str, Variable] = {
             "turning: yaw for forward and starboard, roll and pitch for down",
             considered=True,
         ),
-        Variable(
-            "dvl_time_offset",
-            "t",
-            _ONE,
-            "s",
-            0.1,
-            (*_DVL, "dvl_heading"),
-            "how late the DVL's stamps are" + _LATE,
-            "starts, stops and turns; waves",
-        ),
+        _time_offset("dvl", "t", 0.1, (*_DVL, "dvl_heading"), "the DVL's stamps are", "starts, stops and turns; waves"),
         *_compass("dvl_compass", "de", "dvl_heading", "the DVL's compass"),
         *_compass("ahrs", "af", "ahrs", "the IMU's own heading"),
-        Variable(
-            "ahrs_time_offset",
+        _time_offset(
+            "ahrs",
             "A",
-            _ONE,
-            "s",
             0.05,  # what a fusing filter and one period of a message at 10 Hz add to a compass
             ("ahrs",),
-            "how late the stamps of the IMU's own heading are" + _LATE,
+            "the stamps of the IMU's own heading are",
             "turning in both senses, against the gyro",
         ),
         *_compass("mag", "mg", "mag", "the magnetometer's heading", " beside its hard iron"),
-        Variable(
-            "mag_time_offset",
-            "M",
-            _ONE,
-            "s",
-            0.05,  # a period at 20 Hz
-            ("mag",),
-            "how late the magnetometer's stamps are" + _LATE,
-            "turning in both senses, against the gyro",
-        ),
+        _time_offset(
+            "mag", "M", 0.05, ("mag",), "the magnetometer's stamps are", "turning in both senses, against the gyro"
+        ),  # a period at 20 Hz
         Variable(
             "hard_iron",
             "h",
@@ -307,24 +302,20 @@ TABLE: dict[str, Variable] = {
             "large changes of depth, against a DVL whose scale is known",
             considered=True,
         ),
-        Variable(
-            "depth_time_offset",
+        _time_offset(
+            "depth",
             "Z",
-            _ONE,
-            "s",
             0.1,  # a pressure sensor's averaging and one period of a message at 10 Hz
             ("depth",),
-            "how late the depth sensor's stamps are" + _LATE,
+            "the depth sensor's stamps are",
             "diving and waves, against the vertical velocity of a DVL",
         ),
-        Variable(
-            "fix_time_offset",
+        _time_offset(
+            "fix",
             "F",
-            _ONE,
-            "s",
             0.3,  # 200 m of sound through water both ways; a receiver of GPS at 5 Hz has less
             ("fix",),
-            "how late the stamps of fixes are" + _LATE,
+            "the stamps of fixes are",
             "legs in several directions, against a DVL and a heading",
         ),
         Variable(
@@ -456,29 +447,3 @@ class Belief:
     walk: float = 0.0
     considered: bool = False
     time_constant: float = np.inf
-
-
-def stationary_walk(sd: float, time_constant: float) -> float:
-    """The random walk that keeps a first-order Gauss-Markov process at a standard deviation [unit per root second]."""
-    return float(sd * np.sqrt(2.0 / time_constant))
-
-
-def walked(walk: ArrayLike, time_constant: ArrayLike, seconds: ArrayLike) -> tuple[Array, Array]:
-    """A first-order Gauss-Markov process after a time (Gelb 1974, 3.8), of infinite time constant a random walk.
-
-        x(t + dt) - mean = exp(-dt / T) (x(t) - mean) + w,  var w = walk^2 T / 2 (1 - exp(-2 dt / T))
-
-    Parameters
-    ----------
-    walk, time_constant, seconds : array_like that broadcast [unit per root second], [s], [s]
-
-    Returns
-    -------
-    kept : exp(-dt / T)
-    sd : of w
-    """
-    q, T, dt = np.broadcast_arrays(np.asarray(walk, float), np.asarray(time_constant, float), seconds)
-    lasting = np.isfinite(T)
-    finite = np.where(lasting, T, 1.0)
-    kept = np.where(lasting, np.exp(-dt / finite), 1.0)
-    return kept, q * np.sqrt(np.where(lasting, -0.5 * finite * np.expm1(-2.0 * dt / finite), dt))

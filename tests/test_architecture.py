@@ -17,6 +17,7 @@ PACKAGE = ROOT / "rovgraph"
 LAYERS = (
     {"errors", "process"},
     {"geometry", "workers", "fast_csv"},
+    {"gauss_markov", "units"},
     {"kernels"},
     {"state", "calibration", "thesis"},
     {"vehicle"},

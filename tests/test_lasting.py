@@ -5,12 +5,13 @@ import pytest
 from dives import changed, falcon, incremental, renewed, rms, simulated, smoothed, true_at
 from scipy.stats import chi2
 
-from rovgraph.calibration import LAYOUT, stationary_walk, walked
+from rovgraph.calibration import LAYOUT
 from rovgraph.config import beliefs, parse_config
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.optimum import joint_prior_sd
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, newest_calibration
+from rovgraph.gauss_markov import stationary_walk, walked
 from rovgraph.simulate import Truth
 from rovgraph.simulate.files import known
 from rovgraph.simulate.lasting import draw_lasting

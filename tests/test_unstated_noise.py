@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from dives import altered, batch, changed, falcon, simulated, true_at
 
-from rovgraph.calibration import TABLE, stationary_walk
+from rovgraph.calibration import TABLE
+from rovgraph.config import parse_config
+from rovgraph.engine.chain import Chain
 from rovgraph.engine.lasting import LASTING, find_lasting
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.unstated_noise import noise_factor
+from rovgraph.gauss_markov import stationary_walk
 from rovgraph.simulate.files import known
+from rovgraph.state import POSE
 
 SHORT = {"dvl_rate": 3.0, "imu_rate": 50.0, "start_error": True}
 ERROR = {"estimate": True, "sd": 1.5, "time_constant_s": 20.0}
@@ -78,11 +82,35 @@ def test_what_the_configuration_says_of_an_error_stands(correlated):
         assert nees(case, dive, "smoothed") > 4.0
 
 
+def test_a_default_that_is_written_out_means_the_same():
+    """The start from the first fix, and errors that last from the dive: to the last bit."""
+    case, config = with_fixes(seed=5, fix_error=ERROR)
+    start = {key: value for key, value in config.model_dump()["start"].items() if key not in ("north_m", "east_m")}
+    sparse = unsaid(config).model_copy(update={"start": type(config.start)(**start)})
+    written = parse_config(sparse.to_yaml())
+    assert not sparse.start.located and not written.start.located
+    one, other = (smooth(case.log, c, "smoothed").estimates[0] for c in (sparse, written))
+    assert one.summary["noise_found"] == other.summary["noise_found"] != []
+    np.testing.assert_array_equal(one.trajectory.p_n, other.trajectory.p_n)
+    np.testing.assert_array_equal(one.trajectory.cov_p, other.trajectory.cov_p)
+
+
 def test_a_healthy_dive_is_solved_as_before():
     case, config = with_fixes(seed=2)
     dive, plain = (smooth(case.log, c, "smoothed") for c in (config, changed(config, graph={"find_noise": False})))
     assert "noise_found" not in dive.estimates[0].summary
     np.testing.assert_array_equal(dive.estimates[0].trajectory.p_n, plain.estimates[0].trajectory.p_n)
+
+
+def test_search_costs_one_elimination_of_a_healthy_dive_and_few_of_others(correlated, monkeypatch):
+    calls, eliminate = [], Chain.eliminate
+    monkeypatch.setattr(Chain, "eliminate", lambda *a, **b: (calls.append(1), eliminate(*a, **b))[1])
+    for (case, config), errors, most in ((with_fixes(seed=2), 0, 1), (correlated, 1, 50)):
+        best = batch(case.log, config).optimum()
+        best.covariances(POSE)
+        calls.clear()
+        assert len(find_lasting(best)) == errors
+        assert 0 < len(calls) <= most
 
 
 def test_an_error_of_next_to_nothing_explains_nothing_where_the_dive_has_shown_what_was_considered():
@@ -95,6 +123,8 @@ def test_an_error_of_next_to_nothing_explains_nothing_where_the_dive_has_shown_w
     with_error = best.unknowns.with_lasting(replace(known, estimate=True, walk=stationary_walk(1e-5, 30.0)))
     assert {*best.unknowns.estimated} < {*with_error.estimated} and with_error.considered == best.unknowns.considered
     assert find_lasting(best) == []
+    root = best.chain.eliminate(best.state, best.solution.gates)
+    assert best.linear == pytest.approx((root.log_determinant(), root.left), rel=1e-9)
 
 
 def test_noise_three_times_what_is_stated_is_found_and_believed():

@@ -1,18 +1,15 @@
 """Whether sensors that see the same motion agree: sign, scale, and clock.
 
-Each comparison takes what two sensors say of the change within windows of some seconds
-and fits ``change_b = slope * change_a + const``, so biases and constant offsets drop out.
+Each comparison takes what two sensors say of the change within windows of some seconds (`rovgraph.check.signals`).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rovgraph.check.correlation import Correlator
 from rovgraph.check.findings import Finding, integral, valid_pings
 from rovgraph.check.inertial import inertial_motion
+from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, rotate
 from rovgraph.log import Log, Stream
@@ -20,183 +17,11 @@ from rovgraph.sensors import Level
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
-MIN_WINDOWS = 15
-FOLLOWS = 0.7  # correlation of sensors that see the same motion
 CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
-LAG_WARNING = 0.3  # [s]
-LARGEST_LAG = 3.0  # that is searched for [s]
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
-FARTHEST_LAG = 300.0  # that is searched for coarsely [s]
-FAR_BETTER = 4.0  # times smaller a part that two signals do not share
 EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
 WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
-SURE = 3.0  # standard deviations of a lag that is no chance
-PARTS = 10  # of the log, each left out once to see how much a lag depends on it
-OVERLAP = 5  # windows that begin within one
 NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading"}
-
-
-@dataclass(frozen=True)
-class Signal:
-    """An integrated quantity over time, such as a heading without jumps.
-
-    Attributes
-    ----------
-    time : ndarray, shape (n,) [s]
-    value : ndarray, shape (n,)
-    """
-
-    time: Array
-    value: Array
-
-    def at(self, times: Array, longest: float) -> Array:
-        """Values at times of any order, NaN in a gap; shape (len(times),)."""
-        k = np.searchsorted(self.time, times).clip(1, len(self.time) - 1)
-        in_gap = self.time[k] - self.time[k - 1] > longest
-        inside = (times >= self.time[0]) & (times <= self.time[-1]) & ~in_gap
-        return np.where(inside, np.interp(times, self.time, self.value), np.nan)
-
-    def changes(self, edges: Array, longest: float) -> Array:
-        """Change from each edge to the next, NaN next to a gap; shape (len(edges) - 1,)."""
-        return np.diff(self.at(edges, longest))
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Straight line through the changes of two signals.
-
-    Attributes
-    ----------
-    slope, correlation : of b's changes against a's
-    sd_a, sd_b : of the changes
-    windows : how many
-    """
-
-    slope: float
-    correlation: float
-    sd_a: float
-    sd_b: float
-    windows: int
-
-
-@dataclass(frozen=True)
-class Lag:
-    """How much later one signal shows a motion than another.
-
-    Attributes
-    ----------
-    seconds : NaN if they do not follow each other
-    sd : NaN if it is not known
-    evidence : how much better they agree than unshifted, in chi-square
-    """
-
-    seconds: float
-    sd: float
-    evidence: float = 0.0
-
-    def significant(self, evidence: float) -> bool:
-        """Whether it is more than noise makes of clocks that agree, and explains so much."""
-        beyond = abs(self.seconds) > LAG_WARNING and abs(self.seconds) > SURE * self.sd
-        return bool(beyond and self.evidence > evidence)
-
-
-def fit(a: Signal, b: Signal, window: float) -> Fit:
-    """Compare the changes of two signals."""
-    first, last = max(a.time[0], b.time[0]) + LARGEST_LAG, min(a.time[-1], b.time[-1]) - LARGEST_LAG
-    edges = np.arange(first, last, window)
-    if len(edges) < 3:
-        return Fit(np.nan, 0.0, 0.0, 0.0, 0)
-    x, y = a.changes(edges, window), b.changes(edges, window)
-    both = np.isfinite(x) & np.isfinite(y)
-    x, y = x[both], y[both]
-    if len(x) < 3 or x.std() == 0.0 or y.std() == 0.0:
-        return Fit(np.nan, 0.0, 0.0, 0.0, len(x))
-    correlation = float(np.corrcoef(x, y)[0, 1])
-    return Fit(correlation * float(y.std() / x.std()), correlation, float(x.std()), float(y.std()), len(x))
-
-
-def coarse_lag(a: Signal, b: Signal, window: float) -> float:
-    """How much later b shows the same motion than a, to a step, where that is beyond what `lag` searches; else 0 [s].
-
-    Legs of a dive are alike, so a shifted one has to agree far better than the one that is not shifted.
-    """
-    step = 0.5
-    first, last = max(a.time[0], b.time[0]), min(a.time[-1], b.time[-1])
-    times = np.arange(first, last, step)
-    apart = max(1, round(window / step))
-    if len(times) < 4 * MIN_WINDOWS * apart:
-        return 0.0
-    values = [signal.at(times, window) for signal in (a, b)]
-    changes = [value[apart:] - value[:-apart] for value in values]
-    known = [np.isfinite(change) for change in changes]
-    x, y = (np.where(k, change - np.nanmean(change), 0.0) for k, change in zip(known, changes, strict=True))
-    reach = int(min(FARTHEST_LAG / step, 0.4 * len(x)))
-    correlate = Correlator(len(x), reach)
-    left, right = (np.column_stack([k * 1.0, v, v * v]) for k, v in zip(known, (x, y), strict=True))
-    both = correlate(left, right)
-    sums = np.array([both[0, 0], both[1, 0], both[0, 1], both[2, 0], both[0, 2], both[1, 1]]).T
-    lags = step * np.arange(-reach, reach + 1)
-    correlation = np.where(sums[:, 0] > 0.5 * len(x), _correlation(sums), 0.0)
-    near = np.abs(lags) <= LARGEST_LAG
-    best = int(np.argmax(correlation))
-    far_better = 1.0 - correlation[near].max() ** 2 > FAR_BETTER * (1.0 - correlation[best] ** 2)
-    return float(lags[best]) if correlation[best] > FOLLOWS and far_better else 0.0
-
-
-def lag(a: Signal, b: Signal, window: float) -> Lag:
-    """How much later b shows the same motion than a; NaN if they do not follow each other.
-
-    ``a``, the less noisy one, is moved along: b's noise is then the same at every lag, so that
-    the correlation is a smooth function of it. The standard deviation comes from leaving out one
-    part of the log after the other, which needs no model of what the two signals do not share.
-    """
-    step = 0.1
-    lags = np.arange(-LARGEST_LAG, LARGEST_LAG + step / 2, step)
-    first, last = max(a.time[0], b.time[0]) + LARGEST_LAG, min(a.time[-1], b.time[-1]) - LARGEST_LAG
-    times = np.arange(first, last, window / OVERLAP)
-    count = len(times) - OVERLAP
-    if count < OVERLAP * MIN_WINDOWS:
-        return Lag(np.nan, np.nan)
-
-    def changes(signal: Signal, late: float) -> Array:
-        value = signal.at(times - late, window)
-        return value[OVERLAP:] - value[:-OVERLAP]
-
-    centre = coarse_lag(a, b, window)
-    b = Signal(b.time - centre, b.value)
-    part, y = np.arange(count) * PARTS // count, changes(b, 0.0)
-    sums = np.array([_moments(changes(a, float(x)), y, part) for x in lags])
-    every = sums.sum(axis=-1)
-    correlation = _correlation(every)
-    seconds = _peak(lags, correlation)
-    without = np.array([_peak(lags, _correlation(every - sums[..., k])) for k in range(PARTS)])
-    unshifted = correlation[len(lags) // 2] if centre == 0.0 else 0.0
-    better = np.log((1.0 - unshifted**2) / max(1.0 - float(correlation.max()) ** 2, 1e-9))
-    return Lag(centre + seconds, float(np.sqrt((PARTS - 1) * np.var(without))), float(better * count / OVERLAP))
-
-
-def _moments(x: Array, y: Array, part: NDArray[np.int64]) -> Array:
-    """Sums over the windows of each part: how many, x, y, x squared, y squared, x times y; shape (6, PARTS)."""
-    both = np.isfinite(x) & np.isfinite(y)
-    x, y = np.where(both, x, 0.0), np.where(both, y, 0.0)
-    return np.array([np.bincount(part, w, PARTS) for w in (both * 1.0, x, y, x * x, y * y, x * y)])
-
-
-def _correlation(sums: Array) -> Array:
-    """Absolute correlation of sums (m, 6) as `_moments` gives them; shape (m,), 0 where there is none."""
-    n, x, y, xx, yy, xy = sums.T
-    spread = (n * xx - x * x) * (n * yy - y * y)
-    return np.asarray(np.abs(n * xy - x * y) / np.sqrt(np.where(spread > 0.0, spread, np.inf)))
-
-
-def _peak(lags: Array, correlation: Array) -> float:
-    """Lag at which a correlation is largest [s]; NaN if the signals do not follow each other there."""
-    k = int(np.argmax(correlation))
-    if not 0 < k < len(lags) - 1 or correlation[k] < FOLLOWS:
-        return np.nan
-    before, peak, after = correlation[k - 1 : k + 2]
-    bend = before - 2.0 * peak + after
-    return float(lags[k] + (0.5 * (lags[1] - lags[0]) * (before - after) / bend if bend < 0 else 0.0))
 
 
 def headings(log: Log, config: Config) -> Iterator[Finding]:

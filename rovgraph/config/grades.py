@@ -5,12 +5,10 @@ minutes of that is knowledge that hardly anyone has. A prior that is far wider i
 instruments whose data sheets state both (`rovgraph.config.presets`) the widest offset is 250 sqrt(Hz) d.
 """
 
-import warnings
-
 import numpy as np
 
 from rovgraph.config.sections import Imu
-from rovgraph.errors import DataWarning
+from rovgraph.errors import warn
 
 SHARPEST = 1.0 / np.sqrt(600.0)  # of the prior over the density [sqrt(Hz)]
 WIDEST = 1000.0  # a fibre-optic gyro beside the bias of a MEMS gyro has 3000
@@ -37,4 +35,4 @@ def warn_of_mixed_grades(imu: Imu, source: str) -> None:
         else:
             continue
         text = f"{source}: {bias} = {shown:g} {verdict} than {noise} = {density:.3g}; state both of one data sheet"
-        warnings.warn(text, DataWarning, stacklevel=4)
+        warn(text)

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Variable
+from rovgraph.calibration import AUTO, CONSIDERED, MOUNT, TABLE, Variable
 from rovgraph.config.error_messages import count
 from rovgraph.config.sections import NotNegative, Positive, Section
 
@@ -16,7 +16,7 @@ from rovgraph.config.sections import NotNegative, Positive, Section
 def considerable(variable: Variable) -> bool:
     """Whether it can be considered: what walks, lasts for a while, or moves stamps, is estimated or exact."""
     constant = variable.walk == 0.0 and not np.isfinite(variable.time_constant)
-    return constant and not variable.name.endswith("_time_offset")
+    return constant and not variable.time_offset
 
 
 def _components(dim: int) -> Callable[[Any], Any]:
@@ -32,16 +32,30 @@ def _components(dim: int) -> Callable[[Any], Any]:
     return check
 
 
-def _estimate(value: Any) -> Any:
-    """Refuses what is neither true nor false nor considered."""
-    if not isinstance(value, bool) and value != CONSIDERED:
-        raise PydanticCustomError("estimate", "expected true, false or considered")
-    return value
+def _estimate(word: str) -> Callable[[Any], Any]:
+    """Refuses what is neither true nor false nor a word."""
+
+    def check(value: Any) -> Any:
+        if not isinstance(value, bool) and value != word:
+            raise PydanticCustomError("estimate", f"expected true, false or {word}")
+        return value
+
+    return check
+
+
+def _estimate_of(variable: Variable) -> tuple[Any, Any, str]:
+    """Type, default and choices of what is done with a variable."""
+    if considerable(variable):
+        kind = Annotated[bool | Literal["considered"], BeforeValidator(_estimate(CONSIDERED))]
+        return kind, CONSIDERED if variable.considered else variable.estimate, "true, considered or false"
+    if np.isfinite(variable.time_constant):
+        return Annotated[bool | Literal["auto"], BeforeValidator(_estimate(AUTO))], AUTO, "true, auto or false"
+    return bool, variable.estimate, "estimate it"
 
 
 def _constant(entry: Any) -> Any:
-    """Refuses what is said to be considered and to change; a walk of what is not estimated has no effect."""
-    if entry.estimate == CONSIDERED and "estimate" in entry.model_fields_set:
+    """Refuses what is considered and changes."""
+    if entry.estimate == CONSIDERED:
         for key, value in ((key, getattr(entry, key)) for key in type(entry).model_fields):
             if key.startswith(("walk", "time_constant")) and value:
                 raise PydanticCustomError("constant", f"expected estimate: true or false beside {key}")
@@ -58,14 +72,11 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
     scale = float(np.rad2deg(1.0)) if variable.angular else 1.0
     unit = "degrees" if variable.angular else variable.unit
     mounted = variable.name in MOUNT
-    choices = "true, considered or false" if considerable(variable) else "estimate it"
+    kind, default, choices = _estimate_of(variable)
     fields: dict[str, Any] = {
         "estimate": (
-            Annotated[bool | Literal["considered"], BeforeValidator(_estimate)] if considerable(variable) else bool,
-            Field(
-                CONSIDERED if variable.considered else variable.estimate,
-                description=f"{choices}: {variable.about}. Shown by: {variable.excited_by}",
-            ),
+            kind,
+            Field(default, description=f"{choices}: {variable.about}. Shown by: {variable.excited_by}"),
         ),
         "mean" + tail: (
             Annotated[float | tuple[float, ...] | None, BeforeValidator(_components(variable.dim))],

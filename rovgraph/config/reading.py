@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable, stationary_walk
+from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable
 from rovgraph.config.error_messages import complaint
 from rovgraph.config.grades import warn_of_mixed_grades
 from rovgraph.config.presets import with_presets
@@ -37,6 +37,7 @@ from rovgraph.config.sections import (
     Vehicle,
 )
 from rovgraph.errors import InputError
+from rovgraph.gauss_markov import stationary_walk
 from rovgraph.geometry import Array, matrix_from_rpy
 
 Model = TypeVar("Model", bound=BaseModel)

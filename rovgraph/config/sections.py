@@ -33,8 +33,8 @@ class Section(BaseModel):
 class Start(Section):
     """Where the dive begins; null = from the log."""
 
-    north_m: float = Field(0.0, description="north of the first epoch")
-    east_m: float = Field(0.0, description="east of the first epoch")
+    north_m: float | None = Field(None, description="north of the first epoch; null = 0 beside east_m, else first fix")
+    east_m: float | None = Field(None, description="east of the first epoch; null = 0 beside north_m, else first fix")
     down_m: float | None = Field(None, description="depth of the first epoch; null = first depth sample, else 0")
     heading_deg: float | None = Field(None, description="heading; null = first heading samples")
     roll_deg: float | None = Field(None, description="roll; null = gravity")
@@ -43,6 +43,11 @@ class Start(Section):
     down_sd_m: Positive | None = Field(None, description="sd of the start's down; null = position_sd_m")
     heading_sd_deg: Positive = Field(5.0, description="sd of the start's heading")
     tilt_sd_deg: Positive = Field(2.0, description="sd of the start's roll and pitch, where it begins at rest")
+
+    @property
+    def located(self) -> bool:
+        """Whether north or east is stated."""
+        return self.north_m is not None or self.east_m is not None
 
 
 class Environment(Section):

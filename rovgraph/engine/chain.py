@@ -192,13 +192,16 @@ class Chain:
         return R, p, v, b, c
 
     def step(self, point: State, gates: Gates) -> ChainStep:
+        """As `rovgraph.engine.gauss_newton.Linearizable`."""
         root = self.eliminate(point, gates)
         return ChainStep(*root.solve(), root.explained)
 
     def promised(self, step: ChainStep) -> float:
+        """As `rovgraph.engine.gauss_newton.Linearizable`."""
         return step.promised
 
     def moved(self, point: State, step: ChainStep, share: float) -> State:
+        """As `rovgraph.engine.gauss_newton.Linearizable`."""
         x, y = share * step.x, share * step.y
         calibration = dict(point.calibration)
         for name, (border, part) in self.layout.places.items():

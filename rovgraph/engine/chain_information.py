@@ -195,10 +195,16 @@ class SquareRoot:
         chain_posterior.back_substitute(self.conditionals, np.zeros((len(self.border), 1)), out)
         return out[..., 0]
 
-    def log_determinant(self) -> float:
-        """Of the information of keyframes and border."""
+    def log_determinant(self, held: int = 0) -> float:
+        """Of the information of keyframes and border, the border's last components held."""
         diagonals = np.einsum("kii->ki", self.conditionals[:, :, : self.conditionals.shape[1]])
-        return 2.0 * float(np.log(np.abs(diagonals)).sum() + np.log(np.abs(np.diagonal(self.border))).sum())
+        border = np.diagonal(self.border)[: len(self.border) - held]
+        return 2.0 * float(np.log(np.abs(diagonals)).sum() + np.log(np.abs(border)).sum())
+
+    def least(self, held: int = 0) -> float:
+        """The least sum of squares, the border's last components held at 0."""
+        z = self.border[len(self.border) - held :, -1]
+        return self.left + float(z @ z)
 
 
 def square_root(

@@ -81,11 +81,20 @@ class ChainOptimum:
         return self._wide.eliminate(self.state, self.solution.gates, kept=1)
 
     @cached_property
-    def _marginals(self) -> tuple[Array, Array]:
-        """Covariances of the keyframes and of the border; what they come of would be the larger part of a long dive."""
-        root = self._wide.eliminate(self.state, self.solution.gates)
+    def _marginals(self) -> tuple[Array, Array, float, float]:
+        """Covariances of the keyframes and of the border, and `linear`.
+
+        What they come of would be the larger part of a long dive.
+        """
+        root, held = self._wide.eliminate(self.state, self.solution.gates), len(self._believed)
         P_y = root.border_covariance(self._believed)
-        return root.covariances(P_y), P_y
+        return root.covariances(P_y), P_y, root.log_determinant(held), root.least(held)
+
+    @property
+    def linear(self) -> tuple[float, float]:
+        """Log determinant of the information of what is estimated, linearised at the optimum, and its least sum of
+        squares."""
+        return self._marginals[2:]
 
     def relative_sd(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""

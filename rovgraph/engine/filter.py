@@ -154,8 +154,9 @@ class FilterEngine:
         """The next keyframe, from the IMU alone; calibration walks."""
         assert interval.motion is not None
         n = len(before.P)
-        P, B, x, c, F = before.P.copy(), before.B.copy(), np.empty(21), np.empty_like(before.c), np.empty((n, n))
-        Q, scale = np.empty((n, n)), _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
+        scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
+        P, B = before.P.copy(), before.B.copy()
+        x, c, F, Q = np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n))
         walk = self._walk if n == self.layout.size else np.pad(self._walk, ((0, 0), (0, n - self.layout.size)))
         tables = interval.motion.row, scale, self.layout.column, walk, self.layout.size
         predict_filter(before.x, before.c, P, B, before.L, *tables, x, c, F, Q)

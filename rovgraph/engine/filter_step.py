@@ -34,7 +34,7 @@ def states_of(x: Array, c: Array) -> State:
     return State(x[:, :9].reshape(-1, 3, 3), x[:, 9:12], x[:, 12:15], x[:, 15:21], calibration)
 
 
-def nothing() -> Array:
+def _nothing() -> Array:
     """Of what is considered where nothing is."""
     return np.zeros((0, 0))
 
@@ -58,8 +58,8 @@ class Gaussian:
     c: Array
     P: Array
     places: tuple[RememberedPlace, ...] = ()
-    B: Array = field(default_factory=nothing)
-    L: Array = field(default_factory=nothing)
+    B: Array = field(default_factory=_nothing)
+    L: Array = field(default_factory=_nothing)
 
     @staticmethod
     def of(state: State, P: Array, places: tuple[RememberedPlace, ...] = ()) -> "Gaussian":

@@ -19,7 +19,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from rovgraph.geometry import Array
+
 Gates = dict[str, NDArray[np.bool_]]  # sensor -> which of its measurements are let in
 
 MAX_ITERATIONS = 50
@@ -72,7 +73,7 @@ class Linearizable(Protocol[Point, Step]):
         ...
 
     def step(self, point: Point, gates: Gates) -> Step:
-        """The Gauss-Newton step.
+        """The Gauss-Newton step from a point, with the weights that its residuals have there.
 
         Raises
         ------

@@ -9,7 +9,9 @@ priors, motions, walks and measurements, and the square root R of their informat
 which counts what the error's freedom costs (Bar-Shalom et al. 2001, 11.4), so dives with and without it compare. It
 sees the error through all that the estimate has followed of it, where the autocovariance of residuals would not: fixes
 that are off for a minute take the track along. One elimination at the optimum, with an error as large as the noise,
-tells whether to look for more; that is all that a healthy dive costs.
+tells whether to look for more; that is all that a healthy dive costs. The most likely sd and time constant are those of
+the dive linearised at its optimum, and the dive is solved once with them. Where it gains other than promised, it is
+linearised there for another search: fixes that were rejected without the error come back with it.
 """
 
 from collections.abc import Collection
@@ -17,14 +19,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
-from rovgraph.calibration import TABLE, stationary_walk
+from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
-from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.gauss_newton import Gates, Solution, minimise
+from rovgraph.engine.gauss_newton import Solution, minimise
 from rovgraph.engine.measurements import Block
+from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
 from rovgraph.state import State
 
@@ -34,14 +36,15 @@ LIKELY = 3.0  # gain of log likelihood, at the optimum without the error, that i
 WINDOW_S = 20.0  # over which residuals are summed
 WORTH_A_LOOK = {"ahrs": 0.5, "dvl_heading": 0.5, "fix": 1.0}  # least `unity`; the track takes a DVL's error along
 CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
-LONGEST = 1.0  # time constant, in the length of the dive
-IMPLAUSIBLE = 10.0  # sd, in that of the table: a heading that is mirrored is no noise
-NO_GROUND = 0.5  # the same of a velocity's fraction that is the IMU's own scale rather than the bottom
+SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
+LONGEST = {"dvl": 0.5}  # time constant in the length of the dive, 1 where none stands here
+SMALLEST = 0.01  # sd, in that of the table
+IMPLAUSIBLE = 10.0  # the same: a heading that is mirrored is no noise
 CONSTANT = np.array([1.0, 10.0])  # sds of the same error as a constant, in that of the table
-SHORTEST = 5.0  # the same in intervals between measurements: what is shorter is noise
-LARGEST = 100.0  # sd, in that of the table
-SPREADS = (1.0, 0.3)  # of the search, of sd and time constant by their logarithms, each from an optimum
-EVALUATIONS = 20  # of the likelihood in each
+FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
+EVALUATIONS = 12  # of the likelihood in it
+AT_LONGEST = 0.9  # of that time constant
+AS_PROMISED = 0.1  # of a gain, by which that of the linear dive may differ
 TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
 
 
@@ -63,9 +66,6 @@ class LastingError:
     gain: float
 
 
-Fit = tuple[LastingError, Chain, Solution[State]]
-
-
 def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> list[LastingError]:
     """Errors that last, the clearest first, each looked for beside those before it.
 
@@ -75,35 +75,70 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> list[Last
     without : calibration variables that are, too
     """
     found: list[LastingError] = []
-    chain, solution = best.chain, best.solution
-    root = chain.eliminate(solution.point, solution.gates)
-    while likely := _likely(chain, solution, root, without):
-        known = _minus_log_likelihood(chain, root, solution.cost)
-        fits = [_fit(chain, solution, sensor, known) for sensor in likely]
-        clearest, fitted, after = max(fits, key=lambda fit: fit[0].gain)
-        if clearest.gain < CLEAR:
+    now, passed = _Baseline(best.chain, best.solution, *best.linear), {*without}
+    while candidates := [_most_likely(now, probe) for probe in _probes(now, passed)]:
+        passed |= {c.variable for c in candidates if _implausible(now.chain, c)}  # they have another cause
+        candidates = sorted((c for c in candidates if c.variable not in passed), key=lambda c: c.gain, reverse=True)
+        fits = (_fit(now, candidate) for candidate in candidates)
+        clear = next(((error, fitted) for error, fitted in fits if error.gain >= CLEAR), None)
+        if clear is None:
             break
-        found.append(clearest)
-        chain, solution = fitted, after
-        root = chain.eliminate(solution.point, solution.gates)
+        error, now = clear
+        found.append(error)
     return found
 
 
-def _likely(chain: Chain, solution: Solution[State], root: SquareRoot, without: Collection[str]) -> list[str]:
-    """Sensors with which an error that is as large as their noise makes the dive more likely."""
-    known, out = _minus_log_likelihood(chain, root, 0.5 * root.left), []
+@dataclass(frozen=True)
+class _Baseline:
+    """A dive with the errors that were found so far.
+
+    Attributes
+    ----------
+    chain, solution : the dive and its optimum
+    log_determinant, least : of the information of the dive linearised there, and its least sum of squares
+    """
+
+    chain: Chain
+    solution: Solution[State]
+    log_determinant: float
+    least: float
+
+    @property
+    def minus_log_likelihood(self) -> float:
+        return self.solution.cost + _freedom(self.chain, self.log_determinant)
+
+    def linear_gain(self, name: str, sd: float, time_constant: float) -> float:
+        """Of log likelihood, by one more error, of the dive as it is linearised here."""
+        wider = _with(self.chain, name, sd, time_constant)
+        root = wider.eliminate(_begin(wider, self.solution.point), self.solution.gates)
+        without = 0.5 * self.least + _freedom(self.chain, self.log_determinant)
+        return without - 0.5 * root.left - _freedom(wider, root.log_determinant())
+
+    def with_error(self, name: str, sd: float, time_constant: float) -> "_Baseline":
+        """The dive with one more error, solved from here."""
+        wider = _with(self.chain, name, sd, time_constant)
+        solution = minimise(wider, _begin(wider, self.solution.point), tolerance=TOLERANCE)
+        root = wider.eliminate(solution.point, solution.gates)
+        return _Baseline(wider, solution, root.log_determinant(), root.left)
+
+
+def _probes(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
+    """Errors as large as their sensors' noise with which the dive is more likely."""
+    out, (chain, solution) = [], (now.chain, now.solution)
     for sensor, name in LASTING.items():
         block = chain.blocks.get(sensor)
-        if block is None or len(block) < ENOUGH or name in {*chain.unknowns.estimated, *without}:
+        if block is None or len(block) < ENOUGH or name in {*chain.unknowns.estimated, *passed}:
             continue
         state = solution.point.at(block.keyframe)
         H = block.by_calibration(state, name)
         seen = np.sum(H**2, axis=(1, 2)) / H.shape[2]
         if not np.any(seen > 0.0) or unity(block, state, H, solution.gates[sensor]) < WORTH_A_LOOK.get(sensor, 0.0):
             continue
-        wider = _with(chain, name, float(1.0 / np.sqrt(np.median(seen[seen > 0.0]))), TABLE[name].time_constant)
-        if known - _linear(wider, solution.point, solution.gates) > LIKELY:
-            out.append(sensor)
+        sd = min(float(1.0 / np.sqrt(np.median(seen[seen > 0.0]))), 0.5 * IMPLAUSIBLE * TABLE[name].sd)
+        time_constant = float(np.clip(TABLE[name].time_constant, *_time_constants(chain, sensor)))
+        gain = now.linear_gain(name, sd, time_constant)
+        if gain > LIKELY:
+            out.append(LastingError(sensor, name, sd, time_constant, gain))
     return out
 
 
@@ -123,60 +158,81 @@ def unity(block: Block, state: State, H: Array, gate: NDArray[np.bool_]) -> floa
     return float(np.mean(sums[0] ** 2 / np.maximum(sums[1], 0.1 * np.median(sums[1]))))
 
 
-def _fit(chain: Chain, solution: Solution[State], sensor: str, known: float) -> Fit:
-    """The most likely error of a sensor, the chain with it among its unknowns, and the optimum of that.
+def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseline]:
+    """The most likely error of a sensor, and the dive with it.
 
     Its gain is that over the same error as a constant, where that is more likely than none: a scale or an offset that
     is held wrongly is no error that lasts for a while.
     """
-    name, interval = LASTING[sensor], float(np.median(np.diff(chain.blocks[sensor].time)))
+    error, fitted = candidate, now.with_error(candidate.variable, candidate.sd, candidate.time_constant)
+    gain = now.minus_log_likelihood - fitted.minus_log_likelihood
+    if abs(gain - candidate.gain) > AS_PROMISED * candidate.gain:  # the optimum has moved, and with it what is likely
+        error = _most_likely(fitted, replace(candidate, gain=0.0))
+        fitted = fitted.with_error(error.variable, error.sd, error.time_constant)
+    if _implausible(now.chain, error):
+        return replace(error, gain=-np.inf), fitted
+    gain = now.minus_log_likelihood - fitted.minus_log_likelihood
+    return replace(error, gain=gain - _gain_of_constant(now, error.variable)), fitted
+
+
+def _gain_of_constant(now: _Baseline, name: str) -> float:
+    """Of log likelihood, by an error that is constant over the dive, at least 0."""
+    gain, sd = max((now.linear_gain(name, sd, np.inf), sd) for sd in CONSTANT * TABLE[name].sd)
+    if gain <= LIKELY:
+        return 0.0
+    return max(0.0, now.minus_log_likelihood - now.with_error(name, sd, np.inf).minus_log_likelihood)
+
+
+def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
+    """The error of a sensor that makes the linear dive the most likely, or one that is implausible and more likely.
+
+    What the data tell best is how an error walks over short times, so that and the time constant are searched for: of
+    sd and time constant the likelihood has a long ridge.
+    """
+    name, seconds = begin.variable, _time_constants(now.chain, begin.sensor)
+    sds = TABLE[name].sd * np.array([SMALLEST, IMPLAUSIBLE])
+    walks = stationary_walk(sds[0], seconds[1]), stationary_walk(sds[1], seconds[0])
+
+    def error(x: Array) -> LastingError:
+        walk, time_constant = np.exp(x).tolist()
+        return replace(begin, sd=stationary_sd(walk, time_constant), time_constant=time_constant)
+
+    start = np.log([stationary_walk(begin.sd, begin.time_constant), begin.time_constant])
+
+    def loss(x: Array) -> float:
+        at = error(x)
+        return -begin.gain if np.array_equal(x, start) else -now.linear_gain(name, at.sd, at.time_constant)
+
+    def stop(intermediate_result: OptimizeResult) -> None:
+        if error(intermediate_result.x).sd > IMPLAUSIBLE * TABLE[name].sd:
+            raise StopIteration
+
+    best = minimize(
+        loss,
+        start,
+        method="COBYQA",
+        bounds=np.log([walks, seconds]).tolist(),
+        callback=stop,
+        options={"initial_tr_radius": FIRST, "final_tr_radius": LAST, "maxfev": EVALUATIONS},
+    )
+    return replace(error(best.x), gain=-float(best.fun))
+
+
+def _time_constants(chain: Chain, sensor: str) -> tuple[float, float]:
+    """The shortest and the longest that is looked for [s]."""
     duration = float(chain.rows.time[-1] - chain.rows.time[0])
-    shortest = SHORTEST * interval
-    least, wider, after = _most_likely(chain, solution, name, shortest, max(LONGEST * duration, shortest))
-    if known - least >= CLEAR:
-        known = min(
-            [known, *(_solved(_with(chain, name, sd, np.inf), solution)[0] for sd in CONSTANT * TABLE[name].sd)]
-        )
-    sd, time_constant = wider.beliefs[name].sd, wider.beliefs[name].time_constant
-    other_cause = name == "dvl_error" and time_constant > NO_GROUND * duration
-    gain = -np.inf if other_cause or sd > IMPLAUSIBLE * TABLE[name].sd else known - least
-    return LastingError(sensor, name, sd, time_constant, gain), wider, after
+    shortest = SHORTEST * float(np.median(np.diff(chain.blocks[sensor].time)))
+    return shortest, max(LONGEST.get(sensor, 1.0) * duration, shortest)
 
 
-def _most_likely(
-    chain: Chain, solution: Solution[State], name: str, shortest: float, longest: float
-) -> tuple[float, Chain, Solution[State]]:
-    """The least minus log likelihood with an error of a time constant within bounds [s], its chain and optimum."""
-    low = np.log([TABLE[name].sd / LARGEST, shortest])
-    high = np.log([TABLE[name].sd * LARGEST, longest])
-    x, least, wider = np.clip(np.log([TABLE[name].sd, TABLE[name].time_constant]), low, high), np.inf, chain
-    for spread in SPREADS:
-        x = _search(chain, solution, name, x, spread, low, high)
-        wider = _with(chain, name, *np.exp(x).tolist())
-        least, solution = _solved(wider, solution)
-    return least, wider, solution
+def _implausible(chain: Chain, error: LastingError) -> bool:
+    """Whether an error has another cause: it is larger than a sensor's can be, or a DVL's that is there all the time.
 
-
-def _solved(chain: Chain, near: Solution[State]) -> tuple[float, Solution[State]]:
-    """Minus log likelihood of a dive, and its optimum, from that of one close by."""
-    solution = minimise(chain, _begin(chain, near.point), tolerance=TOLERANCE)
-    root = chain.eliminate(solution.point, solution.gates)
-    return _minus_log_likelihood(chain, root, solution.cost), solution
-
-
-def _search(
-    chain: Chain, solution: Solution[State], name: str, x: Array, spread: float, low: Array, high: Array
-) -> Array:
-    """Logarithms of sd and time constant, shape (2,), that make the dive linearised at an optimum the most likely."""
-
-    def value(x: Array) -> float:
-        inside = np.clip(x, low, high)
-        outside = float(np.sum((x - inside) ** 2))
-        return outside + _linear(_with(chain, name, *np.exp(inside).tolist()), solution.point, solution.gates)
-
-    simplex = x + spread * np.array([[0.0, 0.0], [-1.0, 0.0], [0.0, -0.7]])
-    options = {"maxfev": EVALUATIONS, "xatol": 0.05, "fatol": 0.1, "initial_simplex": simplex}
-    return np.asarray(np.clip(minimize(value, x, method="Nelder-Mead", options=options).x, low, high))
+    What lasts as long as the dive is the IMU's own scale rather than the bottom under a DVL.
+    """
+    longest = _time_constants(chain, error.sensor)[1]
+    all_the_time = error.sensor in LONGEST and error.time_constant > AT_LONGEST * longest
+    return all_the_time or error.sd > IMPLAUSIBLE * TABLE[error.variable].sd
 
 
 def _begin(chain: Chain, point: State) -> State:
@@ -194,16 +250,13 @@ def _with(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
     return replace(chain, beliefs={**chain.beliefs, name: believed}, unknowns=chain.unknowns.with_lasting(believed))
 
 
-def _linear(chain: Chain, point: State, gates: Gates) -> float:
-    """Minus log likelihood of the dive linearised at a point, where that is least."""
-    root = chain.eliminate(_begin(chain, point), gates)
-    return _minus_log_likelihood(chain, root, 0.5 * root.left)
+def _freedom(chain: Chain, log_determinant: float) -> float:
+    """Minus log likelihood of a dive less its cost, up to what does not change with the errors that last.
 
-
-def _minus_log_likelihood(chain: Chain, root: SquareRoot, cost: float) -> float:
-    """Of a dive that costs as much, up to what does not change with the errors that last."""
-    diagonals = np.diagonal(root.conditionals, axis1=1, axis2=2), np.diagonal(root.border)
-    freedom = sum(float(np.sum(np.log(np.abs(d)))) for d in diagonals)
+    Parameters
+    ----------
+    log_determinant : of its information
+    """
     own = [name for name in LASTING.values() if name in chain.unknowns.estimated]
-    priors = sum(TABLE[name].dim * np.log(chain.beliefs[name].sd) for name in own)
-    return cost + freedom - float(np.sum(np.log(chain.walk[0]))) + float(priors)
+    priors = sum(TABLE[name].dim * float(np.log(chain.beliefs[name].sd)) for name in own)
+    return 0.5 * log_determinant - float(np.sum(np.log(chain.walk[0]))) + priors

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
 from rovgraph.engine.gauss_newton import (
-    Array,
     Gates,
     Linearizable,
     Measured,
@@ -37,6 +36,7 @@ from rovgraph.engine.gauss_newton import (
     minimise,
 )
 from rovgraph.errors import InputError
+from rovgraph.geometry import Array
 
 CHANCE = 1e-6  # that good measurements look like bad ones
 USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rovgraph.calibration import Belief, walked
+from rovgraph.calibration import Belief
+from rovgraph.gauss_markov import walked
 from rovgraph.geometry import Array
 
 
@@ -63,7 +64,7 @@ class Unknowns:
         return replace(self, walks={**self.walks, name: belief.walk}, considered=left, time_constants=lasting)
 
     def walked(self, name: str, seconds: ArrayLike) -> tuple[Array, Array]:
-        """How one that walks moves in a time: `rovgraph.calibration.walked`."""
+        """How one that walks moves in a time: `rovgraph.gauss_markov.walked`."""
         return walked(self.walks[name], self.time_constants.get(name, np.inf), seconds)
 
 

@@ -95,6 +95,8 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
             break
         found, config = found + more, with_noise(config, more)
         dive, best = _solve(log, config, frozen, estimate, progress)
+        if more[-1].lasts:
+            break
     return _saying(dive, found) if found else dive
 
 

@@ -150,9 +150,9 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
     assumptions : to be added to, one line each
     """
     start, begin = config.start, log["imu"].time[0]
-    p_n = np.array([start.north_m, start.east_m, 0.0 if start.down_m is None else start.down_m])
+    p_n = np.array([start.north_m or 0.0, start.east_m or 0.0, start.down_m or 0.0])
     sd = np.array([start.position_sd_m, start.position_sd_m, start.down_sd_m or start.position_sd_m])
-    if "fix" in log and not start.model_fields_set & {"north_m", "east_m"}:
+    if "fix" in log and not start.located:
         fixes = log["fix"]
         if len(fixes):
             fixes = _opening(fixes, fixes.time[0], WITHIN_S)  # however late they begin: the frame is theirs
@@ -160,7 +160,7 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
             p_n[:2] = here - rotate(R_nb, np.asarray(config.fix.lever_arm_m))[:2]
             sd[:2] = np.maximum(sd[:2], max(own_sd, FIRST_FIX_SD, MOST_MPS * (fixes.time[0] - begin)))
             assumptions.append(f"start position from the first fix, north {p_n[0]:.1f} m, east {p_n[1]:.1f} m")
-    elif log.origin is not None and not start.model_fields_set & {"north_m", "east_m"}:
+    elif log.origin is not None and not start.located:
         where = f"latitude {log.origin[0]:.6f}, longitude {log.origin[1]:.6f}"
         assumptions.append(f"start at the origin, {where}, within {sd[0]:g} m, as the log has no fix")
     if start.down_m is None and "depth" in log:

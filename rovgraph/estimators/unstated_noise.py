@@ -19,12 +19,14 @@ import numpy as np
 from pydantic import BaseModel
 from scipy.special import chdtri
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
 from rovgraph.estimators.alarms import Alarm
 from rovgraph.estimators.alarms.residuals import SD_KEY
+from rovgraph.geometry import Array
+from rovgraph.units import behind, shown
 
 NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another cause
 ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
@@ -50,6 +52,11 @@ class UnstatedNoise:
     values: Any
     text: str
 
+    @property
+    def lasts(self) -> bool:
+        """An error that lasts; those are found all at once, after all white noise."""
+        return self.key.startswith("calibration.")
+
 
 def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> list[UnstatedNoise]:
     """What the residuals of a dive say of its noise; white noise goes first, as errors that last stand out of it.
@@ -67,8 +74,8 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
     larger = [found for sensor in best.blocks if (found := _larger(best, sensor, config)) is not None]
     if larger:
         return larger
-    said = [name for name in LASTING.values() if "estimate" in getattr(config.calibration, name).model_fields_set]
-    errors = find_lasting(best, said)
+    stated = [name for name in LASTING.values() if getattr(config.calibration, name).estimate != AUTO]
+    errors = find_lasting(best, stated)
     # a score test's figure z is worth z^2 / 2 of log likelihood
     return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
 
@@ -104,7 +111,7 @@ def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | 
     return UnstatedNoise(sensor, key, value, text)
 
 
-def noise_factor(r: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+def noise_factor(r: Array) -> float | None:
     """How many times larger the white noise of n normalised residuals is, shape (n, dim); None = too few."""
     if len(r) <= ENOUGH:
         return None
@@ -121,10 +128,10 @@ def _is_stated(best: ChainOptimum, sensor: str) -> bool:
 
 def _lasting(error: LastingError, config: Config) -> UnstatedNoise:
     variable = TABLE[error.variable]
-    unit, shown = (np.rad2deg(1.0), "degrees") if variable.angular else (1.0, variable.unit)
-    sd, seconds = float(unit * error.sd), float(error.time_constant)
+    factor, unit = shown(variable.unit)
+    sd, seconds = factor * error.sd, float(error.time_constant)
     values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd, "time_constant_s": seconds}
-    size = f"{100.0 * sd:.2g} % of the velocity" if shown == "1" else f"{sd:.2g} {shown}"
+    size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"
     text = (
         f"{error.sensor}: its errors are correlated over {seconds:.0f} s with an sd of {size}; "
         f"they are estimated (calibration.{error.variable})"

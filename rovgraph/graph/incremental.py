@@ -17,13 +17,14 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from rovgraph.calibration import LAYOUT, Belief, walked
+from rovgraph.calibration import LAYOUT, Belief
 from rovgraph.engine.filter import ORIGIN, FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.errors import InputError
+from rovgraph.gauss_markov import walked
 from rovgraph.geometry import Array, exp_rotation, rotate
 from rovgraph.graph.batch import indeterminate
 from rovgraph.graph.factors import ANYWHERE_M

@@ -88,7 +88,7 @@ class Navigator:
         self._heard: dict[str, frozenset[str]] = {}  # source -> sensors, until the dive begins
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
-        self._located = bool(self.config.start.model_fields_set & {"north_m", "east_m"})  # where the fixes count from
+        self._located = self.config.start.located  # where the fixes count from
 
     @property
     def origin(self) -> tuple[float, float] | None:

@@ -21,7 +21,8 @@ from rovgraph.report.style import (
     panel_grid,
     thin,
 )
-from rovgraph.report.units import plus_minus, shown
+from rovgraph.report.units import plus_minus
+from rovgraph.units import shown
 
 COLUMNS = 3
 SETTLED = 0.25  # of the dive; what is before it may leave the panel

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 from rovgraph.estimators.observability import OBSERVABLE, OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE, WEAK
 from rovgraph.report.style import Clock, name_lowest, new_figure, panel_grid, save, style
-from rovgraph.report.units import shown
 from rovgraph.studies.observability import OTHER_LABELS, Observability
+from rovgraph.units import shown
 
 COLUMNS = 3
 COLORS = {OBSERVABLE: "#009E73", WEAK: "#E69F00"}

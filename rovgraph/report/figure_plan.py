@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from rovgraph.geometry import Array
 from rovgraph.report.style import new_figure, save, style
-from rovgraph.report.units import shown
 from rovgraph.studies.plan import Plan
+from rovgraph.units import shown
 
 LEAST_SPAN = (0.2, 10.0, 1.0)  # of speed [m/s], heading [deg] and depth [m]
 BEST, OTHERS = "#0072B2", "#B8C7D3"

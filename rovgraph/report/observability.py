@@ -14,10 +14,11 @@ from rovgraph.config import Config
 from rovgraph.estimators.observability import OBSERVABLE, OBSERVABLE_BELOW, UNOBSERVABLE_ABOVE
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
-from rovgraph.report.units import label_with_unit, shown
+from rovgraph.report.units import label_with_unit
 from rovgraph.studies.directions import directions, in_words
 from rovgraph.studies.observability import OTHER_LABELS, Observability
 from rovgraph.studies.plan import Plan
+from rovgraph.units import shown
 
 OBSERVABILITY, PLAN = "observability.json", "plan.json"
 TOLD = 12  # correlations in the table's caption

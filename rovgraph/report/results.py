@@ -20,8 +20,9 @@ from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.report.folder import STAMP, SUMMARY
-from rovgraph.report.units import key_suffix, shown
+from rovgraph.report.units import key_suffix
 from rovgraph.trajectory import Trajectory
+from rovgraph.units import shown
 
 CHI2_99 = 9.21  # of two degrees of freedom, so sqrt(9.21) semi-axes hold 99 %
 _ORDER = ("smoothed", "filtered", "dead_reckoning")

@@ -11,7 +11,8 @@ from rich.table import Table
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.estimators.observability import UNOBSERVABLE
 from rovgraph.report.results import main_first, narrowing
-from rovgraph.report.units import label_with_unit, percent, plus_minus, shown
+from rovgraph.report.units import label_with_unit, percent, plus_minus
+from rovgraph.units import shown
 
 
 def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> Table:

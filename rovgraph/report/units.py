@@ -1,19 +1,8 @@
-"""Units as a person reads them: degrees instead of radians."""
+"""Numbers and names with units, as a person reads them."""
 
 import numpy as np
 
-_DEGREES = float(np.rad2deg(1.0))
-
-
-def shown(unit: str) -> tuple[float, str]:
-    """Factor from a unit inside the program to the one shown, and that one's name.
-
-    >>> shown("m")
-    (1.0, 'm')
-    """
-    if unit.startswith("rad"):
-        return _DEGREES, "deg" + unit[3:]
-    return 1.0, unit
+from rovgraph.units import behind, shown
 
 
 def plus_minus(value: float, sd: float, unit: str = "") -> str:
@@ -22,7 +11,7 @@ def plus_minus(value: float, sd: float, unit: str = "") -> str:
     >>> plus_minus(-21.5312, 1.912, "deg")
     '-21.5 ± 1.9 deg'
     """
-    tail = f" {unit}" if unit not in ("", "1") else ""
+    tail = behind(unit)
     if not np.isfinite(value):
         return "unknown"
     if not np.isfinite(sd) or sd <= 0.0:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter  # type: ignore[attr-defined]
 
+from rovgraph.gauss_markov import stationary_walk, walked
 from rovgraph.geometry import Array
 from rovgraph.thesis import R_DVL, R_MTI, SAMPLE_S
 
@@ -71,7 +72,7 @@ def remembered(white: Array, steps: float) -> Array:
     """
     if steps == 0.0:
         return white
-    keep = float(np.exp(-1.0 / steps))
-    driven = white * np.sqrt(1.0 - keep**2)
+    keep, sd = walked(stationary_walk(1.0, steps), steps, 1.0)
+    driven = white * sd
     driven[0] = white[0]  # it has been going on for long
-    return np.asarray(lfilter([1.0], [1.0, -keep], driven, axis=0))
+    return np.asarray(lfilter([1.0], [1.0, -float(keep)], driven, axis=0))

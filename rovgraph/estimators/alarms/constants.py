@@ -11,6 +11,7 @@ from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import EARTH_RATE, Array
+from rovgraph.units import behind, shown
 
 # Of the 25 components of a dive one is beyond 3 sds in every fifteenth healthy dive, beyond 4 in one of 600.
 MOVED, FAR_MOVED = 4.0, 10.0  # sds
@@ -31,7 +32,7 @@ DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
 FEELS_THE_EARTH = 10.0  # sds
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
-TIME_OFFSETS = tuple(name for name in TABLE if name.endswith("_time_offset"))
+TIME_OFFSETS = tuple(name for name, variable in TABLE.items() if variable.time_offset)
 RELEASED = ("dvl_roll", "dvl_pitch", "dvl_yaw", "dvl_scale", "dvl_lever_arm", "gyr_scale", *TIME_OFFSETS)
 BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(3, 6), "imu.gyr_bias_sd_dps"))
 
@@ -68,15 +69,15 @@ def moved_constant(c: CalibrationEstimate, begin: float, end: float) -> Iterator
     off = float(sds_moved(np.array(c.value), np.array(c.sd), np.array(c.prior_mean), np.array(c.prior_sd)))
     if c.sd > NARROWED * c.prior_sd:
         return
-    shown, unit = _shown(c.unit)
+    factor, unit = shown(c.unit)
     name = next((n for n in TABLE if c.label in TABLE[n].labels), c.label)
     yield _moved(
         begin,
         end,
         _sensor_of(name),
         off,
-        f"{c.label} came out at {shown * c.value:.3g}{unit}, {off:.0f} sd from the "
-        f"{shown * c.prior_mean:.3g} ± {shown * c.prior_sd:.2g}{unit} that was believed",
+        f"{c.label} came out at {factor * c.value:.3g}{behind(unit)}, {off:.0f} sd from the "
+        f"{factor * c.prior_mean:.3g} ± {factor * c.prior_sd:.2g}{behind(unit)} that was believed",
         f"check {_key_of(name)}; if it is as it is, state its mean or a larger sd in calibration.{name}",
     )
 
@@ -105,7 +106,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
         variable = TABLE[r.name]
         if r.sd > SHOWN_OF.get(r.name, SHOWN) * variable.sd:
             continue
-        shown, unit = _shown(variable.unit)
+        factor, unit = shown(variable.unit)
         belief = best.beliefs[r.name]
         mean, allowed = belief.mean[variable.labels.index(r.label)], belief.sd if belief.considered else 0.0
         yield Statistic(
@@ -116,8 +117,8 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
             HELD,
             HELD_FAR_OFF,
-            f"{r.label} is held at {shown * mean:.4g}{unit}, where the measurements have it "
-            f"{shown * r.step:+.2g} ± {shown * r.sd:.1g}{unit} from that",
+            f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, where the measurements have it "
+            f"{factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)} from that",
             _remedy_of_held(r, evidence.beginning.config),
         )
 
@@ -182,11 +183,6 @@ def halves(evidence: Evidence) -> Iterator[Statistic]:
                 f"it changes during the dive, or something else acts as it does: check {_key_of(name)}, "
                 f"or let it walk (calibration.{name})",
             )
-
-
-def _shown(unit: str) -> tuple[float, str]:
-    """Factor and unit that a person reads."""
-    return (float(np.rad2deg(1.0)), " deg") if unit == "rad" else (1.0, "" if unit in ("", "1") else f" {unit}")
 
 
 def _sensor_of(name: str) -> str:

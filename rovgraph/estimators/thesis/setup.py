@@ -205,7 +205,7 @@ def _start(
     q = from_matrix(R_nb)
     by_angle = 0.5 * rate_matrix(q)
     mean: dict[str, ArrayLike] = {
-        "p": [where.north_m, where.east_m, where.down_m or 0.0],
+        "p": [where.north_m or 0.0, where.east_m or 0.0, where.down_m or 0.0],
         "q": q,
         "mag_bias": iron.mean,
         "mount": np.concatenate([priors[name].mean for name in MOUNT]),
