@@ -102,5 +102,5 @@ def lake() -> Config:
 
 
 def falcon() -> Config:
-    """The configuration of the thesis's vehicle, ``configs/falcon.yaml``."""
+    """The configuration of the thesis's vehicle, ``falcon.yaml``."""
     return parse_config((files("rovgraph.config") / "falcon.yaml").read_text(encoding="utf-8"), "falcon.yaml")
