@@ -49,6 +49,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from rovgraph.api.comparison import ComparisonResult as ComparisonResult
     from rovgraph.api.comparison import compare as compare
+    from rovgraph.api.demo import Demo as Demo
+    from rovgraph.api.demo import demo as demo
     from rovgraph.api.logs import check as check
     from rovgraph.api.logs import read_log as read_log
     from rovgraph.api.observability import ObservabilityResult as ObservabilityResult
@@ -79,6 +81,7 @@ _HOMES = {
     "ComparisonResult": "api.comparison",
     "Config": "config",
     "DataWarning": "errors",
+    "Demo": "api.demo",
     "InputError": "errors",
     "Log": "log",
     "Metrics": "evaluate",
@@ -90,6 +93,7 @@ _HOMES = {
     "Trajectory": "trajectory",
     "check": "api.logs",
     "compare": "api.comparison",
+    "demo": "api.demo",
     "evaluate": "evaluate",
     "load_config": "config",
     "observe": "api.observability",

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 import rovgraph as rg
+from rovgraph.api.demo import CHOICES, SCENARIO, SEED
 from rovgraph.cli.app import main
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
@@ -183,6 +184,27 @@ def test_simulate_writes_what_the_command_writes(monkeypatch, tmp_path):
     dive.save(tmp_path / "twin")
     same_files(tmp_path / "command", tmp_path / "twin")
     assert len(dive.log["dvl"]) == len(rg.read_log(tmp_path / "twin" / "log.csv", dive.config)["dvl"])
+
+
+def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
+    """A minute of it; the whole dive is smoothed from the installed wheel."""
+    monkeypatch.setattr("rovgraph.api.demo.CHOICES", rg.Choices(duration=60.0, outliers=0.01))
+    monkeypatch.chdir(tmp_path)
+    assert command(monkeypatch, "demo") == 0
+    said = capsys.readouterr().out
+    assert "verdict: trusted" in said and f"{Path('demo/results/track.png')}: " in said
+    done = rg.demo("demo", force=True)  # in the same place, which the summary names
+    assert f"{done.metrics.rms_m:.3f} m" in said and done.metrics.rms_m < 0.1
+    assert done.result.verdict == "trusted" and (done.results / "track.png").is_file()
+    assert command(monkeypatch, "demo") == 2
+    assert "demo exists; choose another --out or give --force" in capsys.readouterr().err
+
+
+def test_the_demonstration_dive_is_the_one_of_the_repository():
+    made = (SHIPPED / "README.md").read_text(encoding="utf-8")
+    stated = f"simulate {SCENARIO} --seed {SEED} --outliers {CHOICES.outliers} --config rovgraph/config/falcon.yaml"
+    assert stated in made
+    assert rg.Choices(outliers=CHOICES.outliers) == CHOICES  # nothing else is chosen
 
 
 def test_observe_writes_what_the_command_writes(monkeypatch, tmp_path, short, config):

@@ -167,6 +167,7 @@ print("MODULES", *sys.modules)
     "command",
     [
         [],
+        ["demo"],
         ["smooth"],
         ["online"],
         ["evaluate"],

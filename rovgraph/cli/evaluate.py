@@ -33,11 +33,11 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(metrics.as_dict(), indent=2))
     else:
-        _show(metrics, f"{trajectory} against {reference}")
+        show_metrics(metrics, f"{trajectory} against {reference}")
 
 
-def _show(metrics: "Metrics", title: str) -> None:
-    """The table that the command prints; what is not known has no row."""
+def show_metrics(metrics: "Metrics", title: str) -> None:
+    """Print the table; unknown metrics have no row."""
     from rich.console import Console
     from rich.table import Table
 

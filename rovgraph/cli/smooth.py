@@ -2,9 +2,12 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rovgraph import Result
 
 NOT_TRUSTED = 3  # exit code of --strict
 VERDICT_STYLE = {"trusted": "green", "doubtful": "bold yellow", "wrong": "bold red"}
@@ -43,12 +46,9 @@ def smooth(
     """
     import time
 
-    from rich.console import Console
-
     import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.folder import check_writable
-    from rovgraph.report.tables import calibration_table, summary_table
 
     out = Path("results-" + log.name.split(".")[0]) if out is None else out
     settings = None if config is None else rg.load_config(config)
@@ -60,6 +60,17 @@ def smooth(
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
     summary = result.save(out, force, figures)
+    show_result(result, summary, out)
+    if strict and result.verdict != "trusted":
+        raise typer.Exit(NOT_TRUSTED)
+
+
+def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
+    """Print verdict, alarms, tables and assumptions."""
+    from rich.console import Console
+
+    from rovgraph.report.tables import calibration_table, summary_table
+
     console = Console()
     console.print(f"verdict: {result.verdict}", style=VERDICT_STYLE[result.verdict], highlight=False)
     for alarm in result.alarms:
@@ -69,5 +80,3 @@ def smooth(
     for line in result.assumptions:
         console.print(f"assumed: {line}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
-    if strict and result.verdict != "trusted":
-        raise typer.Exit(NOT_TRUSTED)
