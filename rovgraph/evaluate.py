@@ -88,9 +88,12 @@ def evaluate(
 
     Raises
     ------
-    InputError : a start before or after the trajectory; an end before the start; fewer than two reference epochs
+    InputError : no `Trajectory`; a start before or after the trajectory; an end before the start; fewer than two reference epochs
         inside the rest of it
     """
+    for name, track in (("trajectory", trajectory), ("reference", reference)):
+        if not isinstance(track, Trajectory):
+            raise InputError(f"{name}: expected a Trajectory, as read_{name} gives it, found a {type(track).__name__}")
     if not start >= 0.0:
         raise InputError(f"comparing from {start:g} s on: expected 0 or more after the trajectory's first epoch")
     if (lasts := float(trajectory.time[-1] - trajectory.time[0])) < start:

@@ -372,6 +372,7 @@ def test_a_frame_is_refused_with_the_words_that_the_command_has_for_its_file(mon
     [
         ([{"time": T, "depth": T[:2]}], r"columns of different length \(time 3, depth 2\)"),
         ([{"time": T, "depth": np.ones((3, 1))}], r"column depth has shape \(3, 1\)"),
+        ([{"time": T, "depth": [[1, 2], [3], [4]]}], "column depth holds lists, expected one number per row"),
         ([{"time": T, "depth": 1.0}], r"column depth has shape \(\)"),
         ([{"time": T, "depth": T}, {"dvl_vx": T}], "rows without time"),
         ([], "no rows"),
@@ -411,3 +412,25 @@ def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
         rg.Choices(duration=1e5)
     with pytest.raises(rg.InputError, match="compare wants either a log"):
         rg.compare()
+
+
+def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
+    for use in (
+        lambda: rg.read_log(SHIPPED / "log.csv.gz", "vehicle.yaml"),
+        lambda: rg.Log.from_frame(short, {}),
+        lambda: rg.simulate("circle", "vehicle.yaml"),
+        lambda: rg.simulate("vattern", {}),
+        lambda: rg.plan("vehicle.yaml"),
+    ):
+        with pytest.raises(
+            rg.InputError, match=r"config: expected a Config, as load_config gives it, found a (str|di)"
+        ):
+            use()
+    with pytest.raises(rg.InputError, match="configuration: expected YAML text, found a dict"):
+        rg.parse_config({"imu": {}})
+    with pytest.raises(rg.InputError, match=r"is a DataFrame, .* use Log\.from_frame"):
+        rg.read_log(short)
+    with pytest.raises(rg.InputError, match="trajectory: expected a Trajectory, as read_trajectory gives it"):
+        rg.evaluate("trajectory.csv", "reference.csv")
+    with pytest.raises(rg.InputError, match="reference: expected a Trajectory, as read_reference gives it"):
+        rg.evaluate(rg.simulate("circle", choices=rg.Choices(duration=40.0)).truth, short)

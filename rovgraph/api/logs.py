@@ -3,10 +3,12 @@
 import warnings
 from pathlib import Path
 
+import pandas as pd
+
 from rovgraph import log as library
 from rovgraph.check import Finding, Report, bridge_jumps, examine
 from rovgraph.check import warn as warn_of_findings
-from rovgraph.config import Config
+from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import InputError, warn
 from rovgraph.estimators.initialise import refusal
 from rovgraph.log import Log
@@ -28,6 +30,8 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
     -----
     DataWarning : what was left out or put in order; a configuration that lies beside the log and was not given
     """
+    if isinstance(path, pd.DataFrame):
+        raise InputError("log: is a DataFrame, expected a file's name; use Log.from_frame")
     if config is None:
         warn_of_unused(path)
     return library.read_log(path, config)
@@ -92,8 +96,6 @@ def given(log: Log, config: Config | None) -> Config:
     """
     if not isinstance(log, Log):
         raise InputError(f"log: expected a Log, as read_log or Log.from_frame gives it, found a {type(log).__name__}")
-    config = Config() if config is None else config
-    if not isinstance(config, Config):
-        raise InputError(f"config: expected a Config, as load_config gives it, found a {type(config).__name__}")
+    config = config_or_defaults(config)
     log.require_read_with(config)
     return config

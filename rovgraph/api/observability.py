@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rovgraph.api.logs import given, prepared
-from rovgraph.config import Config
+from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import collected_warnings
 from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.log import Log
@@ -145,7 +145,7 @@ def plan(
     ------
     InputError : no such manoeuvre or variable, nothing to estimate, a goal for what is not estimated
     """
-    config = estimating(Config() if config is None else config, estimate)
+    config = estimating(config_or_defaults(config), estimate)
     candidates = chosen(manoeuvres or None, duration)
     before: Known | None
     if isinstance(known, ObservabilityResult):
