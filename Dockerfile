@@ -2,7 +2,7 @@
 #
 #   docker build -t rovgraph .
 #   docker run --rm -it --network host -v "$PWD:/data" rovgraph \
-#       online waterlinked://192.168.2.95 mavlink:udpin:0.0.0.0:14550 --config dive1.yaml --out dive1
+#       online waterlinked://192.168.2.95 mavlink:udpin:0.0.0.0:14551 --config dive1.yaml --out dive1
 #
 # --network host gives the container the host's ports; a serial port needs --device too. Kernels are compiled for the
 # processor that builds the image: build it on the machine that runs it, or the first start compiles for a minute or two.

@@ -88,8 +88,8 @@ def evaluate(
 
     Raises
     ------
-    InputError : no `Trajectory`; a start before or after the trajectory; an end before the start; fewer than two reference epochs
-        inside the rest of it
+    InputError : no `Trajectory`; a start before or after the trajectory; an end before the start; fewer than two
+        reference epochs inside the rest of it
     """
     for name, track in (("trajectory", trajectory), ("reference", reference)):
         if not isinstance(track, Trajectory):

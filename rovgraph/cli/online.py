@@ -35,7 +35,7 @@ def online(
 ) -> None:
     """Estimate while data arrive, on board or at the topside.
 
-    Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:127.0.0.1:14550 --out dive
+    Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:0.0.0.0:14551 --out dive
     """
     import sys
 
