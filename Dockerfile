@@ -16,7 +16,7 @@ RUN pip install --no-cache-dir '.[online]'
 
 WORKDIR /data
 RUN mkdir -p "$ROVGRAPH_CACHE_DIR" \
-    && rovgraph simulate circle --duration 20 --out /tmp/dive \
+    && rovgraph simulate circle --duration 40 --out /tmp/dive \
     && rovgraph online file:/tmp/dive/log.csv --speed max --config /tmp/dive/config.yaml --out /tmp/dive/live \
     && rm -rf /tmp/dive /src \
     && chmod -R a+rwX "$ROVGRAPH_CACHE_DIR"

@@ -35,6 +35,7 @@ def compare(
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.comparison import comparison_table
     from rovgraph.report.folder import check_writable
+    from rovgraph.report.narrow import fitting
     from rovgraph.studies.estimators import select
 
     names = None if estimators is None else [name.strip() for name in estimators.split(",") if name.strip()]
@@ -53,7 +54,8 @@ def compare(
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
-    console.print(comparison_table(result.comparison, result.title, result.thesis))
+    for part in fitting(comparison_table(result.comparison, result.title, result.thesis), console):
+        console.print(part)
     for row in result.comparison.runs.dropna(subset="error").drop_duplicates("estimator").itertuples():
         console.print(f"{row.estimator} failed on {row.run}: {row.error}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)

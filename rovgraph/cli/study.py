@@ -36,6 +36,7 @@ def misalignment(
     from rovgraph.cli.progress import progress_bar
     from rovgraph.errors import InputError
     from rovgraph.report.figure_study import draw_study
+    from rovgraph.report.narrow import fitting
     from rovgraph.report.study import plan_table, study_table, write_study
     from rovgraph.studies.engines import Cluster, Local
     from rovgraph.studies.misalignment import chosen, open_results, read_study
@@ -48,7 +49,8 @@ def misalignment(
     plan = read_study(config)
     cells = chosen(plan, only)
     if show:
-        console.print(plan_table(plan))
+        for part in fitting(plan_table(plan), console):
+            console.print(part)
         return
     if out is None:
         raise InputError("--out is needed: a folder for the results")
@@ -66,7 +68,8 @@ def misalignment(
     with kept_so_far(out):  # its rows are on disk already
         write_study(out, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
         draw_study(out, tables)
-    console.print(study_table(tables))
+    for part in fitting(study_table(tables), console):
+        console.print(part)
     for row in tables.runs.dropna(subset="failure").drop_duplicates("cell").itertuples():
         console.print(f"{row.cell} failed in run {row.run}: {row.failure}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)

@@ -53,7 +53,7 @@ def write_comparison(folder: Path, comparison: Comparison, about: Mapping[str, A
 
 
 def comparison_table(comparison: Comparison, title: str, thesis: bool) -> Table:
-    """A row per estimator, for a terminal of 120 columns.
+    """A row per estimator, 120 columns wide; `rovgraph.report.narrow` fits it into fewer.
 
     Parameters
     ----------
