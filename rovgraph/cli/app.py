@@ -29,7 +29,7 @@ from rovgraph.process import be_frugal
 
 app = typer.Typer(
     name="rovgraph",
-    help="Where a small underwater vehicle was, and where it is.",
+    help="Compute where a small underwater vehicle was, and where it is.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -45,7 +45,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _of_all_commands(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
     ] = False,
 ) -> None:
     pass

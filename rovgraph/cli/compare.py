@@ -12,14 +12,16 @@ def compare(
     out: Annotated[Path, typer.Option("--out", "-o", help="results folder", show_default=False)],
     log: Annotated[Path | None, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md")] = None,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
-    reference: Annotated[Path | None, typer.Option(help="CSV with time, north, east and what else it knows")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="CSV with time, north, east, and optionally attitude and velocity")
+    ] = None,
     scenario: Annotated[str | None, typer.Option(help="simulate dives of this scenario instead of a LOG")] = None,
     seeds: Annotated[int, typer.Option(help="number of simulated dives")] = 30,
     first_seed: Annotated[int, typer.Option(min=0, help="seed of the first of them")] = 1,
     duration: Annotated[float | None, typer.Option(help="of a simulated dive [s]; default: the scenario's own")] = None,
     estimators: Annotated[
         str | None,
-        typer.Option(help="names or patterns (graph-*), separated by commas; default: all that need no thrusters"),
+        typer.Option(help="names or patterns (graph-*), separated by commas; default: all without thrusters"),
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,

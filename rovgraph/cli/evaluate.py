@@ -11,12 +11,14 @@ if TYPE_CHECKING:
 
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(help="CSV of an estimate.", show_default=False)],
-    reference: Annotated[Path, typer.Argument(help="CSV with time, north, east and what else it knows.")],
-    start: Annotated[float, typer.Option("--from", help="Leave out the first seconds of the trajectory.")] = 0.0,
+    reference: Annotated[
+        Path, typer.Argument(help="CSV with time, north, east, and optionally attitude and velocity.")
+    ],
+    start: Annotated[float, typer.Option("--from", help="Skip the first seconds of the trajectory.")] = 0.0,
     end: Annotated[
-        float | None, typer.Option("--to", help="Leave out what is later than this many seconds.", show_default=False)
+        float | None, typer.Option("--to", help="Skip what is later than this many seconds.", show_default=False)
     ] = None,
-    align: Annotated[bool, typer.Option("--align", help="Turn and shift the trajectory to fit first.")] = False,
+    align: Annotated[bool, typer.Option("--align", help="Rotate and shift the trajectory to fit first.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare a trajectory with a reference.

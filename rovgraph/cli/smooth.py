@@ -33,14 +33,15 @@ def smooth(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
     engine: Annotated[
-        Engine | None, typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; else graph.solver")
+        Engine | None,
+        typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; default: graph.solver"),
     ] = None,
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
 ) -> None:
-    """Estimate the track of a dive and everything that was calibrated on the way.
+    """Estimate the track of a dive, and the calibration of its instruments.
 
     Example: rovgraph smooth log.csv --config vehicle.yaml --out results
     """
