@@ -183,7 +183,7 @@ def normalised_error(error: Array, covariance: Array) -> Array:
 
 
 def aligned(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, dict[str, Any]]:
-    """The estimate turned about down and shifted in the horizontal to fit the truth best.
+    """The estimate rotated about down and shifted horizontally for the best fit to the truth.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def aligned(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, dict[s
 
 
 def read_reference(path: Path | str) -> Trajectory:
-    """Read a reference CSV, forgiving what references from other tools come with.
+    """Read a reference CSV, tolerating what other tools write.
 
     Rows without time, north or east and repeated times are left out with a `DataWarning`;
     rows out of order are sorted.

@@ -1,4 +1,4 @@
-"""A first dive without a log of one's own: what ``rovgraph demo`` does."""
+"""A first dive without a log of your own: what ``rovgraph demo`` does."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +51,7 @@ def demo(path: Path | str = "demo", force: bool = False, progress: Progress = no
     ----------
     path : the folder to make: the files of ``rovgraph simulate``, and those of ``rovgraph smooth`` in ``results``
     force : replace an older folder
-    progress : called now and then with what is being done, and how far it is from 0 to 1
+    progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""``rovgraph demo``: a first dive, without a log of one's own."""
+"""``rovgraph demo``: a first dive, without a log of your own."""
 
 from pathlib import Path
 from typing import Annotated
