@@ -18,7 +18,9 @@ def compare(
     scenario: Annotated[str | None, typer.Option(help="simulate dives of this scenario instead of a LOG")] = None,
     seeds: Annotated[int, typer.Option(help="number of simulated dives")] = 30,
     first_seed: Annotated[int, typer.Option(min=0, help="seed of the first of them")] = 1,
-    duration: Annotated[float | None, typer.Option(help="of a simulated dive [s]; default: the scenario's own")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="seconds of a simulated dive; default: the scenario's own")
+    ] = None,
     estimators: Annotated[
         str | None,
         typer.Option(help="names or patterns (graph-*), separated by commas; default: all without thrusters"),
