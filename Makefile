@@ -1,4 +1,4 @@
-# make demo   a track from the dive in data/falcon, and how far it is from the truth
+# make demo   rovgraph demo: a dive, its track, and how far it is from the truth
 # make test   linters, types and tests
 # Each makes the environment that it needs in .venv.
 
@@ -6,7 +6,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-DEMO   ?= results/falcon
+DEMO   ?= results/demo
 
 .PHONY: help venv demo test lint bench clean
 .DELETE_ON_ERROR:
@@ -32,8 +32,7 @@ $(VENV)/dev.stamp: $(VENV)/venv.stamp pyproject.toml
 	@touch $@ $(VENV)/run.stamp
 
 demo: $(VENV)/run.stamp
-	$(BIN)/rovgraph smooth data/falcon/log.csv.gz --config data/falcon/config.yaml --out $(DEMO) --force
-	$(BIN)/rovgraph evaluate $(DEMO)/trajectory_smoothed.csv data/falcon/truth.csv.gz
+	$(BIN)/rovgraph demo --out $(DEMO) --force
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .

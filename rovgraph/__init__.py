@@ -50,6 +50,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from rovgraph.api.comparison import ComparisonResult as ComparisonResult
     from rovgraph.api.comparison import compare as compare
+    from rovgraph.api.demo import Demo as Demo
+    from rovgraph.api.demo import demo as demo
     from rovgraph.api.exporting import export as export
     from rovgraph.api.exporting import tag as tag
     from rovgraph.api.logs import check as check
@@ -82,6 +84,7 @@ _HOMES = {
     "ComparisonResult": "api.comparison",
     "Config": "config",
     "DataWarning": "errors",
+    "Demo": "api.demo",
     "InputError": "errors",
     "Log": "log",
     "Metrics": "evaluate",
@@ -93,6 +96,7 @@ _HOMES = {
     "Trajectory": "trajectory",
     "check": "api.logs",
     "compare": "api.comparison",
+    "demo": "api.demo",
     "evaluate": "evaluate",
     "export": "api.exporting",
     "load_config": "config",

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 import rovgraph as rg
+from rovgraph.api.demo import CHOICES, SCENARIO, SEED
 from rovgraph.cli.app import main
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
@@ -185,6 +186,27 @@ def test_simulate_writes_what_the_command_writes(monkeypatch, tmp_path):
     assert len(dive.log["dvl"]) == len(rg.read_log(tmp_path / "twin" / "log.csv", dive.config)["dvl"])
 
 
+def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
+    """A minute of it; the whole dive is smoothed from the installed wheel."""
+    monkeypatch.setattr("rovgraph.api.demo.CHOICES", rg.Choices(duration=60.0, outliers=0.01))
+    monkeypatch.chdir(tmp_path)
+    assert command(monkeypatch, "demo") == 0
+    said = capsys.readouterr().out
+    assert "verdict: trusted" in said and f"{Path('demo/results/track.png')}: " in said
+    done = rg.demo("demo", force=True)  # in the same place, which the summary names
+    assert f"{done.metrics.rms_m:.3f} m" in said and done.metrics.rms_m < 0.1
+    assert done.result.verdict == "trusted" and (done.results / "track.png").is_file()
+    assert command(monkeypatch, "demo") == 2
+    assert "demo exists; choose another --out or give --force" in capsys.readouterr().err
+
+
+def test_the_demonstration_dive_is_the_one_of_the_repository():
+    made = (SHIPPED / "README.md").read_text(encoding="utf-8")
+    stated = f"simulate {SCENARIO} --seed {SEED} --outliers {CHOICES.outliers} --config rovgraph/config/falcon.yaml"
+    assert stated in made
+    assert rg.Choices(outliers=CHOICES.outliers) == CHOICES  # nothing else is chosen
+
+
 def test_observe_writes_what_the_command_writes(monkeypatch, tmp_path, short, config):
     log = tmp_path / "log.csv"
     short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
@@ -350,6 +372,7 @@ def test_a_frame_is_refused_with_the_words_that_the_command_has_for_its_file(mon
     [
         ([{"time": T, "depth": T[:2]}], r"columns of different length \(time 3, depth 2\)"),
         ([{"time": T, "depth": np.ones((3, 1))}], r"column depth has shape \(3, 1\)"),
+        ([{"time": T, "depth": [[1, 2], [3], [4]]}], "column depth holds lists, expected one number per row"),
         ([{"time": T, "depth": 1.0}], r"column depth has shape \(\)"),
         ([{"time": T, "depth": T}, {"dvl_vx": T}], "rows without time"),
         ([], "no rows"),
@@ -389,3 +412,25 @@ def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
         rg.Choices(duration=1e5)
     with pytest.raises(rg.InputError, match="compare wants either a log"):
         rg.compare()
+
+
+def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
+    for use in (
+        lambda: rg.read_log(SHIPPED / "log.csv.gz", "vehicle.yaml"),
+        lambda: rg.Log.from_frame(short, {}),
+        lambda: rg.simulate("circle", "vehicle.yaml"),
+        lambda: rg.simulate("vattern", {}),
+        lambda: rg.plan("vehicle.yaml"),
+    ):
+        with pytest.raises(
+            rg.InputError, match=r"config: expected a Config, as load_config gives it, found a (str|di)"
+        ):
+            use()
+    with pytest.raises(rg.InputError, match="configuration: expected YAML text, found a dict"):
+        rg.parse_config({"imu": {}})
+    with pytest.raises(rg.InputError, match=r"is a DataFrame, .* use Log\.from_frame"):
+        rg.read_log(short)
+    with pytest.raises(rg.InputError, match="trajectory: expected a Trajectory, as read_trajectory gives it"):
+        rg.evaluate("trajectory.csv", "reference.csv")
+    with pytest.raises(rg.InputError, match="reference: expected a Trajectory, as read_reference gives it"):
+        rg.evaluate(rg.simulate("circle", choices=rg.Choices(duration=40.0)).truth, short)

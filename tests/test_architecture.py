@@ -168,6 +168,7 @@ print("MODULES", *sys.modules)
     "command",
     [
         [],
+        ["demo"],
         ["smooth"],
         ["online"],
         ["evaluate"],

@@ -46,7 +46,7 @@ class ComparisonResult:
         return self.comparison.table
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph compare`` (docs/compare.md), all of it or nothing.
+        """Write the folder of ``rovgraph compare`` (docs/compare.md), complete or not at all.
 
         Raises
         ------

@@ -1,12 +1,14 @@
-"""A log on its way into an estimate: read with a configuration, checked, its clocks bridged."""
+"""Logs for an estimate: reading with a configuration, checking, bridging of clock jumps."""
 
 import warnings
 from pathlib import Path
 
+import pandas as pd
+
 from rovgraph import log as library
 from rovgraph.check import Finding, Report, bridge_jumps, examine
 from rovgraph.check import warn as warn_of_findings
-from rovgraph.config import Config
+from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import InputError, warn
 from rovgraph.estimators.initialise import refusal
 from rovgraph.log import Log
@@ -26,27 +28,29 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
 
     Warns
     -----
-    DataWarning : what was left out or put in order; a configuration that lies beside the log and was not given
+    DataWarning : what was ignored or sorted; a configuration beside the log that was not given
     """
+    if isinstance(path, pd.DataFrame):
+        raise InputError("log: is a DataFrame, expected a file's name; use Log.from_frame")
     if config is None:
         warn_of_unused(path)
     return library.read_log(path, config)
 
 
 def warn_of_unused(*logs: Path | str) -> None:
-    """Say that a configuration lies beside a log: forgetting it makes a wrong track, which looks certain."""
+    """Warn of a configuration beside a log: without it the track is wrong, and its sd does not show it."""
     for beside in (Path(log).parent / "config.yaml" for log in logs):
         if beside.is_file():
             warn(f"{beside} lies beside the log and is not used; give it as the configuration if it is the vehicle's")
 
 
 def check(log: Log, config: Config | None = None) -> Report:
-    """Look at a log: is it sane, and what would an estimate make of it (docs/check.md)?
+    """Check a log, and list the assumptions of an estimate (docs/check.md).
 
     Parameters
     ----------
     log : as read with the configuration
-    config : what is believed of the vehicle; None = all defaults
+    config : of vehicle and sensors; None = all defaults
 
     Returns
     -------
@@ -68,7 +72,7 @@ def check(log: Log, config: Config | None = None) -> Report:
 
 
 def prepared(log: Log, config: Config) -> Log:
-    """A log as every estimate takes it: checked, with clocks that go on.
+    """A log for an estimate: checked, with jumps of clocks bridged.
 
     Raises
     ------
@@ -76,7 +80,7 @@ def prepared(log: Log, config: Config) -> Log:
 
     Warns
     -----
-    DataWarning : whatever looks wrong
+    DataWarning : findings of the check
     """
     log = bridge_jumps(log, given(log, config))
     warn_of_findings(log, config)
@@ -92,8 +96,6 @@ def given(log: Log, config: Config | None) -> Config:
     """
     if not isinstance(log, Log):
         raise InputError(f"log: expected a Log, as read_log or Log.from_frame gives it, found a {type(log).__name__}")
-    config = Config() if config is None else config
-    if not isinstance(config, Config):
-        raise InputError(f"config: expected a Config, as load_config gives it, found a {type(config).__name__}")
+    config = config_or_defaults(config)
     log.require_read_with(config)
     return config

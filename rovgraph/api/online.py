@@ -26,7 +26,7 @@ class Online:
 
     Attributes
     ----------
-    config : what is believed of vehicle and sensors
+    config : of vehicle and sensors
     rate_hz : of solutions, by the log's time
     engine : "fixed-lag", or "isam2", which smooths the whole dive as it goes
     """
@@ -42,7 +42,7 @@ class Online:
             raise InputError(f"engine {self.engine!r}: expected {', '.join(ENGINES)}")
 
     def replay(self, log: Log) -> Iterator[Solution]:
-        """The solutions of a log, as if its measurements came in now; each call begins anew.
+        """The solutions of a log, as if its measurements arrived now; each call starts again.
 
         Nothing in it is checked beforehand: sensors that fail are noticed as they fail, and solutions have the events.
 

@@ -21,13 +21,13 @@ ESTIMATES = ("smoothed", "filtered", "both")
 
 @dataclass(frozen=True)
 class Result:
-    """The estimates of a dive, and what is to be thought of them.
+    """The estimates of a dive with verdict and alarms.
 
     Attributes
     ----------
     dive : estimates, assumptions, alarms and verdict
-    log : as it was estimated, with clocks that go on
-    warnings : what was said of the log while it was read and checked, a line each; also issued as `DataWarning`
+    log : as estimated, with jumps of clocks bridged
+    warnings : of reading and checking the log, a line each; also issued as `DataWarning`
     seconds : stage of the work -> wall time [s]; the command adds that of reading
     """
 
@@ -38,7 +38,7 @@ class Result:
 
     @property
     def smoothed(self) -> Estimate:
-        """From the whole dive, the best for every moment.
+        """The smoothed estimate: the best for every moment, from the whole dive.
 
         Raises
         ------
@@ -48,7 +48,7 @@ class Result:
 
     @property
     def filtered(self) -> Estimate:
-        """What could have been known at each moment.
+        """The filtered estimate: what could have been known at each moment.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class Result:
 
     @property
     def dead_reckoning(self) -> Estimate:
-        """What the estimates are to be better than."""
+        """Dead reckoning, the baseline."""
         return self._estimate("dead_reckoning")
 
     @property
@@ -68,7 +68,7 @@ class Result:
 
     @property
     def calibration(self) -> Mapping[str, CalibrationEstimate]:
-        """Label of each scalar component -> what the main estimate says of it: value, sd, prior, verdict; SI."""
+        """Label of each scalar component -> its value, sd, prior and verdict in the main estimate; SI."""
         return {entry.label: entry for entry in self.main.calibration}
 
     @property
@@ -78,12 +78,12 @@ class Result:
 
     @property
     def alarms(self) -> Sequence[Alarm]:
-        """What the estimates say against themselves, the worst first; ``.text`` has cause and remedy."""
+        """Alarms, the worst first; ``.text`` has cause and remedy."""
         return self.dive.alarms
 
     @property
     def assumptions(self) -> Sequence[str]:
-        """What neither log nor configuration told, a line each."""
+        """What neither log nor configuration states, a line each."""
         return self.dive.assumptions
 
     @property
@@ -100,7 +100,7 @@ class Result:
     def save(
         self, path: Path | str, force: bool = False, figures: bool = True, export: Sequence[str] = ()
     ) -> dict[str, Any]:
-        """Write the results folder of ``rovgraph smooth`` (docs/results.md), all of it or nothing.
+        """Write the results folder of ``rovgraph smooth`` (docs/results.md), complete or not at all.
 
         Parameters
         ----------
@@ -148,15 +148,15 @@ def smooth(
     engine: str | None = None,
     progress: Progress = no_progress,
 ) -> Result:
-    """Estimate the track of a dive and everything that was calibrated on the way, as ``rovgraph smooth`` does.
+    """Estimate the track of a dive and the calibration of its instruments, as ``rovgraph smooth`` does.
 
     Parameters
     ----------
     log : as read with the configuration
-    config : what is believed of vehicle and sensors; None = all defaults
+    config : of vehicle and sensors; None = all defaults
     estimate : "smoothed", "filtered" or "both"
     engine : "batch", or "isam2" for both from one pass; None = the configuration's ``graph.solver``
-    progress : called now and then with what is being done, and how far it is from 0 to 1
+    progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------

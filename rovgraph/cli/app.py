@@ -16,6 +16,7 @@ from rovgraph.cli.calibrate import calibrate
 from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
+from rovgraph.cli.demo import demo
 from rovgraph.cli.evaluate import evaluate
 from rovgraph.cli.export import export
 from rovgraph.cli.observe import observe
@@ -30,7 +31,7 @@ from rovgraph.process import be_frugal
 
 app = typer.Typer(
     name="rovgraph",
-    help="Where a small underwater vehicle was, and where it is.",
+    help="Compute where a small underwater vehicle was, and where it is.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -46,13 +47,13 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _of_all_commands(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
     ] = False,
 ) -> None:
     pass
 
 
-for _command in (smooth, online, export, tag, evaluate, compare, observe, plan, check, config, simulate):
+for _command in (demo, smooth, online, export, tag, evaluate, compare, observe, plan, check, config, simulate):
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(study, name="study")

@@ -11,7 +11,9 @@ if TYPE_CHECKING:
 
     from rovgraph.calibrate import MagnetometerCalibration, NoiseReport
 
-calibrate = typer.Typer(help="Calibrate the magnetometer, or read the noise of sensors at rest.", no_args_is_help=True)
+calibrate = typer.Typer(
+    help="Calibrate the magnetometer, or determine the noise of sensors at rest.", no_args_is_help=True
+)
 
 LogPath = Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")]

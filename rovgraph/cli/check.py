@@ -17,7 +17,7 @@ def check(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
 ) -> None:
-    """Look at a log: sensors, rates, gaps, units, signs, clocks, and what an estimate would make of it."""
+    """Check a log: sensors, rates, gaps, units, signs, clocks, and the assumptions of an estimate."""
     import json
 
     from rich.console import Console

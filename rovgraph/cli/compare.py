@@ -12,14 +12,18 @@ def compare(
     out: Annotated[Path, typer.Option("--out", "-o", help="results folder", show_default=False)],
     log: Annotated[Path | None, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md")] = None,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
-    reference: Annotated[Path | None, typer.Option(help="CSV with time, north, east and what else it knows")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="CSV with time, north, east, and optionally attitude and velocity")
+    ] = None,
     scenario: Annotated[str | None, typer.Option(help="simulate dives of this scenario instead of a LOG")] = None,
     seeds: Annotated[int, typer.Option(help="number of simulated dives")] = 30,
     first_seed: Annotated[int, typer.Option(min=0, help="seed of the first of them")] = 1,
-    duration: Annotated[float | None, typer.Option(help="of a simulated dive [s]; default: the scenario's own")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="seconds of a simulated dive; default: the scenario's own")
+    ] = None,
     estimators: Annotated[
         str | None,
-        typer.Option(help="names or patterns (graph-*), separated by commas; default: all that need no thrusters"),
+        typer.Option(help="names or patterns (graph-*), separated by commas; default: all without thrusters"),
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
@@ -35,6 +39,7 @@ def compare(
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.comparison import comparison_table
     from rovgraph.report.folder import check_writable
+    from rovgraph.report.narrow import fitting
     from rovgraph.studies.estimators import select
 
     names = None if estimators is None else [name.strip() for name in estimators.split(",") if name.strip()]
@@ -53,7 +58,8 @@ def compare(
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
-    console.print(comparison_table(result.comparison, result.title, result.thesis))
+    for part in fitting(comparison_table(result.comparison, result.title, result.thesis), console):
+        console.print(part)
     for row in result.comparison.runs.dropna(subset="error").drop_duplicates("estimator").itertuples():
         console.print(f"{row.estimator} failed on {row.run}: {row.error}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)

@@ -44,7 +44,7 @@ def config(
     ] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="with --keys or --presets: as in the manual")] = False,
 ) -> None:
-    """Print the effective configuration, every key written out; a wrong key is named."""
+    """Print the effective configuration with every key; a wrong key is an error."""
     from rovgraph.config import load_config
 
     settings = load_config(path)

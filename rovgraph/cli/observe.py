@@ -13,11 +13,11 @@ def observe(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: observed-LOG")] = None,
     estimate: Annotated[
-        str | None, typer.Option(help="calibration variables to estimate too, separated by commas")
+        str | None, typer.Option(help="further calibration variables to estimate, separated by commas")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
 ) -> None:
-    """What a dive shows of every calibration variable, when it did, and what is missing.
+    """Show how well a dive determines each calibration variable, when it did, and what is missing.
 
     Example: rovgraph observe log.csv --config vehicle.yaml --estimate dvl_yaw,dvl_scale
     """

@@ -26,16 +26,16 @@ def online(
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=200.0, help="solutions per second")] = 5.0,
     speed: Annotated[str, typer.Option(help="of files: 1, 10, max")] = "1",
-    engine: Annotated[Engine, typer.Option(help="fixed-lag for missions without end, isam2 for all of the track")] = (
-        Engine.fixed_lag
-    ),
-    resume: Annotated[bool, typer.Option("--resume", help="go on after a crash, with what is in --out")] = False,
+    engine: Annotated[
+        Engine, typer.Option(help="fixed-lag for missions of any length, isam2 for the smoothed track too")
+    ] = (Engine.fixed_lag),
+    resume: Annotated[bool, typer.Option("--resume", help="continue after a crash, with the files in --out")] = False,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="smooth the recording at the end")] = True,
     force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
 ) -> None:
     """Estimate while data arrive, on board or at the topside.
 
-    Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:127.0.0.1:14550 --out dive
+    Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:0.0.0.0:14551 --out dive
     """
     import sys
 

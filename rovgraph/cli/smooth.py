@@ -2,9 +2,12 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rovgraph import Result
 
 NOT_TRUSTED = 3  # exit code of --strict
 VERDICT_STYLE = {"trusted": "green", "doubtful": "bold yellow", "wrong": "bold red"}
@@ -30,7 +33,8 @@ def smooth(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
     engine: Annotated[
-        Engine | None, typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; else graph.solver")
+        Engine | None,
+        typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; default: graph.solver"),
     ] = None,
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
@@ -41,19 +45,16 @@ def smooth(
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
 ) -> None:
-    """Estimate the track of a dive and everything that was calibrated on the way.
+    """Estimate the track of a dive, and the calibration of its instruments.
 
     Example: rovgraph smooth log.csv --config vehicle.yaml --out results
     """
     import time
 
-    from rich.console import Console
-
     import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
     from rovgraph.export import known_formats
     from rovgraph.report.folder import check_writable
-    from rovgraph.report.tables import calibration_table, summary_table
 
     out = Path("results-" + log.name.split(".")[0]) if out is None else out
     settings = None if config is None else rg.load_config(config)
@@ -66,6 +67,17 @@ def smooth(
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
     summary = result.save(out, force, figures, export or [])
+    show_result(result, summary, out)
+    if strict and result.verdict != "trusted":
+        raise typer.Exit(NOT_TRUSTED)
+
+
+def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
+    """Print verdict, alarms, tables and assumptions."""
+    from rich.console import Console
+
+    from rovgraph.report.tables import calibration_table, summary_table
+
     console = Console()
     console.print(f"verdict: {result.verdict}", style=VERDICT_STYLE[result.verdict], highlight=False)
     for alarm in result.alarms:
@@ -75,5 +87,3 @@ def smooth(
     for line in result.assumptions:
         console.print(f"assumed: {line}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
-    if strict and result.verdict != "trusted":
-        raise typer.Exit(NOT_TRUSTED)

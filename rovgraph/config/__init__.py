@@ -8,6 +8,7 @@ all keys, `beliefs` gives the calibration variables of `rovgraph.calibration` th
 from rovgraph.config.reading import (
     Config,
     beliefs,
+    config_or_defaults,
     describe,
     load_config,
     mount_matrix,
@@ -26,6 +27,7 @@ __all__ = [
     "Mag",
     "SensorSettings",
     "beliefs",
+    "config_or_defaults",
     "describe",
     "load_config",
     "mount_matrix",

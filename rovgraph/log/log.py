@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from rovgraph.config import Config
+from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import InputError, collected_warnings
 from rovgraph.log.reading import read_streams
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
@@ -135,7 +135,7 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
 
 def _log(table: Table, config: Config | None, before: Iterable[str] = ()) -> Log:
     """A log of a table, with what was warned of ``before`` and while its streams were made."""
-    config = Config() if config is None else config
+    config = config_or_defaults(config)
     with collected_warnings() as texts:
         streams, origin = read_streams(table, config)
     return Log(table.source, streams, origin, config, (*before, *texts))

@@ -1,4 +1,4 @@
-"""Biases and calibration variables against time, with what was believed before."""
+"""Biases and calibration variables against time, with their priors."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -82,9 +82,9 @@ def rejected_in(sensor: str, begin: float, end: float, share: float, start: floa
         share,
         REJECTED,
         MOSTLY_REJECTED,
-        f"up to {share:.0%} of a minute's measurements contradict the others and were left out, "
+        f"up to {share:.0%} of a minute's measurements contradict the others and were rejected, "
         f"{span(begin, end, start)}",
-        f"take that time out of the log if it is the instrument; if it is everywhere, check its mounting, signs "
+        f"if the instrument failed, remove that time from the log; if it lasts, check its mounting, signs "
         f"and clock (rovgraph check), and {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}",
     )
 
@@ -150,7 +150,7 @@ def too_small_in(sensor: str, begin: float, end: float, mean: float) -> Statisti
         1.0 / max(mean, 1e-9),
         1.0 / TOO_SMALL,
         np.inf,
-        f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so more is known than is said",
+        f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so the stated noise is too large",
         f"lower {sd_key(sensor)}",
     )
 
