@@ -71,7 +71,7 @@ def examples() -> str:
         text = path.read_text(encoding="utf-8")
         _, about, code = text.split('"""', 2)
         title, _, rest = about.partition("\n")
-        parts.append(f"## {title.rstrip('.')}\n{rest}\n```python title=\"examples/{path.name}\"\n{code.strip()}\n```\n")
+        parts.append(f'## {title.rstrip(".")}\n{rest}\n```python title="examples/{path.name}"\n{code.strip()}\n```\n')
     return "\n".join(parts)
 
 
