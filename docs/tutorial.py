@@ -28,7 +28,7 @@ vehicle = rg.parse_config("""
 dvl: {mount_rpy_deg: [180, 0, -45], velocity_sd_mps: [0.01, 0.01, 0.005]}
 calibration: {dvl_yaw: {estimate: true, sd_deg: 5}}
 """)
-dive = rg.simulate("square", vehicle, seed=4, choices=rg.Choices(duration=100, speed=0.5))
+dive = rg.simulate("square", vehicle, seed=4, choices=rg.Choices(duration=150, speed=0.5))
 raw = dive.dive.log_frame.copy()
 for axis in "xyz":
     raw[f"gyr_{axis}"] *= 57.29578

@@ -1,6 +1,6 @@
-"""The trajectory in pandas, xarray and a GIS. It needs pip install '.[examples]'.
+"""The trajectory in pandas, xarray and a GIS.
 
-It writes track.geojson, which QGIS opens, and export.png.
+It needs pip install '.[examples]'. It writes track.geojson, which QGIS opens, and export.png.
 """
 
 from pathlib import Path

@@ -37,6 +37,7 @@ RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
     "rovgraph.live.solution.Solution",
     "rovgraph.live.solution.Event",
 )
+FIRST = ("smooth", "residuals", "mountings", "own_sensor", "live")  # of the examples, others by name
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)(#[^)\s]*)?\)")
 
 
@@ -67,7 +68,8 @@ def examples() -> str:
         "# Examples\n\nEach script runs as it stands and ends with a figure, which it writes into the current folder: "
         "`python examples/smooth.py`. The data come with the project. `export.py` needs `pip install '.[examples]'`.\n"
     ]
-    for path in sorted((ROOT / "examples").glob("*.py")):
+    scripts = {path.stem: path for path in sorted((ROOT / "examples").glob("*.py"))}
+    for path in (scripts[name] for name in dict.fromkeys([*FIRST, *scripts])):
         text = path.read_text(encoding="utf-8")
         _, about, code = text.split('"""', 2)
         title, _, rest = about.partition("\n")
