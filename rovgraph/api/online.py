@@ -170,7 +170,7 @@ class Online:
             raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
         feed = Feed(opened, warnings)
         with ExitStack() as opened_outputs:  # they have threads, which a refused folder must not leave behind
-            receivers = []
+            receivers: list[Output] = []
             for url in outputs:
                 receivers.append(open_output(url, warnings, patient=feed.recorded))
                 opened_outputs.callback(receivers[-1].close)
