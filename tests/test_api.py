@@ -4,6 +4,7 @@ import ast
 import doctest
 import json
 import shutil
+import socket
 import subprocess
 import sys
 import warnings
@@ -238,6 +239,55 @@ def test_online_gives_the_solutions_of_the_command(monkeypatch, capfd, tmp_path,
     assert len(said) > 10
     track = np.array([[row["north"], row["east"], row["down"], row["north_sd"]] for row in said])
     assert np.array([[*s.position, s.position_sd[0]] for s in solutions]) == pytest.approx(track, rel=1e-5, abs=1e-6)
+
+
+def test_a_run_of_sources_gives_sends_and_keeps_what_the_command_does(monkeypatch, capfd, tmp_path, short):
+    log = tmp_path / "log.csv"
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
+    options = ["-c", SHIPPED / "config.yaml", "--speed", "max", "--output", "-", "--rate", 2, "--no-refine"]
+    assert command(monkeypatch, "online", f"file:{log}", *options, "--out", tmp_path / "command") == 0
+    said = capfd.readouterr().out
+    online = rg.Online(rg.load_config(SHIPPED / "config.yaml"), rate_hz=2.0)
+    run = online.run(f"file:{log}", outputs=["-"], speed="max", out=tmp_path / "twin")
+    solutions = list(run)
+    assert [{**json.loads(line), "update_s": 0} for line in capfd.readouterr().out.splitlines()] == [
+        {**json.loads(line), "update_s": 0} for line in said.splitlines()
+    ]
+    assert len(solutions) == len(said.splitlines()) > 10
+    for name in ("received.csv", "trajectory_filtered.csv", "config.yaml", "config_online.yaml", "events.jsonl"):
+        assert (tmp_path / "twin" / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
+    one, other = (json.loads((tmp_path / folder / "summary.json").read_text()) for folder in ("command", "twin"))
+    assert one | {"updates": 0} == other | {"updates": 0}
+    assert one["state"] == "finished"
+
+
+def test_leaving_the_loop_ends_a_run_and_its_folder_is_whole(tmp_path, short):
+    log = tmp_path / "log.csv"
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
+    run = rg.Online(rg.load_config(SHIPPED / "config.yaml")).run(f"file:{log}", speed="max", out=tmp_path / "dive")
+    for solution in run:
+        if solution.distance > 1.0:
+            break
+    summary = json.loads((tmp_path / "dive" / "summary.json").read_text())
+    assert summary["state"] == "finished"
+    assert summary["time"] == pytest.approx(solution.time, abs=1.0)
+    kept = rg.read_trajectory(tmp_path / "dive" / "trajectory_filtered.csv")
+    assert kept.time[-1] == pytest.approx(summary["time"], abs=0.5)
+
+
+def test_a_run_that_cannot_be_is_refused_and_leaves_no_output_open(tmp_path):
+    (tmp_path / "kept.txt").write_text("mine")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(rg.InputError, match="choose another --out"):
+        rg.Online().run("tcp://127.0.0.1:5", outputs=[f"tcp://:{port}"], out=tmp_path)
+    with socket.socket() as again:
+        again.bind(("127.0.0.1", port))
+    with pytest.raises(rg.InputError, match="at least one source"):
+        rg.Online().run()
+    with pytest.raises(rg.InputError, match="--resume needs the folder"):
+        rg.Online().run("tcp://127.0.0.1:5", resume=True)
 
 
 # results

@@ -79,6 +79,7 @@ class Log:
 
     @property
     def sensors(self) -> set[str]:
+        """Names of its streams."""
         return set(self.streams)
 
     def require_read_with(self, config: Config) -> None:
