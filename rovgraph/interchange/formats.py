@@ -21,7 +21,7 @@ from rovgraph.interchange.recording import Recording
 
 HEAD = 65536  # bytes of a file that a format is recognised by
 LIKELY = 0.5  # confidence from which a file is taken to be of a format
-OWN: tuple[str, ...] = ()  # modules of this package, each with a `FORMAT`
+OWN: tuple[str, ...] = ("own_log",)  # modules of this package, each with a `FORMAT`
 GROUP = "rovgraph.formats"
 
 
@@ -33,10 +33,13 @@ class Options:
     ----------
     choose : sensor -> instance, message or topic that feeds it, where a file has several
     progress : called with the bytes read so far and those of the file
+    columns, units : of a configuration, for rovgraph's own log (docs/log-format.md)
     """
 
     choose: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[int, int], None] = lambda done, total: None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 class Format(Protocol):
