@@ -26,7 +26,8 @@ from rovgraph.interchange.motion import Acceleration, Motion, Signal
 MOST_SAMPLES = 20_000  # of a recording that are searched; longer ones are sampled more coarsely
 STEPS = 4  # of a window
 TURNS = np.deg2rad(np.arange(0.0, 90.0, 15.0))  # about the vertical, between right angles
-FLOOR_S = {"turning": 0.05, "depth": 0.05, "speed": 0.1}  # least sd of a lag [s]
+FLOOR_S = {"turning": 0.03, "depth": 0.05, "speed": 0.1}  # least sd of a lag [s]
+COMPASSES, COMPASS_S = {"ahrs", "dvl_heading"}, 0.3  # a compass that is filtered slowly comes late [s]
 ARM_SD = 0.5  # [m]
 ARM_INFORMATION = np.array([0.0, 0.0, 0.0, 0.0, *[ARM_SD**-2] * 3])
 
@@ -99,7 +100,7 @@ class Changes:
 
     @property
     def floor_s(self) -> float:
-        return FLOOR_S[self.a.kind]
+        return COMPASS_S if {self.a.sensor, self.b.sensor} & COMPASSES else FLOOR_S[self.a.kind]
 
     @property
     def window(self) -> float:
