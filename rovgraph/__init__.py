@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / report / studies, live / estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
+cli / api / report / studies, live / interchange / estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / geometry, workers, fast_csv / errors, process.
 """
@@ -49,6 +49,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from rovgraph.api.comparison import ComparisonResult as ComparisonResult
     from rovgraph.api.comparison import compare as compare
+    from rovgraph.api.conversion import Conversion as Conversion
+    from rovgraph.api.conversion import convert as convert
     from rovgraph.api.logs import check as check
     from rovgraph.api.logs import read_log as read_log
     from rovgraph.api.observability import ObservabilityResult as ObservabilityResult
@@ -78,6 +80,7 @@ _HOMES = {
     "Choices": "simulate",
     "ComparisonResult": "api.comparison",
     "Config": "config",
+    "Conversion": "api.conversion",
     "DataWarning": "errors",
     "InputError": "errors",
     "Log": "log",
@@ -90,6 +93,7 @@ _HOMES = {
     "Trajectory": "trajectory",
     "check": "api.logs",
     "compare": "api.comparison",
+    "convert": "api.conversion",
     "evaluate": "evaluate",
     "load_config": "config",
     "observe": "api.observability",

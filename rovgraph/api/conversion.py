@@ -40,6 +40,12 @@ class Conversion:
     used: Mapping[str, Any]
 
     @property
+    def notes(self) -> list[str]:
+        """What was assumed, and which settings of the files hold, a sentence each."""
+        told = [text for recording in self.merged.recordings for text in recording.notes]
+        return [*told, *_settings_told(self.merged, self.used)]
+
+    @property
     def report(self) -> dict[str, Any]:
         """What was made of what, for JSON: files, columns, clocks, settings, warnings."""
         return account(self.merged)
@@ -134,15 +140,18 @@ def convert(
     bare = full.model_copy(update={"columns": {}, "units": {}})
     with collected_warnings() as texts:
         log = Log.from_frame(merged.frame, bare, source)
-    told = [f"{key}: {value} by {merged.settings[key][1]}" for key, value in used.items()]
     log = replace(
         log,
         config=full,
         warnings=(*merged.warnings, *texts),
         settings=merged.nested_settings(),
-        notes=(*notes(merged), *told),
+        notes=(*notes(merged), *_settings_told(merged, used)),
     )
     return Conversion(merged, log, bare, used)
+
+
+def _settings_told(merged: Merged, used: Mapping[str, Any]) -> list[str]:
+    return [f"{key}: {value} ({merged.settings[key][1]})" for key, value in used.items()]
 
 
 def is_plain_log(path: Path, config: Config) -> bool:
@@ -161,13 +170,9 @@ def is_plain_log(path: Path, config: Config) -> bool:
         raise InputError(f"{path}: {what}")
     if head and not is_text(head):
         raise InputError(refusal(path, [each.title for each in formats()]))
-    return not path.is_dir()
+    return True
 
 
-def _format(path: Path, config: Config) -> Format:
-    """The format of a file, by its content."""
-    if is_plain_log(path, config):
-        return OWN_LOG
-    if (found := recognise(path)) is None:
-        raise InputError(f"{path}: is a directory in no format that is known; give the files in it")
-    return found
+def _format(path: Path, config: Config) -> Format | None:
+    """The format of a file, by its content; None = by the formats' own word."""
+    return OWN_LOG if is_plain_log(path, config) else None

@@ -16,6 +16,7 @@ from rovgraph.cli.calibrate import calibrate
 from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
+from rovgraph.cli.convert import convert
 from rovgraph.cli.evaluate import evaluate
 from rovgraph.cli.observe import observe
 from rovgraph.cli.online import online
@@ -50,7 +51,7 @@ def _of_all_commands(
     pass
 
 
-for _command in (smooth, online, evaluate, compare, observe, plan, check, config, simulate):
+for _command in (smooth, online, evaluate, compare, observe, plan, check, config, convert, simulate):
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(study, name="study")

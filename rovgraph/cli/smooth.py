@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from rovgraph.cli.files import Choose, Files, Shift, name_of, read_files
+
 NOT_TRUSTED = 3  # exit code of --strict
 VERDICT_STYLE = {"trusted": "green", "doubtful": "bold yellow", "wrong": "bold red"}
 
@@ -26,7 +28,7 @@ class Which(StrEnum):
 
 
 def smooth(
-    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    files: Files,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
     engine: Annotated[
@@ -36,6 +38,8 @@ def smooth(
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
+    choose: Choose = None,
+    shift: Shift = None,
 ) -> None:
     """Estimate the track of a dive and everything that was calibrated on the way.
 
@@ -50,11 +54,11 @@ def smooth(
     from rovgraph.report.folder import check_writable
     from rovgraph.report.tables import calibration_table, summary_table
 
-    out = Path("results-" + log.name.split(".")[0]) if out is None else out
+    out = Path("results-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     check_writable(out, force)
     began = time.perf_counter()
-    dive_log = rg.read_log(log, settings)
+    dive_log = read_files(files, settings, choose, shift)
     read = time.perf_counter()
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.interchange.clocks import JoinedClock
 from rovgraph.interchange.merging import Merged
 from rovgraph.interchange.recording import Channel
 
@@ -35,7 +36,7 @@ def account(merged: Merged) -> dict[str, Any]:
         {
             "file": names[clock.file],
             "clock": clock.name,
-            "offset_s": sum(line.offset for line in clock.lines),
+            "offset_s": _added(merged, clock),
             "drift": clock.drift,
             "sd_s": clock.sd,
             "drift_sd": clock.drift_sd,
@@ -51,6 +52,13 @@ def account(merged: Merged) -> dict[str, Any]:
         "settings": {key: {"value": value, "source": source} for key, (value, source) in merged.settings.items()},
         "warnings": list(merged.warnings),
     }
+
+
+def _added(merged: Merged, clock: JoinedClock) -> float:
+    """What is added to the first stamp of a clock [s]."""
+    channels = merged.recordings[clock.file].channels
+    first = np.array([min(float(c.columns["time"][0]) for c in channels if c.clock == clock.name)])
+    return float((clock(first) - first)[0])
 
 
 def columns(merged: Merged) -> dict[str, str]:
@@ -88,7 +96,8 @@ def notes(merged: Merged) -> list[str]:
     said += [text for recording in merged.recordings for text in recording.notes]
     if len(merged.clocks) > 1:
         said += [
-            f"{names[clock.file]}: clock {clock.name} joined by {clock.how}" + (f", sd {clock.sd:.3f} s" if clock.sd else "")
+            f"{names[clock.file]}: clock {clock.name} joined by {clock.how}"
+            + (f", sd {clock.sd:.3f} s" if clock.sd else "")
             for clock in merged.clocks
         ]
     return said

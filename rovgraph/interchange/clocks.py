@@ -137,7 +137,7 @@ def join_clocks(
         said += [f"{names[k]}: {text}" for text in unset]
     base = _base(axes, selected)
     stated, beside = _stated(axes, base, selected, recordings, shift)
-    joined: list[tuple[_Axis, Line | None, float, float, str]] = [(base, None, 0.0, 0.0, "")]
+    joined: list[tuple[_Axis, Line, float, float, str]] = [(base, Line(), 0.0, 0.0, "")]
     pool: list[_Joined] = []
     if len(axes) > 1:
         pool.append(_known(base.channels(recordings[base.file]), motion_of))
@@ -161,7 +161,7 @@ def join_clocks(
         for name, own in axis.lines.items():
             source, own_sd = axis.sources[name]
             told = ", ".join(text for text in (source, how) if text) or "the log's clock"
-            lines = (own,) if line is None else (own, line)
+            lines = (own, line)
             out.append(JoinedClock(axis.file, name, lines, float(np.hypot(own_sd, sd)), drift_sd, told))
     return [clock for clock in out if (clock.file, clock.name) in needed], beside, base.unix, said
 
@@ -176,7 +176,9 @@ def _axes(file: int, recording: Recording) -> tuple[list[_Axis], list[str]]:
         if clock.unix_offset is None:
             continue
         if len(stamps[name]) and np.median(stamps[name]) + clock.unix_offset < SINCE_2000:
-            said.append(f"clock {name} reads {_date(float(np.median(stamps[name])) + clock.unix_offset)}: it was not set")
+            said.append(
+                f"clock {name} reads {_date(float(np.median(stamps[name])) + clock.unix_offset)}: it was not set"
+            )
             continue
         known[name] = Line(clock.unix_offset)
         sources[name] = clock.source or "Unix time", clock.offset_sd
@@ -243,7 +245,7 @@ def _stated(
                 beside[key] = float(seconds)
                 continue
             raise InputError(f"shift {key}: its clock is that of the log; shift the other files")
-        out |= {id(axis): float(seconds) for axis in meant }
+        out |= {id(axis): float(seconds) for axis in meant}
     return out, beside
 
 

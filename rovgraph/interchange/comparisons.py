@@ -18,7 +18,7 @@ from itertools import chain
 from typing import Protocol
 
 import numpy as np
-from scipy.signal import fftconvolve
+from scipy.signal import fftconvolve  # type: ignore[attr-defined]
 
 from rovgraph.geometry import Array, exp_rotation, signed_permutations, skew
 from rovgraph.interchange.motion import Acceleration, Motion, Signal

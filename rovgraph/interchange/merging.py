@@ -20,7 +20,7 @@ from rovgraph.log import Log
 from rovgraph.log.streams import LABEL, all_columns
 
 OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
-UNSURE_S = 0.05  # sd of a joined clock from which the sensors' time offset is estimated [s]
+UNSURE_S = 0.1  # sd of a joined clock from which the sensors' time offset is estimated [s]
 OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix")  # sensors with a calibration variable for it
 
 
@@ -90,7 +90,8 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
         columns["time"] = clock(columns["time"]) + beside.get(each.channel.sensor, 0.0)
         frames.append(pd.DataFrame(columns))
     frame = pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
-    order = [name for name in all_columns() if name in frame] + sorted(set(frame) - set(all_columns()), key=_natural)
+    others = {str(name) for name in frame} - set(all_columns())
+    order = [name for name in all_columns() if name in frame] + sorted(others, key=_natural)
     if LABEL in frame:
         frame[LABEL] = frame[LABEL].astype("Int64")
     settings = _settings(recordings, selected, clocks)
@@ -99,7 +100,8 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
 
 def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
     """Recordings whose stamps are in order, and all that is to be warned of."""
-    out, said = [], []
+    out: list[Recording] = []
+    said: list[str] = []
     for recording, name in zip(recordings, file_names(recordings), strict=True):
         said += recording.warnings
         channels = []

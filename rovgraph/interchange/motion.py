@@ -93,7 +93,10 @@ class Acceleration:
         begin, end = (np.column_stack([np.interp(t, edges, c) for c in sums.T]) for t in (times - half, times + half))
         mean = (end - begin) / window
         inside = (times - half >= edges[0]) & (times + half <= edges[-1]) & (mean[:, 6] < 1e-6)
-        ends = [np.column_stack([np.interp(t, motion.time, c) for c in motion.rate_b.T]) for t in (times - half, times + half)]
+        ends = [
+            np.column_stack([np.interp(t, motion.time, c) for c in motion.rate_b.T])
+            for t in (times - half, times + half)
+        ]
         mean = np.where(inside[:, None], mean, np.nan)
         return mean[:, :3], mean[:, 3:6], (ends[1] - ends[0]) / window
 

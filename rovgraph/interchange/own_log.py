@@ -73,7 +73,9 @@ def is_own_log(head: bytes, columns: Mapping[str, str] | None = None) -> bool:
         header = {name.strip() for name in next(csv.reader([top], skipinitialspace=True), [])}
     except (UnicodeDecodeError, csv.Error):
         return False
-    found = {name for name in header if is_column(name)} | {own_name for own_name, name in own.items() if name in header}
+    found = {name for name in header if is_column(name)} | {
+        own_name for own_name, name in own.items() if name in header
+    }
     return "time" in found and len(found) > 1
 
 

@@ -58,7 +58,9 @@ def select(recordings: Sequence[Recording], choose: Mapping[str, str]) -> tuple[
         if sensor in choose or not {sensor, instrument} <= picked.keys():
             continue
         other = picked[instrument].file
-        fitting = [found for found in every[sensor] if found.file == other or not _has(recordings[found.file], instrument)]
+        fitting = [
+            found for found in every[sensor] if found.file == other or not _has(recordings[found.file], instrument)
+        ]
         if fitting:
             picked[sensor] = fitting[0]
             continue
@@ -85,13 +87,10 @@ def _chosen(recordings: Sequence[Recording], found: Sequence[Selected], sensor: 
     """The channel that a choice names, by file, by a word of its source, or by a part of it."""
     word = re.compile(rf"(?<!\w){re.escape(choice)}(?!\w)", re.IGNORECASE)
     names = file_names(recordings)
-    ways = (
-        lambda f: choice in {recordings[f.file].path, names[f.file], Path(recordings[f.file].path).stem},
-        lambda f: word.search(f.channel.source) is not None,
-        lambda f: choice.lower() in f.channel.source.lower(),
-    )
-    for way in ways:
-        if matching := [each for each in found if way(each)]:
-            return matching[0]
+    by_file = [f for f in found if choice in {recordings[f.file].path, names[f.file], Path(recordings[f.file].path).stem}]
+    by_word = [f for f in found if word.search(f.channel.source)]
+    by_part = [f for f in found if choice.lower() in f.channel.source.lower()]
+    if matching := by_file or by_word or by_part:
+        return matching[0]
     told = "; ".join(f"{names[f.file]}: {f.channel.source}" for f in found)
     raise InputError(f"choose {sensor}={choice}: no such source of {sensor}; there are: {told}")

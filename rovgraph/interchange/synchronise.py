@@ -78,8 +78,8 @@ def find_offset(a: Motion, b: Motion) -> Offset | None:
         return None
     step = min(coarse_step(each.comparison) for each in searched)
     lags = np.arange(min(each.lags[0] for each in searched), max(each.lags[-1] for each in searched), step)
-    evidence = sum(np.interp(lags, each.lags, each.evidence, 0.0, 0.0) for each in searched)
-    peaks = _peaks(np.asarray(evidence))
+    evidence = np.sum([np.interp(lags, each.lags, each.evidence, 0.0, 0.0) for each in searched], axis=0)
+    peaks = _peaks(evidence)
     if not peaks.size:
         return None
     rivals = peaks[evidence[peaks] > RIVAL * evidence[peaks[0]]][:MOST_RIVALS]
@@ -163,17 +163,20 @@ def _refined(comparison: Comparison, lag: float, parameters: Array) -> tuple[Off
     times = np.arange(begin, end, step)
     y = comparison.observed(times)
     seconds, drift = lag, 0.0
+    fit = _step(comparison, times - at, times, y, (seconds, drift), parameters)
     for _ in range(ITERATIONS):
-        fit = _step(comparison, times - at, times, y, (seconds, drift), parameters)
         if fit is None:
             return None
-        move = fit.move
-        seconds, drift = seconds + float(move[0]), drift + float(move[1])
-        parameters = comparison.moved(parameters, move[2:])
+        seconds, drift = seconds + float(fit.move[0]), drift + float(fit.move[1])
+        parameters = comparison.moved(parameters, fit.move[2:])
         if abs(seconds - lag) > comparison.window:
             return None
-        if abs(move[0]) < SETTLED:
+        settled = abs(fit.move[0]) < SETTLED
+        fit = _step(comparison, times - at, times, y, (seconds, drift), parameters)
+        if settled:
             break
+    if fit is None:
+        return None
     overlap = fit.known * step
     sd, drift_sd = (float(value) for value in fit.sd)
     offset = Offset(seconds, sd, drift, drift_sd, at, overlap, fit.explained, comparison.name)

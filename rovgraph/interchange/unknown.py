@@ -19,14 +19,16 @@ def purpose(path: Path, head: bytes) -> str:
     """
     if path.is_dir():
         if (path / SUMMARY).is_file():
-            return f"is a results folder; rovgraph evaluate {path / 'trajectory_smoothed.csv'} REFERENCE reads its track"
+            return (
+                f"is a results folder; rovgraph evaluate {path / 'trajectory_smoothed.csv'} REFERENCE reads its track"
+            )
         return ""
     if head.startswith(b"PK\x03\x04"):
         return "is a ZIP archive; unpack it first"
     text = head.decode("utf-8", errors="replace")
     lines = text.splitlines()
     header = {name.strip() for name in next(csv.reader(lines[:1]), [])}
-    if TRACK <= header:
+    if header >= TRACK:
         return f"is a track, not a log; rovgraph evaluate {path} REFERENCE compares it"
     keys = {line.partition(":")[0] for line in lines if ":" in line and not line.startswith((" ", "#"))}
     if path.suffix in (".yaml", ".yml") and keys & set(Config.model_fields):
