@@ -237,7 +237,7 @@ def _stated(
         by_sensor = {(s.file, s.channel.clock) for s in selected if s.channel.sensor == key}
         files = {k for k, name in enumerate(names) if key in (name, Path(name).stem, recordings[k].path)}
         meant = [a for a in axes if a.file in files or any((a.file, name) in by_sensor for name in a.lines)]
-        if not meant:
+        if not meant and not files:
             known = sorted(sensors | set(names))
             raise InputError(f"shift {key}: is neither a sensor nor a file; there are {', '.join(known)}")
         if any(axis is base for axis in meant):

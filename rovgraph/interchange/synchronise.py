@@ -22,7 +22,10 @@ EVIDENCE = 40.0  # in chi-square, that the best lag is better than any other
 DRIFT_SD = 1e-4  # of crystals, their prior
 PARTS = 10  # of the overlap, each left out once
 SURE_S = 0.5  # sd of an offset that is believed [s]
-ITERATIONS = 12
+ITERATIONS = 20
+HELD = 3  # of them with the lag held, until mountings fit
+HOLD = 1e18  # information
+LARGEST_STEP = 0.25  # windows of lag at a time
 RIVAL = 0.5  # of the best evidence, from which a lag is refined, too
 MOST_RIVALS = 16
 FAR = 0.02  # of the best evidence, that others fall short
@@ -83,12 +86,14 @@ def find_offset(a: Motion, b: Motion) -> Offset | None:
     if not peaks.size:
         return None
     rivals = peaks[evidence[peaks] > RIVAL * evidence[peaks[0]]][:MOST_RIVALS]
-    candidates = [found for k in rivals if (found := _candidate(searched, float(lags[k]))) is not None]
-    candidates.sort(key=lambda candidate: -candidate[1])
-    if not candidates:
+    found = [(candidate, k) for k in rivals if (candidate := _candidate(searched, float(lags[k]))) is not None]
+    found.sort(key=lambda each: -each[0][1])
+    if not found:
         return None
-    (offset, best), others = candidates[0], [other for other in candidates[1:] if _differ(other[0], candidates[0][0])]
-    second = max([float(evidence[k]) for k in peaks[len(rivals) :]] + [total for _, total in others], default=0.0)
+    (offset, best), at = found[0]
+    others = [total for (other, total), _ in found[1:] if _differ(other, offset)]
+    unrefined = float(evidence[peaks[len(rivals)]]) if len(rivals) < len(peaks) else 0.0
+    second = max([unrefined * best / float(evidence[at]), *others])  # refined, it may gain as much as the best one
     certain = offset.sd < SURE_S and best - second > max(EVIDENCE, FAR * best)
     return offset if certain else None
 
@@ -156,23 +161,21 @@ def _peaks(evidence: Array) -> NDArray[np.int64]:
 
 
 def _refined(comparison: Comparison, lag: float, parameters: Array) -> tuple[Offset, float] | None:
-    """Least squares from a lag, and its evidence; None where it leads away."""
+    """Least squares from a lag, and its evidence; None where too little is known there."""
     (begin_a, end_a), (begin_b, end_b) = comparison.spans
     begin, end = max(begin_a, begin_b - lag), min(end_a, end_b - lag)
     step, at = coarse_step(comparison), 0.5 * (begin + end)
     times = np.arange(begin, end, step)
     y = comparison.observed(times)
-    seconds, drift = lag, 0.0
-    fit = _step(comparison, times - at, times, y, (seconds, drift), parameters)
-    for _ in range(ITERATIONS):
+    seconds, drift, farthest = lag, 0.0, LARGEST_STEP * comparison.window
+    fit = _step(comparison, times - at, times, y, (seconds, drift), parameters, held=True)
+    for k in range(ITERATIONS):
         if fit is None:
             return None
-        seconds, drift = seconds + float(fit.move[0]), drift + float(fit.move[1])
+        seconds, drift = seconds + float(np.clip(fit.move[0], -farthest, farthest)), drift + float(fit.move[1])
         parameters = comparison.moved(parameters, fit.move[2:])
-        if abs(seconds - lag) > comparison.window:
-            return None
-        settled = abs(fit.move[0]) < SETTLED
-        fit = _step(comparison, times - at, times, y, (seconds, drift), parameters)
+        settled = k > HELD and abs(fit.move[0]) < SETTLED
+        fit = _step(comparison, times - at, times, y, (seconds, drift), parameters, held=k < HELD)
         if settled:
             break
     if fit is None:
@@ -194,9 +197,15 @@ class _Fit:
 
 
 def _step(
-    comparison: Comparison, since: Array, times: Array, y: Array, clock: tuple[float, float], parameters: Array
+    comparison: Comparison,
+    since: Array,
+    times: Array,
+    y: Array,
+    clock: tuple[float, float],
+    parameters: Array,
+    held: bool,
 ) -> _Fit | None:
-    """Linearise and solve; None where too little is known."""
+    """Linearise and solve, with the clock held or not; None where too little is known."""
     others = times + clock[0] + clock[1] * since
     X = comparison.regressors(times, others)
     earlier, later = (comparison.regressors(times, others + h) for h in (-0.5 * DIFFERENCE, 0.5 * DIFFERENCE))
@@ -221,6 +230,7 @@ def _step(
     spread = np.hypot(np.sqrt((PARTS - 1) * np.var(without)), comparison.floor_s)
     wider = max(1.0, float(spread) / float(np.sqrt(np.linalg.inv(information)[0, 0]))) ** 2
     prior[1] += DRIFT_SD**-2
+    prior[:2] += HOLD if held else 0.0
     information = H.sum(axis=0) / wider + np.diag(prior)
     towards = g.sum(axis=0) / wider
     towards[1] -= clock[1] * DRIFT_SD**-2
