@@ -77,11 +77,16 @@ class Comparison(Protocol):
     def search(self, step: float) -> Sums:
         """Every lag that leaves an overlap."""
 
-    def observed(self, times: Array) -> Array:
-        """What clock A shows at its times (n,), shape (n, m), NaN where not known."""
+    def observed(self, times: Array) -> tuple[Array, Array]:
+        """What clock A shows at its times (n,), NaN where not known: shape (n, m), and for `regressors`, (n, k)."""
 
-    def regressors(self, times: Array, others: Array) -> Array:
-        """What the parameters (p,) are multiplied by, at times of clock A and of clock B, shape (n, m, p)."""
+    def regressors(self, shown: Array, others: Array) -> Array:
+        """What the parameters (p,) are multiplied by, at times of clock B, shape (n, m, p).
+
+        Parameters
+        ----------
+        shown : the second result of `observed`
+        """
 
     def tangent(self, parameters: Array) -> Array:
         """Change of the parameters per unit of a step, shape (p, q)."""
@@ -127,10 +132,10 @@ class Changes:
         error = np.clip(total - b**2 * spread, 1e-9 * total, None)
         return Sums(_lags(grids), n * step, total, error, np.column_stack([(sy - b * sx) / count, b]))
 
-    def observed(self, times: Array) -> Array:
-        return self.a.changes(times, self.window)
+    def observed(self, times: Array) -> tuple[Array, Array]:
+        return self.a.changes(times, self.window), np.empty((len(times), 0))
 
-    def regressors(self, times: Array, others: Array) -> Array:
+    def regressors(self, shown: Array, others: Array) -> Array:
         x = self.b.changes(others, self.window)
         return np.concatenate([np.ones_like(x), x], axis=1)[:, None]
 
@@ -184,15 +189,15 @@ class Accelerations:
         seconds = _correlate(known, seen)[:, 0] * step
         return Sums(_lags(grids), seconds, total, error, np.column_stack([M[best], np.zeros((len(best), 3))]))
 
-    def observed(self, times: Array) -> Array:
-        return self.a.means(times, self.window)[0]
+    def observed(self, times: Array) -> tuple[Array, Array]:
+        a, w, spin = self.a.means(times, self.window)
+        return a, np.hstack([w, spin])
 
-    def regressors(self, times: Array, others: Array) -> Array:
-        _, w, spin = self.a.means(times, self.window)
+    def regressors(self, shown: Array, others: Array) -> Array:
         dv, v = self._moved(others)
-        G = skew(w)
+        G, S = skew(shown[:, :3]), skew(shown[:, 3:])
         by_M = np.einsum("il,tk->tilk", np.eye(3), dv) + np.einsum("til,tk->tilk", G, v)
-        return np.concatenate([by_M.reshape(-1, 3, 9), -skew(spin) - G @ G], axis=2)
+        return np.concatenate([by_M.reshape(-1, 3, 9), -S - G @ G], axis=2)
 
     def tangent(self, parameters: Array) -> Array:
         M = parameters[:9].reshape(3, 3)

@@ -26,8 +26,8 @@ ITERATIONS = 20
 HELD = 3  # of them with the lag held, until mountings fit
 HOLD = 1e18  # information
 LARGEST_STEP = 0.25  # windows of lag at a time
-RIVAL = 0.5  # of the best evidence, from which a lag is refined, too
-MOST_RIVALS = 16
+RIVAL = 0.6  # of the best evidence, from which a lag is refined, too
+MOST_RIVALS = 10
 FAR = 0.02  # of the best evidence, that others fall short
 SAME = 4.0  # standard deviations between lags that are one
 TINY = 1e-9  # information, that no step is undetermined
@@ -118,8 +118,9 @@ class _Searched:
 
     def refined(self, lag: float) -> tuple[Offset, float] | None:
         """The offset near a lag, and its evidence."""
-        k = int(np.argmin(np.abs(self.lags - lag)))
-        fit = _refined(self.comparison, self.sign * lag, self.parameters[k])
+        near = np.abs(self.lags - lag) <= self.comparison.window
+        k = int(np.argmax(np.where(near, self.evidence, -np.inf)))
+        fit = _refined(self.comparison, self.sign * float(self.lags[k]), self.parameters[k])
         if fit is None or fit[0].explained < FOLLOWS:
             return None
         return (fit[0] if self.sign > 0.0 else fit[0].reversed()), fit[1]
@@ -166,16 +167,16 @@ def _refined(comparison: Comparison, lag: float, parameters: Array) -> tuple[Off
     begin, end = max(begin_a, begin_b - lag), min(end_a, end_b - lag)
     step, at = coarse_step(comparison), 0.5 * (begin + end)
     times = np.arange(begin, end, step)
-    y = comparison.observed(times)
+    shown = comparison.observed(times)
     seconds, drift, farthest = lag, 0.0, LARGEST_STEP * comparison.window
-    fit = _step(comparison, times - at, times, y, (seconds, drift), parameters, held=True)
+    fit = _step(comparison, times - at, times, shown, (seconds, drift), parameters, held=True)
     for k in range(ITERATIONS):
         if fit is None:
             return None
         seconds, drift = seconds + float(np.clip(fit.move[0], -farthest, farthest)), drift + float(fit.move[1])
         parameters = comparison.moved(parameters, fit.move[2:])
         settled = k > HELD and abs(fit.move[0]) < SETTLED
-        fit = _step(comparison, times - at, times, y, (seconds, drift), parameters, held=k < HELD)
+        fit = _step(comparison, times - at, times, shown, (seconds, drift), parameters, held=k < HELD)
         if settled:
             break
     if fit is None:
@@ -200,15 +201,15 @@ def _step(
     comparison: Comparison,
     since: Array,
     times: Array,
-    y: Array,
+    shown: tuple[Array, Array],
     clock: tuple[float, float],
     parameters: Array,
     held: bool,
 ) -> _Fit | None:
     """Linearise and solve, with the clock held or not; None where too little is known."""
     others = times + clock[0] + clock[1] * since
-    X = comparison.regressors(times, others)
-    earlier, later = (comparison.regressors(times, others + h) for h in (-0.5 * DIFFERENCE, 0.5 * DIFFERENCE))
+    y, shown_too = shown
+    X, earlier, later = (comparison.regressors(shown_too, others + h * DIFFERENCE) for h in (0.0, -0.5, 0.5))
     known = np.isfinite(y).all(axis=1) & np.isfinite(X + earlier + later).all(axis=(1, 2))
     if np.count_nonzero(known) < 4 * PARTS:
         return None
