@@ -67,9 +67,7 @@ def times(merged: Merged, column: str) -> np.ndarray:
     return merged.frame.loc[merged.frame[column].notna(), "time"].to_numpy()
 
 
-@pytest.mark.parametrize(
-    ("offset", "drift"), [(3.2, 0.0), (-40.0, 0.0), (1_735_689_600.0, 0.0), (3.2, 50e-6)], ids=str
-)
+@pytest.mark.parametrize(("offset", "drift"), [(3.2, 0.0), (-40.0, 0.0), (1_735_689_600.0, 0.0), (3.2, 50e-6)], ids=str)
 def test_clocks_apart_are_found_within_their_sd(dive, offset, drift):
     merged = merge([autopilot(dive), instrument(dive, offset, drift)], {}, {})
     late = times(merged, "dvl_vx") - dive.loc[dive["dvl_vx"].notna(), "time"].to_numpy()
@@ -123,7 +121,9 @@ def test_unix_stamps_join_clocks_of_any_epoch_exactly(dive):
     merged = merge([autopilot(dive, boot), instrument(dive, START, clock=unix)], {}, {})
     assert merged.unix
     assert merged.warnings == ()
-    assert times(merged, "dvl_vx") == pytest.approx(START + dive.loc[dive["dvl_vx"].notna(), "time"].to_numpy(), abs=1e-6)
+    assert times(merged, "dvl_vx") == pytest.approx(
+        START + dive.loc[dive["dvl_vx"].notna(), "time"].to_numpy(), abs=1e-6
+    )
     assert all("GPS week" in c.how or "Unix time" in c.how for c in merged.clocks)
 
 
@@ -225,7 +225,10 @@ def test_a_clock_that_is_set_within_a_file_is_refused():
 
 def test_settings_hold_where_the_configuration_states_nothing():
     config = rg.parse_config("dvl: {mount_rpy_deg: [180, 0, 0]}")
-    settings = {"dvl": {"mount_rpy_deg": [0, 0, 90], "lever_arm_m": [0.2, 0, 0]}, "environment": {"declination_deg": 4.0}}
+    settings = {
+        "dvl": {"mount_rpy_deg": [0, 0, 90], "lever_arm_m": [0.2, 0, 0]},
+        "environment": {"declination_deg": 4.0},
+    }
     full, used = completed(config, settings, "a.bin")
     assert full.dvl.mount_rpy_deg == (180, 0, 0)
     assert full.dvl.lever_arm_m == (0.2, 0, 0)
@@ -281,7 +284,9 @@ def toy(monkeypatch):
     def broken() -> None:
         raise ImportError("no module named toys")
 
-    monkeypatch.setattr(sys.modules["rovgraph.interchange.formats"], "entry_points", lambda group: [Entry(Toy), Entry(broken)])
+    monkeypatch.setattr(
+        sys.modules["rovgraph.interchange.formats"], "entry_points", lambda group: [Entry(Toy), Entry(broken)]
+    )
     formats.cache_clear()
     with pytest.warns(rg.DataWarning, match="toy of toys:FORMAT cannot be loaded"):
         formats()

@@ -264,10 +264,10 @@ def _joined(
     found = [o for joined in pool if (o := find_offset(joined.motion, own)) is not None]
     offset = min(found, key=lambda each: each.sd, default=None)
     line = None if offset is None else _line(offset)
-    if axis.unix and base.unix and _overlap(_span(channels), pool):
-        if offset is None or abs(offset.seconds) < max(AGREE_S, SURE * offset.sd):
-            seen = "" if offset is None else f"; motion agrees to {offset.seconds:+.2f} s (sd {offset.sd:.2f} s)"
-            return Line(), 0.0, 0.0, f"Unix time{seen}", ""
+    agrees = offset is None or abs(offset.seconds) < max(AGREE_S, SURE * offset.sd)
+    if axis.unix and base.unix and agrees and _overlap(_span(channels), pool):
+        seen = "" if offset is None else f"; motion agrees to {offset.seconds:+.2f} s (sd {offset.sd:.2f} s)"
+        return Line(), 0.0, 0.0, f"Unix time{seen}", ""
     if offset is None or line is None:
         return None
     how = f"{offset.how}, explained {offset.explained:.0%} over {offset.overlap:.0f} s"
@@ -289,9 +289,11 @@ def _not_joined(axis: _Axis, base: _Axis, recordings: Sequence[Recording], names
     """Why an axis cannot be joined, and what to do."""
     one, other = (_span(a.channels(recordings[a.file])) for a in (axis, base))
     if axis.unix and base.unix:
-        told = f"was recorded {_date(one[0])} to {_date(one[1])}, {names[base.file]} {_date(other[0])} to {_date(other[1])}"
+        spans = [f"{_date(begin)} to {_date(end)}" for begin, end in (one, other)]
+        told = f"was recorded {spans[0]}, {names[base.file]} {spans[1]}"
     else:
-        told = f"clock {next(iter(axis.lines))} reads {one[0]:.1f} to {one[1]:.1f} s, {names[base.file]} {other[0]:.1f} to {other[1]:.1f} s"
+        spans = [f"{begin:.1f} to {end:.1f} s" for begin, end in (one, other)]
+        told = f"clock {next(iter(axis.lines))} reads {spans[0]}, {names[base.file]} {spans[1]}"
     sensors = sorted({channel.sensor for channel in axis.channels(recordings[axis.file])})
     return (
         f"{names[axis.file]}: {told}, and no motion that both show tells how far the clocks are apart; are they of one "

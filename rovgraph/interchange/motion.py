@@ -30,8 +30,8 @@ class Signal:
 
     Attributes
     ----------
-    kind : what changes: "turning" a heading [rad], "depth", a DVL's by its z axis [m], "speed" a distance [m], "velocity" along a DVL's axes
-        [m/s], "way" its integral [m]
+    kind : what changes: "turning" a heading [rad], "depth", a DVL's by its z axis [m], "speed" a distance [m],
+        "velocity" along a DVL's axes [m/s], "way" its integral [m]
     sensor : that shows it
     time : ndarray, shape (n,), increasing [s]
     value : ndarray, shape (n, k)

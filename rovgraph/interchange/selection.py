@@ -87,7 +87,8 @@ def _chosen(recordings: Sequence[Recording], found: Sequence[Selected], sensor: 
     """The channel that a choice names, by file, by a word of its source, or by a part of it."""
     word = re.compile(rf"(?<!\w){re.escape(choice)}(?!\w)", re.IGNORECASE)
     names = file_names(recordings)
-    by_file = [f for f in found if choice in {recordings[f.file].path, names[f.file], Path(recordings[f.file].path).stem}]
+    files = [{recordings[f.file].path, names[f.file], Path(recordings[f.file].path).stem} for f in found]
+    by_file = [f for f, called in zip(found, files, strict=True) if choice in called]
     by_word = [f for f in found if word.search(f.channel.source)]
     by_part = [f for f in found if choice.lower() in f.channel.source.lower()]
     if matching := by_file or by_word or by_part:

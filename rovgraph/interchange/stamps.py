@@ -32,7 +32,8 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     kept = rows[_of_one_epoch(time[rows])]
     if lost := len(rows) - len(kept):
         odd = np.setdiff1d(rows, kept)[0]
-        told = f"{lost} of {len(rows)} rows have stamps of another time ({time[odd]:.1f} s, others from {time[kept[0]]:.1f} s)"
+        apart = f"{time[odd]:.1f} s, others from {time[kept[0]]:.1f} s"
+        told = f"{lost} of {len(rows)} rows have stamps of another time ({apart})"
         if lost > LOST * len(rows):
             raise InputError(f"{where}: {told}; was the clock set, or are two dives in one file? Split it")
         said.append(f"{where}: {told}; left out")
