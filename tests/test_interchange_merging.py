@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -73,15 +74,9 @@ def test_clocks_apart_are_found_within_their_sd(dive, offset, drift):
     late = times(merged, "dvl_vx") - dive.loc[dive["dvl_vx"].notna(), "time"].to_numpy()
     clock = next(c for c in merged.clocks if c.file == 1)
     assert "acceleration" in clock.how
-    assert 0.0 < clock.sd < 0.05
+    assert 0.0 < clock.sd < 0.033  # so that a tenth of a second would not pass
     span = float(np.ptp(times(merged, "dvl_vx")))
     assert np.abs(late).max() < 3.0 * (clock.sd + 0.5 * clock.drift_sd * span)
-
-
-def test_a_stated_sd_that_is_too_small_would_not_hold(dive):
-    """The test above can fail: an offset that is wrong by a tenth of a second is far outside the sd that is found."""
-    merged = merge([autopilot(dive), instrument(dive, 3.2)], {}, {})
-    assert 0.1 > 3.0 * next(c for c in merged.clocks if c.file == 1).sd
 
 
 def test_a_compass_alone_joins_clocks_with_the_lag_that_it_may_have(dive):
@@ -166,7 +161,7 @@ def test_a_shift_of_a_sensor_moves_its_clock_and_beside_the_imu_that_sensor_alon
     assert times(merged, "dvl_vx") == pytest.approx(dive.loc[dive["dvl_vx"].notna(), "time"].to_numpy(), abs=1e-9)
     alone = merge([autopilot(dive)], {}, {"mag": 0.5})
     assert times(alone, "mag_x")[0] - times(alone, "acc_x")[0] == pytest.approx(0.5)
-    with pytest.raises(InputError, match="shift sonar: is neither a sensor nor a file; there are auto.bin, dvl, "):
+    with pytest.raises(InputError, match=r"shift sonar: is neither a sensor nor a file; there are auto\.bin, dvl, "):
         merge([autopilot(dive), instrument(dive, 3.2)], {}, {"sonar": 1.0})
     with pytest.raises(InputError, match="its clock is that of the log"):
         merge([autopilot(dive), instrument(dive, 3.2)], {}, {"auto.bin": 1.0})
@@ -284,9 +279,8 @@ def toy(monkeypatch):
     def broken() -> None:
         raise ImportError("no module named toys")
 
-    monkeypatch.setattr(
-        sys.modules["rovgraph.interchange.formats"], "entry_points", lambda group: [Entry(Toy), Entry(broken)]
-    )
+    module = sys.modules["rovgraph.interchange.formats"]
+    monkeypatch.setattr(module, "entry_points", lambda group: [Entry(Toy), Entry(broken)])
     formats.cache_clear()
     with pytest.warns(rg.DataWarning, match="toy of toys:FORMAT cannot be loaded"):
         formats()
@@ -307,9 +301,9 @@ def files(dive, tmp_path, toy) -> list[Path]:
 
 
 def test_a_dive_in_two_files_comes_back_to_the_same_track(files, dive):
-    config = changed(falcon(), dvl={"lever_arm_m": [0.2, 0.1, 0.0]})
+    config = changed(falcon(), dvl={"lever_arm_m": [0.2, 0.1, 0.0]}, graph={"find_noise": False})
     whole = rg.smooth(rg.Log.from_frame(dive.drop(columns="dvl_heading", errors="ignore"), config), config, "smoothed")
-    stated = falcon().model_dump(exclude_unset=True)
+    stated = config.model_dump(exclude_unset=True)
     del stated["dvl"]["lever_arm_m"]
     config = type(config).model_validate(stated)
     log = rg.read_log(files, config)
@@ -394,6 +388,21 @@ def test_a_log_with_other_columns_and_units_beside_a_native_file(files, toy):
     np.testing.assert_allclose(np.rad2deg(log["imu"]["gyr_x"]), frame["gyr_x"].dropna(), rtol=1e-9)
     assert log.config is not None and log.config.columns == config.columns
     assert rg.check(log, config).source == "auto.csv + dive.toy"
+
+
+def test_the_format_of_the_manual_reads_its_file(tmp_path, dive):
+    """docs/formats.md: a format of your own, as it stands there."""
+    text = (Path(__file__).parents[1] / "docs" / "formats.md").read_text(encoding="utf-8")
+    code = text.rpartition("```python\n")[2].partition("```")[0]
+    made: dict[str, Any] = {}
+    exec(compile(code, "docs/formats.md", "exec"), made)
+    rows = dive.loc[dive["dvl_vx"].notna(), ["time", *DVL[:3]]].to_numpy()
+    path = tmp_path / "my.txt"
+    path.write_text("".join(f"$MYDVL,{','.join(map(repr, row.tolist()))}\n" for row in rows), encoding="utf-8")
+    assert made["FORMAT"].recognise(path, path.read_bytes()[:64]) == 1.0
+    (own,) = made["FORMAT"].read(path, Options()).channels
+    assert own.columns["dvl_vy"] == pytest.approx(rows[:, 2])
+    assert merge([made["FORMAT"].read(path, Options())], {}, {}).frame["dvl_vz"].notna().all()
 
 
 HOSTILE = {

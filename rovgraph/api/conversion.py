@@ -88,7 +88,8 @@ class Conversion:
             for place, table in zip(temporary[2:], tables.values(), strict=False):
                 write_table(table, place)
             if config_path is not None:
-                temporary[-1].write_text(starter(self, path.name), encoding="utf-8")
+                sources = {key: self.merged.settings[key][1] for key in self.used}
+                temporary[-1].write_text(starter(self.config, self.log, sources, path.name), encoding="utf-8")
         return paths
 
 

@@ -3,7 +3,7 @@
 import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,12 +13,11 @@ from rich.table import Table
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
+from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
-
-if TYPE_CHECKING:
-    from rovgraph.api.conversion import Conversion
+from rovgraph.log import Log
 
 DIGITS = 10  # significant, of a cell: latitudes to a centimetre
 DECIMALS = {"time": 6}
@@ -62,32 +61,34 @@ def write_table(table: Mapping[str, Array], path: Path) -> None:
     write_csv(pd.DataFrame({name: np.asarray(values) for name, values in table.items()}), path, DIGITS)
 
 
-def starter(conversion: "Conversion", log: str) -> str:
+def starter(config: Config, log: Log, sources: Mapping[str, str], name: str) -> str:
     """A configuration to begin with: what is known of the vehicle, each value with where it is from.
 
     Parameters
     ----------
-    log : name of the log that it is for
+    config : what is stated, and what files know
+    log : that it is for
+    sources : dotted key -> file that it comes from
+    name : of the log's file
     """
-    settings: dict[str, Any] = conversion.config.model_dump(mode="json", exclude_unset=True)
+    settings: dict[str, Any] = config.model_dump(mode="json", exclude_unset=True)
     settings = {key: value for key, value in settings.items() if key not in ("columns", "units")}
-    origin = conversion.log.origin
-    sources = {key: source for key, (_, source) in conversion.merged.settings.items() if key in conversion.used}
-    if origin is not None and not conversion.config.environment.origin:
+    sources = dict(sources)
+    if log.origin is not None and not config.environment.origin:
         section = settings.setdefault("environment", {})
-        section |= {"origin_lat_deg": origin[0], "origin_lon_deg": origin[1]}
+        section |= {"origin_lat_deg": log.origin[0], "origin_lon_deg": log.origin[1]}
         sources |= dict.fromkeys(("environment.origin_lat_deg", "environment.origin_lon_deg"), "the first fix")
     for sensor, axes in MOUNTED.items():
-        if sensor in conversion.log and "mount_rpy_deg" not in settings.setdefault(sensor, {}):
+        if sensor in log and "mount_rpy_deg" not in settings.setdefault(sensor, {}):
             settings[sensor]["mount_rpy_deg"] = [0, 0, 0]
             sources[f"{sensor}.mount_rpy_deg"] = f"not known: assumed {axes}; state it"
-        if sensor in conversion.log and "lever_arm_m" not in settings[sensor]:
+        if sensor in log and "lever_arm_m" not in settings[sensor]:
             settings[sensor]["lever_arm_m"] = [0, 0, 0]
             sources[f"{sensor}.lever_arm_m"] = "not known; state it, forward, starboard, down from the vehicle's origin"
         if not settings[sensor]:
             del settings[sensor]
-    counts = ", ".join(f"{sensor} ({len(stream)})" for sensor, stream in conversion.log.streams.items())
-    head = f"# Configuration to begin with, for {log}\n# sensors: {counts}\n"
+    counts = ", ".join(f"{sensor} ({len(stream)})" for sensor, stream in log.streams.items())
+    head = f"# Configuration to begin with, for {name}\n# sensors: {counts}\n"
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 4096
