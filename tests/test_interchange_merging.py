@@ -258,7 +258,7 @@ class Toy:
         columns = {name: np.array(values) for name, values in json.loads(text).items()}
         options.progress(len(text), len(text))
         channels = (Channel("dvl", columns, "/dvl", "x forward, y starboard, z down", "own"),)
-        settings = {"dvl": {"lever_arm_m": [0.2, 0.1, 0.0]}}
+        settings = {"dvl": {"lever_arm_m": [0.24, 0.0, 0.33]}}
         left = (Left("/status", 7, "no column of a log"),)
         return Recording(str(path), self.name, channels, {"own": Clock("own")}, left, settings, ("z is taken down",))
 
@@ -301,21 +301,22 @@ def files(dive, tmp_path, toy) -> list[Path]:
 
 
 def test_a_dive_in_two_files_comes_back_to_the_same_track(files, dive):
-    config = changed(falcon(), dvl={"lever_arm_m": [0.2, 0.1, 0.0]}, graph={"find_noise": False})
+    config = changed(falcon(), graph={"find_noise": False})
     whole = rg.smooth(rg.Log.from_frame(dive.drop(columns="dvl_heading", errors="ignore"), config), config, "smoothed")
     stated = config.model_dump(exclude_unset=True)
     del stated["dvl"]["lever_arm_m"]
     config = type(config).model_validate(stated)
     log = rg.read_log(files, config)
     assert any("joined by" in note for note in log.notes)
-    assert any("dvl.lever_arm_m: [0.2, 0.1, 0.0] (dive.toy)" in note for note in log.notes)
+    assert any("dvl.lever_arm_m: [0.24, 0.0, 0.33] (dive.toy)" in note for note in log.notes)
     result = rg.smooth(log, config, "smoothed")
-    assert result.config.dvl.lever_arm_m == (0.2, 0.1, 0.0)
+    assert result.config.dvl.lever_arm_m == (0.24, 0.0, 0.33)
     assert set(log.notes) <= set(result.assumptions)
     one, other = (r.smoothed.trajectory for r in (whole, result))
     at = np.interp
     apart = [at(one.time, other.time, other.position[:, k]) - one.position[:, k] for k in (0, 1)]
-    assert rms(np.hypot(*apart)) < 0.02
+    assert rms(np.hypot(*apart)) < 0.03
+    assert abs(result.calibration["dvl_time_offset"].value) < 0.05
 
 
 def test_the_command_writes_what_the_library_does_and_smooth_reads_it_the_same(files, tmp_path, monkeypatch, capsys):
@@ -334,8 +335,8 @@ def test_the_command_writes_what_the_library_does_and_smooth_reads_it_the_same(f
     assert report["files"][1]["left"] == [{"name": "/status", "count": 7, "reason": "no column of a log"}]
     assert report["clocks"][1]["offset_s"] == pytest.approx(-3.2, abs=3.0 * report["clocks"][1]["sd_s"])
     config = rg.load_config(tmp_path / "v.yaml")
-    assert config.dvl.lever_arm_m == (0.2, 0.1, 0.0)
-    assert "lever_arm_m: [0.2, 0.1, 0.0]  # dive.toy" in (tmp_path / "v.yaml").read_text(encoding="utf-8")
+    assert config.dvl.lever_arm_m == (0.24, 0.0, 0.33)
+    assert "lever_arm_m: [0.24, 0.0, 0.33]  # dive.toy" in (tmp_path / "v.yaml").read_text(encoding="utf-8")
     assert "not known" in (tmp_path / "v.yaml").read_text(encoding="utf-8")
     written, direct = rg.read_log(out, config), rg.read_log(files)
     for sensor in direct.sensors:

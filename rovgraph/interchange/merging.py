@@ -20,7 +20,7 @@ from rovgraph.log import Log
 from rovgraph.log.streams import LABEL, all_columns
 
 OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
-UNSURE_S = 0.1  # sd of a joined clock from which the sensors' time offset is estimated [s]
+UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
 OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix")  # sensors with a calibration variable for it
 
 
