@@ -160,7 +160,7 @@ def join_clocks(
     for axis, line, sd, drift_sd, how in joined:
         for name, own in axis.lines.items():
             source, own_sd = axis.sources[name]
-            told = ", ".join(text for text in (source, how) if text) or "the log's clock"
+            told = ", ".join(text for text in (source if base.unix else "", how) if text) or "the log's clock"
             lines = (own, line)
             out.append(JoinedClock(axis.file, name, lines, float(np.hypot(own_sd, sd)), drift_sd, told))
     return [clock for clock in out if (clock.file, clock.name) in needed], beside, base.unix, said
