@@ -34,8 +34,8 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / report, export / studies, live /
-estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
+cli / api / report, export / studies, live / interchange /
+estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / gauss_markov, units / geometry, workers, fast_csv / errors, process.
 """
@@ -50,6 +50,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from rovgraph.api.comparison import ComparisonResult as ComparisonResult
     from rovgraph.api.comparison import compare as compare
+    from rovgraph.api.conversion import Conversion as Conversion
+    from rovgraph.api.conversion import convert as convert
     from rovgraph.api.demo import Demo as Demo
     from rovgraph.api.demo import demo as demo
     from rovgraph.api.exporting import export as export
@@ -83,6 +85,7 @@ _HOMES = {
     "Choices": "simulate",
     "ComparisonResult": "api.comparison",
     "Config": "config",
+    "Conversion": "api.conversion",
     "DataWarning": "errors",
     "Demo": "api.demo",
     "InputError": "errors",
@@ -96,6 +99,7 @@ _HOMES = {
     "Trajectory": "trajectory",
     "check": "api.logs",
     "compare": "api.comparison",
+    "convert": "api.conversion",
     "demo": "api.demo",
     "evaluate": "evaluate",
     "export": "api.exporting",

@@ -1,26 +1,40 @@
 """Logs for an estimate: reading with a configuration, checking, bridging of clock jumps."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
 
 from rovgraph import log as library
+from rovgraph.api.conversion import NOTHING, Paths, convert, is_plain_log
 from rovgraph.check import Finding, Report, bridge_jumps, examine
 from rovgraph.check import warn as warn_of_findings
-from rovgraph.config import Config, config_or_defaults
+from rovgraph.config import Config, completed, config_or_defaults
 from rovgraph.errors import InputError, warn
+from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.estimators.initialise import refusal
 from rovgraph.log import Log
 
 
-def read_log(path: Path | str, config: Config | None = None) -> Log:
-    """Read a log (docs/log-format.md) with the columns, units and delays of a configuration.
+def read_log(
+    path: Paths,
+    config: Config | None = None,
+    choose: Mapping[str, str] = NOTHING,
+    shift: Mapping[str, float] = NOTHING,
+    progress: Progress = no_progress,
+) -> Log:
+    """Read a log (docs/log-format.md) with the columns, units and delays of a configuration, or native files as one.
 
     Parameters
     ----------
-    path : CSV, gzipped CSV or Parquet
+    path : CSV, gzipped CSV or Parquet; or native files of one dive, one or several (docs/formats.md)
     config : None = rovgraph's own columns, in SI
+    choose, shift, progress : of `rovgraph.convert`, for native files
+
+    Returns
+    -------
+    Log : what native files know (mountings, ...) is in ``.settings`` and holds where a configuration states nothing
 
     Raises
     ------
@@ -32,9 +46,13 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
     """
     if isinstance(path, pd.DataFrame):
         raise InputError("log: is a DataFrame, expected a file's name; use Log.from_frame")
+    files = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
     if config is None:
-        warn_of_unused(path)
-    return library.read_log(path, config)
+        warn_of_unused(*files)
+    alone = len(files) == 1 and not choose and not shift
+    if alone and is_plain_log(files[0], Config() if config is None else config):
+        return library.read_log(files[0], config)
+    return convert(files, config, choose, shift, progress).log
 
 
 def warn_of_unused(*logs: Path | str) -> None:
@@ -88,7 +106,7 @@ def prepared(log: Log, config: Config) -> Log:
 
 
 def given(log: Log, config: Config | None) -> Config:
-    """The configuration that belongs to a log, all defaults where none is given.
+    """The configuration that belongs to a log, all defaults where none is given, completed by what its files know.
 
     Raises
     ------
@@ -97,5 +115,6 @@ def given(log: Log, config: Config | None) -> Config:
     if not isinstance(log, Log):
         raise InputError(f"log: expected a Log, as read_log or Log.from_frame gives it, found a {type(log).__name__}")
     config = config_or_defaults(config)
+    config, _ = completed(config, log.settings, f"settings in {log.source}")
     log.require_read_with(config)
     return config

@@ -83,8 +83,8 @@ class Result:
 
     @property
     def assumptions(self) -> Sequence[str]:
-        """What neither log nor configuration states, a line each."""
-        return self.dive.assumptions
+        """What neither log nor configuration states, and how native files were read, a line each."""
+        return (*self.log.notes, *self.dive.assumptions)
 
     @property
     def config(self) -> Config:

@@ -16,6 +16,7 @@ from rovgraph.cli.calibrate import calibrate
 from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
+from rovgraph.cli.convert import convert
 from rovgraph.cli.demo import demo
 from rovgraph.cli.evaluate import evaluate
 from rovgraph.cli.export import export
@@ -53,7 +54,9 @@ def _of_all_commands(
     pass
 
 
-for _command in (demo, smooth, online, export, tag, evaluate, compare, observe, plan, check, config, simulate):
+for _command in (
+    demo, smooth, online, convert, export, tag, evaluate, compare, observe, plan, check, config, simulate,
+):  # fmt: skip
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(study, name="study")

@@ -5,12 +5,16 @@ from typing import Annotated
 
 import typer
 
+from rovgraph.cli.files import Choose, Shift, read_files
+
 WIDE = 120  # columns of a file or a pipe, which has no width of its own
 
 
 def compare(
     out: Annotated[Path, typer.Option("--out", "-o", help="results folder", show_default=False)],
-    log: Annotated[Path | None, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md")] = None,
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="a log, or native files of one dive", metavar="[FILE...]")
+    ] = None,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     reference: Annotated[
         Path | None, typer.Option(help="CSV with time, north, east, and optionally attitude and velocity")
@@ -27,6 +31,8 @@ def compare(
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    choose: Choose = None,
+    shift: Shift = None,
 ) -> None:
     """Compare estimators: errors, consistency and cost of each, in a table and figures.
 
@@ -45,10 +51,10 @@ def compare(
     names = None if estimators is None else [name.strip() for name in estimators.split(",") if name.strip()]
     chosen = range(first_seed, first_seed + seeds)
     select(names)
-    require_one(log, reference, scenario, chosen, duration)
+    require_one(files[0] if files else None, reference, scenario, chosen, duration)
     check_writable(out, force)
     settings = None if config is None else rg.load_config(config)
-    dive_log = None if log is None else rg.read_log(log, settings)
+    dive_log = read_files(files, settings, choose, shift) if files else None
     track = None if reference is None else rg.read_reference(reference)
     with progress_bar() as progress:
         result = rg.compare(dive_log, settings, track, scenario, chosen, duration, names, jobs, progress)

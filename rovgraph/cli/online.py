@@ -73,7 +73,7 @@ def _smooth(out: Path) -> None:
     _note("smoothing what was recorded; Ctrl-C leaves it out")
     try:
         with contextlib.redirect_stdout(sys.stderr):
-            smooth(out / RECORDING, out / CONFIG, out / "smoothed", force=True)
+            smooth([out / RECORDING], out / CONFIG, out / "smoothed", force=True)
     except InputError as error:
         _note(f"not smoothed: {error}")
     except KeyboardInterrupt:

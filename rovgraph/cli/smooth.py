@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rovgraph.cli.files import Choose, Files, Shift, name_of, read_files
+
 if TYPE_CHECKING:
     from rovgraph import Result
 
@@ -29,7 +31,7 @@ class Which(StrEnum):
 
 
 def smooth(
-    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    files: Files,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
     engine: Annotated[
@@ -44,6 +46,8 @@ def smooth(
         typer.Option(help="also write the track as kml, geojson, ... (docs/export.md); may be repeated"),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
+    choose: Choose = None,
+    shift: Shift = None,
 ) -> None:
     """Estimate the track of a dive, and the calibration of its instruments.
 
@@ -56,12 +60,12 @@ def smooth(
     from rovgraph.export import known_formats
     from rovgraph.report.folder import check_writable
 
-    out = Path("results-" + log.name.split(".")[0]) if out is None else out
+    out = Path("results-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     known_formats(export or [])
     check_writable(out, force)
     began = time.perf_counter()
-    dive_log = rg.read_log(log, settings)
+    dive_log = read_files(files, settings, choose, shift)
     read = time.perf_counter()
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)

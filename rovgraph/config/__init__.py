@@ -5,6 +5,7 @@
 all keys, `beliefs` gives the calibration variables of `rovgraph.calibration` their priors.
 """
 
+from rovgraph.config.completion import completed
 from rovgraph.config.reading import (
     Config,
     beliefs,
@@ -27,6 +28,7 @@ __all__ = [
     "Mag",
     "SensorSettings",
     "beliefs",
+    "completed",
     "config_or_defaults",
     "describe",
     "load_config",

@@ -1,8 +1,9 @@
 """What a dive has recorded, from a file, a data frame or arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,6 +28,8 @@ class Log:
     config : whose columns, units, delays and magnetometer's calibration it was read with; None where the
         streams were made otherwise
     warnings : what was left out or put in order when it was read
+    settings : what its files know of the vehicle, nested as in YAML; holds where a configuration states nothing
+    notes : how it was made of native files, a sentence each
     """
 
     source: str
@@ -34,6 +37,8 @@ class Log:
     origin: tuple[float, float] | None = None
     config: Config | None = None
     warnings: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def from_frame(frame: pd.DataFrame, config: Config | None = None, source: str = "log") -> "Log":
