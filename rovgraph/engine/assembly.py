@@ -26,6 +26,7 @@ import numpy as np
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
+from rovgraph.engine.constant_velocity import Ticks, has_constant_velocity, tick
 from rovgraph.engine.keyframes import (
     KeyframeInterval,
     KeyframeMeasurement,
@@ -75,7 +76,9 @@ class Assembler:
 
     def __post_init__(self, assumed: TimeOffsets | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
-        self._samples = Samples(self.config, self.learn_noise)
+        self._ticking = has_constant_velocity(self.config)
+        self._samples = Ticks(self.config) if self._ticking else Samples(self.config, self.learn_noise)
+        self._closing = {*self.instruments} if self._ticking else {"dvl"}  # sensors that make keyframes
         self._log: WholeLog | None = None
         self._waiting: deque[StampedMeasurement] = deque()
         self._aiding: Aiding | None = None
@@ -113,6 +116,10 @@ class Assembler:
                     self._aiding.add(measurement)
             elif self._admissible(measurement):
                 insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
+            if not self._ticking:
+                return []
+            measurement = tick(measurement)
+        elif self._ticking:
             return []
         if self._samples.add(measurement):  # after a gap: a keyframe here, so that nothing is carried through it
             insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
@@ -202,7 +209,7 @@ class Assembler:
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
                 self._look_at(m.time)
                 done.append(self._close(m.time, None))
-            elif m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
+            elif m.sensor in self._closing and m.time - self._start >= self.config.graph.min_gap_s:
                 self._look_at(m.time)
                 done.append(self._close(m.time, m))
             elif m.sensor != "imu":

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rovgraph.config import Config
+from rovgraph.engine.constant_velocity import gravity
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument, instruments
 from rovgraph.state import State
@@ -55,6 +56,11 @@ class InitialConditions:
     instruments: dict[str, Instrument]
     prior: StatePrior
     assumptions: list[str]
+
+    @property
+    def gravity(self) -> float:
+        """Gravity that the motion is integrated with [m/s^2]."""
+        return gravity(self.config)
 
     def dump(self) -> dict[str, Any]:
         """What `restored` makes it of again, as plain values and arrays."""

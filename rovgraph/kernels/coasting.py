@@ -5,10 +5,11 @@ gravity into motion: after five seconds, by tens of metres, of which no linear f
 heavy below and light above does not roll over meanwhile. So it is taken to go on as it went, with a velocity that
 walks, a heading that walks, and a tilt that rights itself, a first-order Gauss-Markov process (Gelb 1974):
 
-    tilt_j = a tilt_i + w,  a = exp(-t / RIGHTING_S),  var w = (1 - a^2) TILT_SD^2
+    tilt_j = a tilt_i + w,  a = exp(-t d^2 / (2 TILT_SD^2)),  var w = (1 - a^2) TILT_SD^2
     yaw_j = yaw_i + dyaw + w,  p_j = p_i + t v_i + w,  v_j = v_i + w,  bias_j = bias_i + w
 
-with dyaw from the interpolated gyro, and p and v driven by one white acceleration. Roll, pitch and yaw change with
+with dyaw from the interpolated gyro, p and v driven by one white acceleration, and d the noise density of the rate,
+by which the vehicle at first tilts as it turns. A dive without an IMU is all such motion, with dyaw = 0. Roll, pitch and yaw change with
 a turn of the body by
 
     B = | 1  sin r tan p  cos r tan p |           | 1  0      -sin p       |
@@ -27,7 +28,6 @@ from rovgraph.kernels.rotations import exp_rotation
 
 BRIDGE_ACC, BRIDGE_GYR = 0.3, 0.3  # densities over a gap: an ROV at its liveliest [SI/rtHz]
 TILT_SD = math.radians(8.0)  # of a vehicle that rights itself
-RIGHTING_S = 2.0 * TILT_SD**2 / BRIDGE_GYR**2  # so that at first it tilts as any ROV turns
 
 
 @helper
@@ -59,7 +59,8 @@ def _by_turn(rpy: Array, B_out: Array) -> None:
 @helper
 def _kept(row: Array) -> float:
     """What is kept of roll and pitch."""
-    return math.exp(-row[DURATION] / RIGHTING_S)
+    gyr = row[NOISE + 1]
+    return math.exp(-row[DURATION] * gyr * gyr / (2.0 * TILT_SD * TILT_SD))
 
 
 @helper
@@ -90,8 +91,8 @@ def coasting_covariance(row: Array, S_out: Array) -> None:
         for j in range(15):
             S_out[i, j] = 0.0
     S_out[0, 0] = S_out[1, 1] = (1.0 - kept * kept) * TILT_SD * TILT_SD
-    S_out[2, 2] = BRIDGE_GYR * BRIDGE_GYR * t
-    acc, acc_walk, gyr_walk, integration = BRIDGE_ACC, row[NOISE + 2], row[NOISE + 3], row[NOISE + 4]
+    acc, gyr, acc_walk, gyr_walk, integration = row[NOISE], row[NOISE + 1], row[NOISE + 2], row[NOISE + 3], row[NOISE + 4]
+    S_out[2, 2] = gyr * gyr * t
     for i in range(3):
         S_out[3 + i, 3 + i] = acc * acc * t * t * t / 3.0 + integration * integration * t
         S_out[3 + i, 6 + i] = S_out[6 + i, 3 + i] = 0.5 * acc * acc * t * t

@@ -1,0 +1,73 @@
+"""Motion of a dive without an IMU: the vehicle goes on as it went, while its velocity and its attitude walk.
+
+    p_j = p_i + t v_i + w,  v_j = v_i + w,  yaw_j = yaw_i + w,  tilt_j = a tilt_i + w
+
+It is the motion of `rovgraph.kernels.coasting`, which bridges outages of an IMU, with the densities ``motion.acc`` and
+``motion.gyr``: nearly constant velocity, white noise acceleration (Bar-Shalom et al. 2001, 6.2.2). To an assembler
+the dive has an IMU whose samples are all zero, in a world without gravity, and which is silent throughout: a sample
+stands at the time of every measurement and says that time goes on.
+
+Between a keyframe and a measurement no noise is reckoned with, so here every measurement makes a keyframe, but for
+those within ``graph.min_gap_s`` of one.
+"""
+
+import numpy as np
+
+from rovgraph.config import Config
+from rovgraph.engine.motion import Motion
+from rovgraph.engine.preintegration import INTEGRATION_SD, PreintegrationParams, integrate_motion
+from rovgraph.engine.samples import Samples
+from rovgraph.geometry import Array
+from rovgraph.log import Log, Measurement, Stream
+
+NO_BIAS_SD = 1e-6  # of biases that nothing depends on, at the start and per root second [SI]
+RATE_OVER_S = 1.0  # over which a rate of turn is meant that a lever arm sees
+
+
+def has_constant_velocity(config: Config) -> bool:
+    """Whether the dive is reckoned without an IMU."""
+    return config.motion.model == "constant_velocity"
+
+
+def gravity(config: Config) -> float:
+    """Gravity that the motion is integrated with, none where no accelerometer feels it [m/s^2]."""
+    return 0.0 if has_constant_velocity(config) else config.environment.gravity_mps2
+
+
+def tick(measurement: Measurement) -> Measurement:
+    """The sample that says that time goes on to a measurement."""
+    return measurement._replace(sensor="imu", values=np.zeros(6))
+
+
+def ticks(log: Log) -> Stream:
+    """A sample at the time of every measurement that is not the IMU's."""
+    streams = [stream for sensor, stream in log.streams.items() if sensor != "imu"]
+    time = np.unique(np.concatenate([stream.time for stream in streams])) if streams else np.empty(0)
+    return Stream("imu", ("",) * 6, time, np.zeros((len(time), 6)), np.zeros(len(time), np.int64))
+
+
+class Ticks(Samples):
+    """The zero samples of a dive without an IMU; parameters as `Samples`."""
+
+    def __init__(self, config: Config) -> None:
+        imu = config.imu.model_copy(update={"max_gap_s": np.inf})
+        super().__init__(config.model_copy(update={"imu": imu}), learn_noise=False)
+        densities = config.motion.acc, config.motion.gyr, NO_BIAS_SD, NO_BIAS_SD, INTEGRATION_SD
+        self.params = PreintegrationParams(densities, 0.0, (0.0, 0.0, 0.0))
+
+    def add(self, m: Measurement) -> bool:
+        """Let time go on to a measurement; no sample is missing before it."""
+        return m.time > self.newest and super().add(m)
+
+    def integrated(
+        self, table: Array, bias: Array, start: float, stops: Array, end: float, learn: bool
+    ) -> tuple[Motion, Array]:
+        """As `Samples.integrated`: the vehicle goes on as it went."""
+        return integrate_motion(self.params, bias, table, start, stops, end, np.inf)
+
+    def rate(self, table: Array, time: float) -> tuple[Array, float]:
+        """None is measured; the sd is that of the process, over a second."""
+        return np.zeros(3), self._config.motion.gyr / np.sqrt(RATE_OVER_S)
+
+    def _take_period(self, period: float) -> None:
+        """No silence is a gap."""
