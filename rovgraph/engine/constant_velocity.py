@@ -11,6 +11,8 @@ Between a keyframe and a measurement no noise is reckoned with, so here every me
 those within ``graph.min_gap_s`` of one.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 
 from rovgraph.config import Config
@@ -24,8 +26,14 @@ NO_BIAS_SD = 1e-6  # of biases that nothing depends on, at the start and per roo
 RATE_OVER_S = 1.0  # over which a rate of turn is meant that a lever arm sees
 
 
+def motion_model(config: Config, available: Collection[str]) -> str:
+    """The ``motion.model`` of a log that has some streams; without an IMU attitude has to be measured."""
+    without_imu = "imu" not in available and "vehicle_tilt" in available
+    return config.motion.model or ("constant_velocity" if without_imu else "imu")
+
+
 def has_constant_velocity(config: Config) -> bool:
-    """Whether the dive is reckoned without an IMU."""
+    """Whether a dive is reckoned without an IMU, once `motion_model` is resolved."""
     return config.motion.model == "constant_velocity"
 
 

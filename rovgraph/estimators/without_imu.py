@@ -6,7 +6,7 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config, beliefs
-from rovgraph.engine.constant_velocity import NO_BIAS_SD, has_constant_velocity, ticks
+from rovgraph.engine.constant_velocity import NO_BIAS_SD, has_constant_velocity, motion_model, ticks
 from rovgraph.engine.scale import SCALES
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import WINDOW_S
@@ -23,7 +23,7 @@ def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple
     ------
     InputError : the log lacks what the motion needs, or the configuration asks for what needs an IMU
     """
-    model = config.motion.model or ("imu" if "imu" in log or TILT not in log else "constant_velocity")
+    model = motion_model(config, log.sensors)
     config = config.model_copy(update={"motion": config.motion.model_copy(update={"model": model})})
     if not has_constant_velocity(config):
         if "imu" not in log:
