@@ -132,7 +132,8 @@ class Motion(Section):
         None, description="the IMU, or a constant velocity without it; null = the IMU where the log has one"
     )
     acc: Positive = Field(0.1, description="constant velocity: noise density of the acceleration [m/s2/rtHz]")
-    gyr: Positive = Field(0.1, description="constant velocity: noise density of the rate of turn [rad/s/rtHz]")
+    gyr: Positive = Field(0.3, description="constant velocity: noise density of the rate of turn [rad/s/rtHz]")
+    rate_sd_dps: Positive = Field(5.0, description="constant velocity: rate of turn, as a DVL on a lever arm sees it")
 
 
 class Dvl(Section):

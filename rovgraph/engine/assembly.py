@@ -15,7 +15,7 @@ longer than that, and counting each sample would make the estimate too sure of i
 import math
 from bisect import bisect_right, insort
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import InitVar, dataclass, field
 from itertools import islice
@@ -208,10 +208,10 @@ class Assembler:
             done += self._silence(m.time, due)
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
                 self._look_at(m.time)
-                done.append(self._close(m.time, None))
+                done.append(self._close(m.time))
             elif m.sensor in self._closing and m.time - self._start >= self.config.graph.min_gap_s:
                 self._look_at(m.time)
-                done.append(self._close(m.time, m))
+                done.append(self._close(m.time, m, *self._together_with(m)))
             elif m.sensor != "imu":
                 self._between.append(m)
         return done + self._silence(time, due)
@@ -228,7 +228,7 @@ class Assembler:
         if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
             return done
-        return [*done, self._close(end, None)]
+        return [*done, self._close(end)]
 
     def _admissible(self, m: Measurement) -> bool:
         """Whether a measurement may enter the graph; counts those that may not."""
@@ -239,7 +239,7 @@ class Assembler:
         early = [m for m in self._waiting if m.time < time]
         self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
         self._waiting = deque(m for m in self._waiting if m.time >= time)
-        return self._close(time, None)
+        return self._close(time)
 
     def _silence(self, time: float, ping_due_s: float) -> list[KeyframeInterval]:
         """Keyframes for a time without pings; one that is ``ping_due_s`` late may still come."""
@@ -248,7 +248,7 @@ class Assembler:
         while time - self._start > gap + ping_due_s:
             if self._log is not None:
                 self._look(self._log.count_after(self._start, gap + ping_due_s))
-            done.append(self._close(self._start + gap, None))
+            done.append(self._close(self._start + gap))
         return done
 
     def _look_at(self, time: float) -> None:
@@ -263,8 +263,13 @@ class Assembler:
             for signal in self._log.signals(self._samples.newest):
                 self._aiding.add(signal)
 
-    def _close(self, time: float, ping: StampedMeasurement | None) -> KeyframeInterval:
-        """Make a keyframe at ``time`` and the interval that leads to it."""
+    def _together_with(self, m: StampedMeasurement) -> Iterator[StampedMeasurement]:
+        """Without an IMU, all else that was measured at the same time: it belongs to the same keyframe."""
+        while self._ticking and self._waiting and self._waiting[0].time == m.time:
+            yield self._waiting.popleft()
+
+    def _close(self, time: float, *here: StampedMeasurement) -> KeyframeInterval:
+        """Make a keyframe at ``time``, with what is measured ``here``, and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
         samples = samples[: int(samples[:, 0].searchsorted(time + self._around)) + 1]
@@ -278,9 +283,9 @@ class Assembler:
         if time - self._segment_start >= self._segment_s:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._samples.rate(samples, time)
-        if ping is not None:
+        for m in here:
             row = measurement_rows(time, _AT_KEYFRAME, self.bias, self._dim)[0]
-            attached += self._attach(ping, row, (rate_b, rate_sd), every)
+            attached += self._attach(m, row, (rate_b, rate_sd), every)
         scaled = self._scale_to_bias(samples, before, time) if motion is not None else None
         self._samples.forget(time, self._around)
         return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, motion, attached, scaled)

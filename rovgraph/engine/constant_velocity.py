@@ -1,16 +1,14 @@
-"""Motion of a dive without an IMU: the vehicle goes on as it went, while its velocity and its attitude walk.
+"""Motion of a dive without an IMU: the vehicle goes on as it went (`rovgraph.kernels.cruising`).
 
-    p_j = p_i + t v_i + w,  v_j = v_i + w,  yaw_j = yaw_i + w,  tilt_j = a tilt_i + w
+To an assembler the dive has an IMU whose samples are all zero, in a world without gravity: one at the time of every
+measurement, which says that time goes on. A silence of all sensors is an outage of that IMU
+(`rovgraph.kernels.coasting`).
 
-It is the motion of `rovgraph.kernels.coasting`, which bridges outages of an IMU, with the densities ``motion.acc`` and
-``motion.gyr``: nearly constant velocity, white noise acceleration (Bar-Shalom et al. 2001, 6.2.2). To an assembler
-the dive has an IMU whose samples are all zero, in a world without gravity, and which is silent throughout: a sample
-stands at the time of every measurement and says that time goes on.
-
-Between a keyframe and a measurement no noise is reckoned with, so here every measurement makes a keyframe, but for
-those within ``graph.min_gap_s`` of one.
+Between a keyframe and a measurement no noise is reckoned with, so what is measured at one time makes a keyframe, but
+for what is within ``graph.min_gap_s`` of one.
 """
 
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -20,10 +18,12 @@ from rovgraph.engine.motion import Motion
 from rovgraph.engine.preintegration import INTEGRATION_SD, PreintegrationParams, integrate_motion
 from rovgraph.engine.samples import Samples
 from rovgraph.geometry import Array
+from rovgraph.kernels.imu_samples import survey
+from rovgraph.kernels.motion_row import NO_IMU
 from rovgraph.log import Log, Measurement, Stream
 
 NO_BIAS_SD = 1e-6  # of biases that nothing depends on, at the start and per root second [SI]
-RATE_OVER_S = 1.0  # over which a rate of turn is meant that a lever arm sees
+LONGEST_CRUISED_S = 10.0  # between measurements; in a longer silence nobody knows which way it turned
 
 
 def motion_model(config: Config, available: Collection[str]) -> str:
@@ -70,12 +70,14 @@ class Ticks(Samples):
     def integrated(
         self, table: Array, bias: Array, start: float, stops: Array, end: float, learn: bool
     ) -> tuple[Motion, Array]:
-        """As `Samples.integrated`: the vehicle goes on as it went."""
-        return integrate_motion(self.params, bias, table, start, stops, end, np.inf)
+        """As `Samples.integrated`: the vehicle goes on as it went, in a long silence whichever way it turns."""
+        silent = survey(table, start, end)[1]
+        gap = silent if silent > LONGEST_CRUISED_S else NO_IMU
+        return integrate_motion(self.params, bias, table, start, stops, end, gap)
 
     def rate(self, table: Array, time: float) -> tuple[Array, float]:
-        """None is measured; the sd is that of the process, over a second."""
-        return np.zeros(3), self._config.motion.gyr / np.sqrt(RATE_OVER_S)
+        """None is measured."""
+        return np.zeros(3), math.radians(self._config.motion.rate_sd_dps)
 
     def _take_period(self, period: float) -> None:
         """No silence is a gap."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.engine.constant_velocity import gravity
+from rovgraph.engine.constant_velocity import gravity, has_constant_velocity
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument, instruments
 from rovgraph.state import State
@@ -61,6 +61,11 @@ class InitialConditions:
     def gravity(self) -> float:
         """Gravity that the motion is integrated with [m/s^2]."""
         return gravity(self.config)
+
+    @property
+    def streams(self) -> list[str]:
+        """Names of the sensors in use, of the IMU's where the motion is its own."""
+        return [*self.instruments, *(() if has_constant_velocity(self.config) else ("imu",))]
 
     def dump(self) -> dict[str, Any]:
         """What `restored` makes it of again, as plain values and arrays."""

@@ -1,10 +1,11 @@
 """Whether a dive is reckoned without an IMU, and where it then begins."""
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.calibration import Belief
+from rovgraph.calibration import CONSIDERED, TABLE, Belief
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.constant_velocity import NO_BIAS_SD, has_constant_velocity, motion_model, ticks
 from rovgraph.engine.scale import SCALES
@@ -42,19 +43,40 @@ def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple
         f"{why}: constant velocity between measurements, walking by {motion.acc:g} m/s2/rtHz, "
         f"and attitude by {motion.gyr:g} rad/s/rtHz (motion.acc, motion.gyr)"
     )
-    exact = {name: getattr(config.calibration, name).model_copy(update={"estimate": False}) for name in SCALES}
-    calibration = config.calibration.model_copy(update=exact)
+    entries = dict.fromkeys(SCALES, False) | {name: CONSIDERED for name in unseen(log.sensors)}
+    given = config.calibration
+    stated = {name for name in given.model_fields_set if "estimate" in getattr(given, name).model_fields_set}
+    calibration = given.model_copy(
+        update={
+            name: getattr(given, name).model_copy(update={"estimate": estimate})
+            for name, estimate in entries.items()
+            if name in SCALES or (getattr(given, name).estimate is True and name not in stated)
+        }
+    )
     environment = config.environment.model_copy(update={"earth_rotation": False})
     config = config.model_copy(update={"calibration": calibration, "environment": environment})
     return replace(log, streams={**log.streams, "imu": ticks(log)}), config
 
 
+def unseen(sensors: Collection[str]) -> list[str]:
+    """Calibration variables that a dive without an IMU does not show: against no gyro, deviation curves need fixes.
+
+    How a heading walks is a poor gyro: it would take a curve for likely that makes the vehicle turn less.
+    """
+    return [] if "fix" in sensors else [name for name in TABLE if name.endswith("_deviation")]
+
+
 def _needs_imu(log: Log, config: Config, priors: dict[str, Belief]) -> list[tuple[bool, str]]:
     """What needs an IMU: whether it is asked for, and the key that asks."""
-    estimated = [name for name in (*SCALES, *(n for n in priors if n.endswith("_time_offset"))) if priors[name].estimate]
+    estimated = [
+        name for name in (*SCALES, *(n for n in priors if n.endswith("_time_offset"))) if priors[name].estimate
+    ]
     return [
         (config.graph.hydrodynamics, "graph.hydrodynamics"),
-        ("mag" in log and config.environment.dip_deg is None, "environment.dip_deg: null, as the log has a magnetometer,"),
+        (
+            "mag" in log and config.environment.dip_deg is None,
+            "environment.dip_deg: null, as the log has a magnetometer,",
+        ),
         *((True, f"calibration.{name}: {{estimate: true}}") for name in estimated),
     ]
 

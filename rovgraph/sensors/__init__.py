@@ -23,8 +23,8 @@ from rovgraph.sensors.sensor import (
     settings,
     unregister,
 )
-from rovgraph.sensors.tilt import VEHICLE_TILT, Tilt
 from rovgraph.sensors.thruster import THRUSTER, ModelAiding, WaterVelocity, hydrodynamics
+from rovgraph.sensors.tilt import VEHICLE_TILT, Tilt
 
 __all__ = [
     "DEFAULT_DIP",
