@@ -12,10 +12,9 @@ from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
 from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.graph.values import state_values
-from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, TILT_SD
+from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
-RIGHTING_S = 2.0 * TILT_SD**2 / BRIDGE_GYR**2
 SECONDS = 0.9
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rovgraph.geometry import Array, exp_rotation, log_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
-from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, TILT_SD
+from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
 from rovgraph.kernels.motion import transitions
 from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motion
 from rovgraph.kernels.motion_row import (
@@ -366,7 +366,7 @@ def test_a_coasting_vehicle_goes_on_and_rights_itself():
     row, _ = case.row(2.0)
     before = ends(10, case.bias)
     after, t = predict(row, before), row[DURATION]
-    kept = np.exp(-t * BRIDGE_GYR**2 / (2.0 * TILT_SD**2))
+    kept = np.exp(-t / RIGHTING_S)
     rpy = rpy_from_matrix(before.R[0]) * [kept, kept, 1.0]
     rpy[2] += rpy_from_matrix(exp_rotation(row[TANGENT : TANGENT + 3]))[2]
     np.testing.assert_allclose(wrap_angle(rpy_from_matrix(after.R[0]) - rpy), 0.0, atol=1e-12)

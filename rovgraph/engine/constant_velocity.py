@@ -18,6 +18,7 @@ from rovgraph.engine.motion import Motion
 from rovgraph.engine.preintegration import INTEGRATION_SD, PreintegrationParams, integrate_motion
 from rovgraph.engine.samples import Samples
 from rovgraph.geometry import Array
+from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.kernels.imu_samples import survey
 from rovgraph.kernels.motion_row import NO_IMU
 from rovgraph.log import Log, Measurement, Stream
@@ -60,8 +61,8 @@ class Ticks(Samples):
     def __init__(self, config: Config) -> None:
         imu = config.imu.model_copy(update={"max_gap_s": np.inf})
         super().__init__(config.model_copy(update={"imu": imu}), learn_noise=False)
-        densities = config.motion.acc, config.motion.gyr, NO_BIAS_SD, NO_BIAS_SD, INTEGRATION_SD
-        self.params = PreintegrationParams(densities, 0.0, (0.0, 0.0, 0.0))
+        self.params = _params(config.motion.acc, config.motion.gyr)
+        self._bridge = _params(BRIDGE_ACC, BRIDGE_GYR)
 
     def add(self, m: Measurement) -> bool:
         """Let time go on to a measurement; no sample is missing before it."""
@@ -72,8 +73,8 @@ class Ticks(Samples):
     ) -> tuple[Motion, Array]:
         """As `Samples.integrated`: the vehicle goes on as it went, in a long silence whichever way it turns."""
         silent = survey(table, start, end)[1]
-        gap = silent if silent > LONGEST_CRUISED_S else NO_IMU
-        return integrate_motion(self.params, bias, table, start, stops, end, gap)
+        params, gap = (self._bridge, silent) if silent > LONGEST_CRUISED_S else (self.params, NO_IMU)
+        return integrate_motion(params, bias, table, start, stops, end, gap)
 
     def rate(self, table: Array, time: float) -> tuple[Array, float]:
         """None is measured."""
@@ -81,3 +82,8 @@ class Ticks(Samples):
 
     def _take_period(self, period: float) -> None:
         """No silence is a gap."""
+
+
+def _params(acc: float, gyr: float) -> PreintegrationParams:
+    """Parameters of a motion without gravity, whose biases stay."""
+    return PreintegrationParams((acc, gyr, NO_BIAS_SD, NO_BIAS_SD, INTEGRATION_SD), 0.0, (0.0, 0.0, 0.0))

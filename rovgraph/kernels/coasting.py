@@ -5,11 +5,10 @@ gravity into motion: after five seconds, by tens of metres, of which no linear f
 heavy below and light above does not roll over meanwhile. So it is taken to go on as it went, with a velocity that
 walks, a heading that walks, and a tilt that rights itself, a first-order Gauss-Markov process (Gelb 1974):
 
-    tilt_j = a tilt_i + w,  a = exp(-t d^2 / (2 TILT_SD^2)),  var w = (1 - a^2) TILT_SD^2
+    tilt_j = a tilt_i + w,  a = exp(-t / RIGHTING_S),  var w = (1 - a^2) TILT_SD^2
     yaw_j = yaw_i + dyaw + w,  p_j = p_i + t v_i + w,  v_j = v_i + w,  bias_j = bias_i + w
 
-with dyaw from the interpolated gyro, p and v driven by one white acceleration, and d the noise density of the rate,
-by which the vehicle at first tilts as it turns. Roll, pitch and yaw change with
+with dyaw from the interpolated gyro, and p and v driven by one white acceleration. Roll, pitch and yaw change with
 a turn of the body by
 
     B = | 1  sin r tan p  cos r tan p |           | 1  0      -sin p       |
@@ -28,6 +27,7 @@ from rovgraph.kernels.rotations import exp_rotation
 
 BRIDGE_ACC, BRIDGE_GYR = 0.3, 0.3  # densities over a gap: an ROV at its liveliest [SI/rtHz]
 TILT_SD = math.radians(8.0)  # of a vehicle that rights itself
+RIGHTING_S = 2.0 * TILT_SD**2 / BRIDGE_GYR**2  # so that at first it tilts as any ROV turns
 
 
 @helper
@@ -59,8 +59,7 @@ def _by_turn(rpy: Array, B_out: Array) -> None:
 @helper
 def _kept(row: Array) -> float:
     """What is kept of roll and pitch."""
-    gyr = row[NOISE + 1]
-    return math.exp(-row[DURATION] * gyr * gyr / (2.0 * TILT_SD * TILT_SD))
+    return math.exp(-row[DURATION] / RIGHTING_S)
 
 
 @helper
@@ -91,42 +90,14 @@ def coasting_covariance(row: Array, S_out: Array) -> None:
         for j in range(15):
             S_out[i, j] = 0.0
     S_out[0, 0] = S_out[1, 1] = (1.0 - kept * kept) * TILT_SD * TILT_SD
-    acc, gyr, acc_walk, gyr_walk, integration = (
-        row[NOISE],
-        row[NOISE + 1],
-        row[NOISE + 2],
-        row[NOISE + 3],
-        row[NOISE + 4],
-    )
-    S_out[2, 2] = gyr * gyr * t
+    S_out[2, 2] = BRIDGE_GYR * BRIDGE_GYR * t
+    acc, acc_walk, gyr_walk, integration = BRIDGE_ACC, row[NOISE + 2], row[NOISE + 3], row[NOISE + 4]
     for i in range(3):
         S_out[3 + i, 3 + i] = acc * acc * t * t * t / 3.0 + integration * integration * t
         S_out[3 + i, 6 + i] = S_out[6 + i, 3 + i] = 0.5 * acc * acc * t * t
         S_out[6 + i, 6 + i] = acc * acc * t
         S_out[9 + i, 9 + i] = acc_walk * acc_walk * t
         S_out[12 + i, 12 + i] = gyr_walk * gyr_walk * t
-
-
-@helper
-def angle_error(row: Array, R_i: Array, R_j: Array, r_out: Array, A_i_out: Array, A_j_out: Array) -> None:
-    """Residual of roll, pitch, yaw and its derivatives; of the others those of a difference, -1 and 1."""
-    before, predicted, rpy, B_i, B_j = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    kept = _kept(row)
-    roll_pitch_yaw(R_i, before)
-    roll_pitch_yaw(R_j, rpy)
-    _predict_angles(row, R_i, predicted)
-    _by_turn(before, B_i)
-    _by_turn(rpy, B_j)
-    for i in range(15):
-        for j in range(15):
-            A_i_out[i, j] = A_j_out[i, j] = 0.0
-        A_i_out[i, i], A_j_out[i, i] = -1.0, 1.0
-    for i in range(3):
-        angle = rpy[i] - predicted[i]
-        r_out[i] = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-        for j in range(3):
-            A_i_out[i, j] = -B_i[i, j] * (kept if i < 2 else 1.0)
-            A_j_out[i, j] = B_j[i, j]
 
 
 @helper
@@ -145,22 +116,36 @@ def coasting_error(
     A_j_out: Array,
 ) -> None:
     """Residual: roll, pitch, yaw, position, velocity, bias, and its derivatives by both states."""
-    angle_error(row, R_i, R_j, r_out, A_i_out, A_j_out)
+    before, predicted, rpy, B_i, B_j = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    kept = _kept(row)
+    roll_pitch_yaw(R_i, before)
+    roll_pitch_yaw(R_j, rpy)
+    _predict_angles(row, R_i, predicted)
+    _by_turn(before, B_i)
+    _by_turn(rpy, B_j)
+    for i in range(15):
+        for j in range(15):
+            A_i_out[i, j] = A_j_out[i, j] = 0.0
+        A_i_out[i, i], A_j_out[i, i] = -1.0, 1.0
     for i in range(3):
+        angle = rpy[i] - predicted[i]
+        r_out[i] = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
         r_out[3 + i] = p_j[i] - p_i[i] - row[DURATION] * v_i[i]
         r_out[6 + i] = v_j[i] - v_i[i]
         A_i_out[3 + i, 6 + i] = -row[DURATION]
         for j in range(3):
+            A_i_out[i, j] = -B_i[i, j] * (kept if i < 2 else 1.0)
+            A_j_out[i, j] = B_j[i, j]
             A_i_out[3 + i, 3 + j], A_j_out[3 + i, 3 + j] = -R_i[i, j], R_j[i, j]
     for i in range(6):
         r_out[9 + i] = bias_j[i] - bias_i[i]
 
 
 @helper
-def angle_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out: Array) -> None:
-    """Transition of the rotation and its noise, of a covariance of roll, pitch, yaw in ``Q_out``; else F is 1."""
+def coasting_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out: Array) -> None:
+    """Linear transition and its noise, shape (15, 15), where ``R_j`` was predicted from ``R_i``."""
     before, rpy, B, back = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    kept = _kept(row)
+    kept, t = _kept(row), row[DURATION]
     roll_pitch_yaw(R_i, before)
     roll_pitch_yaw(R_j, rpy)
     _by_turn(before, B)
@@ -168,7 +153,8 @@ def angle_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out: Ar
     back[0, 0], back[0, 1], back[0, 2] = 1.0, 0.0, -sp
     back[1, 0], back[1, 1], back[1, 2] = 0.0, cr, sr * cp
     back[2, 0], back[2, 1], back[2, 2] = 0.0, -sr, cr * cp
-    tilt, heading = Q_out[0, 0], Q_out[2, 2]
+    coasting_covariance(row, Q_out)
+    tilt, heading, both = Q_out[0, 0], Q_out[2, 2], Q_out[3, 6]
     for i in range(15):
         for j in range(15):
             F_out[i, j] = 0.0
@@ -176,18 +162,7 @@ def angle_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out: Ar
     for i in range(3):
         for j in range(3):
             F_out[i, j] = kept * (back[i, 0] * B[0, j] + back[i, 1] * B[1, j]) + back[i, 2] * B[2, j]
-            Q_out[i, j] = tilt * (back[i, 0] * back[j, 0] + back[i, 1] * back[j, 1]) + heading * back[i, 2] * back[j, 2]
-
-
-@helper
-def coasting_transition(row: Array, R_i: Array, R_j: Array, F_out: Array, Q_out: Array) -> None:
-    """Linear transition and its noise, shape (15, 15), where ``R_j`` was predicted from ``R_i``."""
-    t = row[DURATION]
-    coasting_covariance(row, Q_out)
-    both = Q_out[3, 6]
-    angle_transition(row, R_i, R_j, F_out, Q_out)
-    for i in range(3):
-        for j in range(3):
             F_out[3 + i, 3 + j] = R_j[0, i] * R_i[0, j] + R_j[1, i] * R_i[1, j] + R_j[2, i] * R_i[2, j]
             F_out[3 + i, 6 + j] = t * R_j[j, i]
+            Q_out[i, j] = tilt * (back[i, 0] * back[j, 0] + back[i, 1] * back[j, 1]) + heading * back[i, 2] * back[j, 2]
             Q_out[3 + i, 6 + j] = Q_out[6 + j, 3 + i] = both * R_j[j, i]

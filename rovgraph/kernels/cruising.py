@@ -1,43 +1,52 @@
 """Motion without an IMU: one interval, written for the callers in `rovgraph.kernels.motion`.
 
 The vehicle goes on as it went along its own axes: nearly constant velocity, white noise acceleration (Bar-Shalom et al.
-2001, 6.2.2), of the velocity u = R_bn v_n in the body's axes, which a turn takes with it,
+2001, 6.2.2), of the velocity u = R_bn v_n in the body's axes, which a turn takes with it; its attitude walks.
 
-    u_j = u_i + w,              var w = t q^2
+    R_j = R_i Exp(w),  var w = t d^2
+    u_j = u_i + w,     var w = t q^2
     p_j = p_i + t (v_i + v_j) / 2 + w,  var w = t^3 q^2 / 12        what is left once both velocities are known
 
-Roll, pitch and yaw go on as in `rovgraph.kernels.coasting`. In a long silence, in which the way that it faces is lost,
-the vehicle coasts instead.
+with q and d the noise densities of acceleration and rate of turn.
 """
 
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.coasting import angle_error, angle_transition, coast, coasting_covariance
 from rovgraph.kernels.compile import helper
 from rovgraph.kernels.motion_row import DURATION, NOISE
-from rovgraph.kernels.rotations import multiply, multiply_transposed, rotate, rotate_back, skew
+from rovgraph.kernels.rotations import (
+    inverse_right_jacobian,
+    log_rotation,
+    multiply,
+    multiply_transposed,
+    rotate_back,
+    skew,
+)
 
 
 @helper
 def cruise(row: Array, R: Array, p: Array, v: Array, R_out: Array, p_out: Array, v_out: Array) -> None:
     """The state at the end of an interval."""
-    u = np.empty(3)
-    coast(row, R, p, v, R_out, p_out, v_out)
-    rotate_back(R, v, u)
-    rotate(R_out, u, v_out)
     for i in range(3):
-        p_out[i] = p[i] + 0.5 * row[DURATION] * (v[i] + v_out[i])
+        p_out[i], v_out[i] = p[i] + row[DURATION] * v[i], v[i]
+        for j in range(3):
+            R_out[i, j] = R[i, j]
 
 
 @helper
 def cruising_covariance(row: Array, S_out: Array) -> None:
     """Covariance of the residual, shape (15, 15)."""
-    coasting_covariance(row, S_out)
-    t, acc, integration = row[DURATION], row[NOISE], row[NOISE + 4]
+    for i in range(15):
+        for j in range(15):
+            S_out[i, j] = 0.0
+    t, acc, gyr, integration = row[DURATION], row[NOISE], row[NOISE + 1], row[NOISE + 4]
     for i in range(3):
+        S_out[i, i] = gyr * gyr * t
         S_out[3 + i, 3 + i] = acc * acc * t * t * t / 12.0 + integration * integration * t
-        S_out[3 + i, 6 + i] = S_out[6 + i, 3 + i] = 0.0
+        S_out[6 + i, 6 + i] = acc * acc * t
+        S_out[9 + i, 9 + i] = row[NOISE + 2] * row[NOISE + 2] * t
+        S_out[12 + i, 12 + i] = row[NOISE + 3] * row[NOISE + 3] * t
 
 
 @helper
@@ -55,18 +64,31 @@ def cruising_error(
     A_i_out: Array,
     A_j_out: Array,
 ) -> None:
-    """Residual: roll, pitch, yaw, position in n, velocity in the body's axes, bias; its derivatives by both states."""
-    half, u, S = 0.5 * row[DURATION], np.empty((2, 3)), np.empty((2, 3, 3))
-    angle_error(row, R_i, R_j, r_out, A_i_out, A_j_out)
+    """Residual: rotation, position in n, velocity in the body's axes, bias; its derivatives by both states."""
+    half, u, S, turn, Jr = (
+        0.5 * row[DURATION],
+        np.empty((2, 3)),
+        np.empty((2, 3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+    )
+    multiply_transposed(R_i, R_j, turn)
+    log_rotation(turn, r_out[0:3])
+    inverse_right_jacobian(r_out[0:3], Jr)
     rotate_back(R_i, v_i, u[0])
     rotate_back(R_j, v_j, u[1])
     skew(u[0], S[0])
     skew(u[1], S[1])
+    for i in range(15):
+        for j in range(15):
+            A_i_out[i, j] = A_j_out[i, j] = 0.0
+        A_i_out[i, i], A_j_out[i, i] = -1.0, 1.0
     for i in range(3):
         r_out[3 + i] = p_j[i] - p_i[i] - half * (v_i[i] + v_j[i])
         r_out[6 + i] = u[1, i] - u[0, i]
         A_i_out[3 + i, 6 + i] = A_j_out[3 + i, 6 + i] = -half
         for j in range(3):
+            A_i_out[i, j], A_j_out[i, j] = -Jr[j, i], Jr[i, j]  # Jl^-1 is Jr^-1 transposed
             A_i_out[3 + i, 3 + j], A_j_out[3 + i, 3 + j] = -R_i[i, j], R_j[i, j]
             A_i_out[6 + i, j], A_j_out[6 + i, j] = -S[0, i, j], S[1, i, j]
             A_i_out[6 + i, 6 + j], A_j_out[6 + i, 6 + j] = -R_i[j, i], R_j[j, i]
@@ -75,59 +97,35 @@ def cruising_error(
 
 
 @helper
-def cruising_transition(row: Array, R_i: Array, v_i: Array, R_j: Array, F_out: Array, Q_out: Array) -> None:
-    """Linear transition and its noise, shape (15, 15), where ``R_j`` was predicted from ``R_i``.
+def cruising_transition(row: Array, R: Array, v: Array, F_out: Array, Q_out: Array) -> None:
+    """Linear transition and its noise, shape (15, 15), from a state to the predicted one, which has its attitude.
 
-    The residual is zero where the errors e are those of noise w: in the body's axes the velocity's error is
-    R' e_v + u x e_R, which goes over as it is; that of position follows the mean of both velocities.
+    With the noise (w, x, y) of rotation, position and velocity u, velocity errs by R (y - u x w) more, and position in
+    the body's axes by x and half the time of that.
     """
-    t, u, turned, S, M = row[DURATION], np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    by_turn, back = np.empty((3, 3)), np.empty((3, 3))
+    half, u, U, RU = 0.5 * row[DURATION], np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     cruising_covariance(row, Q_out)
-    of_position, of_velocity, G = Q_out[3, 3], Q_out[6, 6], np.zeros((9, 9))
-    angle_transition(row, R_i, R_j, F_out, Q_out)
-    rotate_back(R_i, v_i, u)
-    skew(u, S)
-    multiply(R_j, S, by_turn)  # of the velocity in n by a turn of the body, with the other sign
-    multiply_transposed(R_j, R_i, back)
+    turns, drifts, speeds = Q_out[0, 0], Q_out[3, 3], Q_out[6, 6]
+    rotate_back(R, v, u)
+    skew(u, U)
+    multiply(R, U, RU)
+    for i in range(15):
+        for j in range(15):
+            F_out[i, j] = 0.0
+        F_out[i, i] = 1.0
     for i in range(3):
         for j in range(3):
-            M[i, j] = R_j[i, 0] * R_i[j, 0] + R_j[i, 1] * R_i[j, 1] + R_j[i, 2] * R_i[j, 2]
-            turned[i, j] = by_turn[i, j]
+            F_out[3 + i, 6 + j] = 2.0 * half * R[j, i]
+            across = 0.0  # of u x w, in the body's axes and in n
+            across_n = 0.0
+            mixed = 0.0
             for k in range(3):
-                turned[i, j] -= by_turn[i, k] * F_out[k, j]
-    for i in range(3):
-        for j in range(3):
-            F_out[6 + i, j], F_out[6 + i, 6 + j] = turned[i, j], M[i, j]
-            F_out[3 + i, 3 + j] = back[i, j]
-            G[i, j], G[6 + i, j], G[6 + i, 6 + j] = (1.0 if i == j else 0.0), -by_turn[i, j], R_j[i, j]
-            G[3 + i, 3 + j] = R_j[j, i]
-    for i in range(3):
-        for j in range(3):
-            F_out[3 + i, j] = F_out[3 + i, 6 + j] = 0.0
-            for k in range(3):
-                F_out[3 + i, j] += 0.5 * t * R_j[k, i] * turned[k, j]
-                F_out[3 + i, 6 + j] += 0.5 * t * R_j[k, i] * ((1.0 if k == j else 0.0) + M[k, j])
-                G[3 + i, j] += 0.5 * t * R_j[k, i] * G[6 + k, j]
-                G[3 + i, 6 + j] += 0.5 * t * R_j[k, i] * G[6 + k, 6 + j]
-    _add_noise(G, of_position, of_velocity, Q_out)
-
-
-@helper
-def _add_noise(G: Array, of_position: float, of_velocity: float, Q: Array) -> None:
-    """Of pose and velocity, G w with cov w the rotation's in ``Q``, and variances of position and velocity."""
-    W, GW = np.zeros((9, 9)), np.zeros((9, 9))
-    for i in range(3):
-        W[3 + i, 3 + i], W[6 + i, 6 + i] = of_position, of_velocity
-        for j in range(3):
-            W[i, j] = Q[i, j]
-    for i in range(9):
-        for j in range(9):
-            for k in range(9):
-                GW[i, j] += G[i, k] * W[k, j]
-    for i in range(9):
-        for j in range(9):
-            total = 0.0
-            for k in range(9):
-                total += GW[i, k] * G[j, k]
-            Q[i, j] = total
+                across += turns * U[i, k] * U[j, k]
+                across_n += turns * RU[i, k] * RU[j, k]
+                mixed += turns * U[i, k] * RU[j, k]
+            one = 1.0 if i == j else 0.0
+            Q_out[3 + i, 3 + j] = drifts * one + half * half * (speeds * one + across)
+            Q_out[6 + i, 6 + j] = speeds * one + across_n
+            Q_out[3 + i, 6 + j] = Q_out[6 + j, 3 + i] = half * (speeds * R[j, i] + mixed)
+            Q_out[j, 3 + i] = Q_out[3 + i, j] = -half * turns * U[i, j]
+            Q_out[j, 6 + i] = Q_out[6 + i, j] = -turns * RU[i, j]

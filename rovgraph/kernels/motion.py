@@ -195,7 +195,7 @@ def predict_with_transition(
     """
     if is_cruising(row):
         cruise(row, R, p, v, R_out, p_out, v_out)
-        cruising_transition(row, R, v, R_out, F_out, Q_out)
+        cruising_transition(row, R, v, F_out, Q_out)
         return
     if is_coasted(row):
         coast(row, R, p, v, R_out, p_out, v_out)
