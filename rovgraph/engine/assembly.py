@@ -26,7 +26,7 @@ import numpy as np
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
-from rovgraph.engine.constant_velocity import Ticks, has_constant_velocity, tick
+from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S, Ticks, has_constant_velocity, tick
 from rovgraph.engine.keyframes import (
     KeyframeInterval,
     KeyframeMeasurement,
@@ -85,6 +85,7 @@ class Assembler:
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
+        self._heard = np.inf  # when anything was measured last, without an IMU
         self._segment, self._segment_start = -1, -np.inf
         self._between: list[StampedMeasurement] = []
         self._sighted: dict[float, float] = {}  # place -> when it last counted [s]
@@ -209,11 +210,16 @@ class Assembler:
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
                 self._look_at(m.time)
                 done.append(self._close(m.time))
+            elif self._ticking and m.time - self._heard > LONGEST_CRUISED_S:
+                self._look_at(m.time)  # a keyframe that what is measured at it can align
+                done.append(self._close(m.time))
+                self._between.append(m)
             elif m.sensor in self._closing and m.time - self._start >= self.config.graph.min_gap_s:
                 self._look_at(m.time)
                 done.append(self._close(m.time, m, *self._together_with(m)))
             elif m.sensor != "imu":
                 self._between.append(m)
+            self._heard = m.time
         return done + self._silence(time, due)
 
     def finish(self) -> list[KeyframeInterval]:
