@@ -4,6 +4,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from dives import Simulated, as_log, attitude_errors, batch, changed, falcon, renewed, true_at, without
 from scipy.stats import chi2
 

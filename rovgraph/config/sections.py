@@ -20,8 +20,10 @@ Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
-STAMPED = ("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water")
-STAMPED += ("depth", "fix", "place", "thruster")
+STAMPED = (
+    *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
+    *("depth", "fix", "place", "thruster"),
+)
 HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
 ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
 DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
