@@ -5,10 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dives import Simulated, as_log, attitude_errors, batch, changed, falcon, renewed, true_at, without
+from dives import (
+    Simulated,
+    as_log,
+    attitude_errors,
+    batch,
+    changed,
+    falcon,
+    interrupted,
+    renewed,
+    same,
+    true_at,
+    without,
+)
 from scipy.stats import chi2
 
 from rovgraph.config import Config
+from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.initialise import initialise
@@ -173,7 +186,7 @@ def test_what_needs_an_imu_is_refused(dive, keys, message):
 
 def test_without_imu_roll_and_pitch_are_needed_and_online_refuses(dive):
     case, config = dive
-    with pytest.raises(InputError, match="no IMU, .* or else roll and pitch"):
+    with pytest.raises(InputError, match=r"no IMU, .* or else roll and pitch"):
         initialise(without(case.log, "vehicle_tilt"), config)
     with pytest.raises(InputError, match="online needs an IMU"):
         Startup(changed(config, motion={"model": "constant_velocity"}))
@@ -185,9 +198,9 @@ def test_gtsam_finds_the_same_optimum(dive):
 
     case, config = dive
     smoother = batch(case.log, config)
-    best = smoother.optimum()
-    graph = smooth_graph(smoother.intervals, smoother.beginning, best.state)
-    np.testing.assert_allclose(graph.state.p_n, best.state.p_n, atol=1e-3)
+    problem = smoother.intervals, smoother.beginning, smoother.optimum().state
+    chain, graph = smooth_chain(*problem), smooth_graph(*problem)
+    np.testing.assert_allclose(graph.state.p_n, chain.state.p_n, atol=1e-5)
 
 
 if __name__ == "__main__":  # python tests/test_no_imu.py FIRST LAST: the same by hand, on other dives
