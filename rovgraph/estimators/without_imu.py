@@ -12,6 +12,7 @@ from rovgraph.engine.scale import SCALES
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import WINDOW_S
 from rovgraph.geometry import Array
+from rovgraph.instruments import heading_sources
 from rovgraph.log import Log
 
 TILT = "vehicle_tilt"
@@ -74,8 +75,8 @@ def _needs_imu(log: Log, config: Config, priors: dict[str, Belief]) -> list[tupl
     return [
         (config.graph.hydrodynamics, "graph.hydrodynamics"),
         (
-            "mag" in log and config.environment.dip_deg is None,
-            "environment.dip_deg: null, as the log has a magnetometer,",
+            "mag" in heading_sources(config, log.sensors) and config.environment.dip_deg is None,
+            "environment.dip_deg: null, as the heading is a magnetometer's,",
         ),
         *((True, f"calibration.{name}: {{estimate: true}}") for name in estimated),
     ]
