@@ -27,12 +27,14 @@ from rovgraph.config.sections import (
     Heading,
     Imu,
     Mag,
+    Motion,
     Online,
     Place,
     Section,
     Sensors,
     SensorSettings,
     Start,
+    Tilt,
     Triple,
     Vehicle,
 )
@@ -50,8 +52,10 @@ class Config(Section):
     start: Start = Start()
     environment: Environment = Environment()
     imu: Imu = Imu()
+    motion: Motion = Motion()
     dvl: Dvl = Dvl()
     heading: Heading = Heading()
+    tilt: Tilt = Tilt()
     depth: Depth = Depth()
     fix: Fix = Fix()
     place: Place = Place()

@@ -21,8 +21,11 @@ Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
-STAMPED = ("imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "place", "thruster")
-HeadingSource = Literal["mag", "dvl", "ahrs"]
+STAMPED = (
+    *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
+    *("depth", "fix", "place", "thruster"),
+)
+HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
 ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
 DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
 
@@ -130,6 +133,17 @@ class Imu(Section):
     max_gap_s: Positive = Field(30.0, description="a longer IMU outage is refused")
 
 
+class Motion(Section):
+    """What carries the state from one keyframe to the next."""
+
+    model: Literal["imu", "constant_velocity"] | None = Field(
+        None, description="the IMU, or a constant velocity without it; null = the IMU where the log has one"
+    )
+    acc: Positive = Field(0.1, description="constant velocity: noise density of the acceleration [m/s2/rtHz]")
+    gyr: Positive = Field(0.3, description="constant velocity: noise density of the rate of turn [rad/s/rtHz]")
+    rate_sd_dps: Positive = Field(5.0, description="constant velocity: rate of turn, as a DVL on a lever arm sees it")
+
+
 class Dvl(Section):
     """Doppler velocity log: mounting and noise."""
 
@@ -151,14 +165,25 @@ class Heading(Section):
     """Heading sources and their noise."""
 
     sources: tuple[HeadingSource, ...] | None = Field(
-        None, description="of mag, dvl, ahrs; null = dvl, and mag or else ahrs, as available in the log"
+        None,
+        description="of mag, dvl, ahrs, vehicle; null = dvl, and the first of mag, ahrs and vehicle that the log has",
     )
     mag_sd_deg: Positive = Field(2.0, description="noise of a magnetometer heading")
     dvl_sd_deg: Positive = Field(3.0, description="noise of the DVL's compass")
     ahrs_sd_deg: Positive = Field(3.0, description="noise of the IMU's own heading")
+    vehicle_sd_deg: Positive = Field(3.0, description="noise of the vehicle's own heading")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a heading further off than this many sd is rejected")
     readmit_s: Readmission = 60.0
+
+
+class Tilt(Section):
+    """The vehicle's own roll and pitch, which are used where there is no IMU."""
+
+    sd_deg: Positive = Field(1.0, description="noise of roll and of pitch")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="roll and pitch further off than this many sd are left out")
+    readmit_s: Readmission = 10.0
 
 
 class Depth(Section):

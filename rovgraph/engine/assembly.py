@@ -15,7 +15,7 @@ longer than that, and counting each sample would make the estimate too sure of i
 import math
 from bisect import bisect_right, insort
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import InitVar, dataclass, field
 from itertools import islice
@@ -26,6 +26,7 @@ import numpy as np
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
+from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S, Ticks, has_constant_velocity, tick
 from rovgraph.engine.keyframes import (
     KeyframeInterval,
     KeyframeMeasurement,
@@ -75,13 +76,16 @@ class Assembler:
 
     def __post_init__(self, assumed: TimeOffsets | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
-        self._samples = Samples(self.config, self.learn_noise)
+        self._ticking = has_constant_velocity(self.config)
+        self._samples = Ticks(self.config) if self._ticking else Samples(self.config, self.learn_noise)
+        self._closing = {*self.instruments} if self._ticking else {"dvl"}  # sensors that make keyframes
         self._log: WholeLog | None = None
         self._waiting: deque[StampedMeasurement] = deque()
         self._aiding: Aiding | None = None
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
+        self._heard = np.inf  # when anything was measured last, without an IMU
         self._segment, self._segment_start = -1, -np.inf
         self._between: list[StampedMeasurement] = []
         self._sighted: dict[float, float] = {}  # place -> when it last counted [s]
@@ -113,6 +117,10 @@ class Assembler:
                     self._aiding.add(measurement)
             elif self._admissible(measurement):
                 insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
+            if not self._ticking:
+                return []
+            measurement = tick(measurement)
+        elif self._ticking:
             return []
         if self._samples.add(measurement):  # after a gap: a keyframe here, so that nothing is carried through it
             insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
@@ -201,12 +209,17 @@ class Assembler:
             done += self._silence(m.time, due)
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
                 self._look_at(m.time)
-                done.append(self._close(m.time, None))
-            elif m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
+                done.append(self._close(m.time))
+            elif self._ticking and m.time - self._heard > LONGEST_CRUISED_S:
+                self._look_at(m.time)  # a keyframe that what is measured at it can align
+                done.append(self._close(m.time))
+                self._between.append(m)
+            elif m.sensor in self._closing and m.time - self._start >= self.config.graph.min_gap_s:
                 self._look_at(m.time)
-                done.append(self._close(m.time, m))
+                done.append(self._close(m.time, m, *self._together_with(m)))
             elif m.sensor != "imu":
                 self._between.append(m)
+            self._heard = m.time
         return done + self._silence(time, due)
 
     def finish(self) -> list[KeyframeInterval]:
@@ -221,7 +234,7 @@ class Assembler:
         if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
             return done
-        return [*done, self._close(end, None)]
+        return [*done, self._close(end)]
 
     def _admissible(self, m: Measurement) -> bool:
         """Whether a measurement may enter the graph; counts those that may not."""
@@ -232,7 +245,7 @@ class Assembler:
         early = [m for m in self._waiting if m.time < time]
         self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
         self._waiting = deque(m for m in self._waiting if m.time >= time)
-        return self._close(time, None)
+        return self._close(time)
 
     def _silence(self, time: float, ping_due_s: float) -> list[KeyframeInterval]:
         """Keyframes for a time without pings; one that is ``ping_due_s`` late may still come."""
@@ -241,7 +254,7 @@ class Assembler:
         while time - self._start > gap + ping_due_s:
             if self._log is not None:
                 self._look(self._log.count_after(self._start, gap + ping_due_s))
-            done.append(self._close(self._start + gap, None))
+            done.append(self._close(self._start + gap))
         return done
 
     def _look_at(self, time: float) -> None:
@@ -256,8 +269,13 @@ class Assembler:
             for signal in self._log.signals(self._samples.newest):
                 self._aiding.add(signal)
 
-    def _close(self, time: float, ping: StampedMeasurement | None) -> KeyframeInterval:
-        """Make a keyframe at ``time`` and the interval that leads to it."""
+    def _together_with(self, m: StampedMeasurement) -> Iterator[StampedMeasurement]:
+        """Without an IMU, all else that was measured at the same time: it belongs to the same keyframe."""
+        while self._ticking and self._waiting and self._waiting[0].time == m.time:
+            yield self._waiting.popleft()
+
+    def _close(self, time: float, *here: StampedMeasurement) -> KeyframeInterval:
+        """Make a keyframe at ``time``, with what is measured ``here``, and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
         samples = samples[: int(samples[:, 0].searchsorted(time + self._around)) + 1]
@@ -271,9 +289,9 @@ class Assembler:
         if time - self._segment_start >= self._segment_s:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._samples.rate(samples, time)
-        if ping is not None:
+        for m in here:
             row = measurement_rows(time, _AT_KEYFRAME, self.bias, self._dim)[0]
-            attached += self._attach(ping, row, (rate_b, rate_sd), every)
+            attached += self._attach(m, row, (rate_b, rate_sd), every)
         scaled = self._scale_to_bias(samples, before, time) if motion is not None else None
         self._samples.forget(time, self._around)
         return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, motion, attached, scaled)

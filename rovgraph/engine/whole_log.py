@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rovgraph.config import Config
 from rovgraph.engine.admission import admitted
+from rovgraph.engine.constant_velocity import has_constant_velocity, ticks
 from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
@@ -51,7 +52,9 @@ class WholeLog:
         left_out: Counter[tuple[str, str]],
     ) -> None:
         self._config, self._time_offsets, self._left_out = config, time_offsets, left_out
-        self.imu = log["imu"] if "imu" in log and len(log["imu"]) else None
+        self._ticking = has_constant_velocity(config)
+        imu = ticks(log) if self._ticking else log.streams.get("imu")
+        self.imu = imu if imu is not None and len(imu) else None
         time = np.empty(0) if self.imu is None else self.imu.time
         self.begin, self.end = (float(time[0]), float(time[-1])) if len(time) else (np.inf, -np.inf)
         self._past = time - around  # what each sample lets be looked at
@@ -114,6 +117,8 @@ class WholeLog:
         which, time : ndarray, shape (n,), stream of each measurement, and where it is put [s], in this order
         """
         graph, wanted = self._config.graph, np.ones(len(time), bool)
+        if self._ticking:  # each makes a keyframe
+            return wanted
         ends = np.isin(which, [k for k, name in enumerate(names) if name in ("imu", "dvl")])
         part = np.cumsum(ends)
         edges = np.concatenate([[-np.inf], time[ends], [np.inf]])

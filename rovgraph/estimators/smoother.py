@@ -155,7 +155,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
         intervals, states, b.config.imu.lever_arm_m, best.covariances(POSE), best.covariances(VELOCITY)
     )
     bias_sd = np.sqrt(np.diagonal(best.covariances(BIAS), axis1=1, axis2=2))
-    history = bias_histories(trajectory.time, states.bias, bias_sd)
+    history = bias_histories(trajectory.time, states.bias, bias_sd, b.streams)
     final, spread = dict(best.unknowns.fixed), {}
     held = [name for name in best.unknowns.considered if best.beliefs[name].estimate]
     n, segment = len(intervals), np.array([i.segment for i in intervals])
@@ -175,7 +175,9 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     return Estimate(
         "smoothed",
         trajectory,
-        calibration_estimates(best.beliefs, list(best.blocks), final, spread, relative),
+        calibration_estimates(
+            best.beliefs, [s for s in b.streams if s in {*best.blocks, "imu"}], final, spread, relative
+        ),
         history,
         residual_frame(best.blocks, residual_states(best), best.weights),
         {

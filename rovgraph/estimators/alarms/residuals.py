@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
+from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import MINUTE, Evidence, SensorResiduals, span, windows
 from rovgraph.geometry import Array
@@ -134,6 +135,8 @@ def too_large_in(
 def too_small(evidence: Evidence) -> Iterator[Statistic]:
     """Mean of the filter's normalised innovations squared, per dimension, that is far below 1."""
     filtered = evidence.estimate("filtered")
+    if has_constant_velocity(evidence.beginning.config):  # innovations are the motion's rather than the sensors'
+        return
     for sensor, nis in ({} if filtered is None else filtered.summary.get("nis", {})).items():
         if nis["mean"] is None or nis["count"] < ENOUGH:
             continue
