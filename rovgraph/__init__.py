@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph / engine /
+cli / api / pages / report / studies, live / estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / geometry, workers, fast_csv / errors, process.
 """

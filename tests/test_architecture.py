@@ -29,14 +29,15 @@ LAYERS = (
     {"estimators", "simulate", "evaluate", "check", "calibrate"},
     {"studies", "live"},
     {"report"},
+    {"pages"},
     {"api"},
     {"cli"},
 )
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
 
 # library -> the only member that may import it
-CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "typer": "cli"}
-HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib"}
+CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "jinja2": "pages", "typer": "cli"}
+HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib", "jinja2"}
 
 
 def module_name(path: Path) -> str:

@@ -91,7 +91,7 @@ class Result:
         """The effective configuration."""
         return self.dive.beginning.config
 
-    def save(self, path: Path | str, force: bool = False, figures: bool = True) -> dict[str, Any]:
+    def save(self, path: Path | str, force: bool = False, figures: bool = True, page: bool = True) -> dict[str, Any]:
         """Write the results folder of ``rovgraph smooth`` (docs/results.md), all of it or nothing.
 
         Parameters
@@ -99,6 +99,7 @@ class Result:
         path : the folder to make
         force : replace an older results folder
         figures : draw them
+        page : make report.html
 
         Returns
         -------
@@ -118,9 +119,21 @@ class Result:
 
                 draw_figures(folder, self.dive.estimates, self.log, self.config)
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
-            return write_results(
-                folder, self.dive.estimates, self.log, self.config, [*self.assumptions], seconds, self.alarms
+            summary = write_results(
+                folder,
+                self.dive.estimates,
+                self.log,
+                self.config,
+                [*self.assumptions],
+                seconds,
+                self.alarms,
+                self.warnings,
             )
+            if page:
+                from rovgraph.pages.reporting import write_page
+
+                write_page(folder)
+            return summary
 
     def _estimate(self, kind: str) -> Estimate:
         found = next((estimate for estimate in self.dive.estimates if estimate.kind == kind), None)

@@ -35,6 +35,7 @@ def smooth(
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     figures: Annotated[bool, typer.Option("--figures/--no-figures", help="draw figures")] = True,
+    page: Annotated[bool, typer.Option("--page/--no-page", help="make report.html")] = True,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
 ) -> None:
     """Estimate the track of a dive and everything that was calibrated on the way.
@@ -59,7 +60,7 @@ def smooth(
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
-    summary = result.save(out, force, figures)
+    summary = result.save(out, force, figures, page)
     console = Console()
     console.print(f"verdict: {result.verdict}", style=VERDICT_STYLE[result.verdict], highlight=False)
     for alarm in result.alarms:
@@ -68,6 +69,6 @@ def smooth(
     console.print(calibration_table(result.dive.estimates))
     for line in result.assumptions:
         console.print(f"assumed: {line}", highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False, markup=False)
+    console.print(f"results in {out}" + (", open report.html" if page else ""), highlight=False, markup=False)
     if strict and result.verdict != "trusted":
         raise typer.Exit(NOT_TRUSTED)

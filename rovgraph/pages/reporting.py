@@ -1,0 +1,38 @@
+"""The page of a results folder, whichever command made it."""
+
+from pathlib import Path
+
+from rovgraph.errors import InputError
+from rovgraph.pages.about import PAGE
+from rovgraph.pages.dive import dive_page
+from rovgraph.pages.page import write
+from rovgraph.pages.source import DiveSource, Source
+
+
+def page_of(folder: Path) -> str:
+    """HTML of the page of a results folder.
+
+    Raises
+    ------
+    InputError : no results folder of rovgraph, a file that cannot be read, or a command without a page
+    """
+    source = Source.read(folder)
+    if "main_estimate" in source.summary:
+        return dive_page(DiveSource(source.folder, source.summary))
+    raise InputError(f"{folder}: holds no results that have a page; give a results folder of smooth")
+
+
+def write_page(folder: Path, out: Path | None = None) -> Path:
+    """Write the page of a results folder, by default as ``report.html`` into it.
+
+    Raises
+    ------
+    InputError : of `page_of`; or it cannot be written
+    """
+    path = folder / PAGE if out is None else out
+    html = page_of(folder)
+    try:
+        write(path, html)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another --out") from error
+    return path
