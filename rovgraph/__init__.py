@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from rovgraph.api.observability import observe as observe
     from rovgraph.api.observability import plan as plan
     from rovgraph.api.online import Online as Online
+    from rovgraph.api.reporting import report as report
     from rovgraph.api.simulation import SimulatedDive as SimulatedDive
     from rovgraph.api.simulation import simulate as simulate
     from rovgraph.api.smoothing import Result as Result
@@ -98,6 +99,7 @@ _HOMES = {
     "read_log": "api.logs",
     "read_reference": "evaluate",
     "read_trajectory": "trajectory",
+    "report": "api.reporting",
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
 }
@@ -105,7 +107,7 @@ __all__ = list(_HOMES)
 
 
 class _Package(ModuleType):
-    """This package, whose functions `check`, `evaluate` and `simulate` are not hidden by the modules of these names."""
+    """This package, whose functions (`check`, `evaluate`, `report`, …) are not hidden by modules of the same name."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _HOMES and isinstance(value, ModuleType)):  # which the import of a submodule would set

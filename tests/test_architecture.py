@@ -170,6 +170,7 @@ print("MODULES", *sys.modules)
         [],
         ["smooth"],
         ["online"],
+        ["report"],
         ["evaluate"],
         ["compare"],
         ["check"],

@@ -20,6 +20,7 @@ from rovgraph.cli.evaluate import evaluate
 from rovgraph.cli.observe import observe
 from rovgraph.cli.online import online
 from rovgraph.cli.plan import plan
+from rovgraph.cli.report import report
 from rovgraph.cli.simulate import simulate
 from rovgraph.cli.smooth import smooth
 from rovgraph.cli.study import study
@@ -50,7 +51,7 @@ def _of_all_commands(
     pass
 
 
-for _command in (smooth, online, evaluate, compare, observe, plan, check, config, simulate):
+for _command in (smooth, online, report, evaluate, compare, observe, plan, check, config, simulate):
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(study, name="study")

@@ -118,7 +118,7 @@ def _histories(source: DiveSource) -> list[Item]:
 def _band(kind: str, time: np.ndarray, value: np.ndarray, sd: np.ndarray) -> list[Trace]:
     some = extremes(value, sd, stretches=250)
     t, v, s, colour = time[some], value[some], sd[some], ESTIMATES[kind]
-    none = {"width": 0, "showlegend": False, "hoverinfo": "skip", "band": True}
+    none = {"width": 0, "showlegend": False, "hoverinfo": "skip", "quiet": True}
     low = line(kind, t, v - 2 * s, colour, **none)
     high = line(kind, t, v + 2 * s, colour, fill="tonexty", fillcolor=colour + "26", **none)
     middle = line(kind, t, v, colour, dash="solid" if kind == "smoothed" else "dash")

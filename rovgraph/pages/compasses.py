@@ -88,7 +88,8 @@ def _pair(source: DiveSource, a: str, first: pd.DataFrame, b: str, second: pd.Da
     title = f"{a} minus {b}, as recorded"
     left = first[["time", "measured"]].sort_values("time")
     right = second[["time", "measured"]].sort_values("time")
-    both = pd.merge_asof(left, right, on="time", direction="nearest", tolerance=0.5, suffixes=("_a", "_b")).dropna()
+    both = pd.merge_asof(left, right, on="time", direction="nearest", tolerance=0.5, suffixes=("_a", "_b"))  # type: ignore[arg-type]
+    both = both.dropna()
     if both.empty:
         return Missing(title, "they never measured within half a second of each other")
     both = both.iloc[spread(len(both), MOST)]

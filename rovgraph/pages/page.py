@@ -1,5 +1,6 @@
 """A page: sections to one HTML file, with everything in it."""
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -10,6 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from rovgraph.errors import InputError
 from rovgraph.pages.parts import Image, Missing, Panel, Section, Table, Text
 
 KINDS = {Panel: "panel", Table: "table", Text: "text", Image: "image", Missing: "missing"}
@@ -43,13 +45,21 @@ def render(
 
 
 def write(path: Path, html: str) -> None:
-    """Write a page; the file appears whole or not at all."""
+    """Write a page; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError : it cannot be written
+    """
     partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.write_text(html, encoding="utf-8")
+        partial.write_text(html, encoding="utf-8", errors="replace")
         partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another --out") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 @cache

@@ -22,17 +22,11 @@ def page_of(folder: Path) -> str:
     raise InputError(f"{folder}: holds no results that have a page; give a results folder of smooth")
 
 
-def write_page(folder: Path, out: Path | None = None) -> Path:
-    """Write the page of a results folder, by default as ``report.html`` into it.
+def write_page(folder: Path) -> None:
+    """Write the page of a results folder as ``report.html`` into it.
 
     Raises
     ------
     InputError : of `page_of`; or it cannot be written
     """
-    path = folder / PAGE if out is None else out
-    html = page_of(folder)
-    try:
-        write(path, html)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another --out") from error
-    return path
+    write(folder / PAGE, page_of(folder))

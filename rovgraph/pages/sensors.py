@@ -8,7 +8,7 @@ import pandas as pd
 from rovgraph.geometry import Array
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Table, Trace, bars, line, packed, points
 from rovgraph.pages.source import DiveSource
-from rovgraph.pages.thinning import extremes, spread
+from rovgraph.pages.thinning import cloud, extremes, spread
 from rovgraph.report.colours import REJECTED
 
 BLUE, RED, DARK = "#0072B2", "#D55E00", "#333333"
@@ -51,7 +51,7 @@ def _silences(locked: Array) -> Item:
     edges = np.geomspace(gap.min() * 0.99, max(gap.max(), gap.min() * 1.1) * 1.01, 31)
     count, _ = np.histogram(gap, edges)
     x, y = np.repeat(edges, 2)[1:-1], np.repeat(count, 2).astype(float)
-    drawn = [line("count", x, np.where(y > 0, y, np.nan), BLUE, fill="tozeroy")]
+    drawn = [line("count", x, np.where(y > 0, y, 0.5), BLUE, fill="tozeroy")]
     return Panel(title, "time [s]", "count", drawn, kind="xy", log="xy", wide=False)
 
 
@@ -84,7 +84,7 @@ def _velocities(source: DiveSource, spans: list[tuple[float, float, str]]) -> li
     for component, own in rows[rows["sensor"] == "dvl"].groupby("component", sort=False):
         time = source.clock(own["time"].to_numpy(float))
         measured, predicted = own["measured"].to_numpy(float), own["predicted"].to_numpy(float)
-        first, second = extremes(measured), extremes(predicted)
+        first, second = cloud(measured), extremes(predicted)
         drawn = [
             points("measured", time[first], measured[first], "#7A7A7A", size=3),
             line(source.main.name, time[second], predicted[second], BLUE),
@@ -119,7 +119,7 @@ def _residual_panels(source: DiveSource, name: str, own: pd.DataFrame) -> Iterat
     for label, mask, colour in (("used", used, BLUE), ("rejected", ~used, REJECTED)):
         t, values = time[mask], z[mask]
         if len(values):
-            some = extremes(values)
+            some = cloud(values)
             drawn.append(points(f"{label} ({len(values)})", t[some], values[some], colour, size=3))
     yield Panel(f"{name}: residual", source.clock.label, "residual / sd", drawn, levels=(-3.0, 0.0, 3.0))
     fitted = z[used & np.isfinite(z)]

@@ -14,6 +14,7 @@ from rovgraph import __version__
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.report.folder import STAMP, SUMMARY
+from rovgraph.report.results import CHI2_99
 
 KINDS = ("smoothed", "filtered", "dead_reckoning")
 
@@ -133,7 +134,7 @@ class Track:
     @cached_property
     def horizontal_sd(self) -> Array:
         """sd along the worst direction, shape (n,) [m]."""
-        return self.ellipses[0] / np.sqrt(9.21)
+        return np.asarray(self.ellipses[0] / np.sqrt(CHI2_99))
 
     @cached_property
     def ellipses(self) -> tuple[Array, Array, Array]:
@@ -141,7 +142,7 @@ class Track:
         a, b, c = self["north_sd"] ** 2, self["east_sd"] ** 2, self["cov_north_east"]
         c = np.where(np.isnan(c), 0.0, c)
         half, root = (a + b) / 2, np.hypot((a - b) / 2, c)
-        major, minor = (np.sqrt(9.21 * np.clip(half + s * root, 0.0, None)) for s in (1, -1))
+        major, minor = (np.sqrt(CHI2_99 * np.clip(half + s * root, 0.0, None)) for s in (1, -1))
         return major, minor, 0.5 * np.arctan2(2 * c, a - b)
 
 
@@ -192,7 +193,7 @@ class DiveSource(Source):
             table = self.frame(name, "time", "north", "east")
             if table is None:
                 continue
-            numbers = {c: pd.to_numeric(table[c], errors="coerce").to_numpy(float) for c in table}
+            numbers = {str(c): pd.to_numeric(table[c], errors="coerce").to_numpy(float) for c in table}
             known = np.isfinite(numbers["time"])
             if not known.any():
                 raise InputError(f"{self.folder / name}: has no rows with a time; make the results again")

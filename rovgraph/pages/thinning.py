@@ -39,6 +39,11 @@ def extremes(*series: Array, stretches: int = STRETCHES) -> NDArray[np.intp]:
     return index[index < n]
 
 
+def cloud(values: Array, most: int = 1500) -> NDArray[np.intp]:
+    """Indices of points: some spread evenly, so that the density shows, and the extremes of every stretch."""
+    return np.union1d(spread(len(values), most), extremes(values, stretches=200))
+
+
 def spread(n: int, most: int) -> NDArray[np.intp]:
     """At most ``most`` indices spread evenly over n, both ends kept."""
     return np.arange(n) if n <= most else np.unique(np.linspace(0, n - 1, most).round().astype(np.intp))

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from pymap3d.rcurve import meridian, transverse
 
-from rovgraph.geometry import Array
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Trace, line, packed, points
 from rovgraph.pages.source import DiveSource, Track
 from rovgraph.pages.thinning import extremes, spread
@@ -72,7 +72,7 @@ def origin(source: DiveSource) -> dict[str, float] | None:
     return {"lat": lat, "lon": float(place["lon_deg"]), **metres}
 
 
-def _thinned(track: Track) -> Array:
+def _thinned(track: Track) -> NDArray[np.intp]:
     return extremes(track["north"], track["east"])
 
 
@@ -112,7 +112,7 @@ def _fixes(rows: pd.DataFrame | None, source: DiveSource) -> list[Trace]:
     if not {("measured", "north"), ("measured", "east")} <= set(both.columns):
         return []
     north, east = (both["measured"][c].to_numpy(float) for c in ("north", "east"))
-    weight = both["weight"].min(axis=1).to_numpy(float)
+    weight = both["weight"].to_numpy(float).min(axis=1)
     time = source.clock(both.index.get_level_values("time").to_numpy(float))
     drawn = []
     for name, mask, colour, symbol in (

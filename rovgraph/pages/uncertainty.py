@@ -1,5 +1,7 @@
 """Standard deviations against time, what made them smaller, and the separation of filter and smoother."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pandas as pd
 
@@ -13,16 +15,17 @@ HELPED = 0.85  # an sd that falls to this part of itself within `WITHIN_S` was h
 WITHIN_S = 10.0
 TURN = np.deg2rad(45.0)  # of the heading around that time: a manoeuvre
 SAME = 0.05  # P_filtered - P_smoothed below this part of P_filtered: as good as the same, no separation to expect
+SHOWN: tuple[tuple[str, str, Callable[[Track], Array]], ...] = (
+    ("Horizontal position, one standard deviation along the worst direction", "m", lambda t: t.horizontal_sd),
+    ("Heading, one standard deviation", "°", lambda t: np.rad2deg(t["yaw_sd"])),
+)
 CAUSES = {"fix": USED, "place": "#7B3294", "bottom lock again": "#B35900", "turn": "#000000", "other": "#888888"}
 
 
 def uncertainty_section(source: DiveSource) -> Section:
     """sd of position and heading with marks of what helped."""
     items: list[Item] = []
-    for title, unit, of in (
-        ("Horizontal position, one standard deviation along the worst direction", "m", lambda t: t.horizontal_sd),
-        ("Heading, one standard deviation", "°", lambda t: np.rad2deg(t["yaw_sd"])),
-    ):
+    for title, unit, of in SHOWN:
         lines = _sd_lines(source, of)
         if not lines:
             items.append(Missing(title, "no estimate of the folder states a standard deviation"))
@@ -35,7 +38,7 @@ def uncertainty_section(source: DiveSource) -> Section:
     return Section("uncertainty", "How well it is known", lead, items)
 
 
-def _sd_lines(source: DiveSource, of) -> list[Trace]:  # type: ignore[no-untyped-def]
+def _sd_lines(source: DiveSource, of: Callable[[Track], Array]) -> list[Trace]:
     drawn = []
     for kind, track in source.tracks.items():
         sd = of(track)
@@ -60,6 +63,7 @@ def _marks(source: DiveSource, track: Track, sd: Array) -> list[Trace]:
             size=8,
             symbol="triangle-down",
             hoverinfo="name",
+            quiet=True,
         )
         for cause, at in found.items()
     ]
@@ -113,16 +117,22 @@ def separation_section(source: DiveSource) -> Section:
         return Section("separation", "Separation", lead, [Missing(title, missing)])
     filtered, smoothed = source.tracks["filtered"], source.tracks["smoothed"]
     colours = {"north": "#0072B2", "east": "#D55E00", "down": "#009E73", "yaw": "#7B3294"}
-    drawn = []
+    drawn, unknown = [], 0.0
     for name, colour in colours.items():
         time, values = separation(filtered, smoothed, name)
+        unknown = max(unknown, float(np.isnan(values).mean()))
         if np.isfinite(values).any():
             some = extremes(values)
             drawn.append(line("heading" if name == "yaw" else name, source.clock(time[some]), values[some], colour))
     if not drawn:
         missing = "the standard deviations of the estimates are not known, or the same"
         return Section("separation", "Separation", lead, [Missing(title, missing)])
-    chart = Panel(title, source.clock.label, "difference / its sd", drawn, levels=(-3.0, 0.0, 3.0))
+    note = (
+        f"Left out, up to {100 * unknown:.0f} % of a line: where smoothing made the sd no smaller."
+        if unknown > 0.01
+        else ""
+    )
+    chart = Panel(title, source.clock.label, "difference / its sd", drawn, levels=(-3.0, 0.0, 3.0), note=note)
     return Section("separation", "Separation", lead, [chart])
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from rovgraph.pages.parts import Section, Table
 from rovgraph.pages.source import DiveSource, Track
+from rovgraph.report.units import plus_minus
 
 LOPSIDED = 1.5  # ratio of sd across and along beyond which one of them limits
 SHORT = 0.2  # displacement, as a part of the distance, below which directions say little
@@ -41,10 +42,12 @@ def how_good(source: DiveSource) -> str:
     worst = int(np.nanargmax(reach))
     clock = source.clock
     when = clock(source.main["time"][worst : worst + 1])[0]
-    at_end = f"{_metres(reach[-1])} at the end" if np.isfinite(reach[-1]) else "unknown at the end"
     limit = f"99 times in 100 the vehicle was within {_metres(reach[worst])} of it at the worst moment"
     trusted = words if source.summary.get("verdict") == "trusted" else f"{words} If the noise is as stated,"
-    return f"{trusted} {limit} ({when:.0f} {clock.unit} after the start), and within {at_end}."
+    last = worst == len(reach) - 1
+    moment = "the end" if last else f"{when:.0f} {clock.unit} after the start"
+    further = f", and within {_metres(reach[-1])} at the end" if not last and np.isfinite(reach[-1]) else ""
+    return f"{trusted} {limit} ({moment}){further}."
 
 
 def limits(source: DiveSource) -> list[str]:
@@ -136,18 +139,19 @@ def _numbers(source: DiveSource) -> Table:
     s = source.summary
     end: dict[str, Any] = s.get("end") or {}
 
-    def value(key: str, unit: str, of: dict[str, Any], form: str = ".4g") -> str:
-        number = of.get(key)
-        return f"{number:{form}} {unit}".strip() if isinstance(number, int | float) else "unknown"
+    def value(key: str, unit: str) -> str:
+        number = s.get(key)
+        return f"{number:.4g} {unit}" if isinstance(number, int | float) else "unknown"
 
     def with_sd(name: str, unit: str) -> str:
         short = {"m": "m", "°": "deg"}[unit]
-        return f"{value(f'{name}_{short}', '', end)} ± {value(f'{name}_sd_{short}', unit, end, '.2g')}"
+        number, sd = end.get(f"{name}_{short}"), end.get(f"{name}_sd_{short}")
+        return plus_minus(np.nan if number is None else number, np.nan if sd is None else sd, unit)
 
     rows = [
         ("log", str(s.get("log", "unknown"))),
-        ("duration", value("duration_s", "s", dict(s))),
-        ("distance", value("distance_m", "m", dict(s))),
+        ("duration", value("duration_s", "s")),
+        ("distance", value("distance_m", "m")),
         ("end, north", with_sd("north", "m")),
         ("end, east", with_sd("east", "m")),
         ("end, down", with_sd("down", "m")),

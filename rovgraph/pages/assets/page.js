@@ -37,9 +37,9 @@
   const number = (v) => (Number.isFinite(v) ? String(+v.toPrecision(4)) : "unknown");
 
   // ---- drawing -------------------------------------------------------------------------------
-  const axis = (title, log) => ({
+  const axis = (title, log, ticks) => ({
     title: { text: title, font: { size: 13 }, standoff: 8 }, automargin: true, zeroline: false, linecolor: "#888",
-    gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : 10,
+    gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : ticks,
     exponentformat: "none", ...(log ? { dtick: 1 } : {}),
   });
   const layoutOf = (panel) => {
@@ -48,7 +48,7 @@
       fillcolor: colour, opacity: 0.18, line: { width: 0 }, layer: "below" });
     const layout = {
       margin: { l: 60, r: 12, t: 6, b: 44 }, font: { family: "system-ui, sans-serif", color: "#1c1c1c" },
-      xaxis: axis(panel.x, panel.log.includes("x")), yaxis: axis(panel.y, panel.log.includes("y")),
+      xaxis: axis(panel.x, panel.log.includes("x"), 12), yaxis: axis(panel.y, panel.log.includes("y"), panel.kind === "map" ? 12 : 6),
       hovermode: "closest", bargap: 0, showlegend: panel.traces.some((t) => t.name && t.showlegend !== false),
       legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0, font: { size: 12 } },
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
@@ -76,7 +76,9 @@
     const options = { responsive: true, displaylogo: false, scrollZoom: false,
       toImageButtonOptions: { format: "png", scale: 2, filename: key },
       modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], modeBarButtonsToAdd: [exportButton(entry)] };
-    await Plotly.newPlot(plot, series, layoutOf(panel), options);
+    // an axis shows only where something stands over it
+    const degrees = panel.kind === "map" && data.origin ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
+    await Plotly.newPlot(plot, [...series, ...degrees], layoutOf(panel), options);
     plot.querySelectorAll(".modebar-btn").forEach((b) => { b.setAttribute("role", "button"); b.setAttribute("aria-label", b.dataset.title || "tool"); });
     entry.layer = plot.appendChild(document.createElementNS(svg, "svg"));
     entry.layer.setAttribute("class", "cursor");
@@ -91,7 +93,7 @@
       const x = plot._fullLayout.xaxis, t = x.p2d(event.clientX - plot.getBoundingClientRect().left - x._offset);
       if (t >= x.range[0] && t <= x.range[1]) setTime(t);
     });
-    if (panel.kind === "map") place(entry);
+    if (degrees.length) await regrid(entry);
     mark(entry);
   };
   const exportButton = (entry) => ({
@@ -129,9 +131,9 @@
   };
 
   // ---- latitude and longitude ----------------------------------------------------------------
-  const STEPS = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600].flatMap((s) => [s / 1e4, s / 1e2, s]).sort((a, b) => a - b);
+  const STEPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600];
   const degrees = (value, letters, step) => {
-    const digits = step < 0.001 ? 4 : step < 0.01 ? 3 : step < 0.1 ? 2 : step < 1 ? 1 : 0;
+    const digits = step < 0.01 ? 3 : step < 0.1 ? 2 : step < 1 ? 1 : 0;
     let seconds = +(Math.abs(value) * 3600).toFixed(digits);
     const d = Math.floor(seconds / 3600), m = Math.floor((seconds - 3600 * d) / 60);
     seconds -= 3600 * d + 60 * m;
@@ -187,7 +189,7 @@
     if (now < xaxis.range[0] || now > xaxis.range[1]) { entry.readout.textContent = ""; return; }
     const x = xaxis._offset + xaxis.d2p(now);
     add(entry.layer, "line", { x1: x, x2: x, y1: yaxis._offset, y2: yaxis._offset + yaxis._length, stroke: "#000", "stroke-width": 1 });
-    const told = entry.series.filter((s) => !s.band && s.x.length).map((s) => `${s.name} ${number(s.y[nearest(s.x, now)])}`);
+    const told = entry.series.filter((s) => !s.quiet && s.x.length).map((s) => `${s.name} ${number(s.y[nearest(s.x, now)])}`);
     entry.readout.textContent = `at ${number(now)} ${data.clock.unit}: ${told.join(" · ")}`;
   };
   const place = (entry) => { // the vehicle with its ellipse, and the scale bar
