@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pymap3d.rcurve import meridian, transverse
 
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Trace, line, packed, points
-from rovgraph.pages.source import DiveSource, Track
+from rovgraph.pages.source import KINDS, DiveSource, Track
 from rovgraph.pages.thinning import extremes, spread
 from rovgraph.report.colours import ESTIMATES, OTHER, REJECTED, USED
 
@@ -22,6 +22,7 @@ def track_section(source: DiveSource) -> Section:
     lead = ["North is up. Move the slider below or the mouse over any plot: the arrow shows where the vehicle was."]
     if source.summary.get("origin") is None:
         lead.append("Latitude and longitude are not known: the log has no fix_lat, the configuration no origin.")
+    lead += [f"The folder has no {kind.replace('_', ' ')} track." for kind in KINDS if kind not in source.tracks]
     if source.residuals is None:
         lead.append("residuals.csv is missing, so fixes cannot be shown.")
     elif not (source.residuals["sensor"] == "fix").any():

@@ -235,7 +235,11 @@
     });
   };
   const slider = document.getElementById("time"), output = document.getElementById("now");
-  const setTime = (t) => { now = Math.min(Math.max(t, 0), data.clock.end); slider.value = now; markAll(); };
+  const setTime = (t) => {
+    if (!data.clock) return;
+    now = Math.min(Math.max(t, 0), data.clock.end); slider.value = now;
+    markAll();
+  };
   const tell = () => {
     const unit = data.clock.unit;
     let text = `${now.toFixed(unit === "s" ? 1 : 2)} ${unit}`;
