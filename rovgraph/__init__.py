@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from rovgraph.api.observability import plan as plan
     from rovgraph.api.online import Online as Online
     from rovgraph.api.reporting import report as report
+    from rovgraph.api.reporting import report_check as report_check
     from rovgraph.api.simulation import SimulatedDive as SimulatedDive
     from rovgraph.api.simulation import simulate as simulate
     from rovgraph.api.smoothing import Result as Result
@@ -100,6 +101,7 @@ _HOMES = {
     "read_reference": "evaluate",
     "read_trajectory": "trajectory",
     "report": "api.reporting",
+    "report_check": "api.reporting",
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
 }

@@ -16,6 +16,8 @@ def check(
     log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
+    page: Annotated[Path | None, typer.Option("--page", help="write the report as an HTML page, too")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an older page")] = False,
 ) -> None:
     """Look at a log: sensors, rates, gaps, units, signs, clocks, and what an estimate would make of it."""
     import json
@@ -27,6 +29,8 @@ def check(
 
     settings = None if config is None else rg.load_config(config)
     report = rg.check(rg.read_log(log, settings), settings)
+    if page is not None:
+        rg.report_check(report, page, force)
     if as_json:
         typer.echo(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:
