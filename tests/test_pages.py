@@ -248,7 +248,7 @@ def test_separation_of_two_estimates_that_share_their_data_has_unit_variance():
 
 def test_a_fall_of_the_sd_is_found_once_and_slow_ones_are_not():
     time = np.arange(0.0, 600.0)
-    assert falls(time, np.where(time < 300, 2.0, 1.0)) == [290]
+    assert falls(time, np.where(time < 300, 2.0, 1.0)) == [299]
     assert falls(time, 2.0 - time / 1000) == []
 
 

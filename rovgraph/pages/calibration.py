@@ -74,7 +74,13 @@ def _words(joint: dict[str, list[float]]) -> list[str]:
         sentences = in_words(data_information(P, prior), labels, [_unit(label) for label in labels], prior)
     except np.linalg.LinAlgError:
         return ["the covariance of the calibration is singular, so nothing is said of its combinations"]
-    return [s[:1].upper() + s[1:] + "." if not s.endswith(".") else s for s in sentences]
+    return [sentence(s) for s in sentences]
+
+
+def sentence(words: str) -> str:
+    """With a capital, unless it begins with a variable's name, and a full stop."""
+    named = "_" in words.split(" ", 1)[0]
+    return (words if named else words[:1].upper() + words[1:]) + "."
 
 
 def _unit(label: str) -> str:

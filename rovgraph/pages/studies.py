@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.pages.about import about_section
+from rovgraph.pages.calibration import sentence
 from rovgraph.pages.page import render
 from rovgraph.pages.parts import Image, Item, Missing, Panel, Section, Table, Text, Trace, bars, line, points
 from rovgraph.pages.source import Clock, Source
@@ -14,7 +15,7 @@ from rovgraph.pages.thinning import extremes
 from rovgraph.report.units import label_with_unit, shown
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#7B3294", "#A3206B", "#333333", "#8C6D00", "#56808F")
-MOST_ROWS = 400
+MOST_ROWS = 60
 
 
 def study_page_of(source: Source) -> Callable[[Source], str] | None:
@@ -63,7 +64,7 @@ def observe_page(source: Source) -> str:
         learning.append(line(label, clock(time), sd[:, k] / c["prior_sd"], COLOURS[k % len(COLOURS)], **look))
     note = "1: nothing is known beyond the prior."
     items.insert(1, Panel("When the dive showed it", clock.label, "sd / prior sd", learning, note=note))
-    words = [s[:1].upper() + s[1:] + "." for s in seen["in_words"]]
+    words = [sentence(s) for s in seen["in_words"]]
     sections = [Section("known", "What can be known", words, items)]
     return _render(source, "What can be known", sections, clock)
 
@@ -117,7 +118,7 @@ def _of_runs(runs: pd.DataFrame) -> list[Item]:
     """Every run's errors by estimator."""
     panels: list[Item] = []
     estimators = [*dict.fromkeys(runs["estimator"].astype(str))]
-    for column, axis in (("end_error_m", "end error [m]"), ("rms_m", "rms error [m]")):
+    for column, axis in (("end_m", "end error [m]"), ("rms_m", "rms error [m]")):
         if column not in runs:
             continue
         drawn = []
@@ -173,7 +174,7 @@ def _curves(table: pd.DataFrame, title: str, x: str, y: str, label: str, channel
             some = extremes(np.log(np.where(values > 0, values, np.nan)))
             drawn.append(line(name, own[x].to_numpy(float)[some], values[some], COLOURS[k % len(COLOURS)]))
         unit = str((channels.get(names[0]) or {}).get("unit", ""))
-        unit = f"{unit}/√Hz" if title == "Spectrum" else unit
+        unit = f"({unit})²/Hz" if title == "Spectrum" else unit
         axis = f"{title.lower()} [{unit}]"
         panels.append(Panel(f"{sensor}: {title}", label, axis, drawn, kind="xy", log="xy", wide=False))
     return panels

@@ -70,7 +70,7 @@ def _marks(source: DiveSource, track: Track, sd: Array) -> list[Trace]:
 
 
 def falls(time: Array, sd: Array) -> list[int]:
-    """Epochs after which an sd falls to `HELPED` of itself within `WITHIN_S`; one for each fall.
+    """Epochs at which an sd that falls to `HELPED` of itself within `WITHIN_S` falls most; one for each fall.
 
     Parameters
     ----------
@@ -78,11 +78,12 @@ def falls(time: Array, sd: Array) -> list[int]:
     sd : ndarray, shape (n,)
     """
     later = np.minimum(np.searchsorted(time, time + WITHIN_S), len(time) - 1)
-    falling = np.flatnonzero(sd[later] < HELPED * sd)
+    falling = np.flatnonzero((sd[later] < HELPED * sd) & (sd > 0))
     if not len(falling):
         return []
-    begins = np.append(True, np.diff(time[falling]) > WITHIN_S)
-    return [int(i) for i in falling[begins]]
+    begins = falling[np.append(True, np.diff(time[falling]) > WITHIN_S)]
+    steepest = [i + int(np.argmin(np.diff(sd[i : later[i] + 1]) / sd[i : later[i]])) for i in begins.tolist()]
+    return list(dict.fromkeys(steepest))
 
 
 def _cause(source: DiveSource, track: Track, i: int) -> str:

@@ -8,6 +8,7 @@ from rovgraph.pages.parts import Section, Table
 from rovgraph.pages.source import DiveSource, Track
 from rovgraph.report.units import plus_minus
 
+ALIKE = 0.97  # a radius at the end of this part of the largest is said once
 LOPSIDED = 1.5  # ratio of sd across and along beyond which one of them limits
 SHORT = 0.2  # displacement, as a part of the distance, below which directions say little
 
@@ -44,7 +45,7 @@ def how_good(source: DiveSource) -> str:
     when = clock(source.main["time"][worst : worst + 1])[0]
     limit = f"99 times in 100 the vehicle was within {_metres(reach[worst])} of it at the worst moment"
     trusted = words if source.summary.get("verdict") == "trusted" else f"{words} If the noise is as stated,"
-    last = worst == len(reach) - 1
+    last = reach[-1] > ALIKE * reach[worst]
     moment = "the end" if last else f"{when:.0f} {clock.unit} after the start"
     further = f", and within {_metres(reach[-1])} at the end" if not last and np.isfinite(reach[-1]) else ""
     return f"{trusted} {limit} ({moment}){further}."
@@ -65,13 +66,13 @@ def _cause(source: DiveSource) -> tuple[str, str]:
         text = str(alarms[0].get("text", ""))
         cause, _, remedy = text.partition("; ")
         return cause, remedy or "see the alarms below"
-    track = source.tracks.get("filtered", source.main)
+    track = source.main
     if not np.isfinite(track.horizontal_sd).any() or len(track) < 3:
         return "", ""
     silent = _share_in_silence(source, track)
     if silent > 0.5:
         return (
-            f"{100 * silent:.0f} % of the uncertainty came while the DVL did not see the bottom",
+            f"{100 * silent:.0f} % of what the variance grew fell into times in which the DVL did not see the bottom",
             "keep the DVL within its range of the bottom, or take a position fix after each silence",
         )
     return _by_direction(source)

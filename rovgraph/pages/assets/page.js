@@ -40,7 +40,7 @@
   const axis = (title, log, ticks) => ({
     title: { text: title, font: { size: 13 }, standoff: 8 }, automargin: true, zeroline: false, linecolor: "#888",
     gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : ticks,
-    exponentformat: "none", ...(log ? { dtick: 1 } : {}),
+    exponentformat: log ? "power" : "none", ...(log ? { dtick: 1 } : {}),
   });
   const layoutOf = (panel) => {
     const plain = (v) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: v, y1: v, line: { color: "#666", width: 1, dash: "dot" } });
