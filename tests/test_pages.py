@@ -266,3 +266,27 @@ def test_a_page_of_anything_escapes_its_title():
         NASTY, [Section("a", NASTY, [NASTY], [Panel(NASTY, "x", "y", [line(NASTY, [0], [1], "#000")], kind="xy")])]
     )
     assert "<script>alert" not in html
+
+
+def test_what_check_finds_is_a_page_and_an_older_one_stays(dive, tmp_path):
+    out = rg.report_check(rg.check(dive.log, dive.config), tmp_path / "check.html")
+    html = out.read_text()
+    assert "bottom lock" in html
+    assert html.count("<table>") == 2
+    with pytest.raises(rg.InputError, match="exists; choose another --page"):
+        rg.report_check(rg.check(dive.log, dive.config), out)
+
+
+def test_noise_of_a_log_at_rest_is_a_page_and_one_that_is_incomplete_says_so(tmp_path):
+    channel = {"unit": "m/s2", "rate_hz": 50.0, "sd": 0.02, "sd_without_lines": 0.02, "density": 0.003}
+    summary = {"program": "rovgraph", "calibration": "noise", "channels": {"acc_x": channel}, "remarks": [NASTY]}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    table = pd.DataFrame({"channel": "acc_x", "tau_s": [0.02, 0.2, 2.0], "deviation": [0.02, 0.006, 0.002]})
+    table.to_csv(tmp_path / "allan.csv", index=False)
+    html = page_of(tmp_path)
+    assert "acc: Allan deviation" in html
+    assert "spectra.csv is missing" in html
+    assert "alert(1)</script>" not in html
+    (tmp_path / "summary.json").write_text(json.dumps({"program": "rovgraph", "ranking": [{}]}))
+    with pytest.raises(rg.InputError, match="incomplete or of another version"):
+        page_of(tmp_path)

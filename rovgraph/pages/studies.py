@@ -101,13 +101,7 @@ def compare_page(source: Source) -> str:
     runs = source.frame("runs.csv", "run", "estimator")
     if runs is not None:
         items += _of_runs(runs)
-    names = {
-        "table.csv": "Estimators",
-        "misalignment.csv": "Misalignment",
-        "velocity.csv": "Velocity",
-        "runs.csv": "Runs",
-    }
-    items += [_frame_table(source, name, title) for name, title in names.items() if source.frame(name) is not None]
+    items += [_frame_table(source, name, title) for name, title in (("table.csv", "Estimators"), ("runs.csv", "Runs"))]
     failures = [f"{f['estimator']}, {f['run']}: {f['error']}" for f in source.summary.get("failures") or []]
     lists = {"Failures": failures} if failures else {}
     sections = [Section("estimators", "Estimators", (), [*items, *_images(source)], lists)]
