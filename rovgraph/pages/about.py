@@ -5,6 +5,7 @@ import shlex
 
 from rovgraph.pages.parts import Item, Missing, Section, Table, Text
 from rovgraph.pages.source import Source
+from rovgraph.report.folder import SUMMARY
 
 PAGE = "report.html"
 
@@ -38,7 +39,7 @@ def _files(source: Source) -> Table:
     if isinstance(log, dict):
         rows.append((f"{log.get('path')} (the log)", f"{log.get('bytes')}", str(log.get("sha256"))))
     for path in sorted(source.folder.iterdir()):
-        if path.is_file() and path.name != PAGE:
+        if path.is_file() and path.name not in (PAGE, SUMMARY):  # which says how long the work took
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             rows.append((path.name, str(path.stat().st_size), digest))
