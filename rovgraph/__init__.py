@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / report, export / studies, live / interchange /
+cli / api / pages / report, export / studies, live / interchange /
 estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / gauss_markov, units / geometry, workers, fast_csv / errors, process.
@@ -63,6 +63,8 @@ if TYPE_CHECKING:
     from rovgraph.api.observability import observe as observe
     from rovgraph.api.observability import plan as plan
     from rovgraph.api.online import Online as Online
+    from rovgraph.api.reporting import report as report
+    from rovgraph.api.reporting import report_check as report_check
     from rovgraph.api.simulation import SimulatedDive as SimulatedDive
     from rovgraph.api.simulation import simulate as simulate
     from rovgraph.api.smoothing import Result as Result
@@ -110,6 +112,8 @@ _HOMES = {
     "read_log": "api.logs",
     "read_reference": "evaluate",
     "read_trajectory": "trajectory",
+    "report": "api.reporting",
+    "report_check": "api.reporting",
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
     "tag": "api.exporting",
@@ -118,7 +122,7 @@ __all__ = list(_HOMES)
 
 
 class _Package(ModuleType):
-    """This package, whose functions `check`, `export` and others are not hidden by the modules of these names."""
+    """This package, whose functions (`check`, `evaluate`, `report`, …) are not hidden by modules of the same name."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _HOMES and isinstance(value, ModuleType)):  # which the import of a submodule would set

@@ -31,14 +31,15 @@ LAYERS = (
     {"interchange"},
     {"studies", "live"},
     {"report", "export"},
+    {"pages"},
     {"api"},
     {"cli"},
 )
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
 
 # library -> the only member that may import it
-CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "typer": "cli"}
-HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib"}
+CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "jinja2": "pages", "typer": "cli"}
+HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib", "jinja2"}
 
 
 def module_name(path: Path) -> str:
@@ -172,6 +173,7 @@ print("MODULES", *sys.modules)
         ["demo"],
         ["smooth"],
         ["online"],
+        ["report"],
         ["evaluate"],
         ["compare"],
         ["check"],

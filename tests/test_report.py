@@ -320,7 +320,8 @@ def test_every_file_is_written(written):
     folder, _ = written
     names = {p.name for p in folder.iterdir()}
     tracks = {f"trajectory_{kind}.{ending}" for kind in ("smoothed", "filtered") for ending in ("csv", "tum")}
-    assert names == tracks | {"calibration.csv", "residuals.csv", "history.csv", "config.yaml", "summary.json"}
+    tables = {"calibration.csv", "residuals.csv", "history.csv", "left_out.csv"}
+    assert names == tracks | tables | {"config.yaml", "summary.json"}
 
 
 def test_trajectory_comes_back(written, dive):
@@ -371,7 +372,8 @@ def test_summary_is_json_with_units(written):
     assert summary["duration_s"] == pytest.approx(300.0)
     assert summary["calibration"]["dvl_yaw"]["value_deg"] == pytest.approx(-21.5)
     assert summary["estimates"]["smoothed"]["converged"] is True
-    assert summary["sensors"]["imu"] == {"recorded": 600}
+    imu = summary["sensors"]["imu"]
+    assert imu["recorded"] == 600 and imu["rate_hz"] == pytest.approx(599 / 300.0, rel=1e-3)
     assert summary["assumptions"] == ["heading from the AHRS"] and summary["seconds"] == {"smooth": 1.5}
 
 

@@ -52,6 +52,7 @@ class ComparisonResult:
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
+        from rovgraph.pages.reporting import write_page
         from rovgraph.report.comparison import write_comparison
         from rovgraph.report.figure_compare import draw_comparison
         from rovgraph.report.folder import results_folder
@@ -59,6 +60,7 @@ class ComparisonResult:
         with results_folder(Path(path), force) as folder:
             draw_comparison(folder, self.comparison, self.title, self.thesis)
             write_comparison(folder, self.comparison, self.about)
+            write_page(folder)
 
 
 def compare(

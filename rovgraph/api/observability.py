@@ -50,6 +50,7 @@ class ObservabilityResult:
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
+        from rovgraph.pages.reporting import write_page
         from rovgraph.report.figure_observability import draw_observability
         from rovgraph.report.folder import results_folder
         from rovgraph.report.observability import write_observability
@@ -57,6 +58,7 @@ class ObservabilityResult:
         with results_folder(Path(path), force) as folder:
             draw_observability(folder, self.observability)
             write_observability(folder, self.observability, self.config, self.about)
+            write_page(folder)
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class PlanResult:
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
+        from rovgraph.pages.reporting import write_page
         from rovgraph.report.figure_plan import draw_plan
         from rovgraph.report.folder import results_folder
         from rovgraph.report.observability import write_plan
@@ -88,6 +91,7 @@ class PlanResult:
         with results_folder(Path(path), force) as folder:
             draw_plan(folder, self.plan)
             write_plan(folder, self.plan, self.config, self.about)
+            write_page(folder)
 
 
 def observe(

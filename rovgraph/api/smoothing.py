@@ -98,7 +98,12 @@ class Result:
         return export(self, to, out, **options)
 
     def save(
-        self, path: Path | str, force: bool = False, figures: bool = True, export: Sequence[str] = ()
+        self,
+        path: Path | str,
+        force: bool = False,
+        figures: bool = True,
+        page: bool = True,
+        export: Sequence[str] = (),
     ) -> dict[str, Any]:
         """Write the results folder of ``rovgraph smooth`` (docs/results.md), complete or not at all.
 
@@ -107,6 +112,7 @@ class Result:
         path : the folder to make
         force : replace an older results folder
         figures : draw them
+        page : make report.html
         export : formats that the track is written in too
 
         Returns
@@ -129,9 +135,21 @@ class Result:
             if export:
                 self.export(folder, export)
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
-            return write_results(
-                folder, self.dive.estimates, self.log, self.config, [*self.assumptions], seconds, self.alarms
+            summary = write_results(
+                folder,
+                self.dive.estimates,
+                self.log,
+                self.config,
+                [*self.assumptions],
+                seconds,
+                self.alarms,
+                self.warnings,
             )
+            if page:
+                from rovgraph.pages.reporting import write_page
+
+                write_page(folder)
+            return summary
 
     def _estimate(self, kind: str) -> Estimate:
         found = next((estimate for estimate in self.dive.estimates if estimate.kind == kind), None)

@@ -23,6 +23,7 @@ from rovgraph.cli.export import export
 from rovgraph.cli.observe import observe
 from rovgraph.cli.online import online
 from rovgraph.cli.plan import plan
+from rovgraph.cli.report import report
 from rovgraph.cli.simulate import simulate
 from rovgraph.cli.smooth import smooth
 from rovgraph.cli.study import study
@@ -55,7 +56,7 @@ def _of_all_commands(
 
 
 for _command in (
-    demo, smooth, online, convert, export, tag, evaluate, compare, observe, plan, check, config, simulate,
+    demo, smooth, online, convert, export, tag, report, evaluate, compare, observe, plan, check, config, simulate,
 ):  # fmt: skip
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")

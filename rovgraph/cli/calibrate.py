@@ -45,6 +45,7 @@ def magnetometer(
     from rovgraph.calibrate import calibrate_magnetometer
     from rovgraph.config import load_config
     from rovgraph.log import read_log
+    from rovgraph.pages.reporting import write_page
     from rovgraph.report.calibrations import write_magnetometer
     from rovgraph.report.folder import check_writable, results_folder
 
@@ -53,6 +54,7 @@ def magnetometer(
     found = calibrate_magnetometer(read_log(log, settings.with_raw_magnetometer()), settings, method.value)
     with results_folder(out, force) as folder:
         write_magnetometer(folder, found, settings)
+        write_page(folder)
     console = Console()
     console.print(_magnetometer_table(found))
     console.print(f"for the configuration: {out / 'magnetometer.yaml'}", highlight=False, markup=False)
@@ -69,6 +71,7 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
     from rovgraph.calibrate import calibrate_noise
     from rovgraph.config import load_config
     from rovgraph.log import read_log
+    from rovgraph.pages.reporting import write_page
     from rovgraph.report.calibrations import write_noise
     from rovgraph.report.folder import check_writable, results_folder
 
@@ -78,6 +81,7 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
     found = calibrate_noise(recorded, settings)
     with results_folder(out, force) as folder:
         write_noise(folder, found, settings)
+        write_page(folder)
     console = Console()
     for table in _noise_tables(found):
         console.print(table)

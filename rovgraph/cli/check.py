@@ -20,6 +20,8 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
     choose: Choose = None,
     shift: Shift = None,
+    page: Annotated[Path | None, typer.Option("--page", help="write the report as an HTML page, too")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an older page")] = False,
 ) -> None:
     """Check a log: sensors, rates, gaps, units, signs, clocks, and the assumptions of an estimate."""
     import json
@@ -32,6 +34,8 @@ def check(
     settings = None if config is None else rg.load_config(config)
     log = read_files(files, settings, choose, shift)
     report = rg.check(log, settings)
+    if page is not None:
+        rg.report_check(report, page, force)
     if as_json:
         typer.echo(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:

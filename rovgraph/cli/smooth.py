@@ -45,6 +45,7 @@ def smooth(
         list[str] | None,
         typer.Option(help="also write the track as kml, geojson, ... (docs/export.md); may be repeated"),
     ] = None,
+    page: Annotated[bool, typer.Option("--page/--no-page", help="make report.html")] = True,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
     choose: Choose = None,
     shift: Shift = None,
@@ -70,7 +71,7 @@ def smooth(
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
-    summary = result.save(out, force, figures, export or [])
+    summary = result.save(out, force, figures, page, export or [])
     show_result(result, summary, out)
     if strict and result.verdict != "trusted":
         raise typer.Exit(NOT_TRUSTED)
@@ -90,4 +91,5 @@ def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
     console.print(calibration_table(result.dive.estimates))
     for line in result.assumptions:
         console.print(f"assumed: {line}", highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False, markup=False)
+    page = " (open report.html)" if (out / "report.html").exists() else ""
+    console.print(f"results in {out}{page}", highlight=False, markup=False)

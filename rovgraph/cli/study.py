@@ -35,6 +35,7 @@ def misalignment(
 
     from rovgraph.cli.progress import progress_bar
     from rovgraph.errors import InputError
+    from rovgraph.pages.reporting import write_page
     from rovgraph.report.figure_study import draw_study
     from rovgraph.report.narrow import fitting
     from rovgraph.report.study import plan_table, study_table, write_study
@@ -68,6 +69,7 @@ def misalignment(
     with kept_so_far(out):  # its rows are on disk already
         write_study(out, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
         draw_study(out, tables)
+        write_page(out)
     for part in fitting(study_table(tables), console):
         console.print(part)
     for row in tables.runs.dropna(subset="failure").drop_duplicates("cell").itertuples():

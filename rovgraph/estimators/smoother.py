@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
@@ -188,10 +189,30 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "stretches_taken_out": [asdict(stretch) for stretch in best.solution.stretches],
             "runner_up": best.solution.runner_up if isfinite(best.solution.runner_up) else None,
             "bridged_intervals": sum(i.bridged for i in intervals),
+            "calibration_covariance": _joint_calibration(best),
             "held_at_prior": held,
             "considered": [name for name in best.unknowns.considered if name not in held],
         },
     )
+
+
+def _joint_calibration(best: Optimum) -> dict[str, Any] | None:
+    """What is estimated, jointly, at the end of the dive; None where nothing is.
+
+    Returns
+    -------
+    dict : ``labels`` (c), ``prior_sd`` (c) and ``covariance`` (c x c), radians and SI
+    """
+    names = best.unknowns.estimated
+    if not names:
+        return None
+    end = len(best.intervals) - 1
+    prior = joint_prior_sd(best, end)
+    return {
+        "labels": [label for name in names for label in best.beliefs[name].variable.labels],
+        "prior_sd": np.concatenate([prior[name] for name in names]).tolist(),
+        "covariance": best.knowledge([end]).calibration[0].tolist(),
+    }
 
 
 def _without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
