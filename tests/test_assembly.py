@@ -1,5 +1,7 @@
 """Keyframes and attached measurements: what goes where, and what is left out."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from dives import Simulated, falcon, interrupted, kept, level_log, same, simulated, started
@@ -8,7 +10,10 @@ from hypothesis import strategies as st
 
 from rovgraph.config import Config
 from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.log_assembly import assemble_log
+from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 
@@ -17,13 +22,16 @@ G = np.array([0.0, 0.0, -9.81])
 
 def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInterval], Assembler]:
     config = config or Config()
-    whole, assembler = (Assembler(config, instruments(config), np.zeros(6)) for _ in range(2))
+    assembler, left_out = Assembler(config, instruments(config), np.zeros(6)), Counter()
     done: list[KeyframeInterval] = []
     for measurement in log.measurements():
         done += assembler.add(measurement)
     done += assembler.finish()
-    same(done, whole.take(log))
-    assert whole.left_out == assembler.left_out
+    offsets = TimeOffsets.of(config, assembler.instruments)
+    whole = assemble_log(log, config, assembler.instruments, np.zeros(6), offsets, left_out)
+    same(done, whole.intervals)
+    same(DiveRows.of(done, [*assembler.instruments]), whole.rows)
+    assert left_out == assembler.left_out
     return done, assembler
 
 
