@@ -8,6 +8,7 @@ first by which the keyframe is past, as the assembler waits for it.
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,9 +135,13 @@ class WholeLog:
 
     def longest_step(self, count: Index) -> Array:
         """Step between two samples that is no gap, as it is known after so many samples [s]."""
+        return np.asarray(self._longest_steps[np.clip(count, 1, len(self._longest_steps)) - 1])
+
+    @cached_property
+    def _longest_steps(self) -> Array:
+        """The same after each of the first samples."""
         periods = np.diff(self.imu[: PERIODS + 1, 0]).tolist()
-        known = np.array([longest_regular(periods[:k]) for k in range(len(periods) + 1)])
-        return np.asarray(known[np.clip(count, 1, len(known)) - 1])
+        return np.array([longest_regular(periods[:k]) for k in range(len(periods) + 1)])
 
     def ordered(self) -> Ordered:
         """The measurements that may enter the graph, and samples after a gap; counts those before the first sample."""
@@ -169,12 +174,14 @@ class WholeLog:
                 made.append((start, -1, int(found.time.searchsorted(start, side="right")), count))
 
         enders = np.flatnonzero(found.of("imu", "dvl") & (found.time <= self.end))
-        pings = found.of("dvl")[enders].tolist()
-        for k, time, ping in zip(enders.tolist(), found.time[enders].tolist(), pings, strict=True):
+        times, pings = found.time[enders], found.of("dvl")[enders]
+        counts = np.minimum(self._past.searchsorted(times) + 1, len(self._past))  # up to the first by which it is past
+        each = (column.tolist() for column in (enders, times, pings, counts))
+        for k, time, ping, count in zip(*each, strict=True):
             silence(time, due)
             if time - start >= graph.min_gap_s if ping else time - start > SHORTEST_S:
                 start = time
-                made.append((start, k if ping else -1, k, self._count_at(start)))
+                made.append((start, k if ping else -1, k, count))
         silence(self.end, due)
         silence(self.end, graph.max_gap_s, all_known=True)
         within = int(found.time.searchsorted(self.end, side="right"))
@@ -202,10 +209,6 @@ class WholeLog:
         if long.size and self._stream is not None:
             k = int(long[0])
             raise too_long(self._config, float(periods[k]), float(self.imu[k + 1, 0]), int(self._stream.row[k + 1]))
-
-    def _count_at(self, time: float) -> int:
-        """Samples up to the first by which a time is past."""
-        return min(int(self._past.searchsorted(time)) + 1, len(self._past))
 
     def _count_after(self, start: float, gap: float) -> int:
         """Samples up to the first by which more than ``gap`` has passed since a keyframe [s]."""
