@@ -94,6 +94,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
         if not more:
             break
         found, config = found + more, with_noise(config, more)
+        best = None  # a long dive is not kept twice
         dive, best = _solve(log, config, frozen, estimate, progress)
     return _saying(dive, found) if found else dive
 
