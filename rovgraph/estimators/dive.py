@@ -122,6 +122,7 @@ def _solve(
             progress("smoothing", 0.5)
             best = batch.optimum(states)
             estimates.insert(0, smoothed(best, beginning))
+            best.forget_covariances()  # of a long dive they are large
     intervals = batch.intervals if best is None else best.intervals
     numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen))
     left_out = _left_out(batch, frozen)
