@@ -16,10 +16,9 @@ import numpy as np
 from rovgraph.config import Config
 from rovgraph.engine.motion import Motion
 from rovgraph.engine.preintegration import INTEGRATION_SD, PreintegrationParams, integrate_motion
-from rovgraph.engine.samples import Samples
+from rovgraph.engine.samples import Samples, surveyed, whole
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
-from rovgraph.kernels.imu_samples import survey
 from rovgraph.kernels.motion_row import NO_IMU
 from rovgraph.log import Log, Measurement, Stream
 
@@ -72,7 +71,7 @@ class Ticks(Samples):
         self, table: Array, bias: Array, start: float, stops: Array, end: float, learn: bool
     ) -> tuple[Motion, Array]:
         """As `Samples.integrated`: the vehicle goes on as it went, in a long silence whichever way it turns."""
-        silent = survey(table, start, end)[1]
+        silent = float(surveyed(table, *whole(table), np.array([start]), np.array([end]))[0, 1])
         params, gap = (self._bridge, silent) if silent > LONGEST_CRUISED_S else (self.params, NO_IMU)
         return integrate_motion(params, bias, table, start, stops, end, gap)
 

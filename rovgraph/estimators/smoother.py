@@ -9,9 +9,11 @@ import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.log_assembly import assemble_log
 from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
@@ -59,9 +61,15 @@ class BatchSmoother:
     def take(self, log: Log) -> list[KeyframeInterval]:
         """Take a whole log, before anything else: what `add` of each of its measurements and `finish` give."""
         self._log = log
-        done = self.assembler.take(log)
-        self.intervals += done
-        return done
+        b, assembler = self.beginning, self.assembler
+        if has_constant_velocity(b.config):  # every measurement may make a keyframe, and no samples lie between
+            for measurement in log.measurements():
+                self.intervals += assembler.add(measurement)
+            return self.finish()
+        bias, offsets, left_out = b.prior.state.bias[0], assembler.time_offsets, assembler.left_out
+        dive = assemble_log(log, b.config, b.instruments, bias, offsets, left_out)
+        self.intervals, self._rows = dive.intervals, dive.rows
+        return dive.intervals
 
     @property
     def measurements(self) -> list[Measurement]:

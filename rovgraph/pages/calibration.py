@@ -11,8 +11,9 @@ from rovgraph.pages.parts import Item, Missing, Panel, Section, Table, Trace, li
 from rovgraph.pages.source import DiveSource
 from rovgraph.pages.thinning import extremes
 from rovgraph.report.colours import ESTIMATES
-from rovgraph.report.units import plus_minus, shown
+from rovgraph.report.units import plus_minus
 from rovgraph.studies.directions import in_words
+from rovgraph.units import shown
 
 MOVED = 3.0  # prior sd beyond which a variable has moved suspiciously far
 

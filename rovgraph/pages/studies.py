@@ -12,7 +12,8 @@ from rovgraph.pages.page import render
 from rovgraph.pages.parts import Image, Item, Missing, Panel, Section, Table, Text, Trace, bars, line, points
 from rovgraph.pages.source import Clock, Source
 from rovgraph.pages.thinning import extremes
-from rovgraph.report.units import label_with_unit, shown
+from rovgraph.report.units import label_with_unit
+from rovgraph.units import shown
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#7B3294", "#A3206B", "#333333", "#8C6D00", "#56808F")
 MOST_ROWS = 60
