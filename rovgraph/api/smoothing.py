@@ -13,6 +13,8 @@ from rovgraph.estimators import dive as library
 from rovgraph.estimators.alarms import Alarm, Verdict
 from rovgraph.estimators.dive import Dive, Progress, no_progress
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
+from rovgraph.export import Options, Track, fixes_of, write_track
+from rovgraph.export.track import ESTIMATES as TRACKS
 from rovgraph.log import Log
 
 ENGINES = ("batch", "isam2")
@@ -91,11 +93,18 @@ class Result:
         """The effective configuration."""
         return self.dive.beginning.config
 
-    def export(self, out: Path | str, to: str | Sequence[str], **options: Any) -> list[Path]:
-        """Write the track in formats that others open: `rovgraph.export`, which says what the options are."""
-        from rovgraph.api.exporting import export
+    def track(self, estimate: str | None = None) -> Track:
+        """An estimate with its place on Earth and its fixes, as exports take it; None = the best there is.
 
-        return export(self, to, out, **options)
+        Raises
+        ------
+        InputError : not that estimate
+        """
+        if estimate not in (None, *TRACKS):
+            raise InputError(f"estimate {estimate!r}: expected {', '.join(TRACKS)}")
+        chosen = self.main if estimate is None else self._estimate(estimate)
+        name = self.config.name or Path(self.log.source).name
+        return Track(name, chosen.kind, chosen.trajectory, self.log.origin, fixes_of(self.main.residuals))
 
     def save(
         self,
@@ -133,7 +142,7 @@ class Result:
 
                 draw_figures(folder, self.dive.estimates, self.log, self.config)
             if export:
-                self.export(folder, export)
+                write_track(self.track(), export, folder, Options())
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
             summary = write_results(
                 folder,
