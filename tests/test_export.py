@@ -328,6 +328,16 @@ def test_commands_write_what_the_library_does(results, monkeypatch, capsys):
     assert placed["rov_north"].to_numpy() == pytest.approx(smoothed["north"].to_numpy(), abs=1e-3)
 
 
+def test_an_export_that_cannot_be_is_refused_before_the_dive_is_smoothed(results, monkeypatch, capsys):
+    monkeypatch.chdir(results)
+    monkeypatch.setattr("rovgraph.smooth", lambda *given: pytest.fail("smoothed"), raising=False)
+    monkeypatch.setattr("sys.argv", ["rovgraph", "smooth", "dive/log.csv", "-o", "never", "--export", "kml"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2 and "state environment.origin_lat_deg" in capsys.readouterr().err
+    assert not (results / "never").exists()
+
+
 def test_photos_get_their_place_in_exif_and_keep_their_pixels(results, tmp_path):
     piexif, image = pytest.importorskip("piexif"), pytest.importorskip("PIL.Image")
     t = rg.read_trajectory(results / "dive" / "truth.csv")

@@ -58,7 +58,7 @@ def smooth(
 
     import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
-    from rovgraph.export import known_formats
+    from rovgraph.export import check_exportable, known_formats
     from rovgraph.report.folder import check_writable
 
     out = Path("results-" + name_of(files)) if out is None else out
@@ -67,6 +67,7 @@ def smooth(
     check_writable(out, force)
     began = time.perf_counter()
     dive_log = read_files(files, settings, choose, shift)
+    check_exportable(export or [], dive_log.source, dive_log.origin, dive_log.start)
     read = time.perf_counter()
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)

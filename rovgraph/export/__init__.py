@@ -3,7 +3,7 @@
 `track` is what is written, `formats` finds the writers, each in a module of its own; `tagging` places photos.
 """
 
-from rovgraph.export.formats import ExportFormat, Options, export_formats, known_formats, write_track
+from rovgraph.export.formats import ExportFormat, Options, check_exportable, export_formats, known_formats, write_track
 from rovgraph.export.tagging import Tagged, tag
 from rovgraph.export.track import Fixes, Track, fixes_of, read_track
 
@@ -13,6 +13,7 @@ __all__ = [
     "Options",
     "Tagged",
     "Track",
+    "check_exportable",
     "export_formats",
     "fixes_of",
     "known_formats",

@@ -15,7 +15,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from rovgraph.errors import InputError, in_one_line, warn
-from rovgraph.export.track import Track
+from rovgraph.export.track import Track, require_place, require_utc
 
 OWN = ("geojson", "kml", "gpx", "gis", "nmea", "tum", "kitti", "ros2", "netcdf", "sbet", "srt")
 GROUP = "rovgraph.exports"
@@ -50,6 +50,7 @@ class ExportFormat:
     suffix : of its file, with the dot; of a format that is a folder, ""
     write : makes the file (or folder) at a path, of a track and options
     extra : the extra of this package that it needs ("" = none)
+    needs_place, needs_utc : whether it cannot do without latitude and longitude, or without Unix time
     """
 
     name: str
@@ -57,6 +58,8 @@ class ExportFormat:
     suffix: str
     write: Callable[[Track, Path, Options], None]
     extra: str = ""
+    needs_place: bool = False
+    needs_utc: bool = False
 
 
 @cache
@@ -88,6 +91,25 @@ def known_formats(names: Sequence[str]) -> list[ExportFormat]:
     return [known[name] for name in names]
 
 
+def check_exportable(names: Sequence[str], name: str, origin: tuple[float, float] | None, start: float) -> None:
+    """See that a dive can be written in some formats, before anything is computed or written.
+
+    Parameters
+    ----------
+    names : of formats
+    name, origin, start : of the dive, as `Track` has them; when it begins [s]
+
+    Raises
+    ------
+    InputError : an unknown format; an origin or a Unix time that one needs and the dive does not have
+    """
+    for format_ in known_formats(names):
+        if format_.needs_place:
+            require_place(name, origin)
+        if format_.needs_utc:
+            require_utc(name, start)
+
+
 def write_track(track: Track, names: Sequence[str], folder: Path, options: Options, force: bool = False) -> list[Path]:
     """Write a track as ``track_ESTIMATE`` with each format's suffix, each file whole or not at all.
 
@@ -106,6 +128,7 @@ def write_track(track: Track, names: Sequence[str], folder: Path, options: Optio
     InputError : an unknown format, a library that is not installed, an origin or a time that a format needs, a file
         that is there
     """
+    check_exportable(names, track.name, track.origin, float(track.trajectory.time[0]))
     formats = known_formats(list(dict.fromkeys(names)))
     targets = [folder / f"track_{track.estimate}{format_.suffix or '_' + format_.name}" for format_ in formats]
     for target in targets:

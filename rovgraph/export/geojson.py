@@ -70,4 +70,4 @@ def _feature(kind_of_geometry: str, coordinates: Any, **properties: Any) -> Feat
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-FORMATS = (ExportFormat("geojson", "GeoJSON", ".geojson", write),)
+FORMATS = (ExportFormat("geojson", "GeoJSON", ".geojson", write, needs_place=True),)

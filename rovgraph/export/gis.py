@@ -87,6 +87,6 @@ def write_shp(track: Track, path: Path, options: Options) -> None:
 
 
 FORMATS = (
-    ExportFormat("gpkg", "GeoPackage", ".gpkg", write_gpkg, "gis"),
-    ExportFormat("shp", "shapefile", "", write_shp, "gis"),
+    ExportFormat("gpkg", "GeoPackage", ".gpkg", write_gpkg, "gis", needs_place=True),
+    ExportFormat("shp", "shapefile", "", write_shp, "gis", needs_place=True),
 )

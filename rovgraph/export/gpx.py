@@ -25,4 +25,4 @@ def write(track: Track, path: Path, options: Options) -> None:
     path.write_text(gpx.to_xml("1.1"), encoding="utf-8")
 
 
-FORMATS = (ExportFormat("gpx", "GPX", ".gpx", write, "maps"),)
+FORMATS = (ExportFormat("gpx", "GPX", ".gpx", write, "maps", needs_place=True),)

@@ -72,6 +72,6 @@ def write_kmz(track: Track, path: Path, options: Options) -> None:
 
 
 FORMATS = (
-    ExportFormat("kml", "KML", ".kml", write_kml, "maps"),
-    ExportFormat("kmz", "KMZ", ".kmz", write_kmz, "maps"),
+    ExportFormat("kml", "KML", ".kml", write_kml, "maps", needs_place=True),
+    ExportFormat("kmz", "KMZ", ".kmz", write_kmz, "maps", needs_place=True),
 )

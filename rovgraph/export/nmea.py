@@ -22,4 +22,4 @@ def write(track: Track, path: Path, options: Options) -> None:
             file.write(heading_sentence(yaw) + course_sentence(north, east))
 
 
-FORMATS = (ExportFormat("nmea", "NMEA 0183", ".nmea", write),)
+FORMATS = (ExportFormat("nmea", "NMEA 0183", ".nmea", write, needs_place=True),)

@@ -37,7 +37,6 @@ def write(track: Track, path: Path, options: Options) -> None:
     ------
     InputError : no origin, no Unix time
     """
-    _ = track.utc  # or it is refused
     shown = track.at_rate(options.rate_or(RATE))
     t = shown.trajectory
     lat, lon = shown.lat_lon
@@ -51,4 +50,4 @@ def write(track: Track, path: Path, options: Options) -> None:
     (path / "smrmsg.out").write_bytes(errors.tobytes())
 
 
-FORMATS = (ExportFormat("sbet", "SBET", "", write),)
+FORMATS = (ExportFormat("sbet", "SBET", "", write, needs_place=True, needs_utc=True),)

@@ -61,7 +61,7 @@ class Track:
         ------
         InputError : it is not known where on Earth the dive was
         """
-        return self.trajectory.geodetic(self._known_origin())
+        return self.trajectory.geodetic(require_place(self.name, self.origin))
 
     def place(self, north: Array, east: Array) -> tuple[Array, Array]:
         """Latitude and longitude [deg] of other points, shape as given.
@@ -72,13 +72,13 @@ class Track:
         """
         from pymap3d import ned2geodetic
 
-        lat, lon, _ = ned2geodetic(north, east, 0.0, *self._known_origin(), 0.0)
+        lat, lon, _ = ned2geodetic(north, east, 0.0, *require_place(self.name, self.origin), 0.0)
         return np.asarray(lat), np.asarray(lon)
 
     @property
     def has_utc(self) -> bool:
         """Whether time counts from 1970."""
-        return bool(self.trajectory.time[0] >= EARLIEST_UNIX)
+        return is_utc(float(self.trajectory.time[0]))
 
     @property
     def utc(self) -> pd.DatetimeIndex:
@@ -88,11 +88,7 @@ class Track:
         ------
         InputError : time counts from something else
         """
-        if not self.has_utc:
-            raise InputError(
-                f"{self.name}: its time begins at {self.trajectory.time[0]:g} s, which is no Unix time, and this "
-                "format needs one; add the Unix time of 0 s to the log's times (or give it as --unix-offset)"
-            )
+        require_utc(self.name, self.trajectory.time[0])
         return pd.to_datetime(np.round(self.trajectory.time * 1e6).astype(np.int64), unit="us", utc=True)
 
     def shifted(self, seconds: float) -> "Track":
@@ -121,13 +117,43 @@ class Track:
             raise InputError(f"{self.name}: is shorter than {1.0 / rate:g} s; give a higher rate")
         return replace(self, trajectory=self.trajectory.at(wanted))
 
-    def _known_origin(self) -> tuple[float, float]:
-        if self.origin is None:
-            raise InputError(
-                f"{self.name}: it is not known where on Earth the dive was; state environment.origin_lat_deg and "
-                "origin_lon_deg, or log fixes as fix_lat and fix_lon, and smooth again"
-            )
-        return self.origin
+
+def require_place(name: str, origin: tuple[float, float] | None) -> tuple[float, float]:
+    """The origin of a dive.
+
+    Raises
+    ------
+    InputError : it is not known where on Earth the dive was
+    """
+    if origin is None:
+        raise InputError(
+            f"{name}: it is not known where on Earth the dive was; state environment.origin_lat_deg and "
+            "origin_lon_deg, or log fixes as fix_lat and fix_lon, and smooth again"
+        )
+    return origin
+
+
+def is_utc(time: float) -> bool:
+    """Whether a time [s] counts from 1970."""
+    return time >= EARLIEST_UNIX
+
+
+def require_utc(name: str, start: float) -> None:
+    """See that time is Unix time.
+
+    Parameters
+    ----------
+    start : when the dive began [s]
+
+    Raises
+    ------
+    InputError : it counts from something else
+    """
+    if not is_utc(start):
+        raise InputError(
+            f"{name}: its time begins at {start:g} s, which is no Unix time, and this format needs one; "
+            "add the Unix time of 0 s to the log's times (or give it as --unix-offset)"
+        )
 
 
 def ellipse(covariance: Array, corners: int = 36) -> Array:

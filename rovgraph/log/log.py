@@ -87,6 +87,11 @@ class Log:
         """Names of its streams."""
         return set(self.streams)
 
+    @property
+    def start(self) -> float:
+        """Time of the first measurement [s]."""
+        return min(float(stream.time[0]) for stream in self.streams.values())
+
     def require_read_with(self, config: Config) -> None:
         """See that it was read with a configuration's columns, units, delays and magnetometer's calibration.
 
