@@ -17,8 +17,9 @@ import numpy as np
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.geometry import wrap_angle
+from rovgraph.interchange.lines import Refused, shown
 from rovgraph.live.message import GEODETIC, Message, Reading
-from rovgraph.live.sources.lines import LineDecoder, Refused, shown
+from rovgraph.live.sources.lines import LineDecoder
 from rovgraph.live.sources.preferred import Preferred
 from rovgraph.live.sources.source import Notify
 
