@@ -24,7 +24,7 @@ from rovgraph.interchange.rosbag_messages import COLUMNS, DOWN, GENERAL
 HEADERS, RECORDER = "headers of messages", "recorder"
 SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
 APART_S = 1.0  # between stamp and arrival; more is another clock
-BACK_S = 1.0
+BACK_S = 1.0  # by which stamps go back where their clock was set
 LATENCY_SD_S = 0.05
 SEA = 1025.0  # density of water [kg/m3]
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -153,20 +153,20 @@ class _Made:
     def _unjump(self, topic: Topic, stamp: Array, received: Array, keep: NDArray[np.bool_]) -> None:
         """Put stamps of a clock that went back on its last setting, as the recorder's clock tells."""
         rows = np.flatnonzero(keep)
-        if not (np.diff(stamp[rows]) < -BACK_S).any():
+        unset = stamp[rows] < SET
+        if not ((np.diff(stamp[rows]) < -BACK_S).any() or (unset.any() and not unset.all())):
             return
         clock = receiver_clock(np.arange(len(rows)), stamp[rows], received[rows])
         stamp[rows] = clock.corrected(np.arange(len(rows)), stamp[rows])
-        steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "less than can be told"
+        steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "what too few messages tell"
         self.warnings.append(
             f"{topic.name}: the clock of its headers was set by {steps}; what came before is put on it"
         )
-        back = stamp[rows] < np.maximum.accumulate(stamp[rows]) - BACK_S
-        if back.any():
-            self.left.append(
-                Left(f"{topic.name} ({topic.type})", int(back.sum()), "a stamp before that of earlier ones")
-            )
-            keep[rows[back]] = False
+        apart = received[rows] - stamp[rows]
+        other = np.abs(apart - np.median(apart)) > APART_S  # too few to tell how their clock was set
+        if other.any():
+            self.left.append(Left(f"{topic.name} ({topic.type})", int(other.sum()), "stamps of another clock"))
+            keep[rows[other]] = False
 
     def _new_fixes(self, topic: Topic, time: Array, values: Array) -> NDArray[np.bool_]:
         lat, lon = values[:, 0], values[:, 1]
@@ -189,9 +189,8 @@ class _Made:
                 pressure = factor * pressure
                 break
         surface, said, _ = surface_pressure(None, pressure)
-        self.notes.append(
-            f"{topic.name}: depth against {surface / 100.0:.0f} hPa at the surface ({said}), in water of {SEA:.0f} kg/m3"
-        )
+        at = f"{surface / 100.0:.0f} hPa at the surface ({said})"
+        self.warnings.append(f"{topic.name}: depth against {at}, in water of {SEA:.0f} kg/m3")
         return depth(pressure, surface, SEA)
 
     def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
@@ -229,9 +228,9 @@ class _Made:
         if (mounting := self._mountings.get("depth")) is not None:
             self.settings["depth"] = {"lever_arm_m": mounting.settings()["lever_arm_m"]}
         if "mag" in first and "imu" in first and at["mag"].frame != at["imu"].frame:
+            frames = f"{at['mag'].name} has the frame {at['mag'].frame!r}, the IMU {at['imu'].frame!r}"
             self.warnings.append(
-                f"{at['mag'].name} has the frame {at['mag'].frame!r}, the IMU {at['imu'].frame!r}: a log's magnetic field "
-                "is along the IMU's axes; use it only if theirs are parallel"
+                f"{frames}: a log has the field along the IMU's axes; use it only if theirs are parallel"
             )
 
     def _imu_mounting(self, topic: Topic, columns: Mapping[str, Array]) -> dict[str, Any]:
@@ -255,10 +254,8 @@ class _Made:
         return mounting.settings()
 
     def _unmounted(self, topic: Topic, axes: str) -> None:
-        frame = f"frame {topic.frame!r}" if topic.frame else "messages without a frame"
-        self.warnings.append(
-            f"{topic.name}: no /tf_static from its {frame} to base_link; its axes are taken as {axes}: check the mounting"
-        )
+        way = f"/tf_static does not lead from {topic.frame!r} to base_link"
+        self.warnings.append(f"{topic.name}: {way}; its axes are taken as {axes}: check the mounting")
 
 
 def _rank(topic: Topic) -> int:
