@@ -21,13 +21,15 @@ from rovgraph.interchange.recording import Recording
 
 HEAD = 65536  # bytes of a file that a format is recognised by
 LIKELY = 0.5  # confidence from which a file is taken to be of a format
-OWN: tuple[str, ...] = (
+OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "dataflash",
     "tlog",
     "blueos",
     "waterlinked",
     "rosbag",
-)  # modules of this package, each with a `FORMAT`
+    "nmea",
+    "gpx",
+)
 GROUP = "rovgraph.formats"
 
 

@@ -24,6 +24,7 @@ from rovgraph.interchange.waterlinked_reports import Report, is_report, velocity
 
 DVL, RECORDER, ELAPSED = "DVL", "recorder", "DVL's time between reports"
 SET = 1e9  # [s] since 1970: a clock that shows less has never been set
+SET_SD_S = 0.05  # how well a network sets a clock, a choice
 RESET_S = 1.0  # a clock that goes back further was set, or started anew
 LONGEST = 1 << 16  # bytes of a line
 FRAME = "the DVL's: x forward, y starboard, z down, turned by its own mounting_rotation_offset"
@@ -230,7 +231,7 @@ class _Reports:
         known = len(time) > 0 and bool(time[0] >= SET)
         if not known:
             self.notes.append("the DVL's clock was not set: its stamps count from its start")
-        clock = Clock(DVL, 0.0, 0.0, "its stamps are Unix time") if known else Clock(DVL)
+        clock = Clock(DVL, 0.0, SET_SD_S, "its stamps are Unix time") if known else Clock(DVL)
         mask = np.zeros(len(stamped), bool)
         mask[index] = True
         return mask, time, clock
