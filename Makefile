@@ -1,18 +1,19 @@
-# make demo   a track from the dive in data/falcon, and how far it is from the truth
+# make demo   rovgraph demo: a dive, its track, and how far it is from the truth
 # make test   linters, types and tests
+# make docs   this documentation as pages, in build/site
 # Each makes the environment that it needs in .venv.
 
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-DEMO   ?= results/falcon
+DEMO   ?= results/demo
 
-.PHONY: help venv demo test lint bench clean
+.PHONY: help venv demo test lint docs bench clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n 's/^# //p' Makefile | head -3
+	@sed -n 's/^# //p' Makefile | head -4
 
 venv: $(VENV)/dev.stamp
 
@@ -31,9 +32,12 @@ $(VENV)/dev.stamp: $(VENV)/venv.stamp pyproject.toml
 	$(PIP) --editable '.[dev]'
 	@touch $@ $(VENV)/run.stamp
 
+$(VENV)/docs.stamp: $(VENV)/venv.stamp pyproject.toml
+	$(PIP) --editable '.[docs]'
+	@touch $@ $(VENV)/run.stamp
+
 demo: $(VENV)/run.stamp
-	$(BIN)/rovgraph smooth data/falcon/log.csv.gz --config data/falcon/config.yaml --out $(DEMO) --force
-	$(BIN)/rovgraph evaluate $(DEMO)/trajectory_smoothed.csv data/falcon/truth.csv.gz
+	$(BIN)/rovgraph demo --out $(DEMO) --force
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .
@@ -42,6 +46,9 @@ lint: $(VENV)/dev.stamp
 
 test: lint
 	$(BIN)/pytest -n 2 --dist loadfile -m 'not slow'
+
+docs: $(VENV)/docs.stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python benchmarks/batch.py

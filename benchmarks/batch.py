@@ -27,7 +27,7 @@ from rovgraph.log import read_log
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import write_log
 
-FALCON = Path(__file__).parents[1] / "configs" / "falcon.yaml"
+FALCON = Path(__file__).parents[1] / "rovgraph" / "config" / "falcon.yaml"
 IMU_RATE, DVL_RATE = 100.0, 5.6
 
 

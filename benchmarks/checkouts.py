@@ -60,6 +60,11 @@ class Checkout:
     root: Path
     driver: str
 
+    @property
+    def falcon(self) -> Path:
+        """The configuration of the simulated dives."""
+        return self.root / "rovgraph" / "config" / "falcon.yaml"
+
     def rovgraph(self, *arguments: object) -> Cost:
         """Run the command line."""
         return self.python("-c", COMMAND, *arguments)

@@ -204,7 +204,7 @@ def hours(bench: Bench) -> Iterator[Line]:
         bench.now.drive("simulate", count * bench.hour, log)
 
         def measure(checkout: Checkout, log: Path = log) -> tuple[float, float]:
-            return bench.smooth(checkout, log, checkout.root / "configs" / "falcon.yaml", "--no-figures")
+            return bench.smooth(checkout, log, checkout.falcon, "--no-figures")
 
         spent[count] = bench.both(measure, base=count == 1 or bench.long)
         log.unlink()
@@ -251,10 +251,9 @@ def study(bench: Bench) -> Iterator[Line]:
     """The study of configs/studies/scale.yaml has ten cells of 50 dives."""
 
     def measure(checkout: Checkout) -> float:
-        folder = checkout.root / "configs"
-        plan = (folder / "studies" / "scale.yaml").read_text()
+        plan = (checkout.root / "configs" / "studies" / "scale.yaml").read_text()
         plan = re.sub(r"(?m)^runs: .*", f"runs: {bench.runs}", plan)
-        plan = re.sub(r"(?m)^vehicle: .*", f"vehicle: {folder / 'falcon.yaml'}", plan)
+        plan = re.sub(r"(?m)^vehicle: .*", f"vehicle: {checkout.falcon}", plan)
         if bench.quick:
             plan = plan.replace("duration_s: 300", "duration_s: 40")
         path, out = bench.folder / "scale.yaml", bench.folder / f"study-{checkout.driver}"

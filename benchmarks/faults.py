@@ -22,18 +22,17 @@ from fault_campaign.judge import HONEST_NEES, honest_nees
 
 from rovgraph.workers import cores
 
-READING = """# When the world is not as configured
+READING = """# Faults: when the configuration is wrong
 
 `python benchmarks/faults.py --seeds {seeds} --markdown docs/faults.md` makes this page{version}.
 
 An independent simulator makes the dives: WGS-84, Earth rate, IMU samples averaged over their period, its own frames \
-and equations (`benchmarks/fault_campaign`). Each case breaks one thing and leaves the configuration as it is. Every \
-log goes through `rovgraph smooth`{online}, {seeds} seeds a case; cases named *online* go \
-through `rovgraph online` alone. NEES is the squared error over the stated variance \
-per degree of freedom, its mean over dive and seeds: 1 is honest. The columns show that of the horizontal position, \
-and the largest of depth, heading, `dvl_yaw` and `dvl_scale`. The rms error and the stated sd are of the smoothed \
-horizontal position. *Named* is the part of the dives in which a warning names the cause. The warnings of the same \
-dives without the fault do not count.
+and equations (`benchmarks/fault_campaign`). Each case has one fault that the configuration does not state. Every log \
+goes through `rovgraph smooth`{online}, {seeds} seeds a case; cases named *online* go through `rovgraph online` \
+alone. NEES is the squared error over the stated variance per degree of freedom, its mean over dive and seeds: 1 is \
+consistent. The columns show that of the horizontal position, and the largest of depth, heading, `dvl_yaw` and \
+`dvl_scale`. The rms error and the stated sd are of the smoothed horizontal position. *Named* is the part of the \
+dives in which a warning names the cause. The warnings of the same dives without the fault do not count.
 
 | outcome | |
 |---|---|
@@ -42,17 +41,16 @@ dives without the fault do not count.
 | loud | some NEES is above 2, and the cause is named in 19 of 20 dives, or the log is refused |
 | lie | some NEES is above 2, and the cause is not named |
 
-{limit}*Reported by* says who met such a fault: `audit` is an audit of rovgraph with another simulator and recorded \
-dives, others are issue trackers of drivers, autopilots and navigation software.
+{limit}*Reported by* says who reported such a fault: `audit` is an audit of rovgraph with another simulator and \
+recorded dives, others are issue trackers of drivers, autopilots and navigation software.
 
-Some faults leave no trace in a log: a heading that is off by a constant where there are no fixes, and a depth that is \
-off by a constant. Wider priors are the only defence against those. An IMU that is mounted otherwise than stated is \
-another: the body's axes are those of the IMU as stated, so heading and `dvl_yaw` are off by its error, and the track \
-is not.
+Some faults cannot be observed in a log: a constant error of the heading without fixes, and a constant error of the \
+depth. Only wider priors cover those. A wrongly stated mounting of the IMU is another: the body's axes are those of \
+the IMU as stated, so heading and `dvl_yaw` have its error, and the track does not.
 
-Run the campaign whenever the estimator changes. `--cases` takes some of them, `--jobs` sets the number of \
-processes, `--json` writes all figures, `--keep` goes on with a campaign that was interrupted, \
-`--online` replays each log through `rovgraph online` as well.
+Run the campaign whenever the estimator changes. `--cases` selects some of them, `--jobs` sets the number of \
+processes, `--json` writes all figures, `--keep` continues an interrupted campaign, `--online` replays each log \
+through `rovgraph online` as well.
 """
 
 

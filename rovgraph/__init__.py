@@ -34,8 +34,8 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / report, export / studies, live /
-estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
+cli / api / pages / report, export / studies, live / interchange /
+estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / gauss_markov, units / geometry, workers, fast_csv / errors, process.
 """
@@ -50,6 +50,10 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from rovgraph.api.comparison import ComparisonResult as ComparisonResult
     from rovgraph.api.comparison import compare as compare
+    from rovgraph.api.conversion import Conversion as Conversion
+    from rovgraph.api.conversion import convert as convert
+    from rovgraph.api.demo import Demo as Demo
+    from rovgraph.api.demo import demo as demo
     from rovgraph.api.exporting import export as export
     from rovgraph.api.exporting import tag as tag
     from rovgraph.api.logs import check as check
@@ -59,6 +63,8 @@ if TYPE_CHECKING:
     from rovgraph.api.observability import observe as observe
     from rovgraph.api.observability import plan as plan
     from rovgraph.api.online import Online as Online
+    from rovgraph.api.reporting import report as report
+    from rovgraph.api.reporting import report_check as report_check
     from rovgraph.api.simulation import SimulatedDive as SimulatedDive
     from rovgraph.api.simulation import simulate as simulate
     from rovgraph.api.smoothing import Result as Result
@@ -81,7 +87,9 @@ _HOMES = {
     "Choices": "simulate",
     "ComparisonResult": "api.comparison",
     "Config": "config",
+    "Conversion": "api.conversion",
     "DataWarning": "errors",
+    "Demo": "api.demo",
     "InputError": "errors",
     "Log": "log",
     "Metrics": "evaluate",
@@ -93,6 +101,8 @@ _HOMES = {
     "Trajectory": "trajectory",
     "check": "api.logs",
     "compare": "api.comparison",
+    "convert": "api.conversion",
+    "demo": "api.demo",
     "evaluate": "evaluate",
     "export": "api.exporting",
     "load_config": "config",
@@ -102,6 +112,8 @@ _HOMES = {
     "read_log": "api.logs",
     "read_reference": "evaluate",
     "read_trajectory": "trajectory",
+    "report": "api.reporting",
+    "report_check": "api.reporting",
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
     "tag": "api.exporting",
@@ -110,7 +122,7 @@ __all__ = list(_HOMES)
 
 
 class _Package(ModuleType):
-    """This package, whose functions `check`, `export` and others are not hidden by the modules of these names."""
+    """This package, whose functions (`check`, `evaluate`, `report`, …) are not hidden by modules of the same name."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _HOMES and isinstance(value, ModuleType)):  # which the import of a submodule would set

@@ -376,6 +376,8 @@ TABLE: dict[str, Variable] = {
             "position fixes; starts and stops, against the accelerometer",
             time_constant=30.0,
         ),
+        *_compass("vehicle_compass", "VW", "vehicle_heading", "the vehicle's own heading"),
+        _compass_error("vehicle_compass", "5", "vehicle_heading", "the vehicle's own heading"),
     )
 }
 

@@ -88,9 +88,12 @@ def evaluate(
 
     Raises
     ------
-    InputError : a start before or after the trajectory; an end before the start; fewer than two reference epochs
-        inside the rest of it
+    InputError : no `Trajectory`; a start before or after the trajectory; an end before the start; fewer than two
+        reference epochs inside the rest of it
     """
+    for name, track in (("trajectory", trajectory), ("reference", reference)):
+        if not isinstance(track, Trajectory):
+            raise InputError(f"{name}: expected a Trajectory, as read_{name} gives it, found a {type(track).__name__}")
     if not start >= 0.0:
         raise InputError(f"comparing from {start:g} s on: expected 0 or more after the trajectory's first epoch")
     if (lasts := float(trajectory.time[-1] - trajectory.time[0])) < start:
@@ -180,7 +183,7 @@ def normalised_error(error: Array, covariance: Array) -> Array:
 
 
 def aligned(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, dict[str, Any]]:
-    """The estimate turned about down and shifted in the horizontal to fit the truth best.
+    """The estimate rotated about down and shifted horizontally for the best fit to the truth.
 
     Parameters
     ----------
@@ -208,7 +211,7 @@ def aligned(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, dict[s
 
 
 def read_reference(path: Path | str) -> Trajectory:
-    """Read a reference CSV, forgiving what references from other tools come with.
+    """Read a reference CSV, tolerating what other tools write.
 
     Rows without time, north or east and repeated times are left out with a `DataWarning`;
     rows out of order are sorted.

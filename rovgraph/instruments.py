@@ -12,15 +12,16 @@ HEADING_STREAMS = tuple(s.name for s in SENSORS.values() if s.heading_source)  #
 
 
 def heading_sources(config: Config, available: set[str]) -> list[str]:
-    """Log streams that give heading, in order: "mag", "ahrs", "dvl_heading".
+    """Log streams that give heading, in order: "mag", "ahrs", "vehicle_heading", "dvl_heading".
 
-    Where the configuration names no sources, the magnetometer goes before the IMU's own
-    heading, which is made from it and would count it twice.
+    Where the configuration names no sources, the magnetometer goes before the IMU's own heading, which is made from it
+    and would count it twice, and that before the vehicle's.
     """
     if config.heading.sources is not None:
         wanted = [s for s in HEADING_STREAMS if SENSORS[s].heading_source in config.heading.sources]
     else:
-        wanted = ["mag" if "mag" in available else "ahrs", "dvl_heading"]
+        own = [s for s in ("mag", "ahrs", "vehicle_heading") if s in available]
+        wanted = [*own[:1], "dvl_heading"]
     return [s for s in HEADING_STREAMS if s in wanted and s in available]
 
 

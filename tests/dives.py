@@ -24,7 +24,7 @@ from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.simulate import Dive, Path, Style, Truth, Waves, scenario, simulate
 from rovgraph.trajectory import Trajectory
 
-FALCON = FilePath(__file__).parents[1] / "configs" / "falcon.yaml"
+FALCON = FilePath(__file__).parents[1] / "rovgraph" / "config" / "falcon.yaml"
 LIVELY = Style(waves=Waves(heave=0.05, roll=0.1, pitch=0.08))
 
 

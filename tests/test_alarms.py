@@ -43,7 +43,7 @@ SECONDS = 200.0
 SAID = {
     "DVL y sign flipped": ("wrong", "axes", "dvl: its axes are left-handed, dvl_vx, -dvl_vy, dvl_vz are right"),
     "IMU mounted 2, 1, 3 degrees off": ("wrong", "held", "check imu.mount_rpy_deg"),
-    "DVL biased by 0.3 m/s for 20 s": ("wrong", "taken out", "dvl: contradicts the other sensors together"),
+    "DVL biased by 0.3 m/s for 20 s": ("wrong", "taken out", "dvl: contradicts all other sensors"),
     "DVL frozen for a minute": ("doubtful", "frozen", "dvl: repeats its values for 60 s"),
     "depth stuck": ("doubtful", "frozen", "depth: repeats its values for 140 s"),
     "DVL 0.3 s late": ("wrong", "clock", "s late against the IMU's"),

@@ -4,6 +4,7 @@ import ast
 import doctest
 import json
 import shutil
+import socket
 import subprocess
 import sys
 import warnings
@@ -14,6 +15,7 @@ import pandas as pd
 import pytest
 
 import rovgraph as rg
+from rovgraph.api.demo import CHOICES, SCENARIO, SEED
 from rovgraph.cli.app import main
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
@@ -185,6 +187,27 @@ def test_simulate_writes_what_the_command_writes(monkeypatch, tmp_path):
     assert len(dive.log["dvl"]) == len(rg.read_log(tmp_path / "twin" / "log.csv", dive.config)["dvl"])
 
 
+def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
+    """A minute of it; the whole dive is smoothed from the installed wheel."""
+    monkeypatch.setattr("rovgraph.api.demo.CHOICES", rg.Choices(duration=60.0, outliers=0.01))
+    monkeypatch.chdir(tmp_path)
+    assert command(monkeypatch, "demo") == 0
+    said = capsys.readouterr().out
+    assert "verdict: trusted" in said and f"{Path('demo/results/track.png')}: " in said
+    done = rg.demo("demo", force=True)  # in the same place, which the summary names
+    assert f"{done.metrics.rms_m:.3f} m" in said and done.metrics.rms_m < 0.1
+    assert done.result.verdict == "trusted" and (done.results / "track.png").is_file()
+    assert command(monkeypatch, "demo") == 2
+    assert "demo exists; choose another --out or give --force" in capsys.readouterr().err
+
+
+def test_the_demonstration_dive_is_the_one_of_the_repository():
+    made = (SHIPPED / "README.md").read_text(encoding="utf-8")
+    stated = f"simulate {SCENARIO} --seed {SEED} --outliers {CHOICES.outliers} --config rovgraph/config/falcon.yaml"
+    assert stated in made
+    assert rg.Choices(outliers=CHOICES.outliers) == CHOICES  # nothing else is chosen
+
+
 def test_observe_writes_what_the_command_writes(monkeypatch, tmp_path, short, config):
     log = tmp_path / "log.csv"
     short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
@@ -216,6 +239,55 @@ def test_online_gives_the_solutions_of_the_command(monkeypatch, capfd, tmp_path,
     assert len(said) > 10
     track = np.array([[row["north"], row["east"], row["down"], row["north_sd"]] for row in said])
     assert np.array([[*s.position, s.position_sd[0]] for s in solutions]) == pytest.approx(track, rel=1e-5, abs=1e-6)
+
+
+def test_a_run_of_sources_gives_sends_and_keeps_what_the_command_does(monkeypatch, capfd, tmp_path, short):
+    log = tmp_path / "log.csv"
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
+    options = ["-c", SHIPPED / "config.yaml", "--speed", "max", "--output", "-", "--rate", 2, "--no-refine"]
+    assert command(monkeypatch, "online", f"file:{log}", *options, "--out", tmp_path / "command") == 0
+    said = capfd.readouterr().out
+    online = rg.Online(rg.load_config(SHIPPED / "config.yaml"), rate_hz=2.0)
+    run = online.run(f"file:{log}", outputs=["-"], speed="max", out=tmp_path / "twin")
+    solutions = list(run)
+    assert [{**json.loads(line), "update_s": 0} for line in capfd.readouterr().out.splitlines()] == [
+        {**json.loads(line), "update_s": 0} for line in said.splitlines()
+    ]
+    assert len(solutions) == len(said.splitlines()) > 10
+    for name in ("received.csv", "trajectory_filtered.csv", "config.yaml", "config_online.yaml", "events.jsonl"):
+        assert (tmp_path / "twin" / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
+    one, other = (json.loads((tmp_path / folder / "summary.json").read_text()) for folder in ("command", "twin"))
+    assert one | {"updates": 0} == other | {"updates": 0}
+    assert one["state"] == "finished"
+
+
+def test_leaving_the_loop_ends_a_run_and_its_folder_is_whole(tmp_path, short):
+    log = tmp_path / "log.csv"
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(log, index=False)
+    run = rg.Online(rg.load_config(SHIPPED / "config.yaml")).run(f"file:{log}", speed="max", out=tmp_path / "dive")
+    for solution in run:
+        if solution.distance > 1.0:
+            break
+    summary = json.loads((tmp_path / "dive" / "summary.json").read_text())
+    assert summary["state"] == "finished"
+    assert summary["time"] == pytest.approx(solution.time, abs=1.0)
+    kept = rg.read_trajectory(tmp_path / "dive" / "trajectory_filtered.csv")
+    assert kept.time[-1] == pytest.approx(summary["time"], abs=0.5)
+
+
+def test_a_run_that_cannot_be_is_refused_and_leaves_no_output_open(tmp_path):
+    (tmp_path / "kept.txt").write_text("mine")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(rg.InputError, match="choose another --out"):
+        rg.Online().run("tcp://127.0.0.1:5", outputs=[f"tcp://:{port}"], out=tmp_path)
+    with socket.socket() as again:
+        again.bind(("127.0.0.1", port))
+    with pytest.raises(rg.InputError, match="at least one source"):
+        rg.Online().run()
+    with pytest.raises(rg.InputError, match="--resume needs the folder"):
+        rg.Online().run("tcp://127.0.0.1:5", resume=True)
 
 
 # results
@@ -350,6 +422,7 @@ def test_a_frame_is_refused_with_the_words_that_the_command_has_for_its_file(mon
     [
         ([{"time": T, "depth": T[:2]}], r"columns of different length \(time 3, depth 2\)"),
         ([{"time": T, "depth": np.ones((3, 1))}], r"column depth has shape \(3, 1\)"),
+        ([{"time": T, "depth": [[1, 2], [3], [4]]}], "column depth holds lists, expected one number per row"),
         ([{"time": T, "depth": 1.0}], r"column depth has shape \(\)"),
         ([{"time": T, "depth": T}, {"dvl_vx": T}], "rows without time"),
         ([], "no rows"),
@@ -389,3 +462,25 @@ def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
         rg.Choices(duration=1e5)
     with pytest.raises(rg.InputError, match="compare wants either a log"):
         rg.compare()
+
+
+def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
+    for use in (
+        lambda: rg.read_log(SHIPPED / "log.csv.gz", "vehicle.yaml"),
+        lambda: rg.Log.from_frame(short, {}),
+        lambda: rg.simulate("circle", "vehicle.yaml"),
+        lambda: rg.simulate("vattern", {}),
+        lambda: rg.plan("vehicle.yaml"),
+    ):
+        with pytest.raises(
+            rg.InputError, match=r"config: expected a Config, as load_config gives it, found a (str|di)"
+        ):
+            use()
+    with pytest.raises(rg.InputError, match="configuration: expected YAML text, found a dict"):
+        rg.parse_config({"imu": {}})
+    with pytest.raises(rg.InputError, match=r"is a DataFrame, .* use Log\.from_frame"):
+        rg.read_log(short)
+    with pytest.raises(rg.InputError, match="trajectory: expected a Trajectory, as read_trajectory gives it"):
+        rg.evaluate("trajectory.csv", "reference.csv")
+    with pytest.raises(rg.InputError, match="reference: expected a Trajectory, as read_reference gives it"):
+        rg.evaluate(rg.simulate("circle", choices=rg.Choices(duration=40.0)).truth, short)

@@ -27,17 +27,19 @@ LAYERS = (
     {"instruments"},
     {"engine"},
     {"graph"},
-    {"estimators", "simulate", "evaluate", "check", "calibrate", "interchange"},
+    {"estimators", "simulate", "evaluate", "check", "calibrate"},
+    {"interchange"},
     {"studies", "live"},
     {"report", "export"},
+    {"pages"},
     {"api"},
     {"cli"},
 )
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
 
 # library -> the only member that may import it
-CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "typer": "cli"}
-HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib"}
+CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "jinja2": "pages", "typer": "cli"}
+HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib", "jinja2"}
 
 
 def module_name(path: Path) -> str:
@@ -168,12 +170,15 @@ print("MODULES", *sys.modules)
     "command",
     [
         [],
+        ["demo"],
         ["smooth"],
         ["online"],
+        ["report"],
         ["evaluate"],
         ["compare"],
         ["check"],
         ["config"],
+        ["convert"],
         ["simulate"],
         ["observe"],
         ["plan"],

@@ -1,5 +1,8 @@
 """Keyframes and attached measurements: what goes where, and what is left out."""
 
+from collections import Counter
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from dives import Simulated, falcon, interrupted, kept, level_log, same, simulated, started
@@ -8,7 +11,10 @@ from hypothesis import strategies as st
 
 from rovgraph.config import Config
 from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.log_assembly import assemble_log
+from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
 
@@ -17,13 +23,16 @@ G = np.array([0.0, 0.0, -9.81])
 
 def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInterval], Assembler]:
     config = config or Config()
-    whole, assembler = (Assembler(config, instruments(config), np.zeros(6)) for _ in range(2))
+    assembler, left_out = Assembler(config, instruments(config), np.zeros(6)), Counter()
     done: list[KeyframeInterval] = []
     for measurement in log.measurements():
         done += assembler.add(measurement)
     done += assembler.finish()
-    same(done, whole.take(log))
-    assert whole.left_out == assembler.left_out
+    offsets = TimeOffsets.of(config, assembler.instruments)
+    whole = assemble_log(log, config, assembler.instruments, np.zeros(6), offsets, left_out)
+    same(done, whole.intervals)
+    same(DiveRows.of(done, [*assembler.instruments]), whole.rows)
+    assert left_out == assembler.left_out
     return done, assembler
 
 
@@ -289,3 +298,24 @@ def test_a_log_taken_as_a_whole_gives_what_its_measurements_give_one_by_one(dive
         log = kept(log, "imu", log["imu"].time < 38.765)
     intervals, _ = assembled(log, started(dive, **sections))
     assert len(intervals) > 25
+
+
+def test_places_of_a_whole_log_count_again_after_a_while_as_those_that_come_one_by_one():
+    """`assembled` compares."""
+    at = np.array([0.31, 0.32, 0.87, 1.49, 2.6, 2.6, 3.99])
+    names = np.array([7.0, 7.0, 3.0, 7.0, 3.0, 7.0, 7.0])
+    config = Config.model_validate({"place": {"every_s": 1.0}})
+    places = at, np.column_stack([names, np.full(len(at), np.nan)])
+    intervals, assembler = assembled(log_of(4.0, [0.5, 1.3, 1.31, 2.6], place=places), config)
+    seen = [a.landmark for _, a in found(intervals, "place")]
+    assert [(s.name, s.number) for s in seen if s is not None] == [(7, 1), (3, 2), (7, 3), (3, 4), (7, 5), (7, 6)]
+    assert assembler.left_out["place", "still in view"] == 1
+
+
+def test_a_log_at_the_time_of_a_clock_and_one_that_begins_with_pings_are_taken_alike():
+    """`assembled` compares."""
+    log = log_of(3.0, [-0.4, 0.0, 0.004, 1.1, 3.0, 3.2], depth=scalar([-0.1, 0.0, 1.1, 2.9, 3.0, 3.1]))
+    _, assembler = assembled(log)
+    assert assembler.left_out["dvl", "before the first IMU sample"] == 1
+    later = {name: replace(stream, time=stream.time + 1.7e9) for name, stream in log.streams.items()}
+    assembled(replace(log, streams=later))

@@ -120,7 +120,11 @@ def test_timing_counts_rate_gap_and_repeats():
     [
         (["imu"], "error", "no IMU"),
         (["dvl"], "warning", "no DVL: position is lost"),
-        (["mag", "ahrs", "dvl_heading"], "warning", "no heading source in use: give mag, ahrs_yaw or dvl_heading"),
+        (
+            ["mag", "ahrs", "dvl_heading"],
+            "warning",
+            "no heading source in use: give mag, ahrs_yaw, heading or dvl_heading",
+        ),
         (["depth"], "warning", "no depth"),
         (["fix"], "ok", "no position fixes"),
     ],

@@ -32,7 +32,7 @@ from rovgraph.trajectory import Trajectory
 from rovgraph.workers import in_workers, starting
 
 ROOT = Path(__file__).parents[1]
-FALCON = ROOT / "configs" / "falcon.yaml"
+FALCON = ROOT / "rovgraph" / "config" / "falcon.yaml"
 FEW = "graph-smoothed-misalignment,dead-reckoning,graph-smoothed-c"
 DIVES = ["--scenario", "circle", "--duration", "40", "--config", str(FALCON)]
 

@@ -36,6 +36,7 @@ CASES = {
     "fix": (kernels.POSITION, 2, [*ARM, layout.FIX_ERROR, -1, 0, 1]),
     "place": (kernels.PLACE_OFFSET, 2, ARM),
     "water_velocity": (kernels.WATER_VELOCITY, 2, []),
+    "tilt": (kernels.TILT, 2, []),
 }
 
 

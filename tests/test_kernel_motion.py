@@ -23,6 +23,7 @@ from rovgraph.kernels.motion_row import (
     EARTH_RATE,
     GAP,
     GRAVITY,
+    NO_IMU,
     NOISE,
     ROW,
     TANGENT,
@@ -50,7 +51,9 @@ class Case:
         row[GAP], row[GRAVITY] = gap, 9.81
         row[BIAS : BIAS + 6], row[NOISE : NOISE + 5] = self.bias, self.densities
         row[EARTH_RATE : EARTH_RATE + 3] = self.earth_rate
-        preintegrate(self.imu, self.start, self.stops, self.end, row, snapshots)
+        begin, end, count = np.array([self.start]), np.array([self.end]), np.array([0, len(self.imu)])
+        own = np.array([0, len(self.stops)])
+        preintegrate(self.imu, count[:1], count[1:], begin, end, self.stops, own, row[None], snapshots)
         return row, snapshots
 
     def pim(self, end: float = np.inf) -> gtsam.PreintegratedCombinedMeasurements:
@@ -277,7 +280,7 @@ def test_residual_and_its_derivatives_are_those_of_gtsam(case, apart):
         close(got, expected)
 
 
-@pytest.mark.parametrize("gap", [0.0, 2.0], ids=["whole", "coasted"])
+@pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
 @cases
 def test_derivatives_of_the_residual_are_those_of_its_values(case, gap):
     row, _ = case.row(gap)
@@ -288,7 +291,7 @@ def test_derivatives_of_the_residual_are_those_of_its_values(case, gap):
     close(A_j, derivative(lambda d: error(row, before, after.moved(d))[0]), 1e-8)
 
 
-@pytest.mark.parametrize("gap", [0.0, 2.0], ids=["whole", "coasted"])
+@pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
 @cases
 def test_transition_solves_the_linear_residual_at_the_prediction(case, gap):
     row, _ = case.row(gap)
@@ -308,7 +311,7 @@ def weight(row: Array) -> Array:
     return W[0]
 
 
-@pytest.mark.parametrize("gap", [0.0, 2.0], ids=["whole", "coasted"])
+@pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
 @cases
 def test_transition_carries_small_errors(case, gap):
     row, _ = case.row(gap)
@@ -341,7 +344,7 @@ def test_weights_whiten(case):
 
 
 def test_many_intervals_are_each_alone():
-    rows = np.array([case.row(gap)[0] for case in CASES for gap in (0.0, 2.0)])
+    rows = np.array([case.row(gap)[0] for case in CASES for gap in (0.0, 2.0, NO_IMU)])
     before = ends(9, np.zeros(6), len(rows))
     n = len(rows)
     R, p, v, F, Q = (np.empty((n, *shape)) for shape in ((3, 3), (3,), (3,), (15, 15), (15, 15)))

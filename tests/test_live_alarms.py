@@ -49,7 +49,7 @@ def test_a_healthy_dive_is_trusted_from_beginning_to_end(case):
     [
         ("DVL y sign flipped", "dvl: up to"),
         ("IMU mounted 2, 1, 3 degrees off", "depth: residuals of down last"),
-        ("DVL biased by 0.3 m/s for 20 s", "dvl: contradicts the other sensors together"),
+        ("DVL biased by 0.3 m/s for 20 s", "dvl: contradicts all other sensors"),
         ("depth stuck", "depth: residuals of down last"),
         ("DVL 0.3 s late", "dvl: up to"),
         ("DVL noise three times as stated", "raise dvl.velocity_sd_mps"),

@@ -94,7 +94,7 @@ def test_a_dvl_that_locks_onto_something_else_for_a_minute_is_left_out_and_the_s
 
     flight = flown(case, alter)
     assert "incoherent" in flight.events("dvl")
-    assert any("dvl: contradicts the other sensors together" in e.text for s in flight.solutions for e in s.events)
+    assert any("dvl: contradicts all other sensors" in e.text for s in flight.solutions for e in s.events)
     left_out = flight.time > 30.0 + 15.0
     assert (np.abs(flight.errors) / flight.sd)[left_out].max() < HONEST_SD
     assert flight.sd_at(80.0) > 10.0 * flight.sd_at(29.0)

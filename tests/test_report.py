@@ -2,6 +2,7 @@
 
 import csv
 import errno
+import io
 import json
 import os
 import warnings
@@ -11,7 +12,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.table import Table
 
 from rovgraph.config import Config, load_config
 from rovgraph.errors import InputError
@@ -19,6 +22,7 @@ from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, 
 from rovgraph.geometry import matrix_from_rpy
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.report.folder import check_writable, results_folder
+from rovgraph.report.narrow import fitting
 from rovgraph.report.results import ellipse_axes, sensor_counts, summarise, to_plain, write_results
 from rovgraph.report.tables import calibration_table, summary_table
 from rovgraph.report.units import plus_minus
@@ -316,7 +320,8 @@ def test_every_file_is_written(written):
     folder, _ = written
     names = {p.name for p in folder.iterdir()}
     tracks = {f"trajectory_{kind}.{ending}" for kind in ("smoothed", "filtered") for ending in ("csv", "tum")}
-    assert names == tracks | {"calibration.csv", "residuals.csv", "history.csv", "config.yaml", "summary.json"}
+    tables = {"calibration.csv", "residuals.csv", "history.csv", "left_out.csv"}
+    assert names == tracks | tables | {"config.yaml", "summary.json"}
 
 
 def test_trajectory_comes_back(written, dive):
@@ -367,7 +372,8 @@ def test_summary_is_json_with_units(written):
     assert summary["duration_s"] == pytest.approx(300.0)
     assert summary["calibration"]["dvl_yaw"]["value_deg"] == pytest.approx(-21.5)
     assert summary["estimates"]["smoothed"]["converged"] is True
-    assert summary["sensors"]["imu"] == {"recorded": 600}
+    imu = summary["sensors"]["imu"]
+    assert imu["recorded"] == 600 and imu["rate_hz"] == pytest.approx(599 / 300.0, rel=1e-3)
     assert summary["assumptions"] == ["heading from the AHRS"] and summary["seconds"] == {"smooth": 1.5}
 
 
@@ -565,3 +571,35 @@ def test_compass_headings_are_brought_to_the_body(dive):
 def test_residual_file_reads_as_plain_csv(written):
     with (written[0] / "residuals.csv").open(newline="") as file:
         assert next(csv.reader(file)) == RESIDUAL_COLUMNS
+
+
+def wide_table() -> Table:
+    table = Table(title="errors", caption="in m", box=SIMPLE_HEAD, padding=0)
+    for k in range(9):
+        table.add_column(f"column {k}", no_wrap=True)
+    for name in ("dead-reckoning", "graph-smoothed-misalignment"):
+        table.add_row(name, *(f"{name[:4]}{k} ± 0.01" for k in range(8)), end_section=True)
+    return table
+
+
+@pytest.mark.parametrize("width", [80, 120, 30])
+def test_a_table_wider_than_the_terminal_is_printed_in_parts_that_fit(width):
+    console = Console(width=width, record=True, file=io.StringIO())
+    parts = list(fitting(wide_table(), console))
+    for part in parts:
+        console.print(part)
+    lines = console.export_text().splitlines()
+    assert len(parts) > 1 and all(len(part.columns) > 1 for part in parts)
+    assert [part.title for part in parts] == ["errors", *[None] * (len(parts) - 1)]
+    assert [part.caption for part in parts] == [*[None] * (len(parts) - 1), "in m"]
+    if width >= 80:  # wide enough for two columns
+        assert all(len(part.columns) >= 3 for part in parts[:-1])
+        for name in ("dead-reckoning", "graph-smoothed-misalignment"):
+            cells = " ".join(line for line in lines if name in line)
+            assert cells.count(name) == len(parts)
+            assert all(f"{name[:4]}{k} ± 0.01" in cells for k in range(8))
+
+
+def test_a_table_that_fits_stays_one():
+    (part,) = fitting(wide_table(), Console(width=200, file=io.StringIO()))
+    assert len(part.columns) == 9 and part.title == "errors" and part.caption == "in m"

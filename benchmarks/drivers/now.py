@@ -1,5 +1,6 @@
 """What is measured within a process of this checkout; `at_27325b3.py` does the same at that commit."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.error_state import replay as replay_filter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.log import Log, read_log
-from rovgraph.simulate import Choices, simulated
+from rovgraph.simulate import Choices, choices, simulated
 from rovgraph.simulate.files import write_log
 
 
@@ -64,6 +65,7 @@ def online(kind: str, seconds: str, rate: str) -> dict[str, float]:
 
 def simulate(seconds: str, path: str) -> int:
     """Write the log of a simulated dive; returns the number of its rows."""
+    choices.DURATION_MAX = math.inf
     dive, _ = simulated("lawnmower", 1, falcon(), Choices(duration=float(seconds)))
     write_log(dive.log_frame, Path(path))
     return len(dive.log_frame)

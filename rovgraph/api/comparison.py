@@ -46,12 +46,13 @@ class ComparisonResult:
         return self.comparison.table
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph compare`` (docs/compare.md), all of it or nothing.
+        """Write the folder of ``rovgraph compare`` (docs/compare.md), complete or not at all.
 
         Raises
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
+        from rovgraph.pages.reporting import write_page
         from rovgraph.report.comparison import write_comparison
         from rovgraph.report.figure_compare import draw_comparison
         from rovgraph.report.folder import results_folder
@@ -59,6 +60,7 @@ class ComparisonResult:
         with results_folder(Path(path), force) as folder:
             draw_comparison(folder, self.comparison, self.title, self.thesis)
             write_comparison(folder, self.comparison, self.about)
+            write_page(folder)
 
 
 def compare(

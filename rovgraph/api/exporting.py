@@ -2,19 +2,21 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from rovgraph.api.smoothing import Result
 from rovgraph.errors import InputError
-from rovgraph.export import Options, Tagged, Track, fixes_of, read_track, write_track
+from rovgraph.export import Options, Tagged, Track, read_track, write_track
 from rovgraph.export import tag as tag_table
 from rovgraph.export.tagging import geotag
-from rovgraph.export.track import ESTIMATES
+
+if TYPE_CHECKING:
+    from rovgraph.api.smoothing import Result
 
 
 def export(
-    results: Result | Path | str,
+    results: "Result | Path | str",
     to: str | Sequence[str],
     out: Path | str | None = None,
     estimate: str | None = None,
@@ -45,16 +47,17 @@ def export(
     InputError : an unknown format, a library that is not installed, an origin or a Unix time that a format needs and
         the dive does not have, a file that is there
     """
-    if out is None and isinstance(results, Result):
-        raise InputError("out: expected a folder to write into, since these results are in none")
-    folder = Path(results) if out is None and not isinstance(results, Result) else Path(str(out))
+    if out is None:
+        if not isinstance(results, str | Path):
+            raise InputError("out: expected a folder to write into, since these results are in none")
+        out = results
     track = track_of(results, estimate).shifted(unix_offset)
-    return write_track(track, [to] if isinstance(to, str) else to, folder, Options(rate, crs), force)
+    return write_track(track, [to] if isinstance(to, str) else to, Path(out), Options(rate, crs), force)
 
 
 def tag(
     table: Path | str,
-    results: Result | Path | str,
+    results: "Result | Path | str",
     out: Path | str,
     time: str = "time",
     offset: float = 0.0,
@@ -114,17 +117,11 @@ def tag(
     return tagged
 
 
-def track_of(results: Result | Path | str, estimate: str | None = None) -> Track:
+def track_of(results: "Result | Path | str", estimate: str | None = None) -> Track:
     """A track to be exported.
 
     Raises
     ------
     InputError : not that estimate, no results folder
     """
-    if not isinstance(results, Result):
-        return read_track(results, estimate)
-    if estimate not in (None, *ESTIMATES):
-        raise InputError(f"estimate {estimate!r}: expected {', '.join(ESTIMATES)}")
-    chosen = results.main if estimate is None else getattr(results, estimate)
-    name = results.config.name or Path(results.log.source).name
-    return Track(name, chosen.kind, chosen.trajectory, results.log.origin, fixes_of(results.main.residuals))
+    return read_track(results, estimate) if isinstance(results, str | Path) else results.track(estimate)

@@ -1,24 +1,40 @@
-"""A log on its way into an estimate: read with a configuration, checked, its clocks bridged."""
+"""Logs for an estimate: reading with a configuration, checking, bridging of clock jumps."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
+import pandas as pd
+
 from rovgraph import log as library
+from rovgraph.api.conversion import NOTHING, Paths, convert, is_plain_log
 from rovgraph.check import Finding, Report, bridge_jumps, examine
 from rovgraph.check import warn as warn_of_findings
-from rovgraph.config import Config
+from rovgraph.config import Config, completed, config_or_defaults
 from rovgraph.errors import InputError, warn
+from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.estimators.initialise import refusal
 from rovgraph.log import Log
 
 
-def read_log(path: Path | str, config: Config | None = None) -> Log:
-    """Read a log (docs/log-format.md) with the columns, units and delays of a configuration.
+def read_log(
+    path: Paths,
+    config: Config | None = None,
+    choose: Mapping[str, str] = NOTHING,
+    shift: Mapping[str, float] = NOTHING,
+    progress: Progress = no_progress,
+) -> Log:
+    """Read a log (docs/log-format.md) with the columns, units and delays of a configuration, or native files as one.
 
     Parameters
     ----------
-    path : CSV, gzipped CSV or Parquet
+    path : CSV, gzipped CSV or Parquet; or native files of one dive, one or several (docs/formats.md)
     config : None = rovgraph's own columns, in SI
+    choose, shift, progress : of `rovgraph.convert`, for native files
+
+    Returns
+    -------
+    Log : what native files know (mountings, ...) is in ``.settings`` and holds where a configuration states nothing
 
     Raises
     ------
@@ -26,27 +42,33 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
 
     Warns
     -----
-    DataWarning : what was left out or put in order; a configuration that lies beside the log and was not given
+    DataWarning : what was ignored or sorted; a configuration beside the log that was not given
     """
+    if isinstance(path, pd.DataFrame):
+        raise InputError("log: is a DataFrame, expected a file's name; use Log.from_frame")
+    files = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
     if config is None:
-        warn_of_unused(path)
-    return library.read_log(path, config)
+        warn_of_unused(*files)
+    alone = len(files) == 1 and not choose and not shift
+    if alone and is_plain_log(files[0], Config() if config is None else config):
+        return library.read_log(files[0], config)
+    return convert(files, config, choose, shift, progress).log
 
 
 def warn_of_unused(*logs: Path | str) -> None:
-    """Say that a configuration lies beside a log: forgetting it makes a wrong track, which looks certain."""
+    """Warn of a configuration beside a log: without it the track is wrong, and its sd does not show it."""
     for beside in (Path(log).parent / "config.yaml" for log in logs):
         if beside.is_file():
             warn(f"{beside} lies beside the log and is not used; give it as the configuration if it is the vehicle's")
 
 
 def check(log: Log, config: Config | None = None) -> Report:
-    """Look at a log: is it sane, and what would an estimate make of it (docs/check.md)?
+    """Check a log, and list the assumptions of an estimate (docs/check.md).
 
     Parameters
     ----------
     log : as read with the configuration
-    config : what is believed of the vehicle; None = all defaults
+    config : of vehicle and sensors; None = all defaults
 
     Returns
     -------
@@ -68,7 +90,7 @@ def check(log: Log, config: Config | None = None) -> Report:
 
 
 def prepared(log: Log, config: Config) -> Log:
-    """A log as every estimate takes it: checked, with clocks that go on.
+    """A log for an estimate: checked, with jumps of clocks bridged.
 
     Raises
     ------
@@ -76,7 +98,7 @@ def prepared(log: Log, config: Config) -> Log:
 
     Warns
     -----
-    DataWarning : whatever looks wrong
+    DataWarning : findings of the check
     """
     log = bridge_jumps(log, given(log, config))
     warn_of_findings(log, config)
@@ -84,7 +106,7 @@ def prepared(log: Log, config: Config) -> Log:
 
 
 def given(log: Log, config: Config | None) -> Config:
-    """The configuration that belongs to a log, all defaults where none is given.
+    """The configuration that belongs to a log, all defaults where none is given, completed by what its files know.
 
     Raises
     ------
@@ -92,8 +114,7 @@ def given(log: Log, config: Config | None) -> Config:
     """
     if not isinstance(log, Log):
         raise InputError(f"log: expected a Log, as read_log or Log.from_frame gives it, found a {type(log).__name__}")
-    config = Config() if config is None else config
-    if not isinstance(config, Config):
-        raise InputError(f"config: expected a Config, as load_config gives it, found a {type(config).__name__}")
+    config = config_or_defaults(config)
+    config, _ = completed(config, log.settings, f"settings in {log.source}")
     log.require_read_with(config)
     return config

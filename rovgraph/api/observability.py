@@ -1,4 +1,4 @@
-"""What of the calibration can be known: what ``rovgraph observe`` and ``rovgraph plan`` do."""
+"""Observability of the calibration: what ``rovgraph observe`` and ``rovgraph plan`` do."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rovgraph.api.logs import given, prepared
-from rovgraph.config import Config
+from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import collected_warnings
 from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.log import Log
@@ -23,12 +23,12 @@ USUAL = Sensors()
 
 @dataclass(frozen=True)
 class ObservabilityResult:
-    """What a dive shows of its calibration.
+    """The observability of the calibration in a dive.
 
     Attributes
     ----------
     observability : sd before and after, correlations, and when the dive showed it
-    config : what was believed, and estimated
+    config : of vehicle and sensors, with what was estimated
     warnings : what was said of the log, a line each
     about : what it was made of, for ``summary.json``
     """
@@ -44,12 +44,13 @@ class ObservabilityResult:
         return dict(zip(self.observability.labels, self.observability.verdicts, strict=True))
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph observe`` (docs/observability.md), all of it or nothing.
+        """Write the folder of ``rovgraph observe`` (docs/observability.md), complete or not at all.
 
         Raises
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
+        from rovgraph.pages.reporting import write_page
         from rovgraph.report.figure_observability import draw_observability
         from rovgraph.report.folder import results_folder
         from rovgraph.report.observability import write_observability
@@ -57,16 +58,17 @@ class ObservabilityResult:
         with results_folder(Path(path), force) as folder:
             draw_observability(folder, self.observability)
             write_observability(folder, self.observability, self.config, self.about)
+            write_page(folder)
 
 
 @dataclass(frozen=True)
 class PlanResult:
-    """Manoeuvres, ranked by what they would show.
+    """Manoeuvres, ranked by the information they would add.
 
     Attributes
     ----------
     plan : the manoeuvres, the best first
-    config : what is believed of the vehicle
+    config : of vehicle and sensors
     about : what it was made of, for ``summary.json``
     """
 
@@ -75,12 +77,13 @@ class PlanResult:
     about: Mapping[str, Any]
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph plan`` (docs/observability.md), all of it or nothing.
+        """Write the folder of ``rovgraph plan`` (docs/observability.md), complete or not at all.
 
         Raises
         ------
         InputError : the folder exists and ``force`` is not given, or cannot be written
         """
+        from rovgraph.pages.reporting import write_page
         from rovgraph.report.figure_plan import draw_plan
         from rovgraph.report.folder import results_folder
         from rovgraph.report.observability import write_plan
@@ -88,19 +91,20 @@ class PlanResult:
         with results_folder(Path(path), force) as folder:
             draw_plan(folder, self.plan)
             write_plan(folder, self.plan, self.config, self.about)
+            write_page(folder)
 
 
 def observe(
     log: Log, config: Config | None = None, estimate: Sequence[str] = (), progress: Progress = no_progress
 ) -> ObservabilityResult:
-    """What a dive shows of every calibration variable, when it did, and what is missing.
+    """How well a dive determines each calibration variable, when it did, and what is missing.
 
     Parameters
     ----------
     log : as read with the configuration
-    config : what is believed of vehicle and sensors; None = all defaults
+    config : of vehicle and sensors; None = all defaults
     estimate : calibration variables to estimate beside those of the configuration
-    progress : called now and then with what is being done, and how far it is from 0 to 1
+    progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------
@@ -128,24 +132,24 @@ def plan(
     sensors: Sensors = USUAL,
     progress: Progress = no_progress,
 ) -> PlanResult:
-    """Rank manoeuvres by what they would show of the calibration, before any is made.
+    """Rank manoeuvres by how well they would determine the calibration, before the dive.
 
     Parameters
     ----------
-    config : what is believed of vehicle and sensors; None = all defaults
+    config : of vehicle and sensors; None = all defaults
     goals : label of a component -> sd that is wanted, radians and SI
     known : of a dive before, or its ``observability.json``; None = nothing is known
     duration : of each manoeuvre [s]
     manoeuvres : scenarios, as "circle" or "circle@0.3" (m/s); None = all
     estimate : calibration variables to estimate beside those of the configuration
     sensors : how often they measure
-    progress : called now and then with what is being done, and how far it is from 0 to 1
+    progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------
     InputError : no such manoeuvre or variable, nothing to estimate, a goal for what is not estimated
     """
-    config = estimating(Config() if config is None else config, estimate)
+    config = estimating(config_or_defaults(config), estimate)
     candidates = chosen(manoeuvres or None, duration)
     before: Known | None
     if isinstance(known, ObservabilityResult):

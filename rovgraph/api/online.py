@@ -1,23 +1,109 @@
-"""An estimate while data arrive, from a log that is replayed: what ``rovgraph online file:LOG --speed max`` does."""
+"""An estimate while data arrive: what ``rovgraph online`` does."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from rovgraph.api.logs import given
+from rovgraph.api.live_folder import prepare, settings_of, summarise
+from rovgraph.api.logs import given, warn_of_unused
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.feed import Feed
+from rovgraph.live.files import Files
 from rovgraph.live.navigator import Navigator
+from rovgraph.live.outputs import Output, open_output
 from rovgraph.live.session import RATE_HZ, Session
 from rovgraph.live.solution import Solution
+from rovgraph.live.sources import open_sources
 from rovgraph.live.sources.replay import LogReplay
-from rovgraph.live.warnings import Warnings
+from rovgraph.live.warnings import Complain, Warnings
 from rovgraph.log import Log
 
 AS_FAST_AS_POSSIBLE = float("inf")
 ENGINES = ("fixed-lag", "isam2")
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """A run of the online estimator. Iterate over it once; each solution comes as soon as it is due.
+
+    The run ends with its sources, when `close` is called, and when you leave the loop.
+
+    Attributes
+    ----------
+    sources : their addresses
+    session : the estimate, the newest solution, and counts of warnings
+    feed : messages of the sources
+    outputs : where solutions go
+    folder : what is kept; None = nothing
+    resume : go on with what is in the folder
+    """
+
+    sources: tuple[str, ...]
+    session: Session
+    feed: Feed
+    outputs: tuple[Output, ...]
+    folder: Path | None = None
+    resume: bool = False
+
+    def __iter__(self) -> Iterator[Solution]:
+        """Solutions as they are due.
+
+        Raises
+        ------
+        InputError : the sources ended before an estimate could be made; the summary cannot be written
+        """
+        try:
+            yield from self._solve()
+        except GeneratorExit:  # whoever iterates has had enough
+            self._summarise()
+            raise
+        self._summarise()
+        if self.session.solution is None:
+            raise InputError(f"no estimate was made: {self.waiting()}")
+
+    def close(self) -> None:
+        """End the run after what has come; from any thread or from the handler of a signal, more than once."""
+        self.feed.close()
+
+    def waiting(self) -> str:
+        """What the first solution waits for; empty once there is one."""
+        return self.session.navigator.waiting(self.sources)
+
+    def write_smoothed(self) -> None:
+        """Ask for the smoothed track so far in the folder, where iSAM2 has it; also from the handler of a signal."""
+        self.session.want_smoothed()
+
+    def require_whole_recording(self) -> None:
+        """See that all that was received is in the folder.
+
+        Raises
+        ------
+        InputError : the disk was full for a while
+        """
+        files = self.session.files
+        if files is not None and files.recorder.lost:
+            raise InputError(f"{self.folder}: {files.recorder.lost} rows of the recording were lost, the disk was full")
+
+    def _solve(self) -> Iterator[Solution]:
+        try:
+            if self.resume:
+                self.session.resume()
+            yield from self.session.solve(self.feed)
+        finally:
+            self.feed.close()
+            self.session.navigator.close()
+            for output in self.outputs:
+                output.close()
+            if self.session.files is not None:
+                self.session.files.close()
+
+    def _summarise(self) -> None:
+        if self.folder is not None:
+            summarise(self.folder, self.session)
 
 
 @dataclass(frozen=True)
@@ -26,7 +112,7 @@ class Online:
 
     Attributes
     ----------
-    config : what is believed of vehicle and sensors
+    config : what is believed of vehicle and sensors; None = all defaults, or those of a run that is resumed
     rate_hz : of solutions, by the log's time
     engine : "fixed-lag", or "isam2", which smooths the whole dive as it goes
     """
@@ -41,8 +127,65 @@ class Online:
         if self.engine not in ENGINES:
             raise InputError(f"engine {self.engine!r}: expected {', '.join(ENGINES)}")
 
+    def run(
+        self,
+        *sources: str,
+        outputs: Sequence[str] = (),
+        speed: str = "1",
+        out: Path | str | None = None,
+        resume: bool = False,
+        force: bool = False,
+        complain: Complain | None = None,
+    ) -> LiveRun:
+        """Open sources and outputs; iterate over what it returns for the solutions.
+
+        Parameters
+        ----------
+        sources : addresses as ``rovgraph online`` takes them (docs/online-sources.md), as "tcp://192.168.2.2:5700"
+        outputs : where solutions go beside the iteration (docs/online-output.md), as "udp://127.0.0.1:5600"
+        speed : of files, a number or "max"
+        out : folder for recording, track and checkpoint; None = nothing is kept
+        resume : go on after a crash with what is in ``out``
+        force : replace an older folder
+        complain : called with source, kind and text of what goes wrong with sources, outputs and disk, from other
+            threads too; None = it is only counted
+
+        Raises
+        ------
+        InputError : an address that cannot be used, a folder that exists or cannot be written, nothing to resume
+
+        Warns
+        -----
+        DataWarning : a configuration lies beside a log and was not given
+        """
+        folder = None if out is None else Path(out)
+        if resume and folder is None:
+            raise InputError("--resume needs the folder to go on with, --out")
+        if self.config is None and not resume:
+            warn_of_unused(*(url.removeprefix("file:").partition("?")[0] for url in sources if url.startswith("file:")))
+        config = self.config or (settings_of(folder) if resume and folder is not None else Config())
+        warnings = Warnings(complain)
+        opened = open_sources(sources, warnings, config, speed)
+        if resume and any(source.pace == 1.0 for source in opened):
+            raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
+        feed = Feed(opened, warnings)
+        with ExitStack() as opened_outputs:  # they have threads, which a refused folder must not leave behind
+            receivers: list[Output] = []
+            for url in outputs:
+                receivers.append(open_output(url, warnings, patient=feed.recorded))
+                opened_outputs.callback(receivers[-1].close)
+            files = None
+            if folder is not None:
+                if not resume:
+                    prepare(folder, force, sources)
+                files = Files(folder, config, warnings, resume, anew=self.engine == "isam2")
+            opened_outputs.pop_all()
+        navigator = self._navigator(config, patient=feed.recorded, trust=feed.replayed)
+        session = Session(navigator, [each.send for each in receivers], warnings, self.rate_hz, files)
+        return LiveRun(sources, session, feed, tuple(receivers), folder, resume)
+
     def replay(self, log: Log) -> Iterator[Solution]:
-        """The solutions of a log, as if its measurements came in now; each call begins anew.
+        """The solutions of a log, as if its measurements arrived now; each call starts again.
 
         Nothing in it is checked beforehand: sensors that fail are noticed as they fail, and solutions have the events.
 
@@ -57,20 +200,12 @@ class Online:
         config = given(log, self.config)
         delays = {} if log.config is None else log.config.delay_s
         config = config.with_raw_magnetometer().model_copy(update={"delay_s": delays})  # the log holds the field
-        navigator = Navigator(config, True, smooth=self.engine == "isam2", clocks=Clocks(trust=True))
-        solutions: list[Solution] = []
-        session = Session(navigator, [solutions.append], Warnings(), self.rate_hz)
-        try:
-            for message in Feed([LogReplay(log.source, _as_it_arrived(log, delays), AS_FAST_AS_POSSIBLE)]):
-                session.step(message)
-                yield from solutions
-                solutions.clear()
-            session.end()
-            yield from solutions
-        finally:
-            navigator.close()
-        if session.solution is None:
-            raise InputError(f"no estimate was made: {navigator.waits_for or 'no measurement of an IMU came'}")
+        feed = Feed([LogReplay(log.source, _as_it_arrived(log, delays), AS_FAST_AS_POSSIBLE)])
+        session = Session(self._navigator(config, patient=True, trust=True), [], Warnings(), self.rate_hz)
+        yield from LiveRun((log.source,), session, feed, ())
+
+    def _navigator(self, config: Config, patient: bool, trust: bool) -> Navigator:
+        return Navigator(config, patient, smooth=self.engine == "isam2", clocks=Clocks(trust=trust))
 
 
 def _as_it_arrived(log: Log, delays: Mapping[Any, float]) -> Log:

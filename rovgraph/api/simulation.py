@@ -16,13 +16,13 @@ OWN = Choices()
 
 @dataclass(frozen=True)
 class SimulatedDive:
-    """A simulated dive, what an estimator may know of it and what it may not.
+    """A simulated dive with its truth and the configuration for an estimator.
 
     Attributes
     ----------
     scenario, seed, choices : what it was made of
-    dive : everything, hidden values too
-    config : what an estimator may know
+    dive : everything, also the hidden truth
+    config : for an estimator
     """
 
     scenario: str
@@ -38,7 +38,7 @@ class SimulatedDive:
 
     @property
     def truth(self) -> Trajectory:
-        """Where it really was."""
+        """The true motion."""
         return self.dive.truth
 
     @property
@@ -47,7 +47,7 @@ class SimulatedDive:
         return figures(self.dive)
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write the folder of ``rovgraph simulate`` (docs/simulation.md), all of it or nothing.
+        """Write the folder of ``rovgraph simulate`` (docs/simulation.md), complete or not at all.
 
         Raises
         ------

@@ -13,6 +13,8 @@ from rovgraph.estimators import dive as library
 from rovgraph.estimators.alarms import Alarm, Verdict
 from rovgraph.estimators.dive import Dive, Progress, no_progress
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
+from rovgraph.export import Options, Track, fixes_of, write_track
+from rovgraph.export.track import ESTIMATES as TRACKS
 from rovgraph.log import Log
 
 ENGINES = ("batch", "isam2")
@@ -21,13 +23,13 @@ ESTIMATES = ("smoothed", "filtered", "both")
 
 @dataclass(frozen=True)
 class Result:
-    """The estimates of a dive, and what is to be thought of them.
+    """The estimates of a dive with verdict and alarms.
 
     Attributes
     ----------
     dive : estimates, assumptions, alarms and verdict
-    log : as it was estimated, with clocks that go on
-    warnings : what was said of the log while it was read and checked, a line each; also issued as `DataWarning`
+    log : as estimated, with jumps of clocks bridged
+    warnings : of reading and checking the log, a line each; also issued as `DataWarning`
     seconds : stage of the work -> wall time [s]; the command adds that of reading
     """
 
@@ -38,7 +40,7 @@ class Result:
 
     @property
     def smoothed(self) -> Estimate:
-        """From the whole dive, the best for every moment.
+        """The smoothed estimate: the best for every moment, from the whole dive.
 
         Raises
         ------
@@ -48,7 +50,7 @@ class Result:
 
     @property
     def filtered(self) -> Estimate:
-        """What could have been known at each moment.
+        """The filtered estimate: what could have been known at each moment.
 
         Raises
         ------
@@ -58,7 +60,7 @@ class Result:
 
     @property
     def dead_reckoning(self) -> Estimate:
-        """What the estimates are to be better than."""
+        """Dead reckoning, the baseline."""
         return self._estimate("dead_reckoning")
 
     @property
@@ -68,7 +70,7 @@ class Result:
 
     @property
     def calibration(self) -> Mapping[str, CalibrationEstimate]:
-        """Label of each scalar component -> what the main estimate says of it: value, sd, prior, verdict; SI."""
+        """Label of each scalar component -> its value, sd, prior and verdict in the main estimate; SI."""
         return {entry.label: entry for entry in self.main.calibration}
 
     @property
@@ -78,35 +80,48 @@ class Result:
 
     @property
     def alarms(self) -> Sequence[Alarm]:
-        """What the estimates say against themselves, the worst first; ``.text`` has cause and remedy."""
+        """Alarms, the worst first; ``.text`` has cause and remedy."""
         return self.dive.alarms
 
     @property
     def assumptions(self) -> Sequence[str]:
-        """What neither log nor configuration told, a line each."""
-        return self.dive.assumptions
+        """What neither log nor configuration states, and how native files were read, a line each."""
+        return (*self.log.notes, *self.dive.assumptions)
 
     @property
     def config(self) -> Config:
         """The effective configuration."""
         return self.dive.beginning.config
 
-    def export(self, out: Path | str, to: str | Sequence[str], **options: Any) -> list[Path]:
-        """Write the track in formats that others open: `rovgraph.export`, which says what the options are."""
-        from rovgraph.api.exporting import export
+    def track(self, estimate: str | None = None) -> Track:
+        """An estimate with its place on Earth and its fixes, as exports take it; None = the best there is.
 
-        return export(self, to, out, **options)
+        Raises
+        ------
+        InputError : not that estimate
+        """
+        if estimate not in (None, *TRACKS):
+            raise InputError(f"estimate {estimate!r}: expected {', '.join(TRACKS)}")
+        chosen = self.main if estimate is None else self._estimate(estimate)
+        name = self.config.name or Path(self.log.source).name
+        return Track(name, chosen.kind, chosen.trajectory, self.log.origin, fixes_of(self.main.residuals))
 
     def save(
-        self, path: Path | str, force: bool = False, figures: bool = True, export: Sequence[str] = ()
+        self,
+        path: Path | str,
+        force: bool = False,
+        figures: bool = True,
+        page: bool = True,
+        export: Sequence[str] = (),
     ) -> dict[str, Any]:
-        """Write the results folder of ``rovgraph smooth`` (docs/results.md), all of it or nothing.
+        """Write the results folder of ``rovgraph smooth`` (docs/results.md), complete or not at all.
 
         Parameters
         ----------
         path : the folder to make
         force : replace an older results folder
         figures : draw them
+        page : make report.html
         export : formats that the track is written in too
 
         Returns
@@ -127,11 +142,23 @@ class Result:
 
                 draw_figures(folder, self.dive.estimates, self.log, self.config)
             if export:
-                self.export(folder, export)
+                write_track(self.track(), export, folder, Options())
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
-            return write_results(
-                folder, self.dive.estimates, self.log, self.config, [*self.assumptions], seconds, self.alarms
+            summary = write_results(
+                folder,
+                self.dive.estimates,
+                self.log,
+                self.config,
+                [*self.assumptions],
+                seconds,
+                self.alarms,
+                self.warnings,
             )
+            if page:
+                from rovgraph.pages.reporting import write_page
+
+                write_page(folder)
+            return summary
 
     def _estimate(self, kind: str) -> Estimate:
         found = next((estimate for estimate in self.dive.estimates if estimate.kind == kind), None)
@@ -148,15 +175,15 @@ def smooth(
     engine: str | None = None,
     progress: Progress = no_progress,
 ) -> Result:
-    """Estimate the track of a dive and everything that was calibrated on the way, as ``rovgraph smooth`` does.
+    """Estimate the track of a dive and the calibration of its instruments, as ``rovgraph smooth`` does.
 
     Parameters
     ----------
     log : as read with the configuration
-    config : what is believed of vehicle and sensors; None = all defaults
+    config : of vehicle and sensors; None = all defaults
     estimate : "smoothed", "filtered" or "both"
     engine : "batch", or "isam2" for both from one pass; None = the configuration's ``graph.solver``
-    progress : called now and then with what is being done, and how far it is from 0 to 1
+    progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------

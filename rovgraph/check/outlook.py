@@ -6,15 +6,17 @@ import numpy as np
 
 from rovgraph.check.findings import Finding
 from rovgraph.config import Config
+from rovgraph.engine.constant_velocity import motion_model
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log
+from rovgraph.sensors import SENSORS
 
 
 def plan(log: Log, config: Config) -> Iterator[Finding]:
     """What would be used, and what is assumed where the configuration says nothing."""
     sources = heading_sources(config, log.sensors)
     yield Finding("configuration", "ok", f"heading from {', '.join(sources) or 'the start only'}")
-    wanted = {"dvl": "dvl_heading"} | {s: s for s in ("mag", "ahrs")}
+    wanted = {sensor.heading_source: sensor.name for sensor in SENSORS.values()}
     for source in config.heading.sources or ():
         if wanted[source] not in log:
             yield Finding("configuration", "warning", f"heading.sources names {source}, but the log has none")
@@ -44,7 +46,8 @@ def _assumptions(log: Log, config: Config, sources: list[str]) -> Iterator[str]:
     if start.heading_deg is None and sources:
         yield f"start.heading_deg is not given: taken from the first samples of {sources[0]}"
     if start.roll_deg is None or start.pitch_deg is None:
-        yield "start.roll_deg or start.pitch_deg is not given: taken from gravity"
+        level = "roll and pitch" if motion_model(config, log.sensors) == "constant_velocity" else "gravity"
+        yield f"start.roll_deg or start.pitch_deg is not given: taken from {level}"
     if "depth" in log and start.down_m is None:
         yield "start.down_m is not given: taken from the first depth"
     for section, sensor in ((config.imu, "imu"), (config.dvl, "dvl")):

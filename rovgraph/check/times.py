@@ -7,6 +7,7 @@ import numpy as np
 from rovgraph.check.epochs import shift_of_epoch
 from rovgraph.check.findings import Finding, Timing, repeats, since, told
 from rovgraph.config import Config
+from rovgraph.engine.constant_velocity import motion_model
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import SENSORS
@@ -41,13 +42,16 @@ def timing(stream: Stream) -> Timing:
 def presence(log: Log, config: Config) -> Iterator[Finding]:
     """Sensors that are missing, and what that means."""
     for sensor in SENSORS.values():
-        if sensor.if_missing is not None and sensor.name not in log:
+        if sensor.name == "imu" and motion_model(config, log.sensors) == "constant_velocity":
+            used = "no IMU is used: between measurements the vehicle goes on as it went (motion.model)"
+            yield Finding(sensor.name, "ok", used)
+        elif sensor.if_missing is not None and sensor.name not in log:
             yield Finding(sensor.name, *sensor.if_missing)
     if not heading_sources(config, log.sensors):
         known = (
             "heading starts at start.heading_deg and drifts with the gyro"
             if config.start.heading_deg is not None
-            else "give mag, ahrs_yaw or dvl_heading, or at least start.heading_deg"
+            else "give mag, ahrs_yaw, heading or dvl_heading, or at least start.heading_deg"
         )
         yield Finding("log", "warning", f"no heading source in use: {known}")
 

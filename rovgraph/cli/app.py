@@ -16,11 +16,14 @@ from rovgraph.cli.calibrate import calibrate
 from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
+from rovgraph.cli.convert import convert
+from rovgraph.cli.demo import demo
 from rovgraph.cli.evaluate import evaluate
 from rovgraph.cli.export import export
 from rovgraph.cli.observe import observe
 from rovgraph.cli.online import online
 from rovgraph.cli.plan import plan
+from rovgraph.cli.report import report
 from rovgraph.cli.simulate import simulate
 from rovgraph.cli.smooth import smooth
 from rovgraph.cli.study import study
@@ -30,7 +33,7 @@ from rovgraph.process import be_frugal
 
 app = typer.Typer(
     name="rovgraph",
-    help="Where a small underwater vehicle was, and where it is.",
+    help="Compute where a small underwater vehicle was, and where it is.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -46,13 +49,15 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _of_all_commands(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
     ] = False,
 ) -> None:
     pass
 
 
-for _command in (smooth, online, export, tag, evaluate, compare, observe, plan, check, config, simulate):
+for _command in (
+    demo, smooth, online, convert, export, tag, report, evaluate, compare, observe, plan, check, config, simulate,
+):  # fmt: skip
     app.command()(_command)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(study, name="study")

@@ -11,7 +11,9 @@ if TYPE_CHECKING:
 
     from rovgraph.calibrate import MagnetometerCalibration, NoiseReport
 
-calibrate = typer.Typer(help="Calibrate the magnetometer, or read the noise of sensors at rest.", no_args_is_help=True)
+calibrate = typer.Typer(
+    help="Calibrate the magnetometer, or determine the noise of sensors at rest.", no_args_is_help=True
+)
 
 LogPath = Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")]
@@ -43,6 +45,7 @@ def magnetometer(
     from rovgraph.calibrate import calibrate_magnetometer
     from rovgraph.config import load_config
     from rovgraph.log import read_log
+    from rovgraph.pages.reporting import write_page
     from rovgraph.report.calibrations import write_magnetometer
     from rovgraph.report.folder import check_writable, results_folder
 
@@ -51,6 +54,7 @@ def magnetometer(
     found = calibrate_magnetometer(read_log(log, settings.with_raw_magnetometer()), settings, method.value)
     with results_folder(out, force) as folder:
         write_magnetometer(folder, found, settings)
+        write_page(folder)
     console = Console()
     console.print(_magnetometer_table(found))
     console.print(f"for the configuration: {out / 'magnetometer.yaml'}", highlight=False, markup=False)
@@ -67,6 +71,7 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
     from rovgraph.calibrate import calibrate_noise
     from rovgraph.config import load_config
     from rovgraph.log import read_log
+    from rovgraph.pages.reporting import write_page
     from rovgraph.report.calibrations import write_noise
     from rovgraph.report.folder import check_writable, results_folder
 
@@ -76,6 +81,7 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
     found = calibrate_noise(recorded, settings)
     with results_folder(out, force) as folder:
         write_noise(folder, found, settings)
+        write_page(folder)
     console = Console()
     for table in _noise_tables(found):
         console.print(table)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rovgraph.cli.files import Choose, Files, Shift, read_files
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -13,11 +15,15 @@ if TYPE_CHECKING:
 
 
 def check(
-    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    files: Files,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
+    choose: Choose = None,
+    shift: Shift = None,
+    page: Annotated[Path | None, typer.Option("--page", help="write the report as an HTML page, too")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an older page")] = False,
 ) -> None:
-    """Look at a log: sensors, rates, gaps, units, signs, clocks, and what an estimate would make of it."""
+    """Check a log: sensors, rates, gaps, units, signs, clocks, and the assumptions of an estimate."""
     import json
 
     from rich.console import Console
@@ -26,7 +32,10 @@ def check(
     from rovgraph.check import refuse
 
     settings = None if config is None else rg.load_config(config)
-    report = rg.check(rg.read_log(log, settings), settings)
+    log = read_files(files, settings, choose, shift)
+    report = rg.check(log, settings)
+    if page is not None:
+        rg.report_check(report, page, force)
     if as_json:
         typer.echo(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:
@@ -34,6 +43,8 @@ def check(
         console.print(_timing_table(report))
         for finding in report.findings:
             _print_finding(console, finding.level, f"{finding.sensor}: {finding.text}")
+        for note in log.notes:
+            console.print(f"assumed: {note}", highlight=False, markup=False, soft_wrap=True)
         errors, doubts = len(report.at("error")), len(report.at("warning"))
         console.print(f"{_plural(errors, 'error')}, {_plural(doubts, 'warning')}", style="bold")
     refuse(report)

@@ -5,24 +5,34 @@ from typing import Annotated
 
 import typer
 
+from rovgraph.cli.files import Choose, Shift, read_files
+
 WIDE = 120  # columns of a file or a pipe, which has no width of its own
 
 
 def compare(
     out: Annotated[Path, typer.Option("--out", "-o", help="results folder", show_default=False)],
-    log: Annotated[Path | None, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md")] = None,
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="a log, or native files of one dive", metavar="[FILE...]")
+    ] = None,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
-    reference: Annotated[Path | None, typer.Option(help="CSV with time, north, east and what else it knows")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="CSV with time, north, east, and optionally attitude and velocity")
+    ] = None,
     scenario: Annotated[str | None, typer.Option(help="simulate dives of this scenario instead of a LOG")] = None,
     seeds: Annotated[int, typer.Option(help="number of simulated dives")] = 30,
     first_seed: Annotated[int, typer.Option(min=0, help="seed of the first of them")] = 1,
-    duration: Annotated[float | None, typer.Option(help="of a simulated dive [s]; default: the scenario's own")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="seconds of a simulated dive; default: the scenario's own")
+    ] = None,
     estimators: Annotated[
         str | None,
-        typer.Option(help="names or patterns (graph-*), separated by commas; default: all that need no thrusters"),
+        typer.Option(help="names or patterns (graph-*), separated by commas; default: all without thrusters"),
     ] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    choose: Choose = None,
+    shift: Shift = None,
 ) -> None:
     """Compare estimators: errors, consistency and cost of each, in a table and figures.
 
@@ -35,15 +45,16 @@ def compare(
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.comparison import comparison_table
     from rovgraph.report.folder import check_writable
+    from rovgraph.report.narrow import fitting
     from rovgraph.studies.estimators import select
 
     names = None if estimators is None else [name.strip() for name in estimators.split(",") if name.strip()]
     chosen = range(first_seed, first_seed + seeds)
     select(names)
-    require_one(log, reference, scenario, chosen, duration)
+    require_one(files[0] if files else None, reference, scenario, chosen, duration)
     check_writable(out, force)
     settings = None if config is None else rg.load_config(config)
-    dive_log = None if log is None else rg.read_log(log, settings)
+    dive_log = read_files(files, settings, choose, shift) if files else None
     track = None if reference is None else rg.read_reference(reference)
     with progress_bar() as progress:
         result = rg.compare(dive_log, settings, track, scenario, chosen, duration, names, jobs, progress)
@@ -53,7 +64,8 @@ def compare(
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
-    console.print(comparison_table(result.comparison, result.title, result.thesis))
+    for part in fitting(comparison_table(result.comparison, result.title, result.thesis), console):
+        console.print(part)
     for row in result.comparison.runs.dropna(subset="error").drop_duplicates("estimator").itertuples():
         console.print(f"{row.estimator} failed on {row.run}: {row.error}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)

@@ -22,8 +22,10 @@ _GROUP_TEXT = {
     "start": "start: where the dive begins",
     "environment": "environment: gravity, magnetic field, Earth rate",
     "imu": "imu: inertial unit",
+    "motion": "motion: from keyframe to keyframe",
     "dvl": "dvl: Doppler velocity log",
     "heading": "heading: compasses",
+    "tilt": "tilt: roll and pitch of the vehicle",
     "depth": "depth: pressure sensor",
     "fix": "fix: position fixes",
     "place": "place: places seen before",
@@ -44,7 +46,7 @@ def config(
     ] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="with --keys or --presets: as in the manual")] = False,
 ) -> None:
-    """Print the effective configuration, every key written out; a wrong key is named."""
+    """Print the effective configuration with every key; a wrong key is an error."""
     from rovgraph.config import load_config
 
     settings = load_config(path)

@@ -11,12 +11,14 @@ if TYPE_CHECKING:
 
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(help="CSV of an estimate.", show_default=False)],
-    reference: Annotated[Path, typer.Argument(help="CSV with time, north, east and what else it knows.")],
-    start: Annotated[float, typer.Option("--from", help="Leave out the first seconds of the trajectory.")] = 0.0,
+    reference: Annotated[
+        Path, typer.Argument(help="CSV with time, north, east, and optionally attitude and velocity.")
+    ],
+    start: Annotated[float, typer.Option("--from", help="Skip the first seconds of the trajectory.")] = 0.0,
     end: Annotated[
-        float | None, typer.Option("--to", help="Leave out what is later than this many seconds.", show_default=False)
+        float | None, typer.Option("--to", help="Skip what is later than this many seconds.", show_default=False)
     ] = None,
-    align: Annotated[bool, typer.Option("--align", help="Turn and shift the trajectory to fit first.")] = False,
+    align: Annotated[bool, typer.Option("--align", help="Rotate and shift the trajectory to fit first.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare a trajectory with a reference.
@@ -33,11 +35,11 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(metrics.as_dict(), indent=2))
     else:
-        _show(metrics, f"{trajectory} against {reference}")
+        show_metrics(metrics, f"{trajectory} against {reference}")
 
 
-def _show(metrics: "Metrics", title: str) -> None:
-    """The table that the command prints; what is not known has no row."""
+def show_metrics(metrics: "Metrics", title: str) -> None:
+    """Print the table; unknown metrics have no row."""
     from rich.console import Console
     from rich.table import Table
 

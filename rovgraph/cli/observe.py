@@ -5,19 +5,23 @@ from typing import Annotated
 
 import typer
 
+from rovgraph.cli.files import Choose, Files, Shift, name_of, read_files
+
 WIDE = 150  # columns of a file or a pipe, which has no width of its own
 
 
 def observe(
-    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    files: Files,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: observed-LOG")] = None,
     estimate: Annotated[
-        str | None, typer.Option(help="calibration variables to estimate too, separated by commas")
+        str | None, typer.Option(help="further calibration variables to estimate, separated by commas")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
+    choose: Choose = None,
+    shift: Shift = None,
 ) -> None:
-    """What a dive shows of every calibration variable, when it did, and what is missing.
+    """Show how well a dive determines each calibration variable, when it did, and what is missing.
 
     Example: rovgraph observe log.csv --config vehicle.yaml --estimate dvl_yaw,dvl_scale
     """
@@ -29,10 +33,10 @@ def observe(
     from rovgraph.report.observability import observability_table, words
     from rovgraph.studies.choices import listed
 
-    out = Path("observed-" + log.name.split(".")[0]) if out is None else out
+    out = Path("observed-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     check_writable(out, force)
-    dive_log = rg.read_log(log, settings)
+    dive_log = read_files(files, settings, choose, shift)
     with progress_bar() as progress:
         result = rg.observe(dive_log, settings, listed(estimate), progress)
     result.save(out, force)
@@ -40,7 +44,7 @@ def observe(
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
-    console.print(observability_table(seen, f"what {log.name} shows"))
+    console.print(observability_table(seen, f"what {files[0].name} shows"))
     for sentence in words(seen):
         console.print(sentence, highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)

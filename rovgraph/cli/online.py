@@ -26,80 +26,72 @@ def online(
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=200.0, help="solutions per second")] = 5.0,
     speed: Annotated[str, typer.Option(help="of files: 1, 10, max")] = "1",
-    engine: Annotated[Engine, typer.Option(help="fixed-lag for missions without end, isam2 for all of the track")] = (
-        Engine.fixed_lag
-    ),
-    resume: Annotated[bool, typer.Option("--resume", help="go on after a crash, with what is in --out")] = False,
+    engine: Annotated[
+        Engine, typer.Option(help="fixed-lag for missions of any length, isam2 for the smoothed track too")
+    ] = (Engine.fixed_lag),
+    resume: Annotated[bool, typer.Option("--resume", help="continue after a crash, with the files in --out")] = False,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="smooth the recording at the end")] = True,
     force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
 ) -> None:
     """Estimate while data arrive, on board or at the topside.
 
-    Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:127.0.0.1:14550 --out dive
+    Example: rovgraph online waterlinked://192.168.2.95 mavlink:udpin:0.0.0.0:14551 --out dive
     """
     import sys
 
-    from rovgraph.api.logs import warn_of_unused
+    import rovgraph as rg
     from rovgraph.cli.ending import asked_by_signal, ended_by_signals
-    from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
-    from rovgraph.errors import InputError
-    from rovgraph.live.clocks import Clocks
-    from rovgraph.live.feed import Feed
-    from rovgraph.live.files import Files
-    from rovgraph.live.navigator import Navigator
-    from rovgraph.live.outputs import open_output
-    from rovgraph.live.session import Session
-    from rovgraph.live.sources import open_sources
-    from rovgraph.live.warnings import Warnings
     from rovgraph.report.status import StatusLine
 
-    if resume and out is None:
-        raise InputError("--resume needs the folder to go on with, --out")
-    settings, warnings = configured(config, out, resume), Warnings(_say)
-    replayed = [url.removeprefix("file:").partition("?")[0] for url in sources if url.startswith("file:")]
-    warn_of_unused(*(replayed if config is None and not resume else []))
-    opened = open_sources(sources, warnings, settings, speed)
-    if resume and any(source.pace == 1.0 for source in opened):
-        raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
-    feed = Feed(opened, warnings)
+    believed = None if config is None else rg.load_config(config)
     wanted = output if output is not None else ([] if sys.stdout.isatty() else ["-"])
-    outputs = [open_output(url, warnings, patient=feed.recorded) for url in wanted]
-    files = None
+    run = rg.Online(believed, rate, engine.value).run(
+        *sources, outputs=wanted, speed=speed, out=out, resume=resume, force=force, complain=_say
+    )
+    asked_by_signal(run.write_smoothed)
+    with ended_by_signals(run.close), StatusLine(waiting=run.waiting) as status:
+        for solution in run:
+            status.show(solution)
+            if not status.shown:
+                _tell(solution)
     if out is not None:
-        prepared(out, force, resume, sources)
-        files = Files(out, settings, warnings, resume, anew=engine is Engine.isam2)
-    navigator = Navigator(settings, feed.recorded, smooth=engine is Engine.isam2, clocks=Clocks(trust=feed.replayed))
-    session = Session(navigator, [each.send for each in outputs], warnings, rate, files)
-    asked_by_signal(session.want_smoothed)
-    with ended_by_signals(feed.close):
-        try:
-            with StatusLine(waiting=lambda: navigator.waiting(sources)) as status:
-                session.receivers.append(status.show)
-                if not status.shown:
-                    session.receivers.append(_tell)
-                if resume:
-                    session.resume()
-                session.run(feed)
-        finally:
-            navigator.close()
-            for each in outputs:
-                each.close()
-            if files is not None:
-                files.close()
-    if session.solution is None:
-        unfinished(out)
-        raise InputError(f"no estimate was made: {navigator.waiting(sources)}")
-    if out is not None:
-        finished(out, session, refine)
+        if refine:
+            _smooth(out)
+        run.require_whole_recording()
+        _note(f"results in {out}")
+
+
+def _smooth(out: Path) -> None:
+    """What was recorded, into a folder beside it; standard output is for solutions."""
+    import contextlib
+    import sys
+
+    from rovgraph.cli.smooth import smooth
+    from rovgraph.errors import InputError
+    from rovgraph.live.files import CONFIG, RECORDING
+
+    _note("smoothing what was recorded; Ctrl-C leaves it out")
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            smooth([out / RECORDING], out / CONFIG, out / "smoothed", force=True)
+    except InputError as error:
+        _note(f"not smoothed: {error}")
+    except KeyboardInterrupt:
+        _note("not smoothed: interrupted")
 
 
 def _say(source: str, kind: str, text: str) -> None:
+    """What is wrong with a source, an output or the disk."""
+    _note(f"{source}: {kind}: {text}")
+
+
+def _note(text: str) -> None:
     """A line for a person, wherever that person has gone."""
     import contextlib
     import sys
 
     with contextlib.suppress(OSError, ValueError):
-        print(f"{source}: {kind}: {text}", file=sys.stderr, flush=True)
+        print(text, file=sys.stderr, flush=True)
 
 
 def _tell(solution: "Solution") -> None:

@@ -55,7 +55,7 @@ def simulate(
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Noise, biases and drawn calibration.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an older folder.")] = False,
 ) -> None:
-    """Simulate a dive: log.csv, the truth, and the configuration an estimator may know.
+    """Simulate a dive: log.csv, the truth, and the configuration for an estimator.
 
     Of motions as such, what the configuration says to estimate is drawn from its priors; the world
     of a driven scenario is its own (docs/simulation.md).

@@ -2,9 +2,14 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from rovgraph.cli.files import Choose, Files, Shift, name_of, read_files
+
+if TYPE_CHECKING:
+    from rovgraph import Result
 
 NOT_TRUSTED = 3  # exit code of --strict
 VERDICT_STYLE = {"trusted": "green", "doubtful": "bold yellow", "wrong": "bold red"}
@@ -26,11 +31,12 @@ class Which(StrEnum):
 
 
 def smooth(
-    log: Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")],
+    files: Files,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder; default: results-LOG")] = None,
     engine: Annotated[
-        Engine | None, typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; else graph.solver")
+        Engine | None,
+        typer.Option(help="batch, or isam2 for filtered and smoothed from one pass; default: graph.solver"),
     ] = None,
     estimate: Annotated[Which, typer.Option(help="which estimate to make")] = Which.both,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
@@ -39,33 +45,44 @@ def smooth(
         list[str] | None,
         typer.Option(help="also write the track as kml, geojson, ... (docs/export.md); may be repeated"),
     ] = None,
+    page: Annotated[bool, typer.Option("--page/--no-page", help="make report.html")] = True,
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
+    choose: Choose = None,
+    shift: Shift = None,
 ) -> None:
-    """Estimate the track of a dive and everything that was calibrated on the way.
+    """Estimate the track of a dive, and the calibration of its instruments.
 
     Example: rovgraph smooth log.csv --config vehicle.yaml --out results
     """
     import time
 
-    from rich.console import Console
-
     import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
     from rovgraph.export import known_formats
     from rovgraph.report.folder import check_writable
-    from rovgraph.report.tables import calibration_table, summary_table
 
-    out = Path("results-" + log.name.split(".")[0]) if out is None else out
+    out = Path("results-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     known_formats(export or [])
     check_writable(out, force)
     began = time.perf_counter()
-    dive_log = rg.read_log(log, settings)
+    dive_log = read_files(files, settings, choose, shift)
     read = time.perf_counter()
     with progress_bar() as progress:
         result = rg.smooth(dive_log, settings, estimate.value, None if engine is None else engine.value, progress)
     result.seconds["reading"] = read - began
-    summary = result.save(out, force, figures, export or [])
+    summary = result.save(out, force, figures, page, export or [])
+    show_result(result, summary, out)
+    if strict and result.verdict != "trusted":
+        raise typer.Exit(NOT_TRUSTED)
+
+
+def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
+    """Print verdict, alarms, tables and assumptions."""
+    from rich.console import Console
+
+    from rovgraph.report.tables import calibration_table, summary_table
+
     console = Console()
     console.print(f"verdict: {result.verdict}", style=VERDICT_STYLE[result.verdict], highlight=False)
     for alarm in result.alarms:
@@ -74,6 +91,5 @@ def smooth(
     console.print(calibration_table(result.dive.estimates))
     for line in result.assumptions:
         console.print(f"assumed: {line}", highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False, markup=False)
-    if strict and result.verdict != "trusted":
-        raise typer.Exit(NOT_TRUSTED)
+    page = " (open report.html)" if (out / "report.html").exists() else ""
+    console.print(f"results in {out}{page}", highlight=False, markup=False)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-study = typer.Typer(help="Monte Carlo: what can be known, over many simulated dives.", no_args_is_help=True)
+study = typer.Typer(help="Monte Carlo over many simulated dives: what is observable.", no_args_is_help=True)
 
 WIDE = 170  # columns of a file or a pipe, which has no width of its own
 
@@ -19,13 +19,13 @@ def _study() -> None:
 def misalignment(
     config: Annotated[Path, typer.Option("--config", "-c", help="the study (YAML), see docs/studies.md")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="results folder", show_default=False)] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with what is in the results folder")] = False,
-    only: Annotated[str | None, typer.Option(help="one cell, by the beginning of its id")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="continue with the files in the results folder")] = False,
+    only: Annotated[str | None, typer.Option(help="one cell, by the first characters of its id")] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
     scheduler: Annotated[str | None, typer.Option(help="of a Dask cluster, such as tcp://host:8786")] = None,
     show: Annotated[bool, typer.Option("--list", help="show the cells and their ids, and run nothing")] = False,
 ) -> None:
-    """What can be known of the DVL's misalignment, and whether what the estimators say of it is true.
+    """Study how well the DVL's misalignment can be estimated, and whether the stated sd is right.
 
     Example: rovgraph study misalignment --config configs/studies/quick.yaml --out quick
     """
@@ -35,7 +35,9 @@ def misalignment(
 
     from rovgraph.cli.progress import progress_bar
     from rovgraph.errors import InputError
+    from rovgraph.pages.reporting import write_page
     from rovgraph.report.figure_study import draw_study
+    from rovgraph.report.narrow import fitting
     from rovgraph.report.study import plan_table, study_table, write_study
     from rovgraph.studies.engines import Cluster, Local
     from rovgraph.studies.misalignment import chosen, open_results, read_study
@@ -48,7 +50,8 @@ def misalignment(
     plan = read_study(config)
     cells = chosen(plan, only)
     if show:
-        console.print(plan_table(plan))
+        for part in fitting(plan_table(plan), console):
+            console.print(part)
         return
     if out is None:
         raise InputError("--out is needed: a folder for the results")
@@ -66,7 +69,9 @@ def misalignment(
     with kept_so_far(out):  # its rows are on disk already
         write_study(out, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
         draw_study(out, tables)
-    console.print(study_table(tables))
+        write_page(out)
+    for part in fitting(study_table(tables), console):
+        console.print(part)
     for row in tables.runs.dropna(subset="failure").drop_duplicates("cell").itertuples():
         console.print(f"{row.cell} failed in run {row.run}: {row.failure}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)

@@ -5,9 +5,11 @@
 all keys, `beliefs` gives the calibration variables of `rovgraph.calibration` their priors.
 """
 
+from rovgraph.config.completion import completed
 from rovgraph.config.reading import (
     Config,
     beliefs,
+    config_or_defaults,
     describe,
     load_config,
     mount_matrix,
@@ -26,6 +28,8 @@ __all__ = [
     "Mag",
     "SensorSettings",
     "beliefs",
+    "completed",
+    "config_or_defaults",
     "describe",
     "load_config",
     "mount_matrix",

@@ -27,12 +27,14 @@ from rovgraph.config.sections import (
     Heading,
     Imu,
     Mag,
+    Motion,
     Online,
     Place,
     Section,
     Sensors,
     SensorSettings,
     Start,
+    Tilt,
     Triple,
     Vehicle,
 )
@@ -50,8 +52,10 @@ class Config(Section):
     start: Start = Start()
     environment: Environment = Environment()
     imu: Imu = Imu()
+    motion: Motion = Motion()
     dvl: Dvl = Dvl()
     heading: Heading = Heading()
+    tilt: Tilt = Tilt()
     depth: Depth = Depth()
     fix: Fix = Fix()
     place: Place = Place()
@@ -168,8 +172,29 @@ def load_config(path: Path | str | None = None) -> Config:
     return Config() if path is None else _parse_config(read_yaml(Path(path)), str(path))
 
 
+def config_or_defaults(config: Config | None) -> Config:
+    """A configuration as a caller gave it; None = all defaults.
+
+    Raises
+    ------
+    InputError : it is something else, such as the name of a file
+    """
+    if config is None:
+        return Config()
+    if not isinstance(config, Config):
+        raise InputError(f"config: expected a Config, as load_config gives it, found a {type(config).__name__}")
+    return config
+
+
 def parse_config(text: str, source: str = "configuration") -> Config:
-    """Parse YAML text; ``source`` names it in messages."""
+    """Parse YAML text; ``source`` names it in messages.
+
+    Raises
+    ------
+    InputError : no text, no valid YAML, or a key or value that a configuration does not have
+    """
+    if not isinstance(text, str):
+        raise InputError(f"{source}: expected YAML text, found a {type(text).__name__}")
     return _parse_config(_parse_yaml(text, source), source)
 
 

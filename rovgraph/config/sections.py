@@ -12,7 +12,8 @@ from rovgraph.config.presets import known_preset
 
 Positive = Annotated[float, Field(gt=0)]
 Readmission = Annotated[
-    float, Field(gt=0, description="left out for longer than this, it is taken back: a filter then doubts itself")
+    float,
+    Field(gt=0, description="after this long a rejected sensor is used again; a filter first inflates its covariance"),
 ]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -20,8 +21,11 @@ Triple = tuple[float, float, float]
 PositiveTriple = tuple[Positive, Positive, Positive]
 NotNegativeTriple = tuple[NotNegative, NotNegative, NotNegative]
 Loss = Literal["none", "huber", "cauchy"]
-STAMPED = ("imu", "mag", "ahrs", "dvl", "dvl_heading", "dvl_altitude", "dvl_water", "depth", "fix", "place", "thruster")
-HeadingSource = Literal["mag", "dvl", "ahrs"]
+STAMPED = (
+    *("imu", "mag", "ahrs", "vehicle_heading", "vehicle_tilt", "dvl", "dvl_heading", "dvl_altitude", "dvl_water"),
+    *("depth", "fix", "place", "thruster"),
+)
+HeadingSource = Literal["mag", "dvl", "ahrs", "vehicle"]
 ImuPreset = Annotated[str, AfterValidator(partial(known_preset, "imu"))]
 DvlPreset = Annotated[str, AfterValidator(partial(known_preset, "dvl"))]
 
@@ -31,7 +35,7 @@ class Section(BaseModel):
 
 
 class Start(Section):
-    """Where the dive begins; null = from the log."""
+    """Where the dive starts; null = from the log."""
 
     north_m: float | None = Field(None, description="north of the first epoch; null = 0 beside east_m, else first fix")
     east_m: float | None = Field(None, description="east of the first epoch; null = 0 beside north_m, else first fix")
@@ -42,7 +46,7 @@ class Start(Section):
     position_sd_m: Positive = Field(0.1, description="sd of the start's north and east")
     down_sd_m: Positive | None = Field(None, description="sd of the start's down; null = position_sd_m")
     heading_sd_deg: Positive = Field(5.0, description="sd of the start's heading")
-    tilt_sd_deg: Positive = Field(2.0, description="sd of the start's roll and pitch, where it begins at rest")
+    tilt_sd_deg: Positive = Field(2.0, description="sd of the start's roll and pitch, for a start at rest")
 
     @property
     def located(self) -> bool:
@@ -68,7 +72,7 @@ class Environment(Section):
     dip_deg: Annotated[float, Field(ge=-90, le=90)] | None = Field(
         None, description="dip of the field, down positive; null = from the log, against gravity"
     )
-    earth_rotation: bool = Field(False, description="model the Earth's rotation, which good gyros feel")
+    earth_rotation: bool = Field(False, description="model the Earth's rotation, which good gyros measure")
 
     @model_validator(mode="after")
     def _whole_origin(self) -> Self:
@@ -95,10 +99,10 @@ class ImuNoise(Section):
 class Mag(Section):
     """The magnetometer's calibration, (3.2) with a full matrix: field = matrix (sample - centre)."""
 
-    centre: Triple = Field((0.0, 0.0, 0.0), description="hard iron, IMU axes, log's unit; taken off every sample")
+    centre: Triple = Field((0.0, 0.0, 0.0), description="hard iron, IMU axes, log's unit; subtracted from every sample")
     matrix: tuple[Triple, Triple, Triple] = Field(
         ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        description="soft iron and scale: what a sample without its centre is multiplied by",
+        description="soft iron and scale: factor of (sample - centre)",
     )
 
     @field_validator("matrix")
@@ -118,7 +122,7 @@ class Imu(Section):
     """Inertial unit: mounting and noise."""
 
     preset: ImuPreset | None = Field(
-        None, description="instrument that fills in what is not stated, see docs/presets.md"
+        None, description="instrument whose data sheet fills in missing keys, see docs/presets.md"
     )
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="IMU axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the IMU in body axes")
@@ -126,14 +130,25 @@ class Imu(Section):
     mag: Mag = Mag()
     acc_bias_sd_mps2: Positive = Field(0.05, description="sd of the accelerometer's bias at the start")
     gyr_bias_sd_dps: Positive = Field(0.6, description="sd of the gyro's bias at the start, deg/s")
-    max_gap_s: Positive = Field(30.0, description="a longer silence of the IMU is refused")
+    max_gap_s: Positive = Field(30.0, description="a longer IMU outage is refused")
+
+
+class Motion(Section):
+    """What carries the state from one keyframe to the next."""
+
+    model: Literal["imu", "constant_velocity"] | None = Field(
+        None, description="the IMU, or a constant velocity without it; null = the IMU where the log has one"
+    )
+    acc: Positive = Field(0.1, description="constant velocity: noise density of the acceleration [m/s2/rtHz]")
+    gyr: Positive = Field(0.3, description="constant velocity: noise density of the rate of turn [rad/s/rtHz]")
+    rate_sd_dps: Positive = Field(5.0, description="constant velocity: rate of turn, as a DVL on a lever arm sees it")
 
 
 class Dvl(Section):
     """Doppler velocity log: mounting and noise."""
 
     preset: DvlPreset | None = Field(
-        None, description="instrument that fills in what is not stated, see docs/presets.md"
+        None, description="instrument whose data sheet fills in missing keys, see docs/presets.md"
     )
     mount_rpy_deg: Triple = Field((0.0, 0.0, 0.0), description="DVL axes to body axes: roll, pitch, yaw")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the DVL in body axes")
@@ -141,23 +156,34 @@ class Dvl(Section):
     water_velocity_sd_mps: PositiveTriple = Field((0.03, 0.03, 0.03), description="noise of a water-track ping")
     scale_sd: NotNegative = Field(0.0, description="part of the speed added to the noise of a ping")
     loss: Loss = Field("huber", description="robust loss")
-    gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is left out; null = never")
+    gate_sd: Positive | None = Field(6.0, description="a ping further off than this many sd is rejected; null = never")
     readmit_s: Readmission = 2.0
-    max_speed_mps: Positive = Field(3.0, description="faster pings are left out")
+    max_speed_mps: Positive = Field(3.0, description="faster pings are ignored")
 
 
 class Heading(Section):
     """Heading sources and their noise."""
 
     sources: tuple[HeadingSource, ...] | None = Field(
-        None, description="of mag, dvl, ahrs; null = dvl, and mag or else ahrs, as far as the log has them"
+        None,
+        description="of mag, dvl, ahrs, vehicle; null = dvl, and the first of mag, ahrs and vehicle that the log has",
     )
     mag_sd_deg: Positive = Field(2.0, description="noise of a magnetometer heading")
     dvl_sd_deg: Positive = Field(3.0, description="noise of the DVL's compass")
     ahrs_sd_deg: Positive = Field(3.0, description="noise of the IMU's own heading")
+    vehicle_sd_deg: Positive = Field(3.0, description="noise of the vehicle's own heading")
     loss: Loss = Field("huber", description="robust loss")
-    gate_sd: Positive | None = Field(6.0, description="a heading further off than this many sd is left out")
+    gate_sd: Positive | None = Field(6.0, description="a heading further off than this many sd is rejected")
     readmit_s: Readmission = 60.0
+
+
+class Tilt(Section):
+    """The vehicle's own roll and pitch, which are used where there is no IMU."""
+
+    sd_deg: Positive = Field(1.0, description="noise of roll and of pitch")
+    loss: Loss = Field("huber", description="robust loss")
+    gate_sd: Positive | None = Field(6.0, description="roll and pitch further off than this many sd are left out")
+    readmit_s: Readmission = 10.0
 
 
 class Depth(Section):
@@ -166,17 +192,17 @@ class Depth(Section):
     sd_m: Positive = Field(0.05, description="noise of a depth")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")
-    gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is left out")
+    gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is rejected")
     readmit_s: Readmission = 10.0
 
 
 class Fix(Section):
     """Position fixes."""
 
-    sd_m: Positive = Field(2.0, description="noise of a fix, north and east; a fix's own fix_sd goes before it")
+    sd_m: Positive = Field(2.0, description="noise of a fix, north and east; fix_sd takes precedence")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the antenna or transponder in body axes")
     loss: Loss = Field("huber", description="robust loss")
-    gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is left out")
+    gate_sd: Positive | None = Field(6.0, description="a fix further off than this many sd is rejected")
     readmit_s: Readmission = 300.0
 
 
@@ -184,26 +210,24 @@ class Place(Section):
     """Places seen before, as a camera or a sonar recognises them."""
 
     sd_m: Positive = Field(
-        0.3, description="how far the camera is from a place when it sees it, north and east; place_sd goes before it"
+        0.3, description="sd of the camera's distance from a place, north and east; place_sd takes precedence"
     )
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the camera or sonar in body axes")
-    every_s: NotNegative = Field(5.0, description="a place that stays in view counts once in this time")
+    every_s: NotNegative = Field(5.0, description="a place that stays in view is used once in this time")
     remembered: Annotated[int, Field(ge=1)] = Field(
-        20, description="places that a filter remembers; beyond it forgets the one not seen for longest"
+        20, description="places that a filter remembers; it then forgets the one not seen for longest"
     )
     loss: Loss = Field("cauchy", description="robust loss")
-    gate_sd: Positive | None = Field(
-        4.0, description="a place seen further off than this many sd is another one that looks like it"
-    )
+    gate_sd: Positive | None = Field(4.0, description="an observation further off than this many sd is a false match")
 
 
 class SensorSettings(Section):
-    """What is believed of a sensor that was registered; one with other defaults, or more keys, derives its own."""
+    """Keys of a registered sensor; derive a class for other defaults or more keys."""
 
     sd: Positive = Field(1.0, description="noise of a measurement, every component")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")
-    gate_sd: Positive | None = Field(6.0, description="a measurement further off than this many sd is left out")
+    gate_sd: Positive | None = Field(6.0, description="a measurement further off than this many sd is rejected")
     readmit_s: Readmission = 10.0
 
 
@@ -232,7 +256,7 @@ FALCON_THRUSTERS = (
 class Vehicle(Section):
     """Hydrodynamics (2.16)-(2.24); the defaults are the thesis's Falcon, along forward, starboard, down."""
 
-    mass_kg: Positive = Field(73.3, description="mass; buoyancy is taken as equal to the weight")
+    mass_kg: Positive = Field(73.3, description="mass; buoyancy is assumed equal to the weight")
     added_mass_kg: NotNegativeTriple = Field((27.0, 30.0, 110.0), description="added mass")
     inertia_kgm2: PositiveTriple = Field((3.7, 7.6, 8.3), description="moments of inertia")
     added_inertia_kgm2: NotNegativeTriple = Field((9.0, 15.0, 11.47), description="added moments of inertia")
@@ -250,7 +274,7 @@ class Vehicle(Section):
     thrusters: tuple[Thruster, ...] = Field(FALCON_THRUSTERS, description="thruster_1, thruster_2, ... of the log")
     acceleration_sd_mps2: Positive = Field(0.02, description="error of the model's acceleration, mean of a second")
     loss: Loss = Field("huber", description="robust loss")
-    gate_sd: Positive | None = Field(6.0, description="an interval further off than this many sd is left out")
+    gate_sd: Positive | None = Field(6.0, description="an interval further off than this many sd is rejected")
     readmit_s: Readmission = 10.0
 
 
@@ -261,10 +285,12 @@ class Graph(Section):
     max_gap_s: Positive = Field(
         1.0, description="longest time between keyframes; a ping up to a quarter of it later makes the keyframe itself"
     )
-    min_gap_s: NotNegative = Field(0.05, description="shortest time between keyframes; closer pings are attached")
+    min_gap_s: NotNegative = Field(
+        0.05, description="shortest time between keyframes; closer pings belong to the keyframe before"
+    )
     solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
     segment_s: Positive = Field(10.0, description="isam2: calibration has a new value this often")
-    lag_s: Positive = Field(5.0, description="how late a measurement may come online; without effect on a recorded log")
+    lag_s: Positive = Field(5.0, description="online: how late a measurement may come; no effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")
     find_noise: bool = Field(
         True, description="look for noise that is larger than stated or lasts, and solve the dive again with it"
@@ -295,6 +321,4 @@ Delays = dict[Annotated[str, AfterValidator(_stamped)], float]  # sensor -> how 
 class Online(Section):
     """The online mode."""
 
-    hold_s: NotNegative = Field(
-        0.3, description="measurements wait this long for late ones; what is later than that costs more"
-    )
+    hold_s: NotNegative = Field(0.3, description="measurements wait this long for late ones; later ones cost more time")

@@ -15,10 +15,9 @@ longer than that, and counting each sample would make the estimate too sure of i
 import math
 from bisect import bisect_right, insort
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import InitVar, dataclass, field
-from itertools import islice
 from typing import Any, cast
 
 import numpy as np
@@ -26,28 +25,28 @@ import numpy as np
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
+from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S, Ticks, has_constant_velocity, tick
 from rovgraph.engine.keyframes import (
     KeyframeInterval,
     KeyframeMeasurement,
-    LandmarkObservation,
     measurement_rows,
     sd_of,
 )
-from rovgraph.engine.late_stamp_window import window_around
+from rovgraph.engine.landmarks import STILL_IN_VIEW, Landmarks
+from rovgraph.engine.late_stamp_window import beyond_samples, window_around
 from rovgraph.engine.motion import Motion
 from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
 from rovgraph.engine.scale import scale_to_bias, wanted
 from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
-from rovgraph.engine.whole_log import SHORTEST_S, WholeLog
+from rovgraph.engine.whole_log import SHORTEST_S
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
 from rovgraph.kernels import measurement_row as at
-from rovgraph.log import Log, Measurement
+from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.sensors import SENSORS, ModelAiding
-from rovgraph.state import State
+from rovgraph.state import PLACE, State
 
-SOME = 4096  # measurements of a log that are objects at one time
 _AT_KEYFRAME = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])[None]  # a snapshot without motion
 
 
@@ -75,17 +74,18 @@ class Assembler:
 
     def __post_init__(self, assumed: TimeOffsets | None) -> None:
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
-        self._samples = Samples(self.config, self.learn_noise)
-        self._log: WholeLog | None = None
+        self._ticking = has_constant_velocity(self.config)
+        self._samples = Ticks(self.config) if self._ticking else Samples(self.config, self.learn_noise)
+        self._closing = {*self.instruments} if self._ticking else {"dvl"}  # sensors that make keyframes
         self._waiting: deque[StampedMeasurement] = deque()
         self._aiding: Aiding | None = None
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
         self._index, self._start = -1, 0.0
+        self._heard = np.inf  # when anything was measured last, without an IMU
         self._segment, self._segment_start = -1, -np.inf
         self._between: list[StampedMeasurement] = []
-        self._sighted: dict[float, float] = {}  # place -> when it last counted [s]
-        self._sightings = 0
+        self._landmarks = Landmarks(self.config.place.every_s)
         self.time_offsets = assumed or TimeOffsets.of(self.config, self.instruments)
         believed = beliefs(self.config)
         self._scaled = wanted(believed)
@@ -113,6 +113,10 @@ class Assembler:
                     self._aiding.add(measurement)
             elif self._admissible(measurement):
                 insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
+            if not self._ticking:
+                return []
+            measurement = tick(measurement)
+        elif self._ticking:
             return []
         if self._samples.add(measurement):  # after a gap: a keyframe here, so that nothing is carried through it
             insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
@@ -121,32 +125,12 @@ class Assembler:
             done.append(self._begin(measurement.time))
         return done + self._take_until(measurement.time - self._around)
 
-    def take(self, log: Log) -> list[KeyframeInterval]:
-        """Take a whole log, before anything else: what `add` of each of its measurements and `finish` give.
-
-        Raises
-        ------
-        InputError : an IMU gap longer than ``imu.max_gap_s``
-        """
-        whole = WholeLog(log, self.instruments, self.config, self.time_offsets, self._around, self.left_out)
-        if whole.imu is None:
-            return []
-        self._log = whole
-        measurements = whole.measurements(self._samples.take(whole.imu))
-        self._samples.reach(1)
-        done = [self._begin(whole.begin)]
-        while some := list(islice(measurements, SOME)):
-            self._waiting.extend(some)
-            done += self._take_until(min(some[-1].time, whole.end - self._around))
-        self._look(len(whole.imu))
-        return done + self.finish()
-
     def copy(self) -> "Assembler":
         """One that goes on by itself from here."""
         twin = copy(self)
         twin._samples, twin.left_out = self._samples.copy(), self.left_out.copy()
         twin._waiting, twin._between = self._waiting.copy(), self._between[:]
-        twin._sighted = dict(self._sighted)
+        twin._landmarks = self._landmarks.copy()
         twin.time_offsets = self.time_offsets.copy()
         if self._aiding is not None:
             twin._aiding = self._aiding.copy(twin.left_out)
@@ -161,8 +145,8 @@ class Assembler:
             "assumed": self.time_offsets.assumed,
             "signals": pack(self._aiding.signals if self._aiding is not None else []),
             "at": [self._index, self._start, self._segment, self._segment_start],
-            "sighted": np.array([*self._sighted.items()]).reshape(-1, 2),
-            "landmarks": self._sightings,
+            "sighted": np.array([*self._landmarks.seen.items()]).reshape(-1, 2),
+            "landmarks": self._landmarks.count,
             "bias": self.bias,
         }
 
@@ -175,7 +159,7 @@ class Assembler:
             self._aiding.signals = unpack(state["signals"])
         self._index, self._start, self._segment, self._segment_start = state["at"]
         self.bias = state["bias"]
-        self._sighted, self._sightings = dict(state["sighted"].tolist()), state["landmarks"]
+        self._landmarks.seen, self._landmarks.count = dict(state["sighted"].tolist()), state["landmarks"]
 
     def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> KeyframeInterval:
         """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.
@@ -200,13 +184,15 @@ class Assembler:
             m = self._waiting.popleft()
             done += self._silence(m.time, due)
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
-                self._look_at(m.time)
-                done.append(self._close(m.time, None))
-            elif m.sensor == "dvl" and m.time - self._start >= self.config.graph.min_gap_s:
-                self._look_at(m.time)
-                done.append(self._close(m.time, m))
+                done.append(self._close(m.time))
+            elif self._ticking and m.time - self._heard > LONGEST_CRUISED_S:
+                done.append(self._close(m.time))  # a keyframe that what is measured at it can align
+                self._between.append(m)
+            elif m.sensor in self._closing and m.time - self._start >= self.config.graph.min_gap_s:
+                done.append(self._close(m.time, m, *self._together_with(m)))
             elif m.sensor != "imu":
                 self._between.append(m)
+            self._heard = m.time
         return done + self._silence(time, due)
 
     def finish(self) -> list[KeyframeInterval]:
@@ -215,13 +201,12 @@ class Assembler:
         if end == -math.inf:
             return []
         done = self._take_until(end)
-        self._look_at(math.inf)
         done += self._silence(end, 0.0)
         self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
         if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
             return done
-        return [*done, self._close(end, None)]
+        return [*done, self._close(end)]
 
     def _admissible(self, m: Measurement) -> bool:
         """Whether a measurement may enter the graph; counts those that may not."""
@@ -232,32 +217,23 @@ class Assembler:
         early = [m for m in self._waiting if m.time < time]
         self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
         self._waiting = deque(m for m in self._waiting if m.time >= time)
-        return self._close(time, None)
+        return self._close(time)
 
     def _silence(self, time: float, ping_due_s: float) -> list[KeyframeInterval]:
         """Keyframes for a time without pings; one that is ``ping_due_s`` late may still come."""
         done = []
         gap = self.config.graph.max_gap_s
         while time - self._start > gap + ping_due_s:
-            if self._log is not None:
-                self._look(self._log.count_after(self._start, gap + ping_due_s))
-            done.append(self._close(self._start + gap, None))
+            done.append(self._close(self._start + gap))
         return done
 
-    def _look_at(self, time: float) -> None:
-        """Look at the samples of a log that is known as a whole, up to the first by which a time is past."""
-        if self._log is not None:
-            self._look(self._log.count_at(time))
+    def _together_with(self, m: StampedMeasurement) -> Iterator[StampedMeasurement]:
+        """Without an IMU, all else that was measured at the same time: it belongs to the same keyframe."""
+        while self._ticking and self._waiting and self._waiting[0].time == m.time:
+            yield self._waiting.popleft()
 
-    def _look(self, count: int) -> None:
-        """Look at as many samples of a log that is known as a whole."""
-        self._samples.reach(count)
-        if self._aiding is not None and self._log is not None:
-            for signal in self._log.signals(self._samples.newest):
-                self._aiding.add(signal)
-
-    def _close(self, time: float, ping: StampedMeasurement | None) -> KeyframeInterval:
-        """Make a keyframe at ``time`` and the interval that leads to it."""
+    def _close(self, time: float, *here: StampedMeasurement) -> KeyframeInterval:
+        """Make a keyframe at ``time``, with what is measured ``here``, and the interval that leads to it."""
         every = self._samples.table
         samples = covering(every, self._start)
         samples = samples[: int(samples[:, 0].searchsorted(time + self._around)) + 1]
@@ -271,9 +247,9 @@ class Assembler:
         if time - self._segment_start >= self._segment_s:
             self._segment, self._segment_start = self._segment + 1, time
         rate_b, rate_sd = self._samples.rate(samples, time)
-        if ping is not None:
+        for m in here:
             row = measurement_rows(time, _AT_KEYFRAME, self.bias, self._dim)[0]
-            attached += self._attach(ping, row, (rate_b, rate_sd), every)
+            attached += self._attach(m, row, (rate_b, rate_sd), every)
         scaled = self._scale_to_bias(samples, before, time) if motion is not None else None
         self._samples.forget(time, self._around)
         return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, motion, attached, scaled)
@@ -312,11 +288,12 @@ class Assembler:
         if lag is not None:
             window = window_around(m.stamp, lag, every, self._start, (known.params, self.bias), known.longest_step)
             if window is None:
-                self.left_out[m.sensor, f"calibration.{instrument.time_offset} reaches beyond the IMU's samples"] += 1
+                self.left_out[m.sensor, beyond_samples(instrument)] += 1
                 return []
-        if m.sensor == "place":
-            landmark = self._sighting(m)
+        if m.sensor == PLACE:
+            landmark = self._landmarks.observe(float(m.values[0]), m.time)
             if landmark is None:
+                self.left_out[m.sensor, STILL_IN_VIEW] += 1
                 return []
         else:
             row[at.Z : at.Z + dim] = m.values[:dim]
@@ -327,15 +304,6 @@ class Assembler:
         scaled = self._scale_to_bias(every, self._start, m.time)
         place = (m.sensor, self._index, self._segment, m.row)
         return [KeyframeMeasurement(*place, dim, row, window, scaled, landmark)]
-
-    def _sighting(self, m: StampedMeasurement) -> LandmarkObservation | None:
-        """A place that is seen; None where it has been in view just now."""
-        name = float(m.values[0])
-        if m.time - self._sighted.get(name, -math.inf) < self.config.place.every_s:
-            self.left_out["place", "still in view"] += 1
-            return None
-        self._sighted[name], self._sightings = m.time, self._sightings + 1
-        return LandmarkObservation(name, self._sightings)
 
     def _scale_to_bias(self, samples: Array, begin: float, end: float) -> Array | None:
         """The IMU's mean signal as scale errors make a bias of it, where there may be any."""

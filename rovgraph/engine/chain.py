@@ -113,7 +113,7 @@ class Chain:
         return self._blocks(self._unknown_to_kernels) if self._unknown_to_kernels else {}
 
     def _blocks(self, sensors: set[str]) -> dict[str, Block]:
-        gravity = self.initial.config.environment.gravity_mps2
+        gravity = self.initial.gravity
         return blocks_of(self.intervals, sensors, self.initial.instruments, gravity, self.unknowns)
 
     @cached_property
@@ -170,7 +170,7 @@ class Chain:
     def _squared_lengths(self, point: State) -> Array:
         """Of the whitened innovations of what kernels know, shape (m,)."""
         r, out = self.rows, np.empty(len(self.rows.rows))
-        gravity = self.initial.config.environment.gravity_mps2
+        gravity = self.initial.gravity
         dive = r.rows, r.which, r.first, r.row_scales, self._sensors
         squared_lengths(*dive, *self._arrays(point), gravity, out)
         return out
@@ -267,7 +267,7 @@ class Chain:
             self._put_block(given, place, block, state, gates[sensor])
         r, n, d, c = self.rows, len(self.intervals), self.layout.d, self.layout.c + clones
         dive = r.motions, r.weights, r.scales, r.rows, r.which, r.first, r.row_scales, self._sensors
-        gravity = self.initial.config.environment.gravity_mps2
+        gravity = self.initial.gravity
         walks = *self.walk, -self.walk_residuals(point)
         point_and_layout: Any = *self._arrays(point), self.layout.column, gravity, *walks
         rest: Any = (

@@ -119,6 +119,10 @@ class ChainOptimum:
         P = self._marginals[1][part, part]
         return np.broadcast_to(P, (len(self.intervals), *P.shape))
 
+    def forget_covariances(self) -> None:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        vars(self).pop("_marginals", None)
+
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         layout, names = self._wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)

@@ -68,21 +68,33 @@ class DiveRows:
         row_scales = np.zeros((0, 6, 6))
         if found and found[0].scale_to_bias is not None:
             row_scales = np.array([m.scale_to_bias for m in found])
+        which = np.array([index[m.sensor] for m in found], dtype=np.int64)
         keyframe = np.array([m.keyframe for m in found], dtype=np.int64)
-        weights = np.empty((len(motions), MOTION, MOTION))
+        ends = np.repeat(np.arange(n), [len(i.measurements) for i in intervals])
+        time = np.array([i.time for i in intervals])
+        return DiveRows.from_arrays(motions, scales, rows, which, row_scales, keyframe, ends, time, tuple(sensors))
+
+    @staticmethod
+    def from_arrays(
+        motions: Array,
+        scales: Array,
+        rows: Array,
+        which: Index,
+        row_scales: Array,
+        keyframe: Index,
+        interval: Index,
+        time: Array,
+        sensors: tuple[str, ...],
+    ) -> "DiveRows":
+        """Of arrays as they stand here; ``keyframe`` and ``interval``, shape (m,), are those of each measurement.
+
+        Rows may be wider, as those of measurements that no kernel takes.
+        """
+        n, weights = len(time), np.empty((len(motions), MOTION, MOTION))
         motion_weights(motions, weights)
-        return DiveRows(
-            motions,
-            weights,
-            scales,
-            rows,
-            np.array([index[m.sensor] for m in found], dtype=np.int64),
-            row_scales,
-            keyframe.searchsorted(np.arange(n + 1)),
-            np.cumsum([len(i.measurements) for i in intervals], dtype=np.int64),
-            np.array([i.time for i in intervals]),
-            tuple(sensors),
-        )
+        first, taken = keyframe.searchsorted(np.arange(n + 1)), interval.searchsorted(np.arange(1, n + 1))
+        rows = np.ascontiguousarray(rows[:, : measured.ROW])
+        return DiveRows(motions, weights, scales, rows, which, row_scales, first, taken, time, sensors)
 
     def __len__(self) -> int:
         return len(self.taken)

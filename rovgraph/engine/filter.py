@@ -79,7 +79,7 @@ class FilterEngine:
             self.unknowns = replace(self.unknowns, considered=())
         self.layout = ErrorLayout(self.unknowns.estimated, self.unknowns.considered, initial.instruments)
         self._wide = self.unknowns.estimating(self.unknowns.considered)  # all that has a place in the error
-        self._gravity = initial.config.environment.gravity_mps2
+        self._gravity = initial.gravity
         self._walk = np.zeros((3, self.layout.size))  # as `rovgraph.kernels.prediction` takes it
         for name, walk in self.unknowns.walks.items():
             self._walk[0, self.layout.columns[name]] = walk**2

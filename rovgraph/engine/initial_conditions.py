@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rovgraph.config import Config
+from rovgraph.engine.constant_velocity import gravity, has_constant_velocity
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument, instruments
 from rovgraph.state import State
@@ -55,6 +56,16 @@ class InitialConditions:
     instruments: dict[str, Instrument]
     prior: StatePrior
     assumptions: list[str]
+
+    @property
+    def gravity(self) -> float:
+        """Gravity that the motion is integrated with [m/s^2]."""
+        return gravity(self.config)
+
+    @property
+    def streams(self) -> list[str]:
+        """Names of the sensors in use, of the IMU's where the motion is its own."""
+        return [*self.instruments, *(() if has_constant_velocity(self.config) else ("imu",))]
 
     def dump(self) -> dict[str, Any]:
         """What `restored` makes it of again, as plain values and arrays."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rovgraph.engine.motion import Snapshot
 from rovgraph.engine.preintegration import PreintegrationParams, integrate_motion
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rotate, transpose
+from rovgraph.instruments import Instrument
 from rovgraph.state import BIAS, POSE, VELOCITY, Delta, Jacobians, State
 
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
@@ -171,6 +172,11 @@ def window_around(
     stops, place = np.unique(around, return_inverse=True)
     _, found = integrate_motion(params, bias, imu, begin, stops, end, 0.0)
     return LateStampWindow.of(found[place[-1]], found[place[:-1]], lag, _rate(imu, knots), bias)
+
+
+def beyond_samples(instrument: Instrument) -> str:
+    """Why a measurement of an instrument is left out that has no window."""
+    return f"calibration.{instrument.time_offset} reaches beyond the IMU's samples"
 
 
 def _rate(imu: Array, time: Array) -> Array:

@@ -77,6 +77,10 @@ class Optimum(Protocol):
         """
         ...
 
+    def forget_covariances(self) -> None:
+        """Free the memory of `covariances`; they are calculated again where they are asked for again."""
+        ...
+
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """Joint covariance of the newest keyframe, of the calibration there, and of places.
 

@@ -126,5 +126,7 @@ def integrate_motion(
 ) -> tuple[Motion, Array]:
     """The same with all snapshots in one array, shape (k, SNAPSHOT)."""
     row, snapshots = params.row(bias, gap_s), np.empty((len(stops), SNAPSHOT))
-    integrate(imu, start, stops, end, row, snapshots)
+    times = np.array([start, end])
+    counts = np.array([0, len(imu), 0, len(stops)])
+    integrate(imu, counts[:1], counts[1:2], times[:1], times[1:], stops, counts[2:], row[None], snapshots)
     return Motion(row, imu, start, end, stops), snapshots

@@ -21,8 +21,10 @@ from rovgraph.engine.preintegration import (
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
-from rovgraph.kernels.imu_samples import fit_rate, mean_signal, survey
-from rovgraph.log import Measurement, Stream
+from rovgraph.kernels.imu_samples import fit_rates, mean_signals, survey
+from rovgraph.log import Measurement
+
+Index = NDArray[np.int64]
 
 HALF_WINDOW_S = 0.05  # around a time, over which the rate is averaged; measurements wait that long
 ENOUGH_FOR_A_CURVE = 5  # samples in that window; a slower IMU is interpolated between two
@@ -55,7 +57,6 @@ class Samples:
         self._bridge = preintegration_params(config, BRIDGE_ACC, BRIDGE_GYR)
         self._rows, self._first, self._last = np.empty((ROOM, 7)), 0, 0  # motions hold views of rows: write only once
         self._periods: list[float] = []
-        self._longest_steps: list[float] = []  # as they were known after each of the first samples of a log
         self.longest_step = math.inf
 
     def add(self, m: Measurement) -> bool:
@@ -74,46 +75,16 @@ class Samples:
             period = m.time - self.newest
             missing = period > self.longest_step
             if period > self._config.imu.max_gap_s:
-                raise self._too_long(period, m.time, m.row)
+                raise too_long(self._config, period, m.time, m.row)
             self._take_period(period)
         if self._last == len(self._rows):
             kept = self.table
             self._rows = np.empty((len(kept) + ROOM, 7))
             self._rows[: len(kept)], self._first, self._last = kept, 0, len(kept)
         row = self._rows[self._last]
-        row[0], row[1:] = m.time, self._in_body(m.values[:6])
+        row[0], row[1:] = m.time, in_body(m.values[:6], self._R_sb)
         self._last += 1
         return missing
-
-    def take(self, stream: Stream) -> NDArray[np.bool_]:
-        """Take all samples of a log, to be looked at as far as `reach` says; none may have been taken before.
-
-        Returns
-        -------
-        ndarray of bool, shape (n,) : whether samples were missing before each
-
-        Raises
-        ------
-        InputError : a gap longer than ``imu.max_gap_s``
-        """
-        self._rows = np.column_stack([stream.time, self._in_body(stream.data[:, :6])])
-        periods = np.diff(stream.time)
-        too_long = np.flatnonzero(periods > self._config.imu.max_gap_s)
-        if too_long.size:
-            k = int(too_long[0])
-            raise self._too_long(float(periods[k]), float(stream.time[k + 1]), int(stream.row[k + 1]))
-        self._longest_steps = [math.inf]
-        for period in periods[:PERIODS].tolist():
-            self._take_period(period)
-            self._longest_steps.append(self.longest_step)
-        known = np.full(len(periods), self.longest_step)
-        known[:PERIODS] = self._longest_steps[:-1]
-        return np.concatenate([[False], periods > known])
-
-    def reach(self, count: int) -> None:
-        """Look at the first samples of a log only, at no fewer than before."""
-        count = self._last = max(count, self._last)
-        self.longest_step = self._longest_steps[min(count, len(self._longest_steps)) - 1]
 
     @property
     def table(self) -> Array:
@@ -140,7 +111,7 @@ class Samples:
         """
         rows = [self.table]
         if later:
-            values = self._in_body(np.array([m.values[:6] for m in later]))
+            values = in_body(np.array([m.values[:6] for m in later]), self._R_sb)
             rows.append(np.column_stack([[m.time for m in later], values]))
         if time - rows[-1][-1, 0] > self.longest_step:
             rows.append(np.concatenate([[time], at_rest])[None])
@@ -162,7 +133,7 @@ class Samples:
         bias, start, stops, end : as `rovgraph.engine.preintegration.preintegrate` takes them
         learn : its samples tell of the noise
         """
-        longest, within, *shown = survey(table, start, end)
+        longest, within, *shown = surveyed(table, *whole(table), np.array([start]), np.array([end]))[0].tolist()
         if within > self.longest_step:
             return integrate_motion(self._bridge, bias, table, start, stops, end, within)
         params = self.params
@@ -177,17 +148,12 @@ class Samples:
         the rate into velocity, and the derivative by the misalignment into knowledge
         that is not there, so a single sample would not do.
         """
-        rate = np.empty(3)
-        step, share = fit_rate(table, time, HALF_WINDOW_S, ENOUGH_FOR_A_CURVE, rate)
-        if step > self.longest_step:
-            return rate, BRIDGE_GYR
-        return rate, self._noise[1] * math.sqrt(share / step if step else share)
+        rate, sd = rates(table, *whole(table), np.array([time]), np.array([self.longest_step]), self._noise[1])
+        return rate[0], float(sd[0])
 
     def mean(self, table: Array, begin: float, end: float) -> Array:
         """Mean specific force and rate over a time, shape (6,)."""
-        mean = np.empty(6)
-        mean_signal(table, begin, end, MEAN_OF, mean)
-        return mean
+        return np.asarray(means(table, *whole(table), np.array([begin]), np.array([end]))[0])
 
     def copy(self) -> "Samples":
         """One that goes on by itself from here."""
@@ -204,7 +170,7 @@ class Samples:
         """Go on from where another stood."""
         self._rows, self._first, self._last = np.ascontiguousarray(state["imu"]), 0, len(state["imu"])
         self._periods = list(state["periods"])
-        self.longest_step = GAP_PERIODS * float(np.median(self._periods)) if self._periods else math.inf
+        self.longest_step = longest_regular(self._periods)
         self._floor.restore(state["floor"])
         if self._learn_noise:
             self._raise(*self._floor.densities().tolist())
@@ -212,18 +178,7 @@ class Samples:
     def _take_period(self, period: float) -> None:
         if len(self._periods) < PERIODS:
             self._periods.append(period)
-            self.longest_step = GAP_PERIODS * float(np.median(self._periods))
-
-    def _too_long(self, period: float, time: float, row: int) -> InputError:
-        return InputError(
-            f"row {row}: the IMU is silent for {period:.1f} s before {time:.3f} s, longer than "
-            f"imu.max_gap_s = {self._config.imu.max_gap_s:g}; split the log there or raise that key"
-        )
-
-    def _in_body(self, values: Array) -> Array:
-        """Specific force and rate, shape (..., 6), from the IMU's axes to the body's."""
-        # sample by sample, so that one alone comes out as it does among many
-        return (values.reshape(-1, 2, 3) @ self._R_sb).reshape(values.shape)
+            self.longest_step = longest_regular(self._periods)
 
     def _params_for(self, table: Array, shown: Sequence[float]) -> PreintegrationParams:
         """The believed noise, or where a knock shakes the samples far more, what they show."""
@@ -231,7 +186,7 @@ class Samples:
             self._floor.take(scatter(table[:, 0], table[:, 1:]))
             self._raise(*self._floor.densities().tolist())
         acc, gyr = self._noise
-        if shown[0] < KNOCK * acc and shown[1] < KNOCK * gyr:
+        if not knocked(np.array(shown), self._noise):
             return self.params
         return preintegration_params(self._config, max(shown[0], acc), max(shown[1], gyr))
 
@@ -239,6 +194,69 @@ class Samples:
         """Take other noise densities, where they differ enough to matter."""
         if max(abs(acc / self._noise[0] - 1.0), abs(gyr / self._noise[1] - 1.0)) > 0.05:
             self._noise, self.params = (acc, gyr), preintegration_params(self._config, acc, gyr)
+
+
+def in_body(values: Array, R_sb: Array) -> Array:
+    """Specific force and rate, shape (..., 6), from the IMU's axes to the body's."""
+    # sample by sample, so that one alone comes out as it does among many
+    return (values.reshape(-1, 2, 3) @ R_sb).reshape(values.shape)
+
+
+def longest_regular(periods: Sequence[float]) -> float:
+    """Step between two samples that is no gap, by the first periods of a log [s]."""
+    return GAP_PERIODS * float(np.median(periods)) if len(periods) else math.inf
+
+
+def too_long(config: Config, period: float, time: float, row: int) -> InputError:
+    """A gap before a sample that cannot be bridged."""
+    return InputError(
+        f"row {row}: the IMU is silent for {period:.1f} s before {time:.3f} s, longer than "
+        f"imu.max_gap_s = {config.imu.max_gap_s:g}; split the log there or raise that key"
+    )
+
+
+def knocked(shown: Array, noise: tuple[float, float]) -> NDArray[np.bool_]:
+    """Whether samples scatter so much, shape (..., 2), that they tell of a knock; ``noise`` is what is believed."""
+    return np.asarray((shown >= KNOCK * np.array(noise)).any(axis=-1))
+
+
+# of n times or intervals; each has its samples in a table, from ``first`` to before ``last``, shape (n,)
+
+
+def whole(table: Array) -> tuple[Index, Index]:
+    """All of a table, for one interval."""
+    return np.zeros(1, np.int64), np.array([len(table)])
+
+
+def surveyed(table: Array, first: Index, last: Index, start: Array, end: Array) -> Array:
+    """Gaps and scatter of n intervals, shape (n, 4), of `rovgraph.kernels.imu_samples.survey`."""
+    found = np.empty((len(start), 4))
+    survey(table, first, last, start, end, found)
+    return found
+
+
+def rates(
+    table: Array, first: Index, last: Index, time: Array, longest_step: Array, density: float
+) -> tuple[Array, Array]:
+    """Rate at n times, shape (n, 3), and the sd of its noise, shape (n,) [rad/s].
+
+    Parameters
+    ----------
+    longest_step : shape (n,), step between two samples that is no gap [s]
+    density : of the gyro's noise [rad/s/rtHz]
+    """
+    rate, fit = np.empty((len(time), 3)), np.empty((len(time), 2))
+    fit_rates(table, first, last, time, HALF_WINDOW_S, ENOUGH_FOR_A_CURVE, rate, fit)
+    step, share = fit.T
+    sd = density * np.sqrt(share / np.where(step > 0.0, step, 1.0))
+    return rate, np.where(step > longest_step, BRIDGE_GYR, sd)
+
+
+def means(table: Array, first: Index, last: Index, begin: Array, end: Array) -> Array:
+    """Mean specific force and rate over n times, shape (n, 6)."""
+    mean = np.empty((len(begin), 6))
+    mean_signals(table, first, last, begin, end, MEAN_OF, mean)
+    return mean
 
 
 def first_covering(table: Array, time: float, before: float = HALF_WINDOW_S) -> int:

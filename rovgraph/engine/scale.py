@@ -29,16 +29,16 @@ def scale_to_bias(signal_b: Array, R_bs: Array) -> Array:
 
     Parameters
     ----------
-    signal_b : ndarray, shape (6,), mean specific force and rate, body axes, biases taken off
+    signal_b : ndarray, shape (..., 6), mean specific force and rate, body axes, biases taken off
     R_bs : ndarray, shape (3, 3), mounting of the IMU
 
     Returns
     -------
-    ndarray, shape (6, 6), bias (accelerometer, gyro; body axes) by `SCALES`
+    ndarray, shape (..., 6, 6), bias (accelerometer, gyro; body axes) by `SCALES`
     """
-    S = np.zeros((6, 6))
+    S = np.zeros((*signal_b.shape, 6))
     for part in COLUMNS.values():
-        S[part, part] = R_bs * (R_bs.T @ signal_b[part])
+        S[..., part, part] = R_bs * (signal_b[..., part] @ R_bs)[..., None, :]
     return S
 
 

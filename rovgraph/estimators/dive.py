@@ -94,6 +94,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
         if not more:
             break
         found, config = found + more, with_noise(config, more)
+        best = None  # a long dive is not kept twice
         dive, best = _solve(log, config, frozen, estimate, progress)
         if more[-1].lasts:
             break
@@ -123,6 +124,7 @@ def _solve(
             progress("smoothing", 0.5)
             best = batch.optimum(states)
             estimates.insert(0, smoothed(best, beginning))
+            best.forget_covariances()  # of a long dive they are large
     intervals = batch.intervals if best is None else best.intervals
     numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen))
     left_out = _left_out(batch, frozen)

@@ -129,7 +129,7 @@ def first_heading(
         apart = np.abs(wrap_angle(np.subtract.outer(yaws, yaws))).sum(axis=1)
         return float(yaws[int(np.argmin(apart))]), source
     raise InputError(
-        f"{log.source}: no heading in the first {WITHIN_S:.0f} s (mag_x.., ahrs_yaw or dvl_heading) and no "
+        f"{log.source}: no heading in the first {WITHIN_S:.0f} s (mag_x.., ahrs_yaw, heading or dvl_heading) and no "
         "start.heading_deg; give start.heading_deg in the configuration"
     )
 

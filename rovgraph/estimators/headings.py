@@ -39,10 +39,11 @@ def trusted_first(config: Config, sources: list[str]) -> list[str]:
     Parameters
     ----------
     config : priors of the offsets
-    sources : of "mag", "ahrs", "dvl_heading"
+    sources : of `rovgraph.instruments.HEADING_STREAMS`
     """
     priors = beliefs(config)
     offset = {"mag": "mag_offset", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
+    offset["vehicle_heading"] = "vehicle_compass_offset"
     return sorted(sources, key=lambda s: priors[offset[s]].sd if priors[offset[s]].estimate else 0.0)
 
 

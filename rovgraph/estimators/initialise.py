@@ -10,11 +10,13 @@ from collections.abc import Collection
 import numpy as np
 
 from rovgraph.config import Config, beliefs
+from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
 from rovgraph.engine.noise_floor import NOISIER
 from rovgraph.engine.preintegration import scatter
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
+from rovgraph.estimators.without_imu import TILT, first_tilt, no_bias, with_motion_model
 from rovgraph.geometry import Array, earth_rate_n, level_from_force, matrix_from_rpy, rpy_from_matrix
 from rovgraph.instruments import Instrument, heading_sources, instruments
 from rovgraph.log import Log
@@ -52,27 +54,27 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
 
     Raises
     ------
-    InputError : no IMU; neither DVL nor fixes; no heading and no ``start.heading_deg``
+    InputError : neither an IMU nor roll and pitch; neither DVL nor fixes; no heading and no ``start.heading_deg``
     """
-    if "imu" not in log:
-        raise InputError(f"{log.source}: no IMU, columns acc_x..acc_z and gyr_x..gyr_z are needed")
+    assumptions: list[str] = []
+    log, config = with_motion_model(log, config, assumptions)
     if "dvl" not in log and "fix" not in log:
         raise InputError(
             f"{log.source}: neither DVL (dvl_vx, dvl_vy, dvl_vz) nor position fixes, one of them is needed"
         )
-    assumptions: list[str] = []
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
     sensors = instruments(config, config.imu.lever_arm_m)
     sources = heading_sources(config, log.sensors)
     present = log.sensors | set(expected)
-    own = [s for s in sensors if s in present and s != "thruster" and SENSORS[s].heading_source is None]
+    elsewhere = {"thruster"} if has_constant_velocity(config) else {"thruster", TILT}
+    own = [s for s in sensors if s in present - elsewhere and SENSORS[s].heading_source is None]
     used = own + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
 
     first = level(log, config)
-    bias, bias_sd = _bias(config, first, assumptions)
+    bias, bias_sd = no_bias() if has_constant_velocity(config) else _bias(config, first, assumptions)
     R_nb, rpy_sd = _attitude(log, config, sensors, sources, first, bias[3:], assumptions)
     if first.shows_bias and config.environment.earth_rotation:  # a gyro that stands still shows the Earth's rate, too
         bias[3:] -= R_nb.T @ earth_rate_n(np.deg2rad(config.environment.latitude_deg or 0.0))
@@ -157,7 +159,7 @@ def sample_density(time: Array, samples: Array) -> float:
 def _resolve_noise(log: Log, config: Config, assumptions: list[str]) -> Config:
     """Raise the IMU's noise densities to what its samples scatter in this dive."""
     imu, noise, changes = log["imu"], config.imu.noise, {}
-    if len(imu) < ENOUGH_SAMPLES:
+    if len(imu) < ENOUGH_SAMPLES or has_constant_velocity(config):
         return config
     for name, columns in (("acc", slice(0, 3)), ("gyr", slice(3, 6))):
         seen, believed = sample_density(imu.time, imu.data[:, columns]), getattr(noise, name)
@@ -181,12 +183,12 @@ def _attitude(
 ) -> tuple[Array, Array]:
     """R_nb of the first epoch and the sd of roll, pitch, yaw."""
     start = config.start
-    stated, from_gravity = (start.roll_deg, start.pitch_deg), level_from_force(first.force_b).tolist()
-    roll, pitch = (
-        own if said is None else float(np.deg2rad(said)) for said, own in zip(stated, from_gravity, strict=True)
-    )
+    stated = start.roll_deg, start.pitch_deg
+    moving = not first.quiet and not has_constant_velocity(config)
+    from_log = first_tilt(log) if has_constant_velocity(config) else level_from_force(first.force_b).tolist()
+    roll, pitch = (own if said is None else float(np.deg2rad(said)) for said, own in zip(stated, from_log, strict=True))
     tilt_sd = np.deg2rad(start.tilt_sd_deg)
-    if not first.quiet and (start.roll_deg is None or start.pitch_deg is None):
+    if moving and (start.roll_deg is None or start.pitch_deg is None):
         tilt_sd = max(tilt_sd, MOVING_TILT_SD)
         assumptions.append("the log begins in motion: levelled roughly, roll and pitch settle in the graph")
     yaw_sd = np.deg2rad(start.heading_sd_deg)

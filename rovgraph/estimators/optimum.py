@@ -3,11 +3,13 @@
 from collections.abc import Mapping, Sequence
 
 from rovgraph.engine.chain_optimum import smooth_chain
+from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.observability import shown
+from rovgraph.estimators.without_imu import unseen
 from rovgraph.geometry import Array
 from rovgraph.state import PLACE, State
 
@@ -38,5 +40,6 @@ def optimum(
         best: Optimum = smooth_graph(intervals, initial, states, calibration)
     else:
         best = smooth_chain(intervals, initial, states, calibration, rows)
-    seen = shown(best)
+    hidden = unseen(best.blocks) if has_constant_velocity(initial.config) else []
+    seen = [name for name in shown(best) if name not in hidden]
     return best.estimating(seen) if seen else best

@@ -69,7 +69,7 @@ def calibration_estimates(
     Parameters
     ----------
     beliefs : all calibration variables
-    sensors : in use
+    sensors : in use, "imu" among them where the motion is the IMU's
     values : name -> ndarray, shape (dim,)
     covariance : name -> ndarray, shape (dim, dim), of those that were estimated; others that are believed to be
         considered keep the sd of their prior
@@ -78,7 +78,7 @@ def calibration_estimates(
     """
     out = []
     for name, belief in beliefs.items():
-        if not set(belief.variable.sensors) & {*sensors, "imu"}:
+        if not set(belief.variable.sensors) & set(sensors):
             continue
         estimated = name in covariance
         considered = belief.considered and not estimated
@@ -98,8 +98,10 @@ def calibration_estimates(
     return out
 
 
-def bias_histories(time: Array, bias: Array, sd: Array) -> dict[str, History]:
-    """Accelerometer and gyro bias against time; ``bias`` and ``sd`` have shape (n, 6)."""
+def bias_histories(time: Array, bias: Array, sd: Array, sensors: Sequence[str]) -> dict[str, History]:
+    """Accelerometer and gyro bias against time where there is an IMU; ``bias`` and ``sd`` have shape (n, 6)."""
+    if "imu" not in sensors:
+        return {}
     acc, gyr = (tuple(f"{s}_bias{c}" for c in _XYZ) for s in ("acc", "gyr"))
     return {
         "acc_bias": History(acc, "m/s2", time, bias[:, :3], sd[:, :3]),

@@ -3,14 +3,17 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
 from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.log_assembly import assemble_log
 from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
@@ -58,9 +61,15 @@ class BatchSmoother:
     def take(self, log: Log) -> list[KeyframeInterval]:
         """Take a whole log, before anything else: what `add` of each of its measurements and `finish` give."""
         self._log = log
-        done = self.assembler.take(log)
-        self.intervals += done
-        return done
+        b, assembler = self.beginning, self.assembler
+        if has_constant_velocity(b.config):  # every measurement may make a keyframe, and no samples lie between
+            for measurement in log.measurements():
+                self.intervals += assembler.add(measurement)
+            return self.finish()
+        bias, offsets, left_out = b.prior.state.bias[0], assembler.time_offsets, assembler.left_out
+        dive = assemble_log(log, b.config, b.instruments, bias, offsets, left_out)
+        self.intervals, self._rows = dive.intervals, dive.rows
+        return dive.intervals
 
     @property
     def measurements(self) -> list[Measurement]:
@@ -155,7 +164,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
         intervals, states, b.config.imu.lever_arm_m, best.covariances(POSE), best.covariances(VELOCITY)
     )
     bias_sd = np.sqrt(np.diagonal(best.covariances(BIAS), axis1=1, axis2=2))
-    history = bias_histories(trajectory.time, states.bias, bias_sd)
+    history = bias_histories(trajectory.time, states.bias, bias_sd, b.streams)
     final, spread = dict(best.unknowns.fixed), {}
     held = [name for name in best.unknowns.considered if best.beliefs[name].estimate]
     n, segment = len(intervals), np.array([i.segment for i in intervals])
@@ -175,7 +184,9 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     return Estimate(
         "smoothed",
         trajectory,
-        calibration_estimates(best.beliefs, list(best.blocks), final, spread, relative),
+        calibration_estimates(
+            best.beliefs, [s for s in b.streams if s in {*best.blocks, "imu"}], final, spread, relative
+        ),
         history,
         residual_frame(best.blocks, residual_states(best), best.weights),
         {
@@ -186,10 +197,30 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "stretches_taken_out": [asdict(stretch) for stretch in best.solution.stretches],
             "runner_up": best.solution.runner_up if isfinite(best.solution.runner_up) else None,
             "bridged_intervals": sum(i.bridged for i in intervals),
+            "calibration_covariance": _joint_calibration(best),
             "held_at_prior": held,
             "considered": [name for name in best.unknowns.considered if name not in held],
         },
     )
+
+
+def _joint_calibration(best: Optimum) -> dict[str, Any] | None:
+    """What is estimated, jointly, at the end of the dive; None where nothing is.
+
+    Returns
+    -------
+    dict : ``labels`` (c), ``prior_sd`` (c) and ``covariance`` (c x c), radians and SI
+    """
+    names = best.unknowns.estimated
+    if not names:
+        return None
+    end = len(best.intervals) - 1
+    prior = joint_prior_sd(best, end)
+    return {
+        "labels": [label for name in names for label in best.beliefs[name].variable.labels],
+        "prior_sd": np.concatenate([prior[name] for name in names]).tolist(),
+        "covariance": best.knowledge([end]).calibration[0].tolist(),
+    }
 
 
 def _without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:

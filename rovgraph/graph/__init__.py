@@ -8,4 +8,7 @@ from rovgraph.errors import InputError
 try:
     import gtsam  # noqa: F401
 except ImportError as error:
-    raise InputError(f"places and isam2 need GTSAM, which is missing ({error}): pip install gtsam") from None
+    raise InputError(
+        f"places and iSAM2 need GTSAM, which is missing ({error}); install it with: pip install gtsam "
+        "(it has no package for Windows and 32 bits; there, use the batch engine without places)"
+    ) from None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config
+from rovgraph.engine.constant_velocity import gravity
 from rovgraph.engine.gauss_newton import Gates, Measured, Solution
 from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.engine.keyframes import KeyframeInterval
@@ -164,7 +165,7 @@ def make_problem(
     index = np.arange(len(intervals))
     wanted = wanted or unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
     factors = _others(intervals, prior, beliefs, wanted, index)
-    blocks = blocks_of(intervals, instruments, instruments, config.environment.gravity_mps2, wanted)
+    blocks = blocks_of(intervals, instruments, instruments, gravity(config), wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
     native = gtsam.NonlinearFactorGraph()

@@ -85,6 +85,10 @@ class GraphOptimum:
         K = np.array([self._sensitivity[own] for own in self._keys(variable)])
         return np.asarray(known + K @ transpose(K))
 
+    def forget_covariances(self) -> None:
+        """As `rovgraph.engine.optimum.Optimum`."""
+        vars(self).pop("_covariances", None)
+
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         known = newest_covariance(self.problem, self.solution.point, self.solution.gates, places)

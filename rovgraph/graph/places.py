@@ -24,6 +24,7 @@ import gtsam
 import numpy as np
 
 from rovgraph.config import beliefs as beliefs_of
+from rovgraph.engine.constant_velocity import gravity
 from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
@@ -59,7 +60,7 @@ def smooth_graph(
     seen = _landmarks(intervals)
     if not seen:
         return GraphOptimum(apart, initial, beliefs, problem, solution)
-    found = recognised(seen, instruments["place"], config.environment.gravity_mps2, problem, solution)
+    found = recognised(seen, instruments["place"], gravity(config), problem, solution)
     recognised_dive = _given(intervals, found)
     together = make_problem(recognised_dive, *given)
     values = gtsam.Values(solution.point)

@@ -10,7 +10,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -22,6 +22,7 @@ from rovgraph.interchange.recording import Recording
 HEAD = 65536  # bytes of a file that a format is recognised by
 LIKELY = 0.5  # confidence from which a file is taken to be of a format
 OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
+    "own_log",
     "dataflash",
     "tlog",
     "blueos",
@@ -41,10 +42,13 @@ class Options:
     ----------
     choose : sensor -> instance, message or topic that feeds it, where a file has several
     progress : called with the bytes read so far and those of the file
+    columns, units : of a configuration, for rovgraph's own log (docs/log-format.md)
     """
 
     choose: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[int, int], None] = lambda done, total: None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 class Format(Protocol):
@@ -89,32 +93,40 @@ def formats() -> tuple[Format, ...]:
 
 
 def recognise(path: Path) -> Format | None:
-    """The format that a file is most likely of, None where none is likely.
+    """The format that a file, gzipped or not, is most likely of; None where none is likely."""
+    head = head_of(path)
+    plain = path.with_suffix("") if path.suffix == ".gz" else path
+    sure = [(_confidence(format_, plain, head), -k) for k, format_ in enumerate(formats())]
+    confidence, k = max(sure, default=(0.0, 0))
+    return formats()[-k] if confidence >= LIKELY else None
+
+
+def _confidence(format_: Format, path: Path, head: bytes) -> float:
+    try:
+        return float(format_.recognise(path, head))
+    except Exception:  # whatever another package does with a head that is not its own
+        return 0.0
+
+
+def read_recording(path: Path | str, options: Options | None = None, format_: Format | None = None) -> Recording:
+    """Read a file, or a bag that is a directory, of any format that is known, gzipped or not.
 
     Parameters
     ----------
-    path : not compressed; see `unpacked`
-    """
-    head = _head(path)
-    sure = {format_.name: format_.recognise(path, head) for format_ in formats()}
-    best = max(formats(), key=lambda format_: sure[format_.name], default=None)
-    return best if best is not None and sure[best.name] >= LIKELY else None
-
-
-def read_recording(path: Path | str, options: Options | None = None) -> Recording:
-    """Read a file, or a bag that is a directory, of any format that is known, gzipped or not.
+    format_ : that it is in; None = as recognised
 
     Raises
     ------
     InputError : no such file, an unknown format, a reader that is not installed, nothing that can be used in it
     """
-    options = Options() if options is None else options
-    with unpacked(Path(path)) as plain:
-        if (format_ := recognise(plain)) is None:
-            known = ", ".join(each.title for each in formats())
-            raise InputError(f"{path}: is in no format that is known; expected a log (CSV, Parquet) or one of: {known}")
+    options, path = Options() if options is None else options, Path(path)
+    format_ = recognise(path) if format_ is None else format_
+    if format_ is None:
+        known = ", ".join(each.title for each in formats())
+        raise InputError(f"{path}: is in no format that is known; expected one of: {known}")
+    with unpacked(path) as plain:
         try:
-            return format_.read(plain, options)
+            recording = format_.read(plain, options)
         except ImportError as error:
             missing = (error.name or "").partition(".")[0]
             raise InputError(
@@ -123,6 +135,10 @@ def read_recording(path: Path | str, options: Options | None = None) -> Recordin
             ) from None
         except InputError as error:
             raise InputError(str(error).replace(str(plain), str(path))) from None
+        except Exception as error:  # whatever a damaged file does to a reader
+            raise InputError(f"{path}: cannot be read as a {format_.title} ({in_one_line(error)}); damaged?") from error
+    said = tuple(text.replace(str(plain), str(path)) for text in recording.warnings)
+    return replace(recording, path=str(path), warnings=said)
 
 
 @contextmanager
@@ -147,6 +163,23 @@ def unpacked(path: Path) -> Iterator[Path]:
         except (EOFError, zlib.error, gzip.BadGzipFile):
             raise InputError(f"{path}: gzip data are damaged or cut off; copy the file again") from None
         yield plain
+
+
+def head_of(path: Path) -> bytes:
+    """The first `HEAD` bytes of a file, without gzip's compression; b"" of a directory.
+
+    Raises
+    ------
+    InputError : no such file, or it cannot be read
+    """
+    head = _head(path)
+    if not head.startswith(b"\x1f\x8b"):
+        return head
+    try:
+        with gzip.open(path) as packed:
+            return packed.read(HEAD)
+    except (OSError, EOFError, zlib.error):
+        return b""
 
 
 def _head(path: Path) -> bytes:

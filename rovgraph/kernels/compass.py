@@ -1,4 +1,4 @@
-"""Heading, deviation of a compass, and the magnetometer, for one epoch.
+"""Heading, deviation of a compass, the magnetometer, and tilt, for one epoch.
 
     h = atan2(u_e, u_n) - declination, u = R_nb a, a the instrument's x axis in b
     deviation = A + e + B sin h + C cos h, e an error that lasts          Bowditch
@@ -89,6 +89,16 @@ def compass(R: Array, c: Array, params: Array, in_dvl: bool, z_out: Array, H_out
         for k in range(3):
             by_angle = gradient[0] * axes[0, k] + gradient[1] * axes[1, k] + gradient[2] * axes[2, k]
             H_out[0, MOTION + DVL_ROLL + k] = by_angle
+
+
+@view_helper
+def tilt(R: Array, z_out: Array, H_out: Array) -> None:
+    """Roll and pitch of the body: atan2(d_y, d_z) and -asin(d_x), d the direction down in b."""
+    x, y, z = R[2, 0], R[2, 1], R[2, 2]
+    across = y * y + z * z  # a rotation e of the body changes d by d x e
+    z_out[0], z_out[1] = math.atan2(y, z), -math.asin(min(max(x, -1.0), 1.0))
+    H_out[0, 0], H_out[0, 1], H_out[0, 2] = 1.0, -x * y / across, -x * z / across
+    H_out[1, 0], H_out[1, 1], H_out[1, 2] = 0.0, z / math.sqrt(across), -y / math.sqrt(across)
 
 
 @view_helper

@@ -16,6 +16,7 @@ MAGNETOMETER    z = |H| ((1 + s) S R_sb R_bn u(declination - A - ...,      (3.11
 POSITION        some of (1 + k) (p + R_nb l) + offset, north, east, down
 PLACE_OFFSET    z = (p + R_nb l)_north,east - m, m where the place is
 WATER_VELOCITY  z = (R_bn c_n)_forward,starboard
+TILT            z = roll and pitch of R_nb
 ==============  =========================================================  ==================
 
 Arguments of `predict`, in the order of `rovgraph.kernels.layout`:
@@ -38,13 +39,14 @@ at first can be used again and again:
     POSITION         rotation, translation, its scale and offset
     PLACE_OFFSET     rotation, translation, the last two
     WATER_VELOCITY   rotation, current
+    TILT             rotation
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compass import compass, dvl_mount, magnetometer
+from rovgraph.kernels.compass import compass, dvl_mount, magnetometer, tilt
 from rovgraph.kernels.compile import given, kernel, view_helper
 from rovgraph.kernels.layout import (
     CURRENT,
@@ -60,14 +62,14 @@ from rovgraph.kernels.layout import (
 from rovgraph.kernels.rotations import cross, dot, rotate, rotate_back
 
 Indices = NDArray[np.int64]
-DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY = range(8)
+DVL, DVL_WATER, DVL_COMPASS, COMPASS, MAGNETOMETER, POSITION, PLACE_OFFSET, WATER_VELOCITY, TILT = range(9)
 WORK = 6  # matrices (3, 3) that `predict` needs to calculate with
 
 
 @view_helper
 def is_angular(kind: int) -> bool:
     """Whether the components are angles, so that differences wrap."""
-    return kind in (DVL_COMPASS, COMPASS)
+    return kind in (DVL_COMPASS, COMPASS, TILT)
 
 
 @view_helper
@@ -194,6 +196,8 @@ def predict(
         place_offset(R, p, c, params, z_out, H_out)
     elif kind == WATER_VELOCITY:
         water_velocity(R, c, z_out, H_out)
+    elif kind == TILT:
+        tilt(R, z_out, H_out)
 
 
 @view_helper

@@ -7,7 +7,8 @@ With zeta = (theta, p, v) preintegrated, corrected to first order for the bias b
 On a turning Earth this holds in the axes that n has at the beginning, for v + S(w) p in place of v; what comes out
 is turned back by Exp(-t w), and gravity turns meanwhile. Equal to GTSAM's ``PreintegratedCombinedMeasurements``.
 
-Intervals without samples for longer than `LONGEST_BRIDGED_S` are coasted through (`rovgraph.kernels.coasting`).
+Intervals without samples for longer than `LONGEST_BRIDGED_S` are coasted through (`rovgraph.kernels.coasting`), those
+of a dive without an IMU are cruised (`rovgraph.kernels.cruising`).
 
 Motions are rows of `rovgraph.kernels.motion_row`. States are R_nb, p_n, v_n and the bias that is seen: with errors
 k of the IMU's scale, b + S k. Derivatives are by rotation, position (in body axes), velocity (in n), bias.
@@ -20,7 +21,8 @@ import numpy as np
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coast, coasting_transition
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, GAP, GRAVITY, TANGENT
+from rovgraph.kernels.cruising import cruise, cruising_transition
+from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, GAP, GRAVITY, NO_IMU, TANGENT
 from rovgraph.kernels.rotations import (
     cross,
     exp_rotation,
@@ -37,6 +39,12 @@ LONGEST_BRIDGED_S = 0.75  # intervals in a gap of the IMU that is longer are coa
 def is_coasted(row: Array) -> bool:
     """Whether an interval is coasted through."""
     return bool(row[GAP] > LONGEST_BRIDGED_S)
+
+
+@helper
+def is_cruising(row: Array) -> bool:
+    """Whether there is no IMU."""
+    return bool(row[GAP] == NO_IMU)
 
 
 @helper
@@ -185,6 +193,10 @@ def predict_with_transition(
     is the predicted one, A_j is -1 on the diagonal but for velocity, -R_j', so that e_j = F e_i + w with F and
     Q = cov w without an inverse.
     """
+    if is_cruising(row):
+        cruise(row, R, p, v, R_out, p_out, v_out)
+        cruising_transition(row, R, v, F_out, Q_out)
+        return
     if is_coasted(row):
         coast(row, R, p, v, R_out, p_out, v_out)
         coasting_transition(row, R, R_out, F_out, Q_out)

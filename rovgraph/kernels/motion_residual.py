@@ -5,7 +5,8 @@ predicts, (R, p, v), seen from the keyframe after, and the change of bias:
 
     phi = Log(R_j' R),  r = (phi, Jl(phi)^-1 R_j' (p - p_j), Jl(phi)^-1 R_j' (v - v_j), b_i - b_j)
 
-Of an interval that is coasted through it is that of `rovgraph.kernels.coasting`.
+Of an interval that is coasted through it is that of `rovgraph.kernels.coasting`, without an IMU that of
+`rovgraph.kernels.cruising`.
 """
 
 import math
@@ -15,7 +16,8 @@ import numpy as np
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coasting_covariance, coasting_error
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.motion import is_coasted, predict_motion, predict_with_jacobian
+from rovgraph.kernels.cruising import cruising_covariance, cruising_error
+from rovgraph.kernels.motion import is_coasted, is_cruising, predict_motion, predict_with_jacobian
 from rovgraph.kernels.motion_row import COVARIANCE
 from rovgraph.kernels.rotations import (
     inverse_jacobian_with_slope,
@@ -42,6 +44,9 @@ def motion_error(
     A_j_out: Array,
 ) -> None:
     """Residual of one interval, shape (15,), and its derivatives by both states, shape (15, 15)."""
+    if is_cruising(row):
+        cruising_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, r_out, A_i_out, A_j_out)
+        return
     if is_coasted(row):
         coasting_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, r_out, A_i_out, A_j_out)
         return
@@ -134,6 +139,9 @@ def whiten_motion(W: Array, r: Array, A_i: Array, A_j: Array) -> None:
 @helper
 def motion_covariance(row: Array, S_out: Array) -> None:
     """Covariance of the residual of one interval, shape (15, 15)."""
+    if is_cruising(row):
+        cruising_covariance(row, S_out)
+        return
     if is_coasted(row):
         coasting_covariance(row, S_out)
         return
@@ -163,7 +171,7 @@ def motion_residuals(
             b_i[i], b_j[i] = bias[k, i] + own, bias[k + 1, i] + own
             r[9 + i] = b_i[i] - b_j[i]
         if is_coasted(motions[k]):
-            coasting_error(motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, r, A[0], A[1])
+            motion_error(motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, r, A[0], A[1])
         else:
             predict_motion(motions[k], R[k], p[k], v[k], b_i, R_end, p_end, v_end)
             multiply_transposed(R[k + 1], R_end, apart)

@@ -2,7 +2,7 @@
 
 ===============  =====  ========================================================================================
 `DURATION`           1  [s]
-`GAP`                1  longest time without samples that lies in the interval or reaches into it, or 0 [s]
+`GAP`                1  longest time without samples that lies in the interval or reaches into it, or 0; `NO_IMU` [s]
 `TANGENT`            9  zeta: rotation vector, change of position, change of velocity in the keyframe's axes
 `BIAS`               6  that the integration assumed: accelerometer, gyro; body axes
 `NOISE`              5  densities of accelerometer, gyro, their biases' walks, and of the integration [SI/rtHz]
@@ -13,5 +13,8 @@
 ===============  =====  ========================================================================================
 """
 
+import numpy as np
+
 DURATION, GAP, TANGENT, BIAS, NOISE, GRAVITY, EARTH_RATE, BY_BIAS, COVARIANCE = 0, 1, 2, 11, 17, 22, 23, 26, 80
 ROW = COVARIANCE + 225
+NO_IMU = np.inf  # instead of a gap

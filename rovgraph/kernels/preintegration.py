@@ -22,10 +22,11 @@ its beginning; rotating it by half the step's turn first makes the integration s
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, NOISE, TANGENT
+from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, GRAVITY, NOISE, TANGENT
 from rovgraph.kernels.rotations import (
     cross,
     exp_and_left_jacobian,
@@ -36,6 +37,8 @@ from rovgraph.kernels.rotations import (
     right_jacobian,
     skew,
 )
+
+Index = NDArray[np.int64]
 
 STEP = 8  # numbers of a step: time of its end, length, specific force, rate
 SNAPSHOT = 16  # numbers of a snapshot: time since the keyframe, dR by rows, dv, dp
@@ -244,39 +247,61 @@ def _write_snapshot(duration: float, zeta: Array, R: Array, snapshot_out: Array)
         snapshot_out[10 + i], snapshot_out[13 + i] = zeta[6 + i], zeta[3 + i]
 
 
-@kernel("void(f8[:, ::1], f8, f8[::1], f8, f8[::1], f8[:, ::1])")
-def preintegrate(imu: Array, start: float, stops: Array, end: float, row_out: Array, snapshots_out: Array) -> None:
-    """Integrate IMU samples from ``start`` to ``end``.
+@kernel("void(f8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1])")
+def preintegrate(
+    table: Array,
+    first: Index,
+    last: Index,
+    start: Array,
+    end: Array,
+    stops: Array,
+    first_stop: Index,
+    rows_out: Array,
+    snapshots_out: Array,
+) -> None:
+    """Integrate IMU samples over n intervals.
 
     Parameters
     ----------
-    imu : ndarray, shape (m, 7), time, specific force, rate in body axes; held beyond its ends
-    start, end : [s]
-    stops : ndarray, shape (k,), increasing, from ``start`` to ``end``, times at which a snapshot is wanted [s]
-    row_out : ndarray, shape (ROW,), with bias, noise and rate of the Earth where `rovgraph.kernels.motion_row` has
+    table : ndarray, shape (m, 7), time, specific force, rate in body axes
+    first, last : shape (n,), the samples of each interval, from ``first`` to before ``last``; held beyond their ends
+    start, end : shape (n,) [s]
+    stops : ndarray, shape (k,), times at which a snapshot is wanted, increasing within each interval [s]
+    first_stop : shape (n + 1,), the first stop of each interval
+    rows_out : ndarray, shape (n, ROW), with bias, noise and rate of the Earth where `rovgraph.kernels.motion_row` has
         them; duration, motion and covariance are written
     snapshots_out : ndarray, shape (k, SNAPSHOT)
     """
-    bias, noise, duration, taken = row_out[BIAS : BIAS + 6], row_out[NOISE : NOISE + 5], 0.0, 0
-    steps = np.empty((_most_steps(imu, start, stops, end), STEP))
-    count = _steps(imu, start, stops, end, bias, steps)
-    zeta, X, F, work = np.zeros(9), np.zeros((21, 9)), np.empty((4, 3, 3)), np.empty((3, 3))
-    while taken < len(stops) and stops[taken] <= start:
-        _write_snapshot(0.0, zeta, work, snapshots_out[taken])
-        taken += 1
-    for k in range(count):
-        _advance(zeta, steps[k], bias, work, F)
-        _propagate(F, steps[k, 1], noise, duration, X)
-        duration += steps[k, 1]
-        while taken < len(stops) and stops[taken] <= steps[k, 0]:
-            _write_snapshot(duration, zeta, work, snapshots_out[taken])
+    zeta, X, F, work = np.empty(9), np.empty((21, 9)), np.empty((4, 3, 3)), np.empty((3, 3))
+    for n in range(len(start)):
+        imu, own, row = table[first[n] : last[n]], stops[first_stop[n] : first_stop[n + 1]], rows_out[n]
+        snapshots, bias, noise = (
+            snapshots_out[first_stop[n] : first_stop[n + 1]],
+            row[BIAS : BIAS + 6],
+            row[NOISE:GRAVITY],
+        )
+        steps, duration, taken = np.empty((_most_steps(imu, start[n], own, end[n]), STEP)), 0.0, 0
+        count = _steps(imu, start[n], own, end[n], bias, steps)
+        for j in range(9):
+            zeta[j] = 0.0
+            for i in range(21):
+                X[i, j] = 0.0
+        while taken < len(own) and own[taken] <= start[n]:
+            _write_snapshot(0.0, zeta, work, snapshots[taken])
             taken += 1
-    row_out[DURATION] = duration
-    for i in range(9):
-        row_out[TANGENT + i] = zeta[i]
-        for j in range(6):
-            row_out[BY_BIAS + 6 * i + j] = X[15 + j, i]
-    _write_covariance(zeta, X, noise, duration, row_out)
+        for k in range(count):
+            _advance(zeta, steps[k], bias, work, F)
+            _propagate(F, steps[k, 1], noise, duration, X)
+            duration += steps[k, 1]
+            while taken < len(own) and own[taken] <= steps[k, 0]:
+                _write_snapshot(duration, zeta, work, snapshots[taken])
+                taken += 1
+        row[DURATION] = duration
+        for i in range(9):
+            row[TANGENT + i] = zeta[i]
+            for j in range(6):
+                row[BY_BIAS + 6 * i + j] = X[15 + j, i]
+        _write_covariance(zeta, X, noise, duration, row)
 
 
 @kernel("f8[:, ::1](f8[:, ::1], f8, f8[::1], f8, f8[::1])")

@@ -93,39 +93,48 @@ class Session:
 
     def run(self, feed: Iterable[Message | None]) -> None:
         """Work off what the sources say."""
-        navigator, files = self.navigator, self.files
-        with _seldom_collected():
-            self._work_off(feed)
-        if files is not None:
-            files.keep(navigator, now=True)
-        self.end()
-        if files is not None:
-            files.finish(navigator)
-            self.write_smoothed()
+        for _ in self.solve(feed):
+            pass
 
-    def step(self, message: Message | None) -> None:
+    def solve(self, feed: Iterable[Message | None]) -> Iterator[Solution]:
+        """Work off what the sources say and yield each solution once it has been sent; the disk has all at the end."""
+        try:
+            with _seldom_collected():
+                for message in feed:
+                    if (solution := self._step(message)) is not None:
+                        yield solution
+        except GeneratorExit:  # whoever iterates has had enough
+            self._end()
+            raise
+        if (solution := self._end()) is not None:
+            yield solution
+
+    def _step(self, message: Message | None) -> Solution | None:
         """Take a message, or None where nothing came for a while, and send a solution if one is due."""
         if message is None:
             self._wait()
         elif not self._known(message):
             self._take(message)
-        if self.navigator.engine is not None and self.navigator.time >= self._due:
-            self._send()
+        navigator, solution = self.navigator, None
+        if navigator.engine is not None and navigator.time >= self._due:
+            solution = self._send()
+        if self.files is not None:
+            self.files.keep(navigator)
+        if self._wanted:
+            self._wanted = False
+            self.write_smoothed()
+        return solution
 
-    def end(self) -> None:
-        """No more messages: take what is held back, and send a last solution."""
+    def _end(self) -> Solution | None:
+        """No more messages: take what is held back, send a last solution, and bring all to disk."""
+        if self.files is not None:
+            self.files.keep(self.navigator, now=True)
         self.navigator.finish()
-        self._send()
-
-    def _work_off(self, feed: Iterable[Message | None]) -> None:
-        navigator, files = self.navigator, self.files
-        for message in feed:
-            self.step(message)
-            if files is not None:
-                files.keep(navigator)
-            if self._wanted:
-                self._wanted = False
-                self.write_smoothed()
+        solution = self._send()
+        if self.files is not None:
+            self.files.finish(self.navigator)
+            self.write_smoothed()
+        return solution
 
     def _known(self, message: Message) -> bool:
         """Whether a recording that is read again says what had been received before a crash."""
@@ -150,16 +159,17 @@ class Session:
         if self.navigator.waits_for:
             self.warnings.complain("start", "waiting", self.navigator.waits_for)
 
-    def _send(self) -> None:
+    def _send(self) -> Solution | None:
         solution = self.navigator.solution()
         if solution is None:
-            return
+            return None
         self._due = (math.floor(self.navigator.time * self.rate_hz + 1e-6) + 1) / self.rate_hz
         self.solution, self.solutions = solution, self.solutions + 1
         if self.files is not None:
             self.files.note(solution.events)
         for receive in self.receivers:
             receive(solution)
+        return solution
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from rovgraph.check.values import angles, gravity, turn_rates
 from rovgraph.config import Config
+from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.fixed_lag import place
@@ -32,6 +33,10 @@ class Startup:
     measurements: list[Measurement] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     _next: float | None = None
+
+    def __post_init__(self) -> None:
+        if has_constant_velocity(self.config):
+            raise InputError("motion.model: constant_velocity is for recorded logs, online needs an IMU")
 
     @property
     def expects(self) -> str:

@@ -1,14 +1,15 @@
 """What a dive has recorded, from a file, a data frame or arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from rovgraph.config import Config
+from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import InputError, collected_warnings
 from rovgraph.log.reading import read_streams
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
@@ -27,6 +28,8 @@ class Log:
     config : whose columns, units, delays and magnetometer's calibration it was read with; None where the
         streams were made otherwise
     warnings : what was left out or put in order when it was read
+    settings : what its files know of the vehicle, nested as in YAML; holds where a configuration states nothing
+    notes : how it was made of native files, a sentence each
     """
 
     source: str
@@ -34,6 +37,8 @@ class Log:
     origin: tuple[float, float] | None = None
     config: Config | None = None
     warnings: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def from_frame(frame: pd.DataFrame, config: Config | None = None, source: str = "log") -> "Log":
@@ -79,6 +84,7 @@ class Log:
 
     @property
     def sensors(self) -> set[str]:
+        """Names of its streams."""
         return set(self.streams)
 
     def require_read_with(self, config: Config) -> None:
@@ -135,7 +141,7 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
 
 def _log(table: Table, config: Config | None, before: Iterable[str] = ()) -> Log:
     """A log of a table, with what was warned of ``before`` and while its streams were made."""
-    config = Config() if config is None else config
+    config = config_or_defaults(config)
     with collected_warnings() as texts:
         streams, origin = read_streams(table, config)
     return Log(table.source, streams, origin, config, (*before, *texts))

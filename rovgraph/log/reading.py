@@ -54,8 +54,8 @@ def read_streams(table: Table, config: Config) -> tuple[dict[str, Stream], tuple
     """
     columns, units = config.columns, config.units
     scale = factors(units, table.source)
-    names = _names(table, columns)
-    cells = {name: _finite(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
+    names = map_columns(table, columns)
+    cells = {name: numbers(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
     cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
     cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
     origin = _add_local_fixes(cells, line, table.source, config.environment.origin)
@@ -77,7 +77,7 @@ def _found(names: Sequence[str]) -> str:
     return f"columns found: {shown[:200]}"
 
 
-def _names(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
+def map_columns(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
     """rovgraph's name of each column in use -> its name in the file.
 
     Raises
@@ -107,7 +107,7 @@ def _names(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
     return names
 
 
-def _finite(table: Table, name: str, source: str) -> Array:
+def numbers(table: Table, name: str, source: str) -> Array:
     """A column with infinities taken as missing, shape (n,)."""
     values = table.labels(source) if name == LABEL else table.numbers(source)
     infinite = np.flatnonzero(np.isinf(values))

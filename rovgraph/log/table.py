@@ -126,7 +126,7 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
     """
     frames = []
     for table in tables:
-        arrays = {name: np.asarray(values) for name, values in table.items()}
+        arrays = {name: _array(name, values, source) for name, values in table.items()}
         for name, values in arrays.items():
             if values.ndim != 1:
                 raise InputError(f"{source}: column {name} has shape {values.shape}, expected one number per row")
@@ -140,6 +140,13 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
         latest = [np.fmax.accumulate(Table(source, frame, frame.index.to_numpy()).numbers(time)) for frame in frames]
         merged = merged.iloc[np.argsort(np.concatenate(latest), kind="stable")]
     return table_of_frame(merged, source)
+
+
+def _array(name: str, values: ArrayLike, source: str) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except ValueError:  # rows of different length
+        raise InputError(f"{source}: column {name} holds lists, expected one number per row") from None
 
 
 def _content(path: Path) -> bytes:

@@ -1,9 +1,7 @@
 """The files and the table of ``rovgraph compare``; docs/compare.md describes their columns."""
 
 import json
-import platform
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +13,9 @@ from rich.table import Table
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
 from rovgraph.report.units import plus_minus
+from rovgraph.report.versions import versions
 from rovgraph.studies.compare import Comparison
 
-LIBRARIES = ("numpy", "scipy", "pandas", "gtsam")
 DIGITS = "%.7g"
 MARKS = {"above": "↑", "below": "↓", "within": " "}  # of a mean NEES against its band
 
@@ -47,7 +45,7 @@ def write_comparison(folder: Path, comparison: Comparison, about: Mapping[str, A
         **about,
         "estimators": comparison.table["estimator"].tolist(),
         "failures": failed[["run", "estimator", "error"]].to_dict("records"),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "versions": versions(),
         "config": comparison.config.model_dump(mode="json"),
     }
     text = json.dumps(to_plain(summary), indent=2, allow_nan=False, ensure_ascii=False)
@@ -55,7 +53,7 @@ def write_comparison(folder: Path, comparison: Comparison, about: Mapping[str, A
 
 
 def comparison_table(comparison: Comparison, title: str, thesis: bool) -> Table:
-    """A row per estimator, for a terminal of 120 columns.
+    """A row per estimator, 120 columns wide; `rovgraph.report.narrow` fits it into fewer.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Biases and calibration variables against time, with what was believed before."""
+"""Biases and calibration variables against time, with their priors."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,18 +9,9 @@ from matplotlib.figure import Figure
 
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.geometry import Array
+from rovgraph.report.colours import PRIOR
 from rovgraph.report.results import history_labels
-from rovgraph.report.style import (
-    PRIOR,
-    Clock,
-    legend_below,
-    line_of,
-    name_lowest,
-    name_of,
-    new_figure,
-    panel_grid,
-    thin,
-)
+from rovgraph.report.style import Clock, legend_below, line_of, name_lowest, name_of, new_figure, panel_grid, thin
 from rovgraph.report.units import plus_minus
 from rovgraph.units import shown
 

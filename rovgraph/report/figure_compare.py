@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from rovgraph.geometry import Array
+from rovgraph.report.colours import UNUSED
 from rovgraph.report.results import ellipse_axes
-from rovgraph.report.style import UNUSED, WIDTH, legend_below, new_figure, save, style
+from rovgraph.report.style import WIDTH, legend_below, new_figure, save, style
 from rovgraph.studies.compare import REFERENCE, Comparison
 
 COLUMNS = 4

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from rovgraph.calibrate import MagnetometerCalibration
 from rovgraph.geometry import Array
-from rovgraph.report.style import PRIOR, REJECTED, Clock, legend_below, new_figure, thin
+from rovgraph.report.colours import PRIOR, REJECTED
+from rovgraph.report.style import Clock, legend_below, new_figure, thin
 
 BEFORE, AFTER = "#D55E00", "#0072B2"
 _SIDES = ((0, 1), (0, 2), (1, 2))

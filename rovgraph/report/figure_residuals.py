@@ -9,17 +9,8 @@ from matplotlib.figure import Figure
 
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
-from rovgraph.report.style import (
-    REJECTED,
-    Clock,
-    legend_below,
-    line_of,
-    name_lowest,
-    name_of,
-    new_figure,
-    panel_grid,
-    thin,
-)
+from rovgraph.report.colours import REJECTED
+from rovgraph.report.style import Clock, legend_below, line_of, name_lowest, name_of, new_figure, panel_grid, thin
 
 LIMIT = 6.0  # [sd]; what lies beyond is drawn at the edge
 

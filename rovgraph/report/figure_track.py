@@ -13,8 +13,9 @@ from rovgraph.config import Config
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.report.colours import REJECTED, UNUSED, USED
 from rovgraph.report.results import CHI2_99, ellipse_axes
-from rovgraph.report.style import REJECTED, UNUSED, USED, WIDTH, Clock, legend_below, line_of, name_of, new_figure, thin
+from rovgraph.report.style import WIDTH, Clock, legend_below, line_of, name_of, new_figure, thin
 from rovgraph.report.units import nice_step
 from rovgraph.trajectory import Trajectory
 

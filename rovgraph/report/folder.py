@@ -10,7 +10,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rovgraph import __version__
@@ -73,6 +73,39 @@ def results_folder(path: Path, force: bool = False) -> Iterator[Path]:
             with contextlib.suppress(OSError):
                 parent.rmdir()  # only where empty
         raise
+
+
+@contextlib.contextmanager
+def results_files(paths: Sequence[Path], force: bool = False) -> Iterator[list[Path]]:
+    """Temporary files, of the same names, that become ``paths`` when the block ends without an error.
+
+    Parameters
+    ----------
+    paths : files to write, in folders that exist
+    force : replace older files
+
+    Raises
+    ------
+    InputError : a file exists and ``force`` is not given, or cannot be written; then nothing is kept
+    """
+    for path in paths:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder, not a file; choose another name")
+        if path.exists() and not force:
+            raise InputError(f"{path} exists; choose another name or give --force")
+    folders = {path: _hidden(_resolved(path).parent, "partial") for path in paths}
+    try:
+        for path, folder in folders.items():
+            with _one_line(path):
+                folder.mkdir()
+        with _one_line(paths[0]):
+            yield [folders[path] / path.name for path in paths]
+        for path, folder in folders.items():
+            with _one_line(path):
+                (folder / path.name).replace(_resolved(path))
+    finally:
+        for folder in folders.values():
+            _remove(folder)
 
 
 def _resolved(path: Path) -> Path:

@@ -19,6 +19,7 @@ from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, 
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.report.dive_files import dvl_frame, input_file, left_out_frame, timings, versions
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
 from rovgraph.trajectory import Trajectory
@@ -43,8 +44,9 @@ def write_results(
     assumptions: list[str],
     seconds: dict[str, float],
     alarms: Sequence[Alarm] = (),
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Write every file of a results folder but the figures.
+    """Write every file of a results folder but the figures and the page.
 
     Parameters
     ----------
@@ -54,6 +56,7 @@ def write_results(
     assumptions : what was taken for granted, a sentence each
     seconds : stage of the work -> wall time [s]
     alarms : what the estimates say against themselves
+    warnings : what was said of the log, a line each
 
     Returns
     -------
@@ -66,12 +69,27 @@ def write_results(
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
     write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
+    _write_of_log(folder, estimates[0], log, config)
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
-    summary = summarise(estimates, log, config, assumptions, seconds, alarms)
+    summary = {
+        **summarise(estimates, log, config, assumptions, seconds, alarms),
+        "warnings": [*warnings],
+        "input": input_file(log.source),
+        "versions": versions(),
+    }
     (folder / SUMMARY).write_text(
         json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
     return summary
+
+
+def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config) -> None:
+    """Write dvl.csv, where there is a DVL, and left_out.csv."""
+    pings = dvl_frame(log)
+    if pings is not None:
+        write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
+    left_out = left_out_frame(log, config, main.residuals, main.summary.get("stretches_taken_out", []))
+    write_csv(left_out, folder / "left_out.csv", decimals={"time": 4})
 
 
 def summarise(
@@ -207,7 +225,8 @@ def sensor_counts(residuals: pd.DataFrame) -> dict[str, dict[str, Any]]:
 def _sensors(estimate: Estimate, log: Log) -> dict[str, dict[str, Any]]:
     """Counts of every sensor of the log, those the estimate left aside too."""
     counts = sensor_counts(estimate.residuals)
-    recorded = {name: {"recorded": len(stream)} for name, stream in log.streams.items()}
+    came = timings(log)
+    recorded = {name: {"recorded": len(stream), **came.get(name, {})} for name, stream in log.streams.items()}
     return {name: {**recorded.get(name, {}), **counts.get(name, {})} for name in {**recorded, **counts}}
 
 

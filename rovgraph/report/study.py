@@ -1,9 +1,7 @@
 """The files and the table of ``rovgraph study misalignment``; docs/studies.md describes their columns."""
 
 import json
-import platform
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +12,9 @@ from rich.table import Table
 
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import to_plain
+from rovgraph.report.versions import versions
 from rovgraph.studies.misalignment import Study, Tables
 
-LIBRARIES = ("numpy", "scipy", "pandas", "gtsam")
 SEEDS = "run r of a cell: 15 hexadecimal digits of SHA-256 of [seed, parameters of the dive, r]; column seed"
 MOST_ROWS = 60  # of a table on a terminal
 
@@ -42,7 +40,7 @@ def write_study(folder: Path, tables: Tables, about: Mapping[str, Any]) -> None:
         "planned": tables.study.runs * len(tables.study.all_cells()),
         "failures": failed[["cell", "run", "failure"]].to_dict("records"),
         **about,
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "versions": versions(),
     }
     text = json.dumps(to_plain(summary), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")

@@ -18,21 +18,23 @@ from PIL.PngImagePlugin import PngInfo
 
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
+from rovgraph.report.colours import ESTIMATES
+from rovgraph.report.colours import OTHER as OTHER_COLOUR
 
 DPI = 150
 WIDTH = 7.2  # [in], the text width of a page
 MOST_POINTS = 5000  # of a line; more cannot be seen
 
-# Okabe and Ito's colours, and a line style for each, so that grey prints can be read
+# each with a line style, so that grey prints can be read
 LINES: dict[str, dict[str, Any]] = {
-    "smoothed": {"color": "#0072B2", "linestyle": "-", "linewidth": 1.2, "zorder": 4},
-    "filtered": {"color": "#D55E00", "linestyle": (0, (4, 1.5)), "linewidth": 1.0, "zorder": 3},
-    "dead_reckoning": {"color": "#888888", "linestyle": (0, (1, 1.2)), "linewidth": 1.0, "zorder": 2},
-    "reference": {"color": "black", "linestyle": (0, (6, 1.5, 1, 1.5)), "linewidth": 0.9, "zorder": 5},
+    "smoothed": {"linestyle": "-", "linewidth": 1.2, "zorder": 4},
+    "filtered": {"linestyle": (0, (4, 1.5)), "linewidth": 1.0, "zorder": 3},
+    "dead_reckoning": {"linestyle": (0, (1, 1.2)), "linewidth": 1.0, "zorder": 2},
+    "reference": {"linestyle": (0, (6, 1.5, 1, 1.5)), "linewidth": 0.9, "zorder": 5},
 }
-OTHER: dict[str, Any] = {"color": "#CC79A7", "linestyle": "-.", "linewidth": 1.0, "zorder": 2}
-USED, REJECTED, UNUSED = "#009E73", "#A3206B", "#AAAAAA"
-PRIOR = "#ECE7DA"
+for _kind, _look in LINES.items():
+    _look["color"] = ESTIMATES[_kind]
+OTHER: dict[str, Any] = {"color": OTHER_COLOUR, "linestyle": "-.", "linewidth": 1.0, "zorder": 2}
 
 _RC: dict[str, Any] = {
     "font.size": 9,

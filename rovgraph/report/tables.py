@@ -50,7 +50,7 @@ def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> 
 
 
 def calibration_table(estimates: Sequence[Estimate]) -> Table:
-    """Calibration of the leading estimate against what was believed before."""
+    """Calibration of the leading estimate beside its prior."""
     main = main_first(estimates)[0]
     table = Table(
         title=f"calibration, {main.kind.replace('_', ' ')}",

@@ -4,7 +4,7 @@ One module per sensor holds its model and its `Sensor`; `SENSORS` has them all b
 docs/own-sensor.md shows how to `register` one of your own.
 """
 
-from rovgraph.sensors.compass import AHRS, DVL_HEADING, CompassHeading
+from rovgraph.sensors.compass import AHRS, DVL_HEADING, VEHICLE_HEADING, CompassHeading
 from rovgraph.sensors.dvl import DVL, DVL_ALTITUDE, DVL_WATER, DvlVelocity, dvl_mounting
 from rovgraph.sensors.inertial import IMU
 from rovgraph.sensors.magnetometer import DEFAULT_DIP, MAG, MagneticField, field_direction
@@ -24,6 +24,7 @@ from rovgraph.sensors.sensor import (
     unregister,
 )
 from rovgraph.sensors.thruster import THRUSTER, ModelAiding, WaterVelocity, hydrodynamics
+from rovgraph.sensors.tilt import VEHICLE_TILT, Tilt
 
 __all__ = [
     "DEFAULT_DIP",
@@ -41,6 +42,7 @@ __all__ = [
     "Position",
     "Sensor",
     "SensorModel",
+    "Tilt",
     "WaterVelocity",
     "dvl_mounting",
     "evaluate",
@@ -53,5 +55,6 @@ __all__ = [
     "unregister",
 ]
 
-for _sensor in (IMU, MAG, AHRS, DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DEPTH, FIX, SEEN_PLACE, THRUSTER):
+_VEHICLE = VEHICLE_HEADING, VEHICLE_TILT
+for _sensor in (IMU, MAG, AHRS, *_VEHICLE, DVL, DVL_WATER, DVL_HEADING, DVL_ALTITUDE, DEPTH, FIX, SEEN_PLACE, THRUSTER):
     SENSORS[_sensor.name] = _sensor

@@ -1,4 +1,4 @@
-"""Compasses that give a heading: the IMU's own, and the DVL's."""
+"""Compasses that give a heading: the IMU's own, the DVL's, and the vehicle's."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,7 +21,7 @@ class CompassHeading:
 
     Attributes
     ----------
-    sensor : "ahrs" or "dvl_heading"
+    sensor : "ahrs", "dvl_heading" or "vehicle_heading"
     offset, curve : names of its calibration variables
     declination : [rad], east positive; one for all epochs or for each
     R_bs : ndarray, shape (3, 3), mounting of the instrument; the DVL's own comes from
@@ -78,6 +78,14 @@ def of_dvl(config: Config, origin_b: Array) -> Instrument:
     return instrument(config.heading, model, sd, ("heading",), time_offset=TIME_OFFSET)
 
 
+def of_vehicle(config: Config, origin_b: Array) -> Instrument:
+    """The heading of the body as the vehicle's own navigation gives it."""
+    declination = float(np.deg2rad(config.environment.declination_deg))
+    names = "vehicle_compass_offset", "vehicle_compass_deviation"
+    model = CompassHeading("vehicle_heading", *names, declination, error="vehicle_compass_error")
+    return instrument(config.heading, model, np.deg2rad(config.heading.vehicle_sd_deg), ("heading",))
+
+
 AHRS = Sensor(
     "ahrs",
     (
@@ -100,5 +108,15 @@ DVL_HEADING = Sensor(
     observes=Observed("heading", (2,)),
     linear_in="dvl_compass_offset",
     heading_source="dvl",
+    may_begin_later=True,
+)
+VEHICLE_HEADING = Sensor(
+    "vehicle_heading",
+    (Column("heading", "angle", group="attitude"),),
+    of_vehicle,
+    once_per_interval=True,
+    observes=Observed("heading", (2,)),
+    linear_in="vehicle_compass_offset",
+    heading_source="vehicle",
     may_begin_later=True,
 )

@@ -6,7 +6,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from rovgraph.config import Config, parse_config
+from rovgraph.config import Config, config_or_defaults, parse_config
 from rovgraph.errors import InputError
 from rovgraph.simulate.choices import Choices
 from rovgraph.simulate.dive import Dive, simulate
@@ -54,11 +54,11 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
     if name in DRIVEN:
         driven = DRIVEN[name]
         choices.require(name, driven.choices, driven.variants)
-        config = lake() if config is None else config
+        config = lake() if config is None else config_or_defaults(config)
         path, truth = driven.make(World.drawn(config, choices, seed))
     else:
         choices.require(name, _KINEMATIC)
-        config = Config() if config is None else config
+        config = config_or_defaults(config)
         path = scenario(name, choices.duration, choices.speed)
         truth = _kinematic(path, config, choices, seed)
     dive = simulate(path, truth, np.random.default_rng(seed))
@@ -102,5 +102,5 @@ def lake() -> Config:
 
 
 def falcon() -> Config:
-    """The configuration of the thesis's vehicle, ``configs/falcon.yaml``."""
+    """The configuration of the thesis's vehicle, ``falcon.yaml``."""
     return parse_config((files("rovgraph.config") / "falcon.yaml").read_text(encoding="utf-8"), "falcon.yaml")

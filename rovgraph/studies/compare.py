@@ -162,8 +162,8 @@ def _row(run: str, outcome: Outcome, case: Case) -> dict[str, Any]:
 
 
 def _recorded_s(case: Case) -> float:
-    time = case.log["imu"].time
-    return float(time[-1] - time[0])
+    streams = case.log.streams.values()
+    return float(max(stream.time[-1] for stream in streams) - min(stream.time[0] for stream in streams))
 
 
 def _keep_histories(result: _Result, outcome: Outcome, case: Case, first: bool) -> None:

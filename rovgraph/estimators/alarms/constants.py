@@ -1,4 +1,4 @@
-"""Alarms on constants: estimated ones that went far from what was believed, and held ones that want to move."""
+"""Alarms on constants: estimated ones far from their prior, and held ones that the measurements contradict."""
 
 from collections.abc import Iterator
 
@@ -58,8 +58,8 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
             evidence.end,
             "imu",
             float(np.abs(off[worst])),
-            f"{history.labels[worst]} began at {history.value[0, worst]:.3g} {history.unit}, "
-            f"{abs(off[worst]):.0f} sd from what was believed",
+            f"{history.labels[worst]} started at {history.value[0, worst]:.3g} {history.unit}, "
+            f"{abs(off[worst]):.0f} sd from its prior",
             f"check imu.mount_rpy_deg and the units of the IMU, or raise {key}",
         )
 
@@ -76,9 +76,9 @@ def moved_constant(c: CalibrationEstimate, begin: float, end: float) -> Iterator
         end,
         _sensor_of(name),
         off,
-        f"{c.label} came out at {factor * c.value:.3g}{behind(unit)}, {off:.0f} sd from the "
-        f"{factor * c.prior_mean:.3g} ± {factor * c.prior_sd:.2g}{behind(unit)} that was believed",
-        f"check {_key_of(name)}; if it is as it is, state its mean or a larger sd in calibration.{name}",
+        f"{c.label} was estimated at {factor * c.value:.3g}{behind(unit)}, {off:.0f} sd from its prior "
+        f"{factor * c.prior_mean:.3g} ± {factor * c.prior_sd:.2g}{behind(unit)}",
+        f"check {_key_of(name)}; if the estimate is right, state it as the mean, or a larger sd, in calibration.{name}",
     )
 
 
@@ -117,7 +117,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
             HELD,
             HELD_FAR_OFF,
-            f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, where the measurements have it "
+            f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements put it "
             f"{factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)} from that",
             _remedy_of_held(r, evidence.beginning.config),
         )
@@ -144,7 +144,7 @@ def earth_rate_of(sd: float, begin: float, end: float) -> Statistic:
         EARTH_RATE / sd,
         FEELS_THE_EARTH,
         np.inf,
-        f"the Earth's rotation is not modelled, and the estimate claims the gyro's bias to {np.rad2deg(sd) * 3600:.2g} "
+        f"the Earth's rotation is not modelled, but the gyro's bias has an sd of {np.rad2deg(sd) * 3600:.2g} "
         "deg/h, where the Earth turns 15 deg/h",
         "state environment.latitude_deg and environment.earth_rotation: true",
     )
@@ -180,7 +180,7 @@ def halves(evidence: Evidence) -> Iterator[Statistic]:
                 DISAGREE,
                 DISAGREE_BADLY,
                 f"{label} of the first half of the dive and of the second differ by {off:.0f} sd",
-                f"it changes during the dive, or something else acts as it does: check {_key_of(name)}, "
+                f"it changes during the dive, or another error looks like it: check {_key_of(name)}, "
                 f"or let it walk (calibration.{name})",
             )
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
+from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import MINUTE, Evidence, SensorResiduals, span, windows
 from rovgraph.geometry import Array
@@ -82,9 +83,9 @@ def rejected_in(sensor: str, begin: float, end: float, share: float, start: floa
         share,
         REJECTED,
         MOSTLY_REJECTED,
-        f"up to {share:.0%} of a minute's measurements contradict the others and were left out, "
+        f"up to {share:.0%} of a minute's measurements contradict the others and were rejected, "
         f"{span(begin, end, start)}",
-        f"take that time out of the log if it is the instrument; if it is everywhere, check its mounting, signs "
+        f"if the instrument failed, remove that time from the log; if it lasts, check its mounting, signs "
         f"and clock (rovgraph check), and {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}",
     )
 
@@ -134,6 +135,8 @@ def too_large_in(
 def too_small(evidence: Evidence) -> Iterator[Statistic]:
     """Mean of the filter's normalised innovations squared, per dimension, that is far below 1."""
     filtered = evidence.estimate("filtered")
+    if has_constant_velocity(evidence.beginning.config):  # innovations are the motion's rather than the sensors'
+        return
     for sensor, nis in ({} if filtered is None else filtered.summary.get("nis", {})).items():
         if nis["mean"] is None or nis["count"] < ENOUGH:
             continue
@@ -150,7 +153,7 @@ def too_small_in(sensor: str, begin: float, end: float, mean: float) -> Statisti
         1.0 / max(mean, 1e-9),
         1.0 / TOO_SMALL,
         np.inf,
-        f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so more is known than is said",
+        f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so the stated noise is too large",
         f"lower {sd_key(sensor)}",
     )
 

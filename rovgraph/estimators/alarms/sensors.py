@@ -27,7 +27,7 @@ def frozen(evidence: Evidence) -> Iterator[Statistic]:
 
 def frozen_for(sensor: str, first: float, last: float, seconds: float, times: int, start: float) -> Statistic:
     """A sensor that repeated itself for some seconds in all, so often; ``start`` is when the dive began [s]."""
-    often = "" if times == 1 else f" in {times} stretches"
+    often = "" if times == 1 else f" in {times} intervals"
     return Statistic(
         "frozen",
         sensor,
@@ -36,7 +36,7 @@ def frozen_for(sensor: str, first: float, last: float, seconds: float, times: in
         seconds,
         FROZEN_S,
         float("inf"),
-        f"repeats its values for {seconds:.0f} s{often}, {span(first, last, start)}; they were left out",
+        f"repeats its values for {seconds:.0f} s{often}, {span(first, last, start)}; they were ignored",
         "look at the instrument and its driver; the track is less certain there, as its sd says",
     )
 
@@ -61,7 +61,7 @@ def contradictions(alarms: Sequence[Alarm], start: float) -> Iterator[Alarm]:
             severity: Severity = "wrong" if a.severity == b.severity == "wrong" else "doubtful"
             figure = min(a.figure / a.limit, b.figure / b.limit)
             text = (
-                f"{one} and {other}: they contradict each other in {what}, {span(begin, end, start)}; find out which "
-                f"one is off by leaving one of them out of the log"
+                f"{one} and {other}: they contradict each other in {what}, {span(begin, end, start)}; remove one "
+                "of them from the log to find which one is wrong"
             )
             yield Alarm("contradiction", f"{one}, {other}", begin, end, figure, 1.0, severity, text)

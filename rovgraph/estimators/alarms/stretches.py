@@ -1,4 +1,4 @@
-"""Alarms on the choice between optima: stretches of a sensor that were taken out, and a choice that was close."""
+"""Alarms on the choice between optima: a sensor that was ignored for some time, and a choice that was close."""
 
 from collections.abc import Iterator
 from math import exp, isfinite
@@ -12,13 +12,13 @@ CLOSE = 1e-4  # likelihood of the next best explanation against the best
 
 
 def taken_out(evidence: Evidence) -> Iterator[Statistic]:
-    """Stretches in which a sensor contradicts all others, of `rovgraph.engine.stretches`."""
+    """Intervals in which a sensor contradicts all others, of `rovgraph.engine.stretches`."""
     for stretch in () if evidence.optimum is None else evidence.optimum.solution.stretches:
         yield taken_out_in(stretch, evidence.start)
 
 
 def taken_out_in(stretch: Stretch, start: float) -> Statistic:
-    """One such stretch; ``start`` is when the dive began [s]."""
+    """One such interval; ``start`` is when the dive started [s]."""
     return Statistic(
         "taken out",
         stretch.sensor,
@@ -27,9 +27,9 @@ def taken_out_in(stretch: Stretch, start: float) -> Statistic:
         stretch.end - stretch.begin,
         TAKEN_OUT_S,
         float("inf"),
-        f"contradicts the other sensors together, {span(stretch.begin, stretch.end, start)}, and was left out there",
-        "look at the instrument at that time: a bias, a false lock, water for the bottom; an error that grew "
-        "slowly may have begun earlier",
+        f"contradicts all other sensors, {span(stretch.begin, stretch.end, start)}, and was ignored there",
+        "check the instrument at that time: a bias, a false lock, water instead of the bottom; an error that grew "
+        "slowly may have started earlier",
     )
 
 
@@ -46,6 +46,6 @@ def close(evidence: Evidence) -> Iterator[Statistic]:
         exp(-margin),
         CLOSE,
         float("inf"),
-        f"sensors contradict each other, and which one to leave out was decided by a cost of {margin:.1f} only",
-        "look at the sensors that were rejected, and take the wrong one out of the log",
+        f"sensors contradict each other, and a cost difference of only {margin:.1f} decided which one to ignore",
+        "check the rejected sensors, and remove the wrong one from the log",
     )

@@ -93,11 +93,11 @@ class FilterHistory:
         columns, estimated = engine.layout.columns, engine.unknowns.estimated
         arm = engine.initial.config.imu.lever_arm_m
         trajectory = body_trajectory(self.intervals, states, arm, pose, velocity)
-        history = bias_histories(trajectory.time, states.bias, sd[:, columns[BIAS]])
+        history = bias_histories(trajectory.time, states.bias, sd[:, columns[BIAS]], engine.initial.streams)
         for name in estimated:
             history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[:, columns[name]])
         final = {name: np.diag(sd[-1, columns[name]] ** 2) for name in estimated}
-        sensors = [s for s in engine.initial.instruments if s in self._processed]
+        sensors = [s for s in engine.initial.streams if s in {*self._processed, "imu"}]
         last = {name: value[-1] for name, value in states.calibration.items()}
         calibration = calibration_estimates(engine.beliefs, sensors, last, final)
         residuals = residual_frame(*self._residuals(smoothed))

@@ -35,7 +35,7 @@ def estimate_of(done: Recursion) -> Estimate:
     residuals = pd.concat(tables, ignore_index=True) if tables else _imu_residuals(done)
     residuals = residuals.sort_values("time", kind="stable", ignore_index=True)
     history = _histories(done, time, x, P)
-    calibration = calibration_estimates(setup.beliefs, _sensors(done), *_final_calibration(done))
+    calibration = calibration_estimates(setup.beliefs, [*_sensors(done), "imu"], *_final_calibration(done))
     trajectory = _trajectory(done, time, epoch, x, P)
     return Estimate(setup.variant.name, trajectory, calibration, history, residuals, _summary(done))
 

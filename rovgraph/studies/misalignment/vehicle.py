@@ -2,7 +2,7 @@
 
 Grades of inertial units, noise densities per root hertz:
 
-- mti: Xsens MTi, the figures of ``configs/falcon.yaml`` (thesis, appendix A; data sheet for the biases).
+- mti: Xsens MTi, the figures of ``rovgraph/config/falcon.yaml`` (thesis, appendix A; data sheet for the biases).
 - tactical: Sensonor STIM300 by its data sheet: 0.15 deg/rt(h), 0.06 m/s/rt(h), on-off bias of the
   accelerometer 0.75 mg, of the gyro 10 deg/h over temperature. Walks are a choice: the bias
   instability (0.5 deg/h, 0.05 mg) gained in ten minutes.

@@ -1,0 +1,126 @@
+"""Pages of the site that are made of what stands elsewhere: a hook of mkdocs.
+
+README, changelog and the like stay where GitHub and packages look for them; examples, help texts and docstrings have
+no second copy. A public name without a docstring ends the build.
+"""
+
+import inspect
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+from typer.main import get_command
+from typer.testing import CliRunner
+
+import rovgraph as rg
+from rovgraph.cli.app import app
+
+ROOT = Path(__file__).parents[2]
+ELSEWHERE = {  # page -> file of the project
+    "index.md": "README.md",
+    "changelog.md": "CHANGELOG.md",
+    "licence.md": "LICENSE",
+    "benchmarks.md": "benchmarks/README.md",
+    "falcon.md": "data/falcon/README.md",
+}
+RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
+    "rovgraph.estimators.estimate.Estimate",
+    "rovgraph.estimators.estimate.CalibrationEstimate",
+    "rovgraph.estimators.alarms.Alarm",
+    "rovgraph.api.online.LiveRun",
+    "rovgraph.live.solution.Solution",
+    "rovgraph.live.solution.Event",
+)
+FIRST = ("smooth", "residuals", "mountings", "own_sensor", "live")  # of the examples, others by name
+LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)(#[^)\s]*)?\)")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages."""
+    made = {page: (ROOT / source).read_text(encoding="utf-8") for page, source in ELSEWHERE.items()}
+    made |= {"examples.md": examples(), "commands.md": commands(), "api-reference.md": api_reference()}
+    for page, text in made.items():
+        files.append(File.generated(config, page, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Let links between files of the project be links between pages."""
+    source = ROOT / ELSEWHERE.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    pages = {ROOT / path: name for name, path in ELSEWHERE.items()}
+
+    def on_the_site(link: re.Match[str]) -> str:
+        target = Path(os.path.normpath(source.parent / link[1]))
+        return f"]({pages.get(target) or os.path.relpath(target, ROOT / 'docs')}{link[2] or ''})"
+
+    return LINK.sub(on_the_site, markdown)
+
+
+def examples() -> str:
+    """Each script with its docstring as prose."""
+    parts = [
+        "# Examples\n\nEach script runs as it stands and ends with a figure, which it writes into the current folder: "
+        "`python examples/smooth.py`. The data come with the project. `export.py` needs `pip install '.[examples]'`.\n"
+    ]
+    scripts = {path.stem: path for path in sorted((ROOT / "examples").glob("*.py"))}
+    for path in (scripts[name] for name in dict.fromkeys([*FIRST, *scripts])):
+        text = path.read_text(encoding="utf-8")
+        _, about, code = text.split('"""', 2)
+        title, _, rest = about.partition("\n")
+        parts.append(f'## {title.rstrip(".")}\n{rest}\n```python title="examples/{path.name}"\n{code.strip()}\n```\n')
+    return "\n".join(parts)
+
+
+def commands() -> str:
+    """The help text of every command."""
+    parts = ["# Commands\n\nWhat `rovgraph COMMAND --help` prints. Exit codes: 0 done, 2 bad input, 3 not trusted.\n"]
+    for words in _commands(get_command(app), []):
+        shown = CliRunner().invoke(app, [*words, "--help"], env={"TERMINAL_WIDTH": "88", "NO_COLOR": "1"})
+        text = "\n".join(line.rstrip() for line in shown.output.strip("\n").splitlines())
+        parts.append(f"## {' '.join(['rovgraph', *words])}\n\n```text\n{text}\n```\n")
+    return "\n".join(parts)
+
+
+def _commands(command: click.Command, words: list[str]) -> Iterator[list[str]]:
+    yield words
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from _commands(inner, [*words, name])
+
+
+def api_reference() -> str:
+    """Every public name.
+
+    Raises
+    ------
+    PluginError : one of them, or a public method, has no docstring
+    """
+    bare = [where for name in rg.__all__ for where in _undocumented(name, getattr(rg, name))]
+    if bare:
+        raise PluginError(f"public names without a docstring: {', '.join(bare)}")
+    parts = ["# API, name by name\n\nAll names of `import rovgraph as rg`; [api.md](api.md) shows how they are used.\n"]
+    for name in rg.__all__:
+        what = getattr(rg, name)
+        parts.append(_entry(f"{what.__module__}.{what.__qualname__}", f"rg.{name}"))
+    parts.append("# What they return\n")
+    parts += [_entry(path, path.rpartition(".")[2]) for path in RETURNED]
+    return "\n".join(parts)
+
+
+def _entry(path: str, heading: str) -> str:
+    return f"::: {path}\n    options: {{heading: {heading}, toc_label: {heading}, heading_level: 2}}\n"
+
+
+def _undocumented(name: str, what: object) -> Iterator[str]:
+    if not (what.__doc__ or "").strip():
+        yield name
+    if inspect.isclass(what) and what.__module__.startswith("rovgraph"):
+        for member, value in vars(what).items():
+            callable_or_property = inspect.isfunction(value) or isinstance(value, property | classmethod | staticmethod)
+            if callable_or_property and not member.startswith("_") and not inspect.getdoc(getattr(what, member)):
+                yield f"{name}.{member}"

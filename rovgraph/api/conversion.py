@@ -1,0 +1,179 @@
+"""Native files as one log: what ``rovgraph convert`` does, and `read_log` of anything but a single log."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rovgraph.config import Config, completed
+from rovgraph.errors import InputError, collected_warnings, warn
+from rovgraph.estimators.dive import Progress, no_progress
+from rovgraph.interchange.account import account, notes
+from rovgraph.interchange.formats import Format, Options, formats, head_of, read_recording, recognise
+from rovgraph.interchange.merging import Merged, merge
+from rovgraph.interchange.own_log import FORMAT as OWN_LOG
+from rovgraph.interchange.own_log import is_own_log
+from rovgraph.interchange.unknown import is_text, purpose, refusal
+from rovgraph.log import Log
+
+Paths = Path | str | Sequence[Path | str]
+NOTHING: Mapping[str, Any] = {}
+REPORT = ".report.json"
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A log that was made of native files.
+
+    Attributes
+    ----------
+    merged : columns, sources, clocks and what was left
+    log : as an estimate takes it
+    config : what was given, completed by what the files know, for the log that `save` writes: without columns, units
+    used : dotted key -> value, of what the files know and the configuration did not state
+    """
+
+    merged: Merged
+    log: Log
+    config: Config
+    used: Mapping[str, Any]
+
+    @property
+    def notes(self) -> list[str]:
+        """What was assumed, and which settings of the files hold, a sentence each."""
+        told = [text for recording in self.merged.recordings for text in recording.notes]
+        return [*told, *_settings_told(self.merged, self.used)]
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What was made of what, for JSON: files, columns, clocks, settings, warnings."""
+        return account(self.merged)
+
+    def save(self, path: Path | str, config_out: Path | str | None = None, force: bool = False) -> list[Path]:
+        """Write the log, its report and other tables beside it, and a configuration to begin with; all or nothing.
+
+        Parameters
+        ----------
+        path : CSV, gzipped CSV (``.csv.gz``) or Parquet (``.parquet``)
+        config_out : YAML; None = none
+        force : replace older files
+
+        Returns
+        -------
+        list of Path : what was written
+
+        Raises
+        ------
+        InputError : a file exists, or cannot be written
+        """
+        from rovgraph.report.conversion import check_suffix, starter, write_frame, write_table
+        from rovgraph.report.folder import results_files
+
+        path = Path(path)
+        stem = check_suffix(path)
+        inputs = {Path(recording.path).resolve() for recording in self.merged.recordings}
+        tables = {
+            path.with_name(f"{stem}.{name}.csv"): table
+            for recording in self.merged.recordings
+            for name, table in recording.tables.items()
+        }
+        report, config_path = path.with_name(stem + REPORT), None if config_out is None else Path(config_out)
+        paths = [path, report, *tables, *([] if config_path is None else [config_path])]
+        if clash := next((p for p in paths if p.resolve() in inputs), None):
+            raise InputError(f"{clash} is one of the files that are read; choose another --out")
+        with results_files(paths, force) as temporary:
+            write_frame(self.merged.frame, temporary[0])
+            temporary[1].write_text(json.dumps(self.report, indent=2, default=str) + "\n", encoding="utf-8")
+            for place, table in zip(temporary[2:], tables.values(), strict=False):
+                write_table(table, place)
+            if config_path is not None:
+                sources = {key: self.merged.settings[key][1] for key in self.used}
+                temporary[-1].write_text(starter(self.config, self.log, sources, path.name), encoding="utf-8")
+        return paths
+
+
+def convert(
+    paths: Paths,
+    config: Config | None = None,
+    choose: Mapping[str, str] = NOTHING,
+    shift: Mapping[str, float] = NOTHING,
+    progress: Progress = no_progress,
+) -> Conversion:
+    """Make one log of native files of one dive (docs/formats.md).
+
+    Parameters
+    ----------
+    paths : files of any format, recognised by their content; rovgraph's own logs among them
+    config : for own logs' columns and units; what it states goes before what the files know
+    choose : sensor -> file, instance, message or topic that feeds it, where there are several
+    shift : sensor or file -> what is added to its stamps, where that is known [s]
+    progress : called now and then with what is being done, and how far it is from 0 to 1
+
+    Raises
+    ------
+    InputError : a file that cannot be read, clocks that cannot be joined
+
+    Warns
+    -----
+    DataWarning : what was left out, put in order, or looks wrong
+    """
+    config = Config() if config is None else config
+    files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    if not files:
+        raise InputError("no file was given; expected native files or logs of one dive")
+    found = [_format(path, config) for path in files]
+    recordings = []
+    for k, (path, format_) in enumerate(zip(files, found, strict=True)):
+        progress(f"reading {path.name}", k / len(files))
+
+        def read(done: int, total: int, k: int = k, name: str = path.name) -> None:
+            progress(f"reading {name}", (k + done / max(total, 1)) / len(files))
+
+        options = Options(choose, read, config.columns, config.units)
+        recordings.append(read_recording(path, options, format_))
+    progress("joining clocks", 1.0)
+    merged = merge(recordings, choose, shift)
+    for text in merged.warnings:
+        warn(text)
+    source = " + ".join(merged.names)
+    full, used = completed(config, merged.nested_settings(), f"settings in {source}")
+    bare = full.model_copy(update={"columns": {}, "units": {}})
+    with collected_warnings() as texts:
+        log = Log.from_frame(merged.frame, bare, source)
+    log = replace(
+        log,
+        config=full,
+        warnings=(*merged.warnings, *texts),
+        settings=merged.nested_settings(),
+        notes=(*notes(merged), *_settings_told(merged, used)),
+    )
+    return Conversion(merged, log, bare, used)
+
+
+def _settings_told(merged: Merged, used: Mapping[str, Any]) -> list[str]:
+    return [f"{key}: {value} ({merged.settings[key][1]})" for key, value in used.items()]
+
+
+def is_plain_log(path: Path, config: Config) -> bool:
+    """Whether a file is read as a log, not as a native file.
+
+    Raises
+    ------
+    InputError : it is neither: says what it is, and which command reads it
+    """
+    head = head_of(path)
+    if is_own_log(head, config.columns):
+        return True
+    if recognise(path) is not None:
+        return False
+    if what := purpose(path, head):
+        raise InputError(f"{path}: {what}")
+    if head and not is_text(head):
+        raise InputError(refusal(path, [each.title for each in formats()]))
+    return True
+
+
+def _format(path: Path, config: Config) -> Format | None:
+    """The format of a file, by its content; None = by the formats' own word."""
+    return OWN_LOG if is_plain_log(path, config) else None

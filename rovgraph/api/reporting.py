@@ -1,0 +1,73 @@
+"""Pages of results folders: what ``rovgraph report`` does."""
+
+from pathlib import Path
+
+from rovgraph.check import Report
+from rovgraph.errors import InputError
+from rovgraph.pages.about import PAGE
+from rovgraph.pages.campaign import CAMPAIGN, campaign_page
+from rovgraph.pages.page import write
+from rovgraph.pages.reporting import page_of
+from rovgraph.pages.studies import check_page
+
+
+def report(*results: Path | str, out: Path | str | None = None, force: bool = False) -> Path:
+    """Write the page of a results folder, or one page that sets several dives side by side.
+
+    Parameters
+    ----------
+    results : results folders; of several, each of ``smooth``
+    out : the page; None = ``report.html`` in the folder, of several ``campaign.html`` where you are. A page of
+        this default name is replaced
+    force : replace an older file that ``out`` names
+
+    Returns
+    -------
+    Path : the page
+
+    Raises
+    ------
+    InputError : no results folder, files that cannot be read, or a page that exists or cannot be written
+    """
+    folders = [Path(folder) for folder in results]
+    if not folders:
+        raise InputError("report: give at least one results folder")
+    if out is None:
+        path = folders[0] / PAGE if len(folders) == 1 else Path(CAMPAIGN)
+    else:
+        path = _free(Path(out), force, "--out")
+    html = page_of(folders[0]) if len(folders) == 1 else campaign_page(folders)
+    write(path, html)
+    return path
+
+
+def report_check(found: Report, out: Path | str, force: bool = False) -> Path:
+    """Write what `rovgraph.check` found as a page: what ``rovgraph check --page`` does.
+
+    Parameters
+    ----------
+    found : of `rovgraph.check`
+    out : the page
+    force : replace an older file
+
+    Raises
+    ------
+    InputError : the page exists, or cannot be written
+    """
+    path = _free(Path(out), force, "--page")
+    write(path, check_page(found.as_dict(), found.source))
+    return path
+
+
+def _free(path: Path, force: bool, option: str) -> Path:
+    """A path that may be written.
+
+    Raises
+    ------
+    InputError : it is a folder, or exists and ``force`` is not given
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the name of a page, such as {path / PAGE}")
+    if path.exists() and not force:
+        raise InputError(f"{path} exists; choose another {option} or give --force")
+    return path

@@ -1,0 +1,69 @@
+"""Options of all commands that read logs: native files, which of their channels, and shifts of clocks."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rovgraph import Config, Log
+
+Files = Annotated[
+    list[Path],
+    typer.Argument(help="a log (docs/log-format.md), or native files of one dive (docs/formats.md)", metavar="FILE..."),
+]
+Choose = Annotated[
+    list[str] | None,
+    typer.Option(help="file, instance, message or topic that feeds a sensor; repeat", metavar="SENSOR=SOURCE"),
+]
+Shift = Annotated[
+    list[str] | None,
+    typer.Option(help="seconds that are added to the stamps of a sensor or a file; repeat", metavar="NAME=SECONDS"),
+]
+
+
+def read_files(
+    files: Sequence[Path], config: "Config | None", choose: Sequence[str] | None, shift: Sequence[str] | None
+) -> "Log":
+    """The log of some files, with a progress bar."""
+    import rovgraph as rg
+    from rovgraph.cli.progress import progress_bar
+
+    with progress_bar() as progress:
+        return rg.read_log(files, config, pairs("choose", choose), seconds("shift", shift), progress)
+
+
+def pairs(option: str, texts: Sequence[str] | None) -> dict[str, str]:
+    """``NAME=VALUE`` of a repeated option."""
+    from rovgraph.errors import InputError
+
+    out = {}
+    for text in texts or []:
+        name, equals, value = text.partition("=")
+        if not (name.strip() and equals and value.strip()):
+            raise InputError(f"--{option} {text}: expected NAME=VALUE")
+        out[name.strip()] = value.strip()
+    return out
+
+
+def seconds(option: str, texts: Sequence[str] | None) -> dict[str, float]:
+    """``NAME=SECONDS`` of a repeated option."""
+    import math
+
+    from rovgraph.errors import InputError
+
+    out = {}
+    for name, value in pairs(option, texts).items():
+        try:
+            out[name] = float(value)
+        except ValueError:
+            out[name] = math.nan
+        if not math.isfinite(out[name]):
+            raise InputError(f"--{option} {name}={value}: expected seconds, a number")
+    return out
+
+
+def name_of(files: Sequence[Path]) -> str:
+    """What a results folder is called after: the first file without its suffixes."""
+    return files[0].name.split(".")[0]

@@ -1,0 +1,23 @@
+"""``rovgraph report``: the page of a results folder, or of several dives side by side."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def report(
+    results: Annotated[list[Path], typer.Argument(help="results folders", metavar="RESULTS...")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="page to write; default: report.html in RESULTS, of several campaign.html"),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an older file that --out names")] = False,
+) -> None:
+    """Make the page of a results folder again, or one page that compares several dives.
+
+    Example: rovgraph report results/monday results/tuesday --out campaign.html
+    """
+    import rovgraph as rg
+
+    typer.echo(f"page in {rg.report(*results, out=out, force=force)}")

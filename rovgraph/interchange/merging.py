@@ -1,0 +1,154 @@
+"""Recordings of one dive become one log: sensors selected, clocks joined, rows in the order of time."""
+
+import warnings as python_warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rovgraph.config.completion import leaves
+from rovgraph.errors import InputError
+from rovgraph.interchange.clocks import JoinedClock, join_clocks
+from rovgraph.interchange.motion import Motion
+from rovgraph.interchange.motion import motion_of as motion_of_log
+from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.interchange.selection import Selected, Unused, file_names, select
+from rovgraph.interchange.stamps import put_in_order
+from rovgraph.log import Log
+from rovgraph.log.streams import LABEL, all_columns
+
+OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
+UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
+OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix")  # sensors with a calibration variable for it
+
+
+@dataclass(frozen=True)
+class Merged:
+    """One log of several recordings.
+
+    Attributes
+    ----------
+    frame : columns of a log, in SI, one row per measurement, in the order of time
+    recordings : as read
+    selected, unused : what feeds the log, and what does not
+    clocks : how the stamps were put on the log's clock
+    unix : that is Unix time
+    settings : what the files know, dotted key -> (value, file)
+    warnings : what looks wrong, a sentence each
+    """
+
+    frame: pd.DataFrame
+    recordings: Sequence[Recording]
+    selected: Sequence[Selected]
+    unused: Sequence[Unused]
+    clocks: Sequence[JoinedClock]
+    unix: bool
+    settings: Mapping[str, tuple[Any, str]]
+    warnings: Sequence[str]
+
+    @property
+    def names(self) -> list[str]:
+        """Of the files."""
+        return file_names(self.recordings)
+
+    def nested_settings(self) -> dict[str, Any]:
+        """What the files know, nested as in YAML."""
+        out: dict[str, Any] = {}
+        for key, (value, _) in self.settings.items():
+            *above, last = key.split(".")
+            section = out
+            for name in above:
+                section = section.setdefault(name, {})
+            section[last] = value
+        return out
+
+
+def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Mapping[str, float]) -> Merged:
+    """One log of some recordings of a dive.
+
+    Parameters
+    ----------
+    choose : sensor -> file, instance, message or topic that feeds it
+    shift : sensor or file -> what is added to its stamps [s]
+
+    Raises
+    ------
+    InputError : clocks that cannot be joined; a sensor, file or source that is not there; no measurement
+    """
+    recordings, said = _in_order(recordings)
+    if not any(recording.channels for recording in recordings):
+        raise InputError(f"{', '.join(file_names(recordings))}: no measurement of any sensor in it")
+    selected, unused = select(recordings, choose)
+    clocks, beside, unix, told = join_clocks(recordings, selected, shift, _motion)
+    by_name = {(clock.file, clock.name): clock for clock in clocks}
+    frames = []
+    for each in selected:
+        clock = by_name[each.file, each.channel.clock]
+        columns = {name: np.asarray(values) for name, values in each.channel.columns.items()}
+        columns["time"] = clock(columns["time"]) + beside.get(each.channel.sensor, 0.0)
+        frames.append(pd.DataFrame(columns))
+    frame = pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
+    others = {str(name) for name in frame} - set(all_columns())
+    order = [name for name in all_columns() if name in frame] + sorted(others, key=_natural)
+    if LABEL in frame:
+        frame[LABEL] = frame[LABEL].astype("Int64")
+    settings = _settings(recordings, selected, clocks)
+    return Merged(frame[order], recordings, selected, unused, clocks, unix, settings, (*said, *told))
+
+
+def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
+    """Recordings whose stamps are in order, and all that is to be warned of."""
+    out: list[Recording] = []
+    said: list[str] = []
+    for recording, name in zip(recordings, file_names(recordings), strict=True):
+        said += recording.warnings
+        channels = []
+        for channel in recording.channels:
+            ordered, text = put_in_order(channel, name)
+            channels.append(ordered)
+            said += text
+        out.append(replace(recording, channels=tuple(channels)))
+    return out, said
+
+
+def _natural(name: str) -> tuple[str, int]:
+    stem, _, number = name.rpartition("_")
+    return (stem, int(number)) if number.isdigit() else (name, 0)
+
+
+def _motion(channels: Sequence[Channel]) -> Motion:
+    """What channels on one clock show; of several of one sensor, the first."""
+    first = {channel.sensor: channel for channel in reversed(channels)}
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore")  # the log that is made of them is read again
+        try:
+            log = Log.from_arrays(*(_tabled(channel) for channel in first.values()))
+        except InputError:
+            return Motion((), None)
+    return motion_of_log(log)
+
+
+def _tabled(channel: Channel) -> dict[str, Any]:
+    return {name: np.asarray(values) for name, values in channel.columns.items()}
+
+
+def _settings(
+    recordings: Sequence[Recording], selected: Sequence[Selected], clocks: Sequence[JoinedClock]
+) -> dict[str, tuple[Any, str]]:
+    """What the files know of the instruments that were selected, and how certain the clocks are."""
+    feeds = {each.channel.sensor: each.file for each in selected}
+    out: dict[str, tuple[Any, str]] = {}
+    for k, (recording, name) in enumerate(zip(recordings, file_names(recordings), strict=True)):
+        for path, value in leaves(recording.settings):
+            if path[0] not in OF_INSTRUMENT or feeds.get(path[0]) == k:
+                out.setdefault(".".join(path), (value, name))
+    for each in selected:
+        clock = next(c for c in clocks if (c.file, c.name) == (each.file, each.channel.clock))
+        if each.channel.sensor in OFFSETS and clock.sd > UNSURE_S:
+            key = f"calibration.{each.channel.sensor}_time_offset"
+            origin = f"clock {clock.name}: {clock.how}"
+            out.setdefault(f"{key}.estimate", (True, origin))
+            out.setdefault(f"{key}.sd", (round(clock.sd, 3), origin))
+    return out

@@ -1,0 +1,106 @@
+"""rovgraph's own log (docs/log-format.md) as one of the formats, so that it can be read beside native files.
+
+A log that is read alone does not come here: `rovgraph.log.read_log` reads it.
+"""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from rovgraph.errors import InputError, collected_warnings
+from rovgraph.geometry import Array
+from rovgraph.interchange.formats import Options
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.log.reading import map_columns, numbers
+from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
+from rovgraph.log.table import read_table
+from rovgraph.log.units import factors
+
+SURE = 0.95
+UNIX_S = (9.5e8, 4.2e9)  # stamps within, 2000 to 2103, are taken for Unix time [s]
+IN_RECEIVED = "host that received"
+
+
+class OwnLog:
+    """CSV or Parquet in rovgraph's columns, or in those that a configuration maps."""
+
+    name = "log"
+    title = "rovgraph log (CSV, Parquet)"
+    extra = "parquet"
+
+    def recognise(self, path: Path, head: bytes) -> float:
+        """By the names of the columns; a Parquet file can be nothing else."""
+        return SURE if is_own_log(head) else 0.0
+
+    def read(self, path: Path, options: Options) -> Recording:
+        """Every sensor of the log, its stamps one clock."""
+        with collected_warnings() as texts:
+            table = read_table(path)
+            names = map_columns(table, options.columns)
+            scale = factors(options.units, table.source)
+            cells = {name: numbers(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
+        if RECEIVED in table.names:
+            cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
+        channels = tuple(_channels(cells))
+        if not channels:
+            raise InputError(f"{path}: no measurement of any sensor in it; columns: {', '.join(table.names)[:200]}")
+        clock = _clock(cells["time"])
+        clocks = {clock.name: clock}
+        if RECEIVED in cells:
+            clocks[IN_RECEIVED] = Clock(IN_RECEIVED, 0.0, 0.0, "Unix time of arrival")
+        ignored = [name for name in table.names if name not in names.values() and name != RECEIVED]
+        left = tuple(Left(name, int(table.frame[name].notna().sum()), "no column of a log") for name in ignored)
+        return Recording(str(path), self.name, channels, clocks, left, warnings=tuple(texts))
+
+
+FORMAT = OwnLog()
+
+
+def is_own_log(head: bytes, columns: Mapping[str, str] | None = None) -> bool:
+    """Whether a file that begins like this is a log: its header has a time and a sensor's column.
+
+    Parameters
+    ----------
+    columns : rovgraph's name -> the log's own, of a configuration
+    """
+    if head.startswith(b"PAR1"):
+        return True
+    own = dict(columns or {})
+    try:
+        top = head.partition(b"\n")[0].decode("utf-8").removeprefix("\ufeff").strip()
+        header = {name.strip() for name in next(csv.reader([top], skipinitialspace=True), [])}
+    except (UnicodeDecodeError, csv.Error):
+        return False
+    found = {name for name in header if is_column(name)} | {
+        own_name for own_name, name in own.items() if name in header
+    }
+    return "time" in found and len(found) > 1
+
+
+def _channels(cells: Mapping[str, Array]) -> list[Channel]:
+    """A channel per sensor, of the rows in which any of its columns is filled."""
+    thrusters = tuple(sorted((c for c in cells if THRUSTER.fullmatch(c)), key=lambda c: int(c.partition("_")[2])))
+    sensors = {**{sensor: tuple(STREAMS[sensor]) for sensor in STREAMS}, "thruster": thrusters}
+    sensors["fix"] = (*sensors["fix"], *LAT_LON)
+    out = []
+    for sensor, columns in sensors.items():
+        present = [c for c in columns if c in cells]
+        if not present:
+            continue
+        rows = np.any([~np.isnan(cells[c]) for c in present], axis=0)
+        if not rows.any():
+            continue
+        own = {name: cells[name][rows] for name in ("time", *present)}
+        received = cells[RECEIVED][rows] if RECEIVED in cells else None
+        receiver = "" if received is None else IN_RECEIVED
+        out.append(Channel(sensor, own, f"columns {', '.join(present)}", "", "time", received, receiver))
+    return out
+
+
+def _clock(time: Array) -> Clock:
+    """The clock of the column ``time``: Unix where its stamps look like it."""
+    known = time[np.isfinite(time)]
+    unix = len(known) > 0 and UNIX_S[0] < np.median(known) < UNIX_S[1]
+    return Clock("time", 0.0, 0.0, "stamps look like Unix time") if unix else Clock("time")

@@ -1,0 +1,64 @@
+"""Stamps of a channel that are put in order: a clock that was set within a file is told, never believed."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.interchange.recording import Channel
+
+STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
+JUMP = 86400.0  # ahead, after which a stamp is of another epoch [s]
+LOST = 0.1  # of the rows, that stamps of another epoch may have
+
+
+def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
+    """A channel with its rows in the order of time, and what was done, a sentence each.
+
+    Rows whose stamps jump back, or ahead by a day, are left out where they are few, such as those from before a clock
+    was set.
+
+    Raises
+    ------
+    InputError : no row with a time, or many whose stamps are of another epoch
+    """
+    where, time = f"{file}: {channel.source}", np.asarray(channel.columns["time"], dtype=float)
+    stamped = np.isfinite(time)
+    if not stamped.any():
+        raise InputError(f"{where}: no row has a time")
+    said = [f"{where}: {np.count_nonzero(~stamped)} rows without time left out"] if not stamped.all() else []
+    rows = np.flatnonzero(stamped)
+    kept = rows[_of_one_epoch(time[rows])]
+    if lost := len(rows) - len(kept):
+        odd = np.setdiff1d(rows, kept)[0]
+        apart = f"{time[odd]:.1f} s, others from {time[kept[0]]:.1f} s"
+        told = f"{lost} of {len(rows)} rows have stamps of another time ({apart})"
+        if lost > LOST * len(rows):
+            raise InputError(f"{where}: {told}; was the clock set, or are two dives in one file? Split it")
+        said.append(f"{where}: {told}; left out")
+    late = int(np.count_nonzero(time[kept] < np.maximum.accumulate(time[kept])))
+    if late:
+        said.append(f"{where}: {late} rows behind the time before them, put in order")
+    order = kept[np.argsort(time[kept], kind="stable")]
+    if len(order) == len(time) and not late:
+        return channel, said
+    received = None if channel.received is None else channel.received[order]
+    columns = {name: np.asarray(values)[order] for name, values in channel.columns.items()}
+    return replace(channel, columns=columns, received=received), said
+
+
+def _of_one_epoch(time: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices of the longest piece without a jump, and of the pieces around it that go on in its order."""
+    steps = np.diff(time)
+    breaks = np.flatnonzero((steps < -STEP_BACK) | (steps > JUMP)) + 1
+    pieces = np.split(np.arange(len(time)), breaks)
+    longest = max(range(len(pieces)), key=lambda k: len(pieces[k]))
+    kept = [pieces[longest]]
+    for piece in pieces[longest + 1 :]:
+        if -STEP_BACK <= time[piece[0]] - time[kept[-1]].max() <= JUMP:
+            kept.append(piece)
+    for piece in reversed(pieces[:longest]):
+        if -STEP_BACK <= time[kept[0][0]] - time[piece].max() <= JUMP:
+            kept.insert(0, piece)
+    return np.concatenate(kept)

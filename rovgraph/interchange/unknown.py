@@ -1,0 +1,51 @@
+"""What a file is that is given as a log and is none, and which command reads it."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+from rovgraph.config import Config
+
+TRACK = {"time", "north", "east"}
+SUMMARY = "summary.json"
+
+
+def purpose(path: Path, head: bytes) -> str:
+    """What a file of this program's is good for; "" where it is none of them.
+
+    Parameters
+    ----------
+    head : its first bytes, of a directory b""
+    """
+    if path.is_dir():
+        if (path / SUMMARY).is_file():
+            return (
+                f"is a results folder; rovgraph evaluate {path / 'trajectory_smoothed.csv'} REFERENCE reads its track"
+            )
+        return ""
+    if head.startswith(b"PK\x03\x04"):
+        return "is a ZIP archive; unpack it first"
+    text = head.decode("utf-8", errors="replace")
+    lines = text.splitlines()
+    header = {name.strip() for name in next(csv.reader(lines[:1]), [])}
+    if header >= TRACK:
+        return f"is a track, not a log; rovgraph evaluate {path} REFERENCE compares it"
+    keys = {line.partition(":")[0] for line in lines if ":" in line and not line.startswith((" ", "#"))}
+    if path.suffix in (".yaml", ".yml") and keys & set(Config.model_fields):
+        return "is a configuration; give it with --config"
+    return ""
+
+
+def is_text(head: bytes) -> bool:
+    """Whether a file that begins like this may be a table of text."""
+    try:
+        head.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if len(head) - error.start > 3:  # or a letter was cut
+            return False
+    return b"\0" not in head
+
+
+def refusal(path: Path, titles: Sequence[str]) -> str:
+    """Why a file that is no table of text cannot be read."""
+    return f"{path}: is binary data in no format that is known; expected one of: {', '.join(titles)}"

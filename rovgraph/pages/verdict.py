@@ -1,0 +1,165 @@
+"""The verdict in words for a person who knows nothing of filters: how good, what limits it, what to do next time."""
+
+from typing import Any
+
+import numpy as np
+
+from rovgraph.pages.parts import Section, Table
+from rovgraph.pages.source import DiveSource, Track
+from rovgraph.report.units import plus_minus
+
+ALIKE = 0.97  # a radius at the end of this part of the largest is said once
+LOPSIDED = 1.5  # ratio of sd across and along beyond which one of them limits
+SHORT = 0.2  # displacement, as a part of the distance, below which directions say little
+
+GOOD = {
+    "trusted": "Nothing in the log contradicts this track.",
+    "doubtful": "Use this track with care: something in the log does not fit.",
+    "wrong": "Do not use this track: the sensors contradict each other.",
+}
+
+
+def verdict_section(source: DiveSource) -> Section:
+    """Verdict, what limits the track, advice, alarms, assumptions and warnings."""
+    summary = source.summary
+    alarms = [f"{a.get('severity', '')}: {a.get('text', '')}" for a in summary.get("alarms") or []]
+    lists = {
+        "Alarms": alarms,
+        "Warnings about the log": summary.get("warnings") or [],
+        "Assumed, because neither log nor configuration said": summary.get("assumptions") or [],
+    }
+    notes = [source.other_version] if source.other_version else []
+    lead = [how_good(source), *limits(source), *notes]
+    title = f"Verdict: {summary.get('verdict', 'unknown')}"
+    return Section("verdict", title, lead, [_numbers(source)], {k: v for k, v in lists.items() if v})
+
+
+def how_good(source: DiveSource) -> str:
+    """The verdict and how far off the vehicle may be, in a sentence or two."""
+    words = GOOD.get(str(source.summary.get("verdict")), "The verdict is not known.")
+    reach = source.main.ellipses[0]
+    if not np.isfinite(reach).any():
+        return f"{words} How far it may be off is not known."
+    worst = int(np.nanargmax(reach))
+    clock = source.clock
+    when = clock(source.main["time"][worst : worst + 1])[0]
+    limit = f"99 times in 100 the vehicle was within {_metres(reach[worst])} of it at the worst moment"
+    trusted = words if source.summary.get("verdict") == "trusted" else f"{words} If the noise is as stated,"
+    last = reach[-1] > ALIKE * reach[worst]
+    moment = "the end" if last else f"{when:.0f} {clock.unit} after the start"
+    further = f", and within {_metres(reach[-1])} at the end" if not last and np.isfinite(reach[-1]) else ""
+    return f"{trusted} {limit} ({moment}){further}."
+
+
+def limits(source: DiveSource) -> list[str]:
+    """What limits the track, and what to do next time."""
+    cause, advice = _cause(source)
+    if not cause:
+        return []
+    return [f"What limits it: {cause}.", f"Next time: {advice}."]
+
+
+def _cause(source: DiveSource) -> tuple[str, str]:
+    """The largest cause of uncertainty, read from the estimate's own covariance, and its remedy."""
+    alarms = source.summary.get("alarms") or []
+    if source.summary.get("verdict") == "wrong" and alarms:
+        text = str(alarms[0].get("text", ""))
+        cause, _, remedy = text.partition("; ")
+        return cause, remedy or "see the alarms below"
+    track = source.main
+    if not np.isfinite(track.horizontal_sd).any() or len(track) < 3:
+        return "", ""
+    silent = _share_in_silence(source, track)
+    if silent > 0.5:
+        return (
+            f"{100 * silent:.0f} % of what the variance grew fell into times in which the DVL did not see the bottom",
+            "keep the DVL within its range of the bottom, or take a position fix after each silence",
+        )
+    return _by_direction(source)
+
+
+def _share_in_silence(source: DiveSource, track: Track) -> float:
+    """Share of the growth of the horizontal variance that fell into silences of the DVL."""
+    growth = np.clip(np.diff(track.horizontal_sd**2, prepend=np.nan), 0.0, None)
+    growth[~np.isfinite(growth)] = 0.0
+    time = track["time"]
+    inside = np.zeros(len(track), bool)
+    for begin, end in source.silences:
+        inside |= (time > begin) & (time <= end)
+    total = float(growth.sum())
+    return float(growth[inside].sum()) / total if total > 0 else 0.0
+
+
+def _by_direction(source: DiveSource) -> tuple[str, str]:
+    """Whether heading or speed limits: the sd across and along the way since the last fix."""
+    main = source.main
+    reach = main.ellipses[0]
+    worst = int(np.nanargmax(reach))
+    origin = _last_fix_before(source, main["time"][worst])
+    ahead = np.array([main["north"][worst] - main["north"][origin], main["east"][worst] - main["east"][origin]])
+    distance = float(np.hypot(*ahead))
+    steps = np.hypot(np.diff(main["north"][origin : worst + 1]), np.diff(main["east"][origin : worst + 1]))
+    since = "the last position fix" if origin else "the start"
+    noise = (
+        f"the small errors of the DVL's velocity, which add up over the way since {since}",
+        "take a position fix now and then, or pass a place twice that a camera or a sonar knows again",
+    )
+    if distance < max(SHORT * float(np.nansum(steps)), 1.0):
+        return noise
+    u = ahead / distance
+    cov = main["cov_north_east"][worst]
+    cov = 0.0 if np.isnan(cov) else cov
+    P = np.array([[main["north_sd"][worst] ** 2, cov], [cov, main["east_sd"][worst] ** 2]])
+    across, along = (float(np.sqrt(max(d @ P @ d, 0.0))) for d in (np.array([-u[1], u[0]]), u))
+    if across > LOPSIDED * along:
+        return (
+            f"the direction of travel (compass and mounting of the DVL), known to {np.rad2deg(across / distance):.1f}° "
+            f"over the {distance:.0f} m from {since}",
+            "take position fixes at both ends of a long straight line, and turn two full circles to show the compasses",
+        )
+    if along > LOPSIDED * across:
+        return (
+            f"the distance travelled (scale of the DVL), known to {100 * along / distance:.1f} % "
+            f"over the {distance:.0f} m from {since}",
+            "take position fixes at both ends of a long straight line, and state the sound speed",
+        )
+    return noise
+
+
+def _last_fix_before(source: DiveSource, time: float) -> int:
+    """Index of the epoch of the last fix that counted, 0 where there was none."""
+    rows = source.residuals
+    if rows is None:
+        return 0
+    fixes = rows.loc[(rows["sensor"] == "fix") & (rows["weight"] > 0) & (rows["time"] < time), "time"]
+    return int(np.searchsorted(source.main["time"], fixes.iloc[-1])) if len(fixes) else 0
+
+
+def _numbers(source: DiveSource) -> Table:
+    """The dive in numbers."""
+    s = source.summary
+    end: dict[str, Any] = s.get("end") or {}
+
+    def value(key: str, unit: str) -> str:
+        number = s.get(key)
+        return f"{number:.4g} {unit}" if isinstance(number, int | float) else "unknown"
+
+    def with_sd(name: str, unit: str) -> str:
+        short = {"m": "m", "°": "deg"}[unit]
+        number, sd = end.get(f"{name}_{short}"), end.get(f"{name}_sd_{short}")
+        return plus_minus(np.nan if number is None else number, np.nan if sd is None else sd, unit)
+
+    rows = [
+        ("log", str(s.get("log", "unknown"))),
+        ("duration", value("duration_s", "s")),
+        ("distance", value("distance_m", "m")),
+        ("end, north", with_sd("north", "m")),
+        ("end, east", with_sd("east", "m")),
+        ("end, down", with_sd("down", "m")),
+        ("end, heading", with_sd("heading", "°")),
+    ]
+    return Table(f"The dive in numbers, {source.main.name}, ± one standard deviation", ("", ""), rows)
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2g} m" if value < 10 else f"{value:.0f} m"

@@ -1,0 +1,6 @@
+"""The colours of figures and pages: Okabe and Ito's, which the colour-blind tell apart."""
+
+ESTIMATES = {"smoothed": "#0072B2", "filtered": "#D55E00", "dead_reckoning": "#888888", "reference": "black"}
+OTHER = "#CC79A7"
+USED, REJECTED, UNUSED = "#009E73", "#A3206B", "#AAAAAA"
+PRIOR = "#ECE7DA"

@@ -1,0 +1,160 @@
+"""A converted log as files, the configuration to begin with, and the tables that a command prints."""
+
+import io
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+from rovgraph.config import Config
+from rovgraph.errors import InputError
+from rovgraph.fast_csv import write_csv
+from rovgraph.geometry import Array
+from rovgraph.log import Log
+
+DIGITS = 10  # significant, of a cell: latitudes to a centimetre
+DECIMALS = {"time": 6}
+SUFFIXES = (".csv.gz", ".csv", ".parquet")
+MOUNTED = {"imu": "x forward, y starboard, z down", "dvl": "x forward, y starboard, z down"}
+
+
+def check_suffix(path: Path) -> str:
+    """The name of a log without its suffix.
+
+    Raises
+    ------
+    InputError : a suffix that says nothing of the format to write
+    """
+    suffix = next((s for s in SUFFIXES if path.name.endswith(s)), None)
+    if suffix is None or path.name == suffix:
+        raise InputError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
+    return path.name.removesuffix(suffix)
+
+
+def write_frame(frame: pd.DataFrame, path: Path) -> None:
+    """Write a log as its suffix says.
+
+    Raises
+    ------
+    InputError : Parquet, and pyarrow is not installed
+    """
+    if path.suffix != ".parquet":
+        write_csv(frame, path, DIGITS, decimals=DECIMALS)
+        return
+    try:
+        frame.to_parquet(path, engine="pyarrow", index=False)
+    except ImportError:
+        raise InputError(
+            f"{path.name}: writing Parquet needs pyarrow; install it with: pip install 'rovgraph[parquet]'"
+        ) from None
+
+
+def write_table(table: Mapping[str, Array], path: Path) -> None:
+    """Write one of the other tables of a file."""
+    write_csv(pd.DataFrame({name: np.asarray(values) for name, values in table.items()}), path, DIGITS)
+
+
+def starter(config: Config, log: Log, sources: Mapping[str, str], name: str) -> str:
+    """A configuration to begin with: what is known of the vehicle, each value with where it is from.
+
+    Parameters
+    ----------
+    config : what is stated, and what files know
+    log : that it is for
+    sources : dotted key -> file that it comes from
+    name : of the log's file
+    """
+    settings: dict[str, Any] = config.model_dump(mode="json", exclude_unset=True)
+    settings = {key: value for key, value in settings.items() if key not in ("columns", "units")}
+    sources = dict(sources)
+    if log.origin is not None and not config.environment.origin:
+        section = settings.setdefault("environment", {})
+        section |= {"origin_lat_deg": log.origin[0], "origin_lon_deg": log.origin[1]}
+        sources |= dict.fromkeys(("environment.origin_lat_deg", "environment.origin_lon_deg"), "the first fix")
+    for sensor, axes in MOUNTED.items():
+        if sensor in log and "mount_rpy_deg" not in settings.setdefault(sensor, {}):
+            settings[sensor]["mount_rpy_deg"] = [0, 0, 0]
+            sources[f"{sensor}.mount_rpy_deg"] = f"not known: assumed {axes}; state it"
+        if sensor in log and "lever_arm_m" not in settings[sensor]:
+            settings[sensor]["lever_arm_m"] = [0, 0, 0]
+            sources[f"{sensor}.lever_arm_m"] = "not known; state it, forward, starboard, down from the vehicle's origin"
+        if not settings[sensor]:
+            del settings[sensor]
+    counts = ", ".join(f"{sensor} ({len(stream)})" for sensor, stream in log.streams.items())
+    head = f"# Configuration to begin with, for {name}\n# sensors: {counts}\n"
+    stream = io.StringIO()
+    yaml = YAML()
+    yaml.width = 4096
+    yaml.dump(_commented(settings, sources), stream)
+    return head + stream.getvalue()
+
+
+def _commented(settings: Mapping[str, Any], sources: Mapping[str, str], above: str = "") -> CommentedMap:
+    """Settings as YAML that has a comment behind each key with a source; lists stand in one line."""
+    out = CommentedMap()
+    for name, value in settings.items():
+        key = f"{above}{name}"
+        if isinstance(value, Mapping):
+            out[name] = _commented(value, sources, f"{key}.")
+        else:
+            out[name] = CommentedSeq(value) if isinstance(value, list | tuple) else value
+            if isinstance(out[name], CommentedSeq):
+                out[name].fa.set_flow_style()
+        if key in sources:
+            out.yaml_add_eol_comment(" ".join(sources[key].split()), name)
+    return out
+
+
+def conversion_tables(report: Mapping[str, Any]) -> list[Table]:
+    """What each file held, where every column came from, and how clocks were joined."""
+    return [_channels(report), *([_clocks(report)] if report["clocks"] else []), *_left(report)]
+
+
+def _table(title: str, *headings: str) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for heading in headings:
+        right = heading in ("count", "Hz", "gap s", "offset s", "sd s", "drift ppm")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=right)
+    return table
+
+
+def _channels(report: Mapping[str, Any]) -> Table:
+    table = _table("what the files hold", "file", "sensor", "count", "Hz", "gap s", "from", "used")
+    for file in report["files"]:
+        for k, channel in enumerate(file["channels"]):
+            source = channel["source"] + (f" ({channel['frame']})" if channel["frame"] else "")
+            used = "yes" if channel["used"] else f"no: {channel['reason']}"
+            numbers = (str(channel["count"]), _number(channel["rate_hz"]), _number(channel["gap_s"]))
+            table.add_row(
+                escape(file["file"]) if k == 0 else "", channel["sensor"], *numbers, escape(source), escape(used)
+            )
+    return table
+
+
+def _clocks(report: Mapping[str, Any]) -> Table:
+    table = _table("clocks", "file", "clock", "offset s", "sd s", "drift ppm", "how")
+    for clock in report["clocks"]:
+        drift = f"{1e6 * clock['drift']:+.1f}" if clock["drift"] else ""
+        numbers = f"{clock['offset_s']:+.3f}", f"{clock['sd_s']:.3f}" if clock["sd_s"] else "", drift
+        table.add_row(escape(clock["file"]), escape(clock["clock"]), *numbers, escape(clock["how"]))
+    return table
+
+
+def _left(report: Mapping[str, Any]) -> Iterator[Table]:
+    table = _table("left out", "file", "what", "count", "why")
+    for file in report["files"]:
+        for each in file["left"]:
+            table.add_row(escape(file["file"]), escape(each["name"]), str(each["count"]), escape(each["reason"]))
+    if table.row_count:
+        yield table
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"

@@ -1,0 +1,213 @@
+"""A dive without an IMU: the vehicle's own attitude, a DVL, and a constant velocity in between."""
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from dives import (
+    Simulated,
+    as_log,
+    attitude_errors,
+    batch,
+    changed,
+    falcon,
+    interrupted,
+    renewed,
+    same,
+    true_at,
+    without,
+)
+from scipy.stats import chi2
+
+from rovgraph.config import Config
+from rovgraph.engine.chain_optimum import smooth_chain
+from rovgraph.errors import InputError
+from rovgraph.estimators.dive import smooth
+from rovgraph.estimators.initialise import initialise
+from rovgraph.estimators.smoother import BatchSmoother
+from rovgraph.geometry import Array, wrap_angle
+from rovgraph.live.startup import Startup
+from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.simulate import Truth, scenario, simulate
+from rovgraph.simulate.files import known
+from rovgraph.trajectory import Trajectory
+
+SEEDS = range(1, 25)
+SECONDS, PING_RATE = 120.0, 1.0
+QUANTITIES = ("position", "velocity", "attitude")
+KINDS = ("smoothed", "filtered")
+ACC = 0.05  # a Falcon's own, which is calmer than the default
+HEADING_SD, TILT_SD = np.deg2rad(1.0), np.deg2rad(0.5)
+
+
+def drawn(seed: int) -> tuple[Simulated, Config]:
+    """A dive whose IMU is silent, and what an estimator is told of it."""
+    heading, dvl = {"sources": ["vehicle"], "vehicle_sd_deg": 1.0}, {"velocity_sd_mps": [0.02, 0.02, 0.02]}
+    config = changed(falcon(), heading=heading, dvl=dvl, tilt={"sd_deg": 0.5}, motion={"acc": ACC, "rate_sd_dps": 3.0})
+    truth = Truth(config, start_error=True, dvl_rate=PING_RATE, depth_rate=0.5)
+    dive = simulate(scenario("falcon", SECONDS), truth, np.random.default_rng(seed))
+    case = Simulated(config, dive, as_log(dive.log_frame))
+    log = without(case.log, "imu", "mag", "ahrs", "dvl_heading")
+    case = replace(case, log=with_attitude(log, case, np.random.default_rng(100 + seed)))
+    return case, known(dive, config)
+
+
+def with_attitude(log: Log, case: Simulated, rng: np.random.Generator) -> Log:
+    """The log with roll, pitch and the magnetic heading of the body at each ping."""
+    time, hidden = log["dvl"].time, case.dive.hidden["calibration"]
+    rpy = true_at(case, time).rpy
+    magnetic = rpy[:, 2] - np.deg2rad(case.config.environment.declination_deg)
+    sine, cosine = hidden["vehicle_compass_deviation"]
+    magnetic += hidden["vehicle_compass_offset"][0] + sine * np.sin(magnetic) + cosine * np.cos(magnetic)
+    heading = wrap_angle(magnetic + HEADING_SD * rng.standard_normal(len(time)))
+    tilt = rpy[:, :2] + TILT_SD * rng.standard_normal((len(time), 2))
+    streams, row = dict(log.streams), log["dvl"].row
+    for sensor, data in (("vehicle_heading", heading[:, None]), ("vehicle_tilt", tilt)):
+        streams[sensor] = Stream(sensor, STREAMS[sensor], time, data, row)
+    return replace(log, streams=streams)
+
+
+def nees(trajectory: Trajectory, case: Simulated, epoch: int) -> Array:
+    """Normalised error squared of position, velocity and attitude at one epoch, shape (3,)."""
+    truth = true_at(case, trajectory.time)
+    error = (trajectory.p_n - truth.p_n, trajectory.v_n - truth.v_n, attitude_errors(trajectory, case))
+    covariance = (trajectory.cov_p, trajectory.cov_v, trajectory.cov_theta)
+    return np.array([e[epoch] @ np.linalg.solve(P[epoch], e[epoch]) for e, P in zip(error, covariance, strict=True)])
+
+
+def one_dive(seed: int) -> Array:
+    """NEES smoothed at mid-dive and filtered at the end, and smoothed with too little process noise; (3, 3)."""
+    case, config = drawn(seed)
+    smoothed, filtered = batch(case.log, config).solve().trajectory, renewed(case.log, config).solve().trajectory
+    stiff = batch(case.log, changed(config, motion={"acc": 1e-3, "gyr": 1e-2})).solve().trajectory
+    middle = len(smoothed) // 2
+    return np.array([nees(t, case, k) for t, k in ((smoothed, middle), (filtered, -1), (stiff, middle))])
+
+
+def all_dives(seeds: range) -> Array:
+    """NEES of many dives, shape (dives, 3 kinds, 3 quantities)."""
+    with ProcessPoolExecutor(2) as pool:
+        return np.array(list(pool.map(one_dive, seeds)))
+
+
+@pytest.fixture(scope="module")
+def mean_nees() -> Array:
+    return np.asarray(all_dives(SEEDS).mean(axis=0))
+
+
+def band(dives: int) -> tuple[float, float]:
+    """Within which the mean NEES of 3 components lies with 95 %."""
+    low, high = chi2.ppf([0.025, 0.975], 3 * dives) / dives
+    return float(low), float(high)
+
+
+@pytest.mark.parametrize("quantity", range(3), ids=QUANTITIES)
+@pytest.mark.parametrize("kind", range(2), ids=KINDS)
+def test_errors_are_at_most_as_large_as_the_estimate_says(mean_nees, kind, quantity):
+    low, high = band(len(SEEDS))
+    assert mean_nees[kind, quantity] < high
+    if quantity != 1:  # the process allows for accelerations that no Falcon has at all times
+        assert mean_nees[kind, quantity] > low
+
+
+def test_too_little_process_noise_is_found_out(mean_nees):
+    assert (mean_nees[2] > band(len(SEEDS))[1]).all()
+
+
+@pytest.fixture(scope="module")
+def dive() -> tuple[Simulated, Config]:
+    return drawn(1)
+
+
+def test_a_log_without_imu_is_smoothed_and_no_bias_is_reported(dive):
+    case, config = dive
+    done = smooth(case.log, config)
+    assert any("the log has no IMU" in line for line in done.assumptions)
+    for estimate in done.estimates:
+        assert not {"acc_bias", "gyr_bias"} & set(estimate.history)
+        assert not [c.label for c in estimate.calibration if c.label.startswith(("acc_", "gyr_"))]
+    smoothed, track = done.estimates[0], true_at(case, done.estimates[0].trajectory.time)
+    error = np.linalg.norm((smoothed.trajectory.p_n - track.p_n)[:, :2], axis=1)
+    assert error.max() < 5.0 * np.sqrt(smoothed.trajectory.cov_p[:, 0, 0].max())
+    deviation = [c for c in smoothed.calibration if c.label.startswith("vehicle_compass_deviation")]
+    assert len(deviation) == 2 and not any(c.estimated for c in deviation)
+
+
+def test_measurements_one_by_one_and_a_whole_log_give_the_same_keyframes(dive):
+    case, config = dive
+    beginning = initialise(case.log, config)
+    whole = BatchSmoother(beginning)
+    whole.take(case.log)
+    one_by_one = batch(case.log, config)
+    assert len(whole.intervals) > SECONDS
+    same(whole.intervals, one_by_one.intervals)
+
+
+def test_an_imu_that_is_left_out_changes_nothing(dive):
+    case, config = dive
+    with_imu = as_log(case.dive.log_frame)["imu"]
+    both = replace(case.log, streams={**case.log.streams, "imu": with_imu})
+    alone, left_out = (
+        batch(log, changed(config, motion={"model": "constant_velocity"})).solve().trajectory
+        for log in (case.log, both)
+    )
+    np.testing.assert_array_equal(alone.p_n, left_out.p_n)
+
+
+def test_position_is_wide_after_a_silence_and_the_way_it_faces_is_found_again(dive):
+    case, config = dive
+    log = interrupted(case.log, 40.0, 60.0)
+    for track in (batch(log, config).solve().trajectory, renewed(log, config).solve().trajectory):
+        truth = true_at(case, track.time)
+        after = track.time > 105.0
+        sd = np.sqrt(track.cov_p[:, 0, 0])
+        assert sd[after].min() > 20.0 and sd[track.time < 39.0].max() < 2.0
+        assert (np.linalg.norm(track.p_n - truth.p_n, axis=1)[after] < 3.0 * sd[after]).all()
+        assert np.abs(wrap_angle(track.rpy[after, 2] - truth.rpy[after, 2])).max() < np.deg2rad(20.0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"graph": {"hydrodynamics": True}}, "graph.hydrodynamics needs an IMU"),
+        ({"calibration": {"gyr_scale": {"estimate": True}}}, "gyr_scale: {estimate: true} needs an IMU"),
+        (
+            {"calibration": {"depth_time_offset": {"estimate": True}}},
+            "depth_time_offset: {estimate: true} needs an IMU",
+        ),
+    ],
+)
+def test_what_needs_an_imu_is_refused(dive, keys, message):
+    case, config = dive
+    with pytest.raises(InputError, match=message):
+        initialise(case.log, changed(config, **keys))
+
+
+def test_without_imu_roll_and_pitch_are_needed_and_online_refuses(dive):
+    case, config = dive
+    with pytest.raises(InputError, match=r"no IMU, .* or else roll and pitch"):
+        initialise(without(case.log, "vehicle_tilt"), config)
+    with pytest.raises(InputError, match="online needs an IMU"):
+        Startup(changed(config, motion={"model": "constant_velocity"}))
+
+
+def test_gtsam_finds_the_same_optimum(dive):
+    pytest.importorskip("gtsam")
+    from rovgraph.graph.places import smooth_graph
+
+    case, config = dive
+    smoother = batch(case.log, config)
+    problem = smoother.intervals, smoother.beginning, smoother.optimum().state
+    chain, graph = smooth_chain(*problem), smooth_graph(*problem)
+    np.testing.assert_allclose(graph.state.p_n, chain.state.p_n, atol=1e-5)
+
+
+if __name__ == "__main__":  # python tests/test_no_imu.py FIRST LAST: the same by hand, on other dives
+    import sys
+
+    first, last = (int(a) for a in sys.argv[1:3])
+    found = all_dives(range(first, last))
+    print("band", np.round(band(len(found)), 2), *QUANTITIES)
+    for name, row in zip((*KINDS, "stiff"), found.mean(axis=0), strict=True):
+        print(f"{name:14}", np.round(row, 2))

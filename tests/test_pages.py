@@ -1,0 +1,292 @@
+"""Pages of results folders: whole, offline, safe with any text, and honest about what is missing."""
+
+import base64
+import json
+import re
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import rovgraph as rg
+from rovgraph.api.reporting import report
+from rovgraph.pages.page import render
+from rovgraph.pages.parts import Panel, Section, line
+from rovgraph.pages.reporting import page_of
+from rovgraph.pages.sensors import autocorrelation
+from rovgraph.pages.source import Track
+from rovgraph.pages.thinning import extremes
+from rovgraph.pages.uncertainty import falls, separation
+
+NASTY = "</script><script>alert(1)</script> \"quotes' & <b>δύτης 潜水</b>"
+LIMIT = 6_000_000  # bytes of a page
+SECTIONS = [
+    "verdict",
+    "track",
+    "uncertainty",
+    "separation",
+    "dvl",
+    "residuals",
+    "compasses",
+    "clocks",
+    "calibration",
+    "about",
+]
+
+
+@pytest.fixture(scope="session")
+def dive():
+    """A short dive with faults: without bottom lock for a while, wrong pings, places seen twice."""
+    choices = rg.Choices(duration=90, dropouts=((30.0, 50.0),), outliers=0.02)
+    simulated = rg.simulate("lawnmower", seed=4, choices=choices)
+    return rg.smooth(simulated.log, simulated.config)
+
+
+@pytest.fixture(scope="session")
+def folder(dive, tmp_path_factory):
+    """Its results folder; not to be changed."""
+    out = tmp_path_factory.mktemp("dive") / "results"
+    dive.save(out, figures=False)
+    return out
+
+
+@pytest.fixture
+def own(folder, tmp_path):
+    """A copy that a test may spoil."""
+    return shutil.copytree(folder, tmp_path / "results")
+
+
+def summary_with(path, **entries):
+    file = path / "summary.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **entries}))
+
+
+def test_smooth_and_report_make_the_same_page(own):
+    made = (own / "report.html").read_text()
+    assert report(own) == own / "report.html"
+    assert (own / "report.html").read_text() == made
+
+
+def test_the_page_has_its_sections_in_order_and_is_small(folder):
+    html = (folder / "report.html").read_text()
+    assert re.findall(r'<section id="(\w+)"', html) == SECTIONS
+    assert len(html.encode()) < LIMIT
+
+
+def test_the_page_loads_nothing(folder):
+    html = (folder / "report.html").read_text()
+    assert "default-src 'none'" in html
+    own = html.replace(re.search(r"<script>/\*\*\n\* plotly.*?</script>", html, re.DOTALL)[0], "")
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", own)
+
+
+def test_figures_and_page_can_each_be_left_out(dive, tmp_path):
+    dive.save(tmp_path / "bare", figures=False, page=False)
+    assert not (tmp_path / "bare" / "report.html").exists()
+    assert not list((tmp_path / "bare").glob("*.png"))
+
+
+def test_what_did_not_count_is_written_with_its_reason(folder):
+    table = pd.read_csv(folder / "left_out.csv")
+    assert "no bottom lock" in set(table["reason"])
+    silent = table[table["reason"] == "no bottom lock"]["time"] - pd.read_csv(folder / "dvl.csv")["time"].iloc[0]
+    assert silent.between(29.0, 51.0).all()
+    residuals = pd.read_csv(folder / "residuals.csv")
+    rejected = residuals[residuals["weight"] <= 0].drop_duplicates(["sensor", "time", "row"])
+    assert (table["reason"] == "beyond its gate").sum() == len(rejected)
+
+
+def test_text_of_any_kind_is_shown_and_not_run(own):
+    config = (own / "config.yaml").read_text()
+    (own / "config.yaml").write_text(config + f"\n# {NASTY}\n")
+    summary_with(
+        own, name=NASTY, log=NASTY, assumptions=[NASTY], warnings=[NASTY], verdict=NASTY, versions={NASTY: NASTY}
+    )
+    residuals = pd.read_csv(own / "residuals.csv")
+    residuals["sensor"] = residuals["sensor"].replace({"dvl": NASTY})
+    residuals.to_csv(own / "residuals.csv", index=False)
+    (own / "näme <i>.csv").write_text("x")
+    html = page_of(own)
+    assert "alert(1)</script>" not in html
+    assert "<b>δύτης" not in html
+    assert "<i>.csv" not in html
+    assert "δύτης 潜水" in html
+    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)[1]
+    assert any("δύτης" in panel["title"] for panel in json.loads(data)["panels"].values())
+
+
+MISSING = {
+    "trajectory_filtered.csv": "The folder has no filtered track",
+    "trajectory_dead_reckoning.csv": "The folder has no dead reckoning track",
+    "residuals.csv": "residuals.csv is missing, so fixes cannot be shown",
+    "history.csv": "the folder has no history.csv",
+    "calibration.csv": "calibration.csv is missing",
+    "dvl.csv": "the folder has no dvl.csv",
+    "left_out.csv": "the folder has no left_out.csv",
+    "config.yaml": "config.yaml is missing",
+}
+
+
+@pytest.mark.parametrize(("name", "said"), MISSING.items())
+def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
+    assert said not in page_of(own)
+    (own / name).unlink()
+    html = page_of(own)
+    assert re.findall(r'<section id="(\w+)"', html) == SECTIONS
+    assert said in html
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda f: [p.unlink() for p in f.glob("trajectory_*.csv")], "no trajectory_smoothed.csv"),
+        (lambda f: (f / "summary.json").unlink(), "has no summary.json"),
+        (lambda f: (f / "summary.json").write_text("{"), "cannot be read"),
+        (lambda f: (f / "summary.json").write_text("[1]"), "no summary of rovgraph"),
+        (lambda f: (f / "summary.json").write_text('{"program": "rovgraph"}'), "no results that have a page"),
+        (lambda f: (f / "residuals.csv").write_text(""), "is empty"),
+        (lambda f: (f / "residuals.csv").write_text("time,sensor\n1,dvl\n"), "column component is missing"),
+        (lambda f: (f / "trajectory_smoothed.csv").write_text("time,north,east\n"), "no rows with a time"),
+        (shutil.rmtree, "no such folder"),
+    ],
+)
+def test_what_is_no_results_folder_is_refused_in_a_line_and_an_old_page_stays(own, spoil, said):
+    spoil(own)
+    before = (own / "report.html").read_text() if own.exists() else None
+    with pytest.raises(rg.InputError, match=said) as refusal:
+        report(own)
+    assert "\n" not in str(refusal.value)
+    assert not own.exists() or (own / "report.html").read_text() == before
+
+
+def test_results_of_another_version_are_shown_with_a_note(own):
+    summary = json.loads((own / "summary.json").read_text())
+    kept = {k: summary[k] for k in ("program", "verdict", "main_estimate")}
+    (own / "summary.json").write_text(json.dumps({**kept, "version": "0.0.1"}))
+    html = page_of(own)
+    assert "written by rovgraph 0.0.1" in html
+    assert "unknown" in html
+
+
+def test_a_dive_of_two_keyframes_without_any_sd_has_a_page(own):
+    for path in own.glob("trajectory_*.csv"):
+        table = pd.read_csv(path).head(2)
+        table[[c for c in table if c.endswith("_sd") or c.startswith("cov")]] = np.nan
+        table.to_csv(path, index=False)
+    for name in ("residuals.csv", "history.csv", "dvl.csv", "left_out.csv"):
+        pd.read_csv(own / name).head(2).to_csv(own / name, index=False)
+    html = page_of(own)
+    assert "How far it may be off is not known" in html
+    assert "no estimate of the folder states a standard deviation" in html
+    assert "NaN" not in re.search(r'id="data">(.*?)</script>', html, re.DOTALL)[1]
+
+
+def test_dives_side_by_side_show_each_and_name_what_is_no_dive(folder, tmp_path):
+    second = shutil.copytree(folder, tmp_path / NASTY.replace("/", "∕"))
+    out = report(folder, second, out=tmp_path / "campaign.html")
+    html = out.read_text()
+    assert "2 dives side by side" in html
+    assert "<b>δύτης" not in html
+    with pytest.raises(rg.InputError, match=r"campaign\.html exists"):
+        report(folder, second, out=out)
+    (second / "summary.json").write_text('{"program": "rovgraph", "study": "x"}')
+    with pytest.raises(rg.InputError, match="only dives are set side by side"):
+        report(folder, second, out=out, force=True)
+    assert out.read_text() == html
+
+
+def test_dives_about_known_origins_stand_where_they_were(own, tmp_path):
+    first = shutil.copytree(own, tmp_path / "first")
+    summary_with(first, origin={"lat_deg": 58.0, "lon_deg": 14.0})
+    summary_with(own, origin={"lat_deg": 58.001, "lon_deg": 14.0})
+    html = report(first, own, out=tmp_path / "both.html").read_text()
+    traces = json.loads(re.search(r'id="data">(.*?)</script>', html, re.DOTALL)[1])["panels"]["map-0"]["traces"]
+    north = [np.frombuffer(base64.b64decode(t["y"]), "<f4") for t in traces if t["mode"] == "lines"]
+    assert np.median(north[1] - north[0]) == pytest.approx(111.4, abs=0.5)
+
+
+def test_thinning_keeps_extremes_ends_and_gaps():
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=100_000)
+    values[12_345], values[77_777], values[50_000:50_400] = 40.0, -40.0, np.nan
+    some = extremes(values)
+    assert len(some) < 4500
+    assert {0, 12_345, 77_777, 99_999} <= set(some.tolist())
+    assert np.isnan(values[some]).any()
+    assert (np.diff(some) > 0).all()
+
+
+def test_separation_of_two_estimates_that_share_their_data_has_unit_variance():
+    """Of a random walk with measurements: its Kalman filter against its smoother, many times."""
+    rng = np.random.default_rng(2)
+    n, q, r, runs = 400, 0.1, 1.0, 20
+    seen = []
+    for _ in range(runs):
+        x = np.cumsum(rng.normal(0, np.sqrt(q), n))
+        z = x + rng.normal(0, np.sqrt(r), n)
+        mean, P, means, Ps = 0.0, 10.0, [], []
+        for value in z:
+            P += q
+            gain = P / (P + r)
+            mean, P = mean + gain * (value - mean), (1 - gain) * P
+            means.append(mean)
+            Ps.append(P)
+        later, V = [means[-1]], [Ps[-1]]
+        for k in range(n - 2, -1, -1):
+            G = Ps[k] / (Ps[k] + q)
+            later.insert(0, means[k] + G * (later[0] - means[k]))
+            V.insert(0, Ps[k] + G**2 * (V[0] - Ps[k] - q))
+        time = np.arange(n, dtype=float)
+        tracks = [
+            Track(kind, {"time": time, "down": np.array(m), "down_sd": np.sqrt(v)})
+            for kind, m, v in (("filtered", means, Ps), ("smoothed", later, V))
+        ]
+        seen.append(separation(*tracks, "down")[1])
+    assert np.nanmean(np.square(seen)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_fall_of_the_sd_is_found_once_and_slow_ones_are_not():
+    time = np.arange(0.0, 600.0)
+    assert falls(time, np.where(time < 300, 2.0, 1.0)) == [299]
+    assert falls(time, 2.0 - time / 1000) == []
+
+
+def test_autocorrelation_is_that_of_an_autoregression():
+    rng = np.random.default_rng(3)
+    z = np.zeros(20_000)
+    for k in range(1, len(z)):
+        z[k] = 0.8 * z[k - 1] + rng.normal()
+    assert autocorrelation(z, 3) == pytest.approx([0.8, 0.64, 0.512], abs=0.03)
+    assert autocorrelation(np.ones(5), 10).tolist() == [0.0] * 4
+
+
+def test_a_page_of_anything_escapes_its_title():
+    html = render(
+        NASTY, [Section("a", NASTY, [NASTY], [Panel(NASTY, "x", "y", [line(NASTY, [0], [1], "#000")], kind="xy")])]
+    )
+    assert "<script>alert" not in html
+
+
+def test_what_check_finds_is_a_page_and_an_older_one_stays(dive, tmp_path):
+    out = rg.report_check(rg.check(dive.log, dive.config), tmp_path / "check.html")
+    html = out.read_text()
+    assert "bottom lock" in html
+    assert html.count("<table>") == 2
+    with pytest.raises(rg.InputError, match="exists; choose another --page"):
+        rg.report_check(rg.check(dive.log, dive.config), out)
+
+
+def test_noise_of_a_log_at_rest_is_a_page_and_one_that_is_incomplete_says_so(tmp_path):
+    channel = {"unit": "m/s2", "rate_hz": 50.0, "sd": 0.02, "sd_without_lines": 0.02, "density": 0.003}
+    summary = {"program": "rovgraph", "calibration": "noise", "channels": {"acc_x": channel}, "remarks": [NASTY]}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    table = pd.DataFrame({"channel": "acc_x", "tau_s": [0.02, 0.2, 2.0], "deviation": [0.02, 0.006, 0.002]})
+    table.to_csv(tmp_path / "allan.csv", index=False)
+    html = page_of(tmp_path)
+    assert "acc: Allan deviation" in html
+    assert "spectra.csv is missing" in html
+    assert "alert(1)</script>" not in html
+    (tmp_path / "summary.json").write_text(json.dumps({"program": "rovgraph", "ranking": [{}]}))
+    with pytest.raises(rg.InputError, match="incomplete or of another version"):
+        page_of(tmp_path)
