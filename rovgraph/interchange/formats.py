@@ -30,6 +30,7 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "rosbag",
     "nmea",
     "gpx",
+    "xsens",
 )
 GROUP = "rovgraph.formats"
 
