@@ -507,6 +507,15 @@ def test_without_a_covariance_the_figure_of_merit_is_the_sd(changes, sd, heard):
     np.testing.assert_equal(message.readings[0].values[4], sd)
 
 
+def test_a_velocity_relative_to_the_water_is_no_bottom_track(heard):
+    water = {"type": "velocity_water", "format": "json_v3.2", "tracking_mode": "water", "altitude": 3.0}
+    _, reading = only(decoded(waterlinked("w", heard), report(**water)))
+    assert reading.sensor == "dvl_water"
+    np.testing.assert_allclose(reading.values, [0.5, -0.1, 0.02])
+    assert decoded(waterlinked("w", heard), report(**water, velocity_valid=False)) == []
+    assert not heard.kinds
+
+
 def test_a_report_without_bottom_lock_is_a_lost_ping_whatever_else_it_says(heard):
     data = report(velocity_valid=False, vx=0, vy=0, vz=0, altitude=-1, fom=2.7, status=1)
     _, reading = only(decoded(waterlinked("w", heard), data))
@@ -521,6 +530,7 @@ def test_a_report_without_bottom_lock_is_a_lost_ping_whatever_else_it_says(heard
         (b'{"response_to": "get_config", "success": true, "type": "response", "format": "json_v3"}\n', {}),
         (b'{"type": "telegram", "format": "json_v3"}\n', {"unknown report": 1}),
         (report(format="json_v9"), {"unknown format": 1}),
+        (report(format="json_v2"), {"unknown format": 1}),
         (report(velocity_valid="true"), {"malformed": 1}),
         (report(vx=...), {"null": 1}),
         (report(vy="fast"), {"string": 1}),

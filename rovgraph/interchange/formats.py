@@ -21,7 +21,17 @@ from rovgraph.interchange.recording import Recording
 
 HEAD = 65536  # bytes of a file that a format is recognised by
 LIKELY = 0.5  # confidence from which a file is taken to be of a format
-OWN: tuple[str, ...] = ("own_log", "dataflash", "tlog", "blueos")  # modules of this package, each with a `FORMAT`
+OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
+    "own_log",
+    "dataflash",
+    "tlog",
+    "blueos",
+    "waterlinked",
+    "rosbag",
+    "nmea",
+    "gpx",
+    "xsens",
+)
 GROUP = "rovgraph.formats"
 
 

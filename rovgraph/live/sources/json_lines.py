@@ -8,10 +8,12 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.geometry import Array
+from rovgraph.interchange.lines import Refused, json_number, json_object, shown
+from rovgraph.interchange.waterlinked_reports import is_report
 from rovgraph.live.message import GEODETIC, Message, readings
-from rovgraph.live.sources.lines import LineDecoder, Refused, json_number, json_object, shown
+from rovgraph.live.sources.lines import LineDecoder
 from rovgraph.live.sources.source import Notify
-from rovgraph.live.sources.waterlinked import is_report, report_message
+from rovgraph.live.sources.waterlinked import report_message
 from rovgraph.log.reading import ACC_GAP
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, THRUSTER, is_column, label_number
 from rovgraph.log.units import factors, near_miss

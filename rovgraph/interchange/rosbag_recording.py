@@ -1,0 +1,263 @@
+"""From what a bag's topics say to a recording: which topic feeds a sensor, by which clock, in which axes."""
+
+from array import array
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, rpy_from_matrix
+from rovgraph.interchange.alternatives import preferred_first
+from rovgraph.interchange.fixes import ONE_POINT, new_fixes, one_point
+from rovgraph.interchange.formats import Options
+from rovgraph.interchange.pressure import depth, surface_pressure
+from rovgraph.interchange.rates import too_slow
+from rovgraph.interchange.receiver import receiver_clock
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.rosbag_frames import FRD_OF_FLU, Frames, Mounting
+from rovgraph.interchange.rosbag_messages import COLUMNS, DOWN, GENERAL
+
+HEADERS, RECORDER = "headers of messages", "recorder"
+SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
+APART_S = 1.0  # between stamp and arrival; more is another clock
+BACK_S = 1.0  # by which stamps go back where their clock was set
+LATENCY_SD_S = 0.05
+SEA = 1025.0  # density of water [kg/m3]
+NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass
+class Topic:
+    """What a topic said.
+
+    Attributes
+    ----------
+    name, type : of the topic
+    frame : that its messages name
+    rows : sensor -> stamp [s], arrival [s] and `COLUMNS`, row after row
+    latencies : messages whose stamp is of arrival, less the time that they say they took
+    """
+
+    name: str
+    type: str
+    frame: str = ""
+    rows: "dict[str, array[float]]" = field(default_factory=dict)
+    latencies: int = 0
+
+    def table(self, sensor: str) -> Array:
+        """Rows of a sensor, shape (n, 2 + columns)."""
+        return np.frombuffer(self.rows[sensor]).reshape(-1, 2 + len(COLUMNS[sensor]))
+
+
+def recording(
+    path: Path, format_: str, topics: Mapping[str, Topic], frames: Frames, left: list[Left], options: Options
+) -> Recording:
+    """A recording of all topics.
+
+    Raises
+    ------
+    InputError : no measurement of a sensor
+    """
+    made = _Made(path, frames, left, options)
+    channels = tuple(c for sensor in COLUMNS for c in made.of(sensor, topics) if len(c.columns["time"]))
+    if not channels:
+        found = ", ".join(f"{each.name}: {each.count}" for each in left) or "none"
+        raise InputError(f"{path}: holds no measurement of a sensor; topics: {found}")
+    made.look(channels, topics)
+    used = {c.clock for c in channels} | {c.receiver for c in channels}
+    clocks = {name: clock for name, clock in made.clocks.items() if name in used}
+    notes, warnings = tuple(dict.fromkeys(made.notes)), tuple(dict.fromkeys(made.warnings))
+    return Recording(str(path), format_, channels, clocks, tuple(made.left), made.settings, notes, warnings)
+
+
+class _Made:
+    """Channels, and what is said of them."""
+
+    def __init__(self, path: Path, frames: Frames, left: list[Left], options: Options) -> None:
+        self.left = left
+        self.settings: dict[str, Any] = {}
+        self.notes: list[str] = []
+        self.warnings: list[str] = []
+        self.clocks = {name: Clock(name, 0.0, 0.0, "its stamps are Unix time") for name in (HEADERS, RECORDER)}
+        self._path, self._frames, self._choose = path, frames, options.choose
+        self._mountings: dict[str, Mounting | None] = {}  # of the preferred topic of a sensor
+
+    def of(self, sensor: str, topics: Mapping[str, Topic]) -> Iterator[Channel]:
+        """All topics that tell of a sensor, the preferred one first."""
+        chosen = self._choose.get(sensor, "")
+        telling = {}
+        for topic in topics.values():
+            if sensor not in topic.rows:
+                continue
+            if topic.type in GENERAL and "dvl" not in topic.name.casefold() and topic.name != chosen:
+                reason = "a velocity, by its name not of a DVL; choose dvl=TOPIC if it is"
+                self.left.append(Left(f"{topic.name} ({topic.type})", len(topic.table(sensor)), reason))
+            else:
+                telling[topic.name] = topic
+        order = sorted(telling, key=lambda n: (_rank(telling[n]), -len(telling[n].rows[sensor])))
+        for place, name in enumerate(preferred_first(self._path, sensor, order, self._choose)):
+            said = len(self.notes), len(self.warnings)
+            channel = self._channel(sensor, telling[name], place == 0)
+            if place:  # nothing is said of what may not be used
+                del self.notes[said[0] :], self.warnings[said[1] :]
+            yield channel
+
+    def _channel(self, sensor: str, topic: Topic, first: bool) -> Channel:
+        table = topic.table(sensor)
+        keep, time, clock = self._times(topic, table)
+        received, values = table[keep, 1], table[keep, 2:]
+        frame = f"{topic.frame or 'no frame'} of the messages" if sensor not in ("depth", "fix", "dvl_altitude") else ""
+        if sensor == "fix":
+            new = self._new_fixes(topic, time, values)
+            time, received, values = time[new], received[new], values[new]
+        columns = {"time": time, **self._columns(sensor, topic, values)}
+        if first:
+            self._mountings[sensor] = self._frames.mounting(topic.frame)
+        source = f"{topic.name} ({topic.type})"
+        return Channel(sensor, columns, source, frame, clock, received, RECORDER)
+
+    def _columns(self, sensor: str, topic: Topic, values: Array) -> dict[str, Array]:
+        if sensor == "depth":
+            return {"depth": self._depth(topic, values[:, 0])}
+        if sensor == "ahrs":
+            return self._attitude(topic, values)
+        return dict(zip(COLUMNS[sensor], values.T, strict=True))
+
+    def _times(self, topic: Topic, table: Array) -> tuple[NDArray[np.bool_], Array, str]:
+        """Which rows can be used, their stamps [s], and the clock of these."""
+        stamp, received = table[:, 0].copy(), table[:, 1]
+        keep = np.ones(len(table), bool)
+        if topic.latencies:
+            self.notes.append(f"{topic.name}: stamped by arrival, less the time that each report says it took")
+        empty = stamp == 0.0
+        if empty.mean() > 0.5:
+            self.warnings.append(f"{topic.name}: no stamps in the headers; those of arrival are taken, which are late")
+            return keep, received, RECORDER
+        if empty.any():
+            self.left.append(Left(f"{topic.name} ({topic.type})", int(empty.sum()), "no stamp in the header"))
+            keep &= ~empty
+        self._unjump(topic, stamp, received, keep)
+        apart = float(np.median((received - stamp)[keep]))
+        if abs(apart) <= APART_S:
+            return keep, stamp[keep], HEADERS
+        name = f"{HEADERS} of {topic.name}"
+        offset = float((received - stamp)[keep].min())
+        self.clocks[name] = Clock(name, offset, LATENCY_SD_S, "least of (received - stamp) by the recorder")
+        self.warnings.append(f"{topic.name}: headers are {apart:+.1f} s apart from the recorder's clock, so of another")
+        return keep, stamp[keep], name
+
+    def _unjump(self, topic: Topic, stamp: Array, received: Array, keep: NDArray[np.bool_]) -> None:
+        """Put stamps of a clock that went back on its last setting, as the recorder's clock tells."""
+        rows = np.flatnonzero(keep)
+        unset = stamp[rows] < SET
+        if not ((np.diff(stamp[rows]) < -BACK_S).any() or (unset.any() and not unset.all())):
+            return
+        clock = receiver_clock(np.arange(len(rows)), stamp[rows], received[rows])
+        stamp[rows] = clock.corrected(np.arange(len(rows)), stamp[rows])
+        steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "what too few messages tell"
+        self.warnings.append(
+            f"{topic.name}: the clock of its headers was set by {steps}; what came before is put on it"
+        )
+        apart = received[rows] - stamp[rows]
+        other = np.abs(apart - np.median(apart)) > APART_S  # too few to tell how their clock was set
+        if other.any():
+            self.left.append(Left(f"{topic.name} ({topic.type})", int(other.sum()), "stamps of another clock"))
+            keep[rows[other]] = False
+
+    def _new_fixes(self, topic: Topic, time: Array, values: Array) -> NDArray[np.bool_]:
+        lat, lon = values[:, 0], values[:, 1]
+        name = f"{topic.name} ({topic.type})"
+        if (point := one_point(lat, lon)) is not None:
+            self.warnings.append(f"{topic.name}: {ONE_POINT}")
+            self.settings["environment"] = {"origin_lat_deg": point[0], "origin_lon_deg": point[1]}
+            self.left.append(Left(name, len(values), "one point that repeats"))
+            return np.zeros(len(values), bool)
+        new = new_fixes(time, lat, lon)
+        if not new.all():
+            self.left.append(Left(name, int((~new).sum()), "nowhere on Earth, or the one before repeated"))
+        return new
+
+    def _depth(self, topic: Topic, pressure: Array) -> Array:
+        typical = float(np.nanmedian(pressure))
+        for factor, unit, high in ((1e3, "kPa", 850.0), (1e2, "hPa", 50_000.0)):
+            if 90.0 < typical < high:
+                self.warnings.append(f"{topic.name}: pressures of {typical:.0f} are taken for {unit}, not Pa")
+                pressure = factor * pressure
+                break
+        surface, said, _ = surface_pressure(None, pressure)
+        at = f"{surface / 100.0:.0f} hPa at the surface ({said})"
+        self.warnings.append(f"{topic.name}: depth against {at}, in water of {SEA:.0f} kg/m3")
+        return depth(pressure, surface, SEA)
+
+    def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
+        """The IMU's axes relative to NED; gravity tells whether the messages' world has z up or down."""
+        from scipy.spatial.transform import Rotation
+
+        whole = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < 0.01
+        R_ws = Rotation.from_quat(np.where(whole[:, None], xyzw, [0.0, 0.0, 0.0, 1.0])).as_matrix()
+        acc = np.nanmedian(topic.table("imu")[:, 2:5], axis=0)
+        up = float(np.median(R_ws[:, 2, :] @ acc))
+        if up < 0.0:
+            self.notes.append(f"{topic.name}: gravity says that its orientation is relative to NED, not to ENU")
+        angles = rpy_from_matrix(R_ws if up < 0.0 else NED_OF_ENU @ R_ws)
+        self.notes.append(f"{topic.name}: its yaw is taken relative to magnetic north")
+        return {
+            f"ahrs_{name}": np.where(whole, angles[:, k], np.nan) for k, name in enumerate(("roll", "pitch", "yaw"))
+        }
+
+    def look(self, channels: tuple[Channel, ...], topics: Mapping[str, Topic]) -> None:
+        """State mountings, and warn of what is missing or contradicts."""
+        first = {channel.sensor: channel for channel in reversed(channels)}
+        at = {sensor: topics[channel.source.partition(" (")[0]] for sensor, channel in first.items()}
+        names = ", ".join(each.name for each in self.left) or "none"
+        if "imu" in first:
+            columns = first["imu"].columns
+            self.settings["imu"] = self._imu_mounting(at["imu"], columns)
+            self.warnings += too_slow(columns["time"], at["imu"].name, "record the IMU at 50 Hz or more")
+        else:
+            self.warnings.append(f"no IMU (sensor_msgs/Imu) in the bag; other topics: {names}")
+        dvl = next((sensor for sensor in ("dvl", "dvl_water") if sensor in first), None)
+        if dvl is None:
+            self.warnings.append(f"no DVL in the bag; other topics: {names}")
+        else:
+            self.settings["dvl"] = self._dvl_mounting(at[dvl], self._mountings[dvl])
+        if (mounting := self._mountings.get("depth")) is not None:
+            self.settings["depth"] = {"lever_arm_m": mounting.settings()["lever_arm_m"]}
+        if "mag" in first and "imu" in first and at["mag"].frame != at["imu"].frame:
+            frames = f"{at['mag'].name} has the frame {at['mag'].frame!r}, the IMU {at['imu'].frame!r}"
+            self.warnings.append(
+                f"{frames}: a log has the field along the IMU's axes; use it only if theirs are parallel"
+            )
+
+    def _imu_mounting(self, topic: Topic, columns: Mapping[str, Array]) -> dict[str, Any]:
+        acc = np.array([np.nanmean(columns[name]) if np.isfinite(columns[name]).any() else np.nan for name in
+                        ("acc_x", "acc_y", "acc_z")])  # fmt: skip
+        mounting = self._mountings["imu"]
+        if mounting is None:
+            upwards = bool(acc[2] > 0.0)
+            mounting = Mounting(FRD_OF_FLU if upwards else np.eye(3))
+            axes = "x forward, y left, z up" if upwards else "x forward, y right, z down"
+            self._unmounted(topic, f"{axes}, as gravity has it")
+        elif (mounting.R_bs @ acc)[2] > 0.0:
+            self.warnings.append(f"{topic.name}: gravity is upside down with the mounting of /tf_static; check both")
+        return mounting.settings()
+
+    def _dvl_mounting(self, topic: Topic, mounting: Mounting | None) -> dict[str, Any]:
+        if mounting is None:
+            down = topic.type.startswith(DOWN)
+            mounting = Mounting(np.eye(3) if down else FRD_OF_FLU)
+            self._unmounted(topic, "x forward, y right, z down" if down else "x forward, y left, z up")
+        return mounting.settings()
+
+    def _unmounted(self, topic: Topic, axes: str) -> None:
+        way = f"/tf_static does not lead from {topic.frame!r} to base_link"
+        self.warnings.append(f"{topic.name}: {way}; its axes are taken as {axes}: check the mounting")
+
+
+def _rank(topic: Topic) -> int:
+    """Messages of a DVL before velocities of anything, and these before an odometry, which may be an estimate."""
+    return 1 + GENERAL.index(topic.type) if topic.type in GENERAL else 0

@@ -1,0 +1,280 @@
+"""Files of Water Linked's DVLs: JSON lines as their TCP port sends them, or the same reports as rows of a CSV.
+
+The CSV is that of the maker's own script, https://github.com/waterlinked/dvl-python, whose ``log_time`` is of arrival,
+in microseconds of the recorder's Unix time.
+"""
+
+import csv
+import json
+import math
+from array import array
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array
+from rovgraph.interchange.formats import Options
+from rovgraph.interchange.lines import Refused, json_number, json_object
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.waterlinked_reports import Report, is_report, velocity_report
+
+DVL, RECORDER, ELAPSED = "DVL", "recorder", "DVL's time between reports"
+SET = 1e9  # [s] since 1970: a clock that shows less has never been set
+SET_SD_S = 0.05  # how well a network sets a clock, a choice
+RESET_S = 1.0  # a clock that goes back further was set, or started anew
+LONGEST = 1 << 16  # bytes of a line
+FRAME = "the DVL's: x forward, y starboard, z down, turned by its own mounting_rotation_offset"
+_CSV = {"vx", "vy", "vz", "velocity_valid"}
+_NUMBERS = (
+    "vx",
+    "vy",
+    "vz",
+    "fom",
+    "altitude",
+    "time",
+    "time_of_validity",
+    "time_of_transmission",
+    "log_time",
+    "status",
+)
+_BEAM = ("id", "velocity", "distance", "rssi", "nsd", "beam_valid")
+_POSITION = ("ts", "x", "y", "z", "std", "roll", "pitch", "yaw")
+
+
+class WaterLinked:
+    """The format; see `rovgraph.interchange.formats.Format`."""
+
+    name = "waterlinked"
+    title = "Water Linked DVL log (JSON lines or CSV)"
+    extra = ""
+
+    def recognise(self, path: Path, head: bytes) -> float:
+        if set(_header(head)) >= _CSV:
+            return 0.9
+        for line in head.split(b"\n")[:5]:  # the first may be cut off at its beginning
+            try:
+                if is_report(json_object(line)):
+                    return 0.95
+            except Refused:
+                continue
+        return 0.0
+
+    def read(self, path: Path, options: Options) -> Recording:
+        reports = _Reports()
+        with path.open("rb") as file:
+            rows = _csv_rows if set(_header(file.readline(LONGEST))) >= _CSV else _json_rows
+            file.seek(0)
+            size = path.stat().st_size
+            for row in rows(file, reports.left):
+                options.progress(min(file.tell(), size), size)
+                reports.take(row)
+        return reports.recording(path, self.name)
+
+
+FORMAT = WaterLinked()
+
+
+def _header(head: bytes) -> list[str]:
+    line = head.partition(b"\n")[0].decode("utf-8-sig", "replace")
+    return [name.strip() for name in line.split(",")]
+
+
+def _json_rows(file: Any, left: Counter[tuple[str, str]]) -> Iterator[dict[str, Any]]:
+    while line := file.readline(LONGEST):
+        try:
+            if line.strip():
+                yield json_object(line.strip())
+        except Refused as refused:
+            left["lines", refused.kind] += 1
+
+
+def _csv_rows(file: Any, left: Counter[tuple[str, str]]) -> Iterator[dict[str, Any]]:
+    """Rows as the reports that they were."""
+    names = _header(file.readline(LONGEST))
+    while line := file.readline(LONGEST):
+        cells = next(csv.reader([line.decode("utf-8", "replace").replace("\0", " ").strip()]), [])
+        if len(cells) != len(names):
+            left["lines", "more or fewer cells than the header"] += bool(cells)
+            continue
+        row: dict[str, Any] = {name: cell.strip() for name, cell in zip(names, cells, strict=True)}
+        try:
+            row |= {name: float(row[name]) if row[name] else None for name in _NUMBERS if name in row}
+            covariance = json.loads(row.get("covariance") or "null")
+        except (ValueError, RecursionError):
+            left["lines", "a cell that is no number"] += 1
+            continue
+        valid = {"true": True, "1": True, "1.0": True, "false": False, "0": False, "0.0": False}
+        row |= {"velocity_valid": valid.get(row["velocity_valid"].lower()), "covariance": covariance}
+        yield {"type": "velocity", "format": "json_v3", **{k: v for k, v in row.items() if v != ""}}
+
+
+class _Reports:
+    """Takes reports one by one."""
+
+    def __init__(self) -> None:
+        self.left: Counter[tuple[str, str]] = Counter()
+        self.notes: list[str] = []
+        self.warnings: list[str] = []
+        self._rows = array("d")  # of `_ROW`
+        self._beams = array("d")  # row, `_BEAM`
+        self._position = array("d")  # `_POSITION`
+        self._faults = self._taken = 0
+
+    def take(self, row: dict[str, Any]) -> None:
+        kind = row.get("type")
+        try:
+            if kind == "response":
+                self._response(row)
+            elif kind == "position_local":
+                self._position.extend(json_number(name, row.get(name)) for name in _POSITION)
+                self.left["position_local", "the DVL's own dead reckoning, kept as a table"] += 1
+            elif (report := velocity_report(row)) is not None:
+                self._take(report, row)
+        except Refused as refused:
+            whole = len(self._position) // len(_POSITION) * len(_POSITION)
+            del self._position[whole:]
+            self.left[str(kind) if kind in ("velocity", "velocity_water") else "others", refused.kind] += 1
+
+    def _take(self, report: Report, row: dict[str, Any]) -> None:
+        log_time, since = (_number(row.get(name)) for name in ("log_time", "time"))
+        velocity = (math.nan,) * 3 if report.velocity is None else report.velocity
+        validity = math.nan if report.validity is None else report.validity
+        altitude = math.nan if report.altitude is None else report.altitude
+        self._rows.extend((validity, 1e-6 * log_time, 1e-3 * since, report.water, *velocity, report.sd, altitude))
+        self._faults += report.fault
+        beams = row.get("transducers")
+        for beam in beams[:8] if isinstance(beams, list) else ():
+            if isinstance(beam, dict):
+                self._beams.extend((self._taken, *(_number(beam.get(name)) for name in _BEAM)))
+        self._taken += 1
+
+    def _response(self, row: dict[str, Any]) -> None:
+        self.left["response", "answers to commands"] += 1
+        result = row.get("result")
+        if isinstance(result, dict):
+            said = [
+                f"{name} {result[name]}" for name in ("speed_of_sound", "mounting_rotation_offset") if name in result
+            ]
+            note = f"the DVL's settings: {', '.join(said)}"
+            if said and note not in self.notes:
+                self.notes.append(note)
+
+    def recording(self, path: Path, format_: str) -> Recording:
+        """All that was taken.
+
+        Raises
+        ------
+        InputError : no velocity, no time
+        """
+        if not self._rows:
+            found = ", ".join(f"{name}: {count} ({why})" for (name, why), count in self.left.items()) or "nothing"
+            raise InputError(f"{path}: holds no velocity report of a Water Linked DVL; found {found}")
+        table = np.frombuffer(self._rows).reshape(-1, 9)
+        keep, time, clock = self._times(path, table)
+        if self._faults:
+            self.warnings.append(f"the DVL reported a fault, such as being too hot, {self._faults} times")
+        table, arrived = table[keep], np.isfinite(table[keep, 1]).all()
+        clocks = {clock.name: clock}
+        if arrived:
+            clocks[RECORDER] = Clock(RECORDER, 0.0, 0.0, "its stamps are Unix time")
+        channels = tuple(self._channels(table, time, clock.name, arrived))
+        left = tuple(Left(name, count, why) for (name, why), count in sorted(self.left.items()) if count)
+        notes, warnings = tuple(self.notes), tuple(self.warnings)
+        return Recording(str(path), format_, channels, clocks, left, {}, notes, warnings, self._tables(keep, time))
+
+    def _times(self, path: Path, table: Array) -> tuple[Array, Array, Clock]:
+        """Which reports can be used, when they were valid [s], and by which clock."""
+        validity, log_time, since = table[:, :3].T
+        stamped = np.isfinite(validity)
+        if stamped.mean() > 0.5:
+            if not stamped.all():
+                self.left["velocity", "no time_of_validity"] += int((~stamped).sum())
+            return self._by_dvl(stamped, validity, since)
+        if np.isfinite(log_time).all():
+            self.warnings.append("no time_of_validity: stamps are of arrival, 50 to 150 ms late; state delay_s.dvl")
+            return np.ones(len(table), bool), log_time, Clock(RECORDER, 0.0, 0.0, "its stamps are Unix time")
+        if np.isfinite(since).all():
+            self.warnings.append(
+                "no time_of_validity: times are sums of the milliseconds since the last report; where reports are "
+                "missing from the file, all later ones are too early"
+            )
+            return np.ones(len(table), bool), np.cumsum(since) - since[0], Clock(ELAPSED)
+        raise InputError(f"{path}: has reports without a time; record time_of_validity as the DVL sends it")
+
+    def _by_dvl(self, stamped: Array, validity: Array, since: Array) -> tuple[Array, Array, Clock]:
+        """Stamps of a clock that may have been set meanwhile, or have started anew."""
+        index = np.flatnonzero(stamped)
+        time = validity[index].copy()
+        set_at = np.flatnonzero((time[:-1] < SET) & (time[1:] >= SET)) + 1
+        for at in set_at.tolist():  # the report itself says how long it came after the last one
+            step = since[index[at]]
+            if np.isfinite(step) and 0.0 <= step < 60.0:
+                shift = time[at] - step - time[at - 1]
+                begin = max([0, *(np.flatnonzero(np.diff(time[:at]) < -RESET_S) + 1).tolist()])
+                time[begin:at] += shift
+                self.warnings.append(
+                    f"the DVL's clock was set by {shift:+.1f} s meanwhile; what came before is put on it"
+                )
+        new = (np.diff(time) < -RESET_S) | ((time[:-1] < SET) & (time[1:] >= SET))
+        bounds = np.concatenate([[0], np.flatnonzero(new) + 1, [len(time)]])
+        if len(bounds) > 2:
+            longest = int(np.argmax(np.diff(bounds)))
+            keep = slice(bounds[longest], bounds[longest + 1])
+            lost = len(time) - len(time[keep])
+            self.left["velocity", "of another run of the DVL's clock"] += lost
+            self.warnings.append(f"the DVL's clock jumped {len(bounds) - 2} times; the longest run is read")
+            index, time = index[keep], time[keep]
+        known = len(time) > 0 and bool(time[0] >= SET)
+        if not known:
+            self.notes.append("the DVL's clock was not set: its stamps count from its start")
+        clock = Clock(DVL, 0.0, SET_SD_S, "its stamps are Unix time") if known else Clock(DVL)
+        mask = np.zeros(len(stamped), bool)
+        mask[index] = True
+        return mask, time, clock
+
+    def _channels(self, table: Array, time: Array, clock: str, arrived: bool) -> Iterator[Channel]:
+        water = table[:, 3] == 1.0
+
+        def channel(sensor: str, rows: Array, columns: dict[str, int], source: str, frame: str = FRAME) -> Channel:
+            values = {"time": time[rows], **{name: table[rows, k] for name, k in columns.items()}}
+            if sensor == "dvl":
+                values["dvl_valid"] = np.isfinite(values["dvl_vx"]).astype(float)
+            received = table[rows, 1] if arrived else None
+            return Channel(sensor, values, source, frame, clock, received, RECORDER if arrived else "")
+
+        if (~water).any():
+            columns = {"dvl_vx": 4, "dvl_vy": 5, "dvl_vz": 6, "dvl_sd": 7}
+            yield channel("dvl", ~water, columns, "velocity: vx, vy, vz, covariance or fom")
+        if (valid := water & np.isfinite(table[:, 4])).any():
+            columns = {"dvl_water_vx": 4, "dvl_water_vy": 5, "dvl_water_vz": 6}
+            yield channel("dvl_water", valid, columns, "velocity_water: vx, vy, vz")
+        if (high := np.isfinite(table[:, 8])).any():
+            yield channel("dvl_altitude", high, {"dvl_altitude": 8}, "velocity: altitude", "")
+
+    def _tables(self, keep: Array, time: Array) -> dict[str, dict[str, Array]]:
+        found = {}
+        beams = np.frombuffer(self._beams).reshape(-1, 1 + len(_BEAM))
+        beams = beams[keep[beams[:, 0].astype(int)]]
+        if len(beams):
+            place = np.cumsum(keep) - 1
+            found["dvl_beams"] = {
+                "time": time[place[beams[:, 0].astype(int)]],
+                **dict(zip(_BEAM, beams[:, 1:].T, strict=True)),
+            }
+        position = np.frombuffer(self._position).reshape(-1, len(_POSITION))
+        if len(position):
+            found["dvl_position"] = dict(zip(("time", *_POSITION[1:5]), position[:, :5].T, strict=True)) | {
+                name: np.deg2rad(position[:, 5 + k]) for k, name in enumerate(_POSITION[5:])
+            }
+        return found
+
+
+def _number(value: object) -> float:
+    """A finite number, else NaN."""
+    if isinstance(value, int | float) and abs(value) < 1e300:
+        return float(value)
+    return math.nan
