@@ -21,7 +21,14 @@ from rovgraph.interchange.recording import Recording
 
 HEAD = 65536  # bytes of a file that a format is recognised by
 LIKELY = 0.5  # confidence from which a file is taken to be of a format
-OWN: tuple[str, ...] = ("dataflash", "tlog", "blueos", "pd0")  # modules of this package, each with a `FORMAT`
+OWN: tuple[str, ...] = (
+    "dataflash",
+    "tlog",
+    "blueos",
+    "pd0",
+    "pd4",
+    "pd6",
+)  # modules of this package, each with a `FORMAT`
 GROUP = "rovgraph.formats"
 
 

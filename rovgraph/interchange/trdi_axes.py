@@ -39,7 +39,7 @@ class Attitude:
 
 
 def forward_starboard_down(values: Array, system: NDArray[np.integer], attitude: Attitude) -> tuple[Array, Array]:
-    """Velocity of the far side against the instrument, along axes forward (Y), starboard (X) and down (-Z).
+    """Velocities along axes forward (Y), starboard (X) and down (-Z) of the instrument, upwards ones turned over.
 
     Parameters
     ----------
