@@ -21,14 +21,8 @@ from rovgraph.interchange.recording import Recording
 
 HEAD = 65536  # bytes of a file that a format is recognised by
 LIKELY = 0.5  # confidence from which a file is taken to be of a format
-OWN: tuple[str, ...] = (
-    "dataflash",
-    "tlog",
-    "blueos",
-    "pd0",
-    "pd4",
-    "pd6",
-)  # modules of this package, each with a `FORMAT`
+# modules of this package, each with a `FORMAT`
+OWN: tuple[str, ...] = ("dataflash", "tlog", "blueos", "pd0", "pd4", "pd6", "ad2cp", "nucleus")
 GROUP = "rovgraph.formats"
 
 

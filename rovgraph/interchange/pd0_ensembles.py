@@ -13,18 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.interchange.binary_records import gathered, layout
+
 SYNC = b"\x7f\x7f"
 FIXED, VARIABLE, BOTTOM, NAVIGATION = 0x0000, 0x0080, 0x0600, 0x2000
-ROWS = 8192  # records gathered at a time
-
-
-def _record(*fields: tuple[str, str, int]) -> np.dtype[np.void]:
-    names, formats, offsets = zip(*fields, strict=True)
-    return np.dtype({"names": names, "formats": formats, "offsets": offsets})
 
 
 LAYOUTS = {
-    FIXED: _record(
+    FIXED: layout(
         ("system", "<u2", 4),
         ("coordinates", "u1", 25),
         ("alignment", "<i2", 26),  # of beam 3 against the bow [0.01 deg]
@@ -32,7 +28,7 @@ LAYOUTS = {
         ("source", "u1", 30),  # which values come from its own sensors
         ("beam_angle", "u1", 58),  # [deg]
     ),
-    VARIABLE: _record(
+    VARIABLE: layout(
         ("date", "7u1", 4),  # year, month, day, hour, minute, second, hundredths
         ("depth", "<u2", 16),  # [dm]
         ("heading", "<u2", 18),  # [0.01 deg]
@@ -40,7 +36,7 @@ LAYOUTS = {
         ("roll", "<i2", 22),
         ("century", "u1", 57),
     ),
-    BOTTOM: _record(
+    BOTTOM: layout(
         ("range", "4<u2", 16),  # of each beam, along the vertical [cm]
         ("velocity", "4<i2", 24),  # of the bottom [mm/s]
         ("correlation", "4u1", 32),
@@ -49,7 +45,7 @@ LAYOUTS = {
         ("water", "4<i2", 50),  # velocity of a layer of water [mm/s]
         ("range_high", "4u1", 77),  # [65536 cm]
     ),
-    NAVIGATION: _record(("lat", "<i4", 16), ("lon", "<i4", 20)),  # of a REMUS [180 deg / 2**31]
+    NAVIGATION: layout(("lat", "<i4", 16), ("lon", "<i4", 20)),  # of a REMUS [180 deg / 2**31]
 }
 LEAST = {FIXED: 42, VARIABLE: 40, BOTTOM: 48, NAVIGATION: 24}  # bytes, as older firmware writes them
 OTHERS = {
@@ -87,18 +83,7 @@ class Ensembles:
 
     def records(self, content: bytes | mmap.mmap, kind: int) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
         """Records of a kind, shape (n,), with zeros where an ensemble has none or a short one, and which have it."""
-        layout = LAYOUTS[kind]
-        raw = np.frombuffer(content, np.uint8)
-        at, length = np.array(self.at[kind], dtype=np.int64), np.array(self.length[kind], dtype=np.int64)
-        out = np.zeros(len(at), dtype=layout)
-        there = (at >= 0) & (length >= LEAST[kind])
-        place = np.arange(layout.itemsize)
-        for first in range(0, len(at), ROWS):
-            rows = slice(first, first + ROWS)
-            inside = there[rows, None] & (place < length[rows, None])
-            index = np.where(inside, at[rows, None] + place, 0)
-            out[rows] = np.where(inside, raw[index], 0).astype(np.uint8).view(layout)[:, 0]
-        return out, there
+        return gathered(content, LAYOUTS[kind], self.at[kind], self.length[kind], LEAST[kind])
 
 
 def find_ensembles(content: bytes | mmap.mmap, progress: Callable[[int], None] = lambda done: None) -> Ensembles:
