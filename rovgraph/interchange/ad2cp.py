@@ -3,7 +3,6 @@
 import mmap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +61,8 @@ class AD2CP:
         with path.open("rb") as file:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         found = find_records(content, AD2CP_FAMILIES, lambda done: options.progress(done, len(content)))
-        channels, tables, notes = [], {}, []
+        channels: list[Channel] = []
+        tables, notes = {}, []
         signature, refused = decoded_signature(content, found)
         tracks = {SIGNATURE: signature} | {k: decoded_dvl(content, found, k) for k in (DVL_BOTTOM, DVL_WATER)}
         for kind, track in tracks.items():
@@ -201,7 +201,7 @@ def _left(found: Records, refused: int) -> Iterator[Left]:
         yield Left("velocity", refused, "coordinates ENU; record beams or XYZ")
 
 
-def _warnings(found: Records, refused: int, channels: list[Any]) -> Iterator[str]:
+def _warnings(found: Records, refused: int, channels: list[Channel]) -> Iterator[str]:
     if found.failed:
         yield f"{found.failed} records are damaged or cut off, and left out"
     if found.skipped:

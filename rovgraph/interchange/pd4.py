@@ -161,4 +161,4 @@ def _time(clock: NDArray[np.uint8]) -> Array:
     known = np.flatnonzero(np.isfinite(time))
     days = np.cumsum(np.diff(time[known], prepend=time[known][:1]) < -0.5 * DAY)
     time[known] += DAY * days
-    return time
+    return np.asarray(time)

@@ -130,7 +130,7 @@ class PD6:
                     lost["a line that is no whole sentence"] += bool(line.strip())
                 elif said and sentences.time is None:
                     lost["before the first time (:TS)"] += 1
-                elif said:
+                elif said and sentences.time is not None:
                     _keep(rows, sentences.time, said)
         channels = tuple(_channel(sensor, SENSORS[sensor], found) for sensor, found in rows.items() if found)
         if not channels:

@@ -104,14 +104,15 @@ def _channels(pings: Pings, dated: NDArray[np.bool_]) -> Iterator[Channel]:
             kept = {name: values[rows] for name, values in (("time", pings.time), *columns.items())}
             yield Channel(sensor, kept, f"{source}: {', '.join(columns)}", frame, CLOCK)
 
-    valid = np.isfinite(pings.velocity).all(axis=1)
+    valid = np.asarray(np.isfinite(pings.velocity).all(axis=1))
     velocity = dict(zip(NAMES, np.where(valid[:, None], pings.velocity, np.nan).T, strict=True))
     yield from channel("dvl", pings.tracked, "bottom track", FRAME, **velocity, dvl_valid=valid.astype(float))
-    through = np.isfinite(pings.water).all(axis=1)
+    through = np.asarray(np.isfinite(pings.water).all(axis=1))
     yield from channel("dvl_water", through, "water layer", FRAME, **dict(zip(WATER, pings.water.T, strict=True)))
     seen = np.isfinite(pings.range)
     altitude = np.nansum(pings.range, axis=1) / np.maximum(seen.sum(axis=1), 1)
-    yield from channel("dvl_altitude", seen.any(axis=1), "mean range of the beams", "", dvl_altitude=altitude)
+    bounced = np.asarray(seen.any(axis=1))
+    yield from channel("dvl_altitude", bounced, "mean range of the beams", "", dvl_altitude=altitude)
     roll, pitch, heading = pings.rpy.T
     heading = wrap_angle(heading - pings.bias)
     ship = pings.system == SHIP
