@@ -19,7 +19,7 @@ def in_mm(velocity: Sequence[float]) -> list[int]:
 
 
 def trdi_values(velocity: Sequence[float], system: int, rpy: Sequence[float], up: bool = False) -> np.ndarray:
-    """Four values of a vehicle's velocity (forward, starboard, down) as an instrument of Teledyne has them, not negated.
+    """A vehicle's velocity (forward, starboard, down) in the four values of an instrument of Teledyne, not negated.
 
     Parameters
     ----------
