@@ -37,12 +37,14 @@ class Records:
     at, size : kind -> first byte and bytes of the data of each record
     failed : headers whose data have a wrong checksum, or are cut off
     skipped : bytes that belong to no whole record
+    cut : where a record may begin that is cut off; the end where none does
     """
 
     at: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
     size: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
     failed: int = 0
     skipped: int = 0
+    cut: int = 0
 
 
 def checksum(data: bytes | memoryview) -> int:
@@ -80,19 +82,23 @@ def find_records(
     ----------
     progress : called with the bytes that are done
     """
-    found, position = Records(), 0
+    found, position, size = Records(), 0, len(content)
+    found.cut = size
     while (start := content.find(SYNC, position)) >= 0:
         found.skipped += start - position
         head = header(content, start)
         if head is not None and is_whole(content, head):
             position = head.at + head.size
+            found.cut = size  # what seemed to be cut off was none
             if head.family in families:
                 found.at[head.kind].append(head.at)
                 found.size[head.kind].append(head.size)
             progress(position)
         else:
             found.failed += head is not None
+            unfinished = size - start < LONG if head is None else head.at + head.size > size
+            found.cut = min(found.cut, start) if unfinished else found.cut
             found.skipped += 1
             position = start + 1
-    found.skipped += len(content) - position
+    found.skipped += size - position
     return found

@@ -31,6 +31,7 @@ from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 IMU, MAGNETOMETER, BOTTOM, WATER, AHRS, INS = 0x82, 0x87, 0xB4, 0xBE, 0xD2, 0xDC
 POSIX, BOOT = "Nucleus's Unix time", "Nucleus's time since its start"
 GAUSS = 100.0  # [uT]
+KINDS = IMU, MAGNETOMETER, BOTTOM, WATER, AHRS  # that tell of a sensor
 OTHERS = {0xAA: "altimeter", 0x8B: "field calibration", 0xA0: "text", 0xC0: "current profile", 0xC1: "current profile",
           0x96: "fast pressure", INS: "navigation solution, computed by the instrument"}  # fmt: skip
 COMMON = layout(
@@ -63,6 +64,10 @@ class Said:
     common: NDArray[np.void]
     values: NDArray[np.void]
 
+    def only(self, rows: NDArray[np.bool_]) -> "Said":
+        """Some of them."""
+        return Said(self.time[rows], self.common[rows], self.values[rows])
+
 
 class Nucleus:
     """The format; see `rovgraph.interchange.formats.Format`."""
@@ -78,7 +83,7 @@ class Nucleus:
         with path.open("rb") as file:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         found = find_records(content, NUCLEUS_FAMILIES, lambda done: options.progress(done, len(content)))
-        said = {kind: said_of(content, found, kind) for kind in (IMU, MAGNETOMETER, BOTTOM, WATER, AHRS)}
+        said = {kind: said_of(content, found, kind) for kind in KINDS}
         stamped = [each.common["flags"] & 1 for each in said.values() if len(each.time)]
         unix = bool(stamped) and all(flags.all() for flags in stamped)
         clock = Clock(POSIX, 0.0, 1.0, "its stamps are Unix time") if unix else Clock(BOOT)
@@ -158,7 +163,7 @@ def channels_of(said: Mapping[int, Said], clock: str) -> Iterator[Channel]:
 
 def _left(found: Records) -> Iterator[Left]:
     for kind, at in sorted(found.at.items()):
-        if kind not in (IMU, MAGNETOMETER, BOTTOM, WATER, AHRS):
+        if kind not in KINDS:
             yield Left(OTHERS.get(kind, f"record {kind:#04x}"), len(at), "no measurement of a sensor")
     if found.failed:
         yield Left("record", found.failed, "a wrong checksum, or cut off")

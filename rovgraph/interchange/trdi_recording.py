@@ -78,7 +78,7 @@ def recording(
     dated = np.isfinite(pings.time)
     if not dated.any():
         raise InputError(f"{path}: none of {len(dated)} ensembles has a valid time; set the instrument's clock")
-    channels = tuple(_channels(pings, dated))
+    channels = tuple(channels_of(pings))
     more = []
     if undated := int(np.count_nonzero(~dated)):
         more.append(Left("ensemble", undated, "no valid time"))
@@ -97,7 +97,15 @@ def recording(
     )
 
 
-def _channels(pings: Pings, dated: NDArray[np.bool_]) -> Iterator[Channel]:
+def channels_of(pings: Pings, constants: bool = False) -> Iterator[Channel]:
+    """Channels of all pings that have a time.
+
+    Parameters
+    ----------
+    constants : what is one number throughout is a measurement, as in a single ping; else nothing measured it
+    """
+    dated = np.isfinite(pings.time)
+
     def channel(sensor: str, rows: NDArray[np.bool_], source: str, frame: str, **columns: Array) -> Iterator[Channel]:
         rows = rows & dated
         if rows.any():
@@ -116,18 +124,18 @@ def _channels(pings: Pings, dated: NDArray[np.bool_]) -> Iterator[Channel]:
     roll, pitch, heading = pings.rpy.T
     heading = wrap_angle(heading - pings.bias)
     ship = pings.system == SHIP
-    if _varies(heading):
+    if _measured(heading, constants):
         yield from channel("vehicle_heading", ship, "heading", FRAME, heading=heading)
         yield from channel("dvl_heading", ~ship, "heading", FRAME, dvl_heading=heading)
-    if _varies(roll) or _varies(pitch):
+    if _measured(roll, constants) or _measured(pitch, constants):
         yield from channel("vehicle_tilt", np.ones(len(roll), dtype=bool), "attitude", FRAME, roll=roll, pitch=pitch)
-    if _varies(pings.depth):
+    if _measured(pings.depth, constants):
         yield from channel("depth", np.ones(len(roll), dtype=bool), "depth of the transducer", "", depth=pings.depth)
 
 
-def _varies(values: Array) -> bool:
-    """Whether something was measured; what nothing measures is one number throughout."""
-    return bool(np.ptp(values) > 0.0)
+def _measured(values: Array, constants: bool = False) -> bool:
+    """Whether there is a measurement; what nothing measures is one number throughout."""
+    return bool(np.ptp(values) > 0.0) or (constants and bool(np.isfinite(values).any()))
 
 
 def _settings(pings: Pings) -> dict[str, Any]:
@@ -163,7 +171,7 @@ def _warnings(pings: Pings, channels: tuple[Channel, ...]) -> Iterator[str]:
     dvl = next((c for c in channels if c.sensor == "dvl"), None)
     if dvl is None or not np.any(dvl.columns["dvl_valid"]):
         yield "no bottom track: the instrument did not look for the bottom, or never saw it"
-    if np.isfinite(pings.rpy[:, 2]).any() and not _varies(pings.rpy[:, 2]):
+    if np.isfinite(pings.rpy[:, 2]).any() and not _measured(pings.rpy[:, 2]):
         turned = "; velocities in earth axes are turned by it" if np.any(pings.system == EARTH) else ""
         yield f"the heading is {np.rad2deg(pings.rpy[0, 2]):.2f} deg throughout, so nothing measured it{turned}"
     if np.any(pings.alignment[pings.system != SHIP]):
