@@ -79,13 +79,17 @@ class Frames:
         content, position = self.rest + data, 0
         self.rest = b""
         while position < len(content):
-            start = min((at for head in HEADS if (at := content.find(head, position)) >= 0), default=-1)
-            if start < 0:
-                start = max(position, len(content) - len(HEADS[0]) + 1)
-                self.skipped += start - position
-                self.rest = content[start:]
-                return
+            start = content.find(MARK, position)
+            start = len(content) if start < 0 else start
             self.skipped += start - position
+            head = content[start : start + len(HEADS[0])]
+            if len(head) < len(HEADS[0]):
+                self.rest = head
+                return
+            if head not in HEADS:
+                self.skipped += 1
+                position = start + 1
+                continue
             end = start + SIZES[content[start + 1]]
             if end > len(content):
                 self.rest = content[start:]
