@@ -127,6 +127,11 @@ def test_attitude_that_no_own_sensor_measured_is_not_taken_out_of_ship_axes(tmp_
     body = read(pd0_ensemble(values=(0.0, -1.0, 0.0, 0.0), rpy=(0.0, 0.3, 1.0), source=1), tmp_path)
     np.testing.assert_allclose(velocity(level)[0], [np.cos(0.3), 0.0, np.sin(0.3)], atol=1e-3)
     np.testing.assert_allclose(velocity(body)[0], [1.0, 0.0, 0.0], atol=1e-9)
+    rpy = (0.1, 0.3, 1.0)  # in earth axes it was used, whoever measured it
+    earth = read(
+        pd0_ensemble(values=-trdi_values((1.0, 0.0, 0.0), EARTH, rpy), system=EARTH, rpy=rpy, source=1), tmp_path
+    )
+    np.testing.assert_allclose(velocity(earth)[0], [1.0, 0.0, 0.0], atol=1e-3)
 
 
 def test_a_water_layer_is_the_velocity_through_water(tmp_path):

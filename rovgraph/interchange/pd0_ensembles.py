@@ -6,6 +6,7 @@ not import beside NumPy 2, and keeps one coordinate system for a file.
 
 import mmap
 import struct
+from array import array
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -72,8 +73,8 @@ class Ensembles:
     skipped : bytes that belong to no whole ensemble
     """
 
-    at: dict[int, list[int]] = field(default_factory=lambda: {kind: [] for kind in LAYOUTS})
-    length: dict[int, list[int]] = field(default_factory=lambda: {kind: [] for kind in LAYOUTS})
+    at: dict[int, "array[int]"] = field(default_factory=lambda: {kind: array("q") for kind in LAYOUTS})
+    length: dict[int, "array[int]"] = field(default_factory=lambda: {kind: array("q") for kind in LAYOUTS})
     others: Counter[int] = field(default_factory=Counter)
     failed: int = 0
     skipped: int = 0
