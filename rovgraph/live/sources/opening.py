@@ -11,6 +11,7 @@ from rovgraph.errors import InputError
 from rovgraph.interchange.mavlink import IMUS
 from rovgraph.live.sources import waterlinked
 from rovgraph.live.sources.address import LOOPBACK, Address, one_of, parse_address, positive, whole
+from rovgraph.live.sources.doppler import NucleusDecoder, Pd4Decoder, pd6
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.links import SerialLink, StandardInput, TcpLink, UdpLink
 from rovgraph.live.sources.mavlink import MavlinkDecoder, Options
@@ -21,8 +22,9 @@ from rovgraph.live.sources.source import Decoder, LinkSource, Notify, Source
 from rovgraph.live.warnings import Warnings
 from rovgraph.log.units import nearest
 
-MAVLINK_BAUD, NMEA_BAUD = 115200, 4800
+MAVLINK_BAUD, NMEA_BAUD, DOPPLER_BAUD = 115200, 4800, 115200
 DEVICES = ("/dev/", "COM")
+Opener = Callable[[Address, Notify, Config, float], Source]
 FORMS = {
     "-": "-",
     "tcp": "tcp://host:port",
@@ -30,6 +32,9 @@ FORMS = {
     "waterlinked": "waterlinked://host[:port]",
     "mavlink": "mavlink:udpin:host:port",
     "nmea": "nmea:/dev/ttyUSB0",
+    "pd4": "pd4:tcp://host:port",
+    "pd6": "pd6:/dev/ttyUSB0",
+    "nucleus": "nucleus:tcp://host:port",
     "file": "file:log.csv",
 }
 
@@ -144,6 +149,23 @@ def _waterlinked(address: Address, notify: Notify, config: Config, pace: float) 
     return LinkSource(address.url, link, waterlinked.waterlinked(address.url, notify))
 
 
+def _doppler(make: Callable[[str, Notify], Decoder], end: bytes = b"") -> Opener:
+    """Opener of a Doppler instrument at a TCP or UDP port, or a serial one."""
+
+    def opener(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+        inner, decoder = address.inner(), make(address.url, notify)
+        if inner.scheme in ("tcp", "udp"):
+            address.take({})
+            return _networked(inner, notify, decoder, end)
+        if not _is_device(address.place):
+            scheme = address.scheme
+            raise InputError(f"{address.url}: expected {scheme}:tcp://host:port or {scheme}:/dev/ttyUSB0")
+        baud = address.take({"baud": _baud}).get("baud", DOPPLER_BAUD)
+        return LinkSource(address.url, SerialLink(address.place, baud, notify), decoder)
+
+    return opener
+
+
 def _file(address: Address, notify: Notify, config: Config, pace: float) -> Source:
     pace = address.take({"speed": _pace}).get("speed", pace)
     return log_replay(address.url, address.place.removeprefix("//"), config, pace)
@@ -213,12 +235,15 @@ def _existing(address: Address) -> Path:
     return path
 
 
-_OPENERS: dict[str, Callable[[Address, Notify, Config, float], Source]] = {
+_OPENERS: dict[str, Opener] = {
     "-": _standard_input,
     "tcp": _network,
     "udp": _network,
     "waterlinked": _waterlinked,
     "mavlink": _mavlink,
     "nmea": _nmea,
+    "pd4": _doppler(Pd4Decoder),
+    "pd6": _doppler(pd6, end=b"\n"),
+    "nucleus": _doppler(NucleusDecoder),
     "file": _file,
 }

@@ -1,0 +1,101 @@
+"""Doppler instruments, live: PD4, PD5 and PD6 of Teledyne and others, and Nortek's Nucleus.
+
+Their bytes are read as those of their files are (`rovgraph.interchange.pd4`, `pd6` and `nucleus`).
+"""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from rovgraph.interchange import nucleus
+from rovgraph.interchange.nortek_records import NUCLEUS_FAMILIES, find_records
+from rovgraph.interchange.pd4 import SIZES, Frames, decoded
+from rovgraph.interchange.pd6 import Sentences
+from rovgraph.interchange.recording import Channel
+from rovgraph.interchange.trdi_recording import channels_of
+from rovgraph.live.message import Message, readings
+from rovgraph.live.sources.lines import LineDecoder, Refused, shown
+from rovgraph.live.sources.source import Chunk, Notify
+
+DAY_S = 86400.0
+PENDING = 1 << 14  # bytes that may be the beginning of a record; no Nucleus sends longer ones
+PASSWORD = b"enter password"
+
+
+class Pd4Decoder:
+    """Frames of PD4 and PD5; their clock has no date, and goes on over midnight here."""
+
+    def __init__(self, url: str, notify: Notify) -> None:
+        self._url, self._notify = url, notify
+        self._frames = Frames()
+        self._last: float | None = None  # stamp [s since the first midnight]
+
+    def feed(self, chunk: Chunk) -> Iterator[Message]:
+        if chunk.fresh:
+            self._frames = Frames()
+        skipped = self._frames.skipped
+        for frame in self._frames.feed(chunk.data):
+            row = np.frombuffer(frame.ljust(SIZES[1], b"\0"), np.uint8)[None]
+            pings, refused = decoded(row)
+            for reason in refused:
+                self._notify("coordinates", reason)
+            for message in _messages(channels_of(pings, constants=True), self._url, chunk.arrival):
+                yield message._replace(stamp=self._unwrapped(message.stamp))
+        if self._frames.skipped > skipped:
+            self._notify("malformed", "bytes that are no whole frame with a right checksum are skipped")
+
+    def _unwrapped(self, stamp: float | None) -> float | None:
+        if stamp is not None and self._last is not None:
+            stamp += DAY_S * round((self._last - stamp) / DAY_S)
+        self._last = stamp
+        return stamp
+
+
+def pd6(url: str, notify: Notify) -> LineDecoder:
+    """Decoder of PD6 sentences, stamped by the last ``:TS``."""
+    sentences = Sentences()
+
+    def parse(line: bytes, arrival: float) -> Message | None:
+        cells = sentences.columns(line)
+        if cells is None:
+            raise Refused("malformed", f"expected a PD6 sentence, got {shown(line)}; it is skipped")
+        found = readings(cells)
+        return Message(url, arrival, sentences.time, found) if found else None
+
+    return LineDecoder(parse, notify)
+
+
+class NucleusDecoder:
+    """Records of a Nucleus."""
+
+    def __init__(self, url: str, notify: Notify) -> None:
+        self._url, self._notify = url, notify
+        self._rest = b""
+
+    def feed(self, chunk: Chunk) -> Iterator[Message]:
+        if PASSWORD in chunk.data:
+            text = "the Nucleus asks for a password, which is not sent; read its serial port, or a port without one"
+            self._notify("password", text)
+        content = (b"" if chunk.fresh else self._rest) + chunk.data
+        found = find_records(content, NUCLEUS_FAMILIES)
+        cut = max(found.cut, len(content) - PENDING)
+        self._rest = content[cut:]
+        if found.skipped > len(content) - found.cut:
+            self._notify("malformed", "bytes that are no whole record with right checksums are skipped")
+        said = {kind: nucleus.said_of(content, found, kind) for kind in nucleus.KINDS}
+        for clock, unix in (("boot", 0), ("unix", 1)):
+            of_clock = {kind: each.only(each.common["flags"] & 1 == unix) for kind, each in said.items()}
+            yield from _messages(nucleus.channels_of(of_clock, clock), self._url, chunk.arrival, clock)
+
+
+def _messages(channels: Iterable[Channel], url: str, arrival: float, clock: str = "") -> Iterator[Message]:
+    """A message for each time, in the order of time."""
+    cells: dict[float, dict[str, float]] = {}
+    for channel in channels:
+        rows = zip(*(values.tolist() for values in channel.columns.values()), strict=True)
+        for row in rows:
+            values = dict(zip(channel.columns, row, strict=True))
+            cells.setdefault(values.pop("time"), {}).update(values)
+    for stamp in sorted(cells):
+        if found := readings(cells[stamp]):
+            yield Message(url, arrival, stamp, found, clock)

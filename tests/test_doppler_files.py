@@ -1,0 +1,416 @@
+"""Native files of Doppler instruments: Teledyne PD0, PD4, PD5, PD6, Nortek AD2CP, DVL and Nucleus."""
+
+import gzip
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from autopilot_files import short_dive
+from doppler_files import (
+    BEAM,
+    EARTH,
+    INSTRUMENT,
+    SHIP,
+    UNIX,
+    dvl_record,
+    nucleus_ahrs,
+    nucleus_record,
+    nucleus_track,
+    pd0_ensemble,
+    pd4_frame,
+    pd6_ping,
+    signature_record,
+    trdi_values,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+from scipy.io import loadmat
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import matrix_from_rpy
+from rovgraph.interchange.formats import read_recording
+from rovgraph.interchange.recording import Channel, Recording
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+RNG = np.random.default_rng(5)
+WAYS = [(BEAM, False), (BEAM, True), (INSTRUMENT, False), (INSTRUMENT, True), (SHIP, False), (EARTH, False)]
+
+
+def read(data: bytes, folder: Path) -> Recording:
+    path = folder / "dive.bin"  # content tells what it is, not its name
+    path.write_bytes(data)
+    return read_recording(path)
+
+
+def real(name: str) -> Recording:
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    return read_recording(path)
+
+
+def first(recording: Recording, sensor: str) -> Channel:
+    return next(channel for channel in recording.channels if channel.sensor == sensor)
+
+
+def velocity(recording: Recording, prefix: str = "dvl_v") -> np.ndarray:
+    columns = first(recording, prefix.removesuffix("_v")).columns
+    return np.column_stack([columns[f"{prefix}{axis}"] for axis in "xyz"])
+
+
+def sensors(recording: Recording) -> set[str]:
+    return {channel.sensor for channel in recording.channels}
+
+
+def pinged() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Time since 1970, velocity, roll-pitch-heading and depth of a simulated dive at its pings."""
+    frame = short_dive(0.0)
+    pings = frame[frame["dvl_vx"].notna()]
+    depth = frame.dropna(subset=["depth"])
+    moved = pings[["dvl_vx", "dvl_vy", "dvl_vz"]].to_numpy()
+    time = pings["time"].to_numpy()
+    heading = 0.3 + 0.2 * np.sin(0.1 * time)
+    rpy = np.column_stack([0.1 * np.sin(time), 0.2 * np.cos(time), heading])
+    return UNIX + time, moved, rpy, np.interp(time, depth["time"], depth["depth"])
+
+
+@pytest.mark.parametrize(("system", "up"), WAYS)
+def test_a_simulated_dive_comes_back_of_pd0_from_all_coordinates_within_its_resolution(system, up, tmp_path):
+    time, moved, rpy, depth = pinged()
+    gimballed = rpy.copy()  # the file has the pitch of a tilt sensor that rolls with the instrument
+    gimballed[:, 1] = np.arctan(np.tan(rpy[:, 1]) * np.cos(rpy[:, 0]))
+    data = b"".join(
+        pd0_ensemble(t, -trdi_values(v, system, turned, up), system, printed, d, up=up)
+        for t, v, turned, printed, d in zip(time, moved, gimballed, rpy, depth, strict=True)
+    )
+    recording = read(data, tmp_path)
+    assert recording.format == "pd0"
+    assert recording.warnings == ()
+    columns = first(recording, "dvl").columns
+    np.testing.assert_allclose(columns["time"], time, atol=0.0051)
+    resolution = 0.0012 if system == BEAM else 0.0009  # of 1 mm/s, and of 0.01 degrees at 2 m/s
+    np.testing.assert_allclose(velocity(recording), moved, atol=resolution)
+    assert np.all(columns["dvl_valid"] == 1.0)
+    np.testing.assert_allclose(first(recording, "depth").columns["depth"], depth, atol=0.051)
+    tilt = first(recording, "vehicle_tilt").columns
+    np.testing.assert_allclose(tilt["roll"], rpy[:, 0], atol=1e-4)
+    np.testing.assert_allclose(tilt["pitch"], rpy[:, 1], atol=1e-4)
+    heading = first(recording, "vehicle_heading" if system == SHIP else "dvl_heading").columns
+    np.testing.assert_allclose(heading["heading" if system == SHIP else "dvl_heading"], rpy[:, 2], atol=1e-4)
+    np.testing.assert_allclose(first(recording, "dvl_altitude").columns["dvl_altitude"], 3.0)
+
+
+def test_ensembles_of_two_coordinate_systems_in_one_file_agree(tmp_path):
+    moved, rpy = (0.5, 0.1, -0.05), (0.0, 0.3, 2.0)
+    data = [pd0_ensemble(UNIX + k, -trdi_values(moved, k % 4, rpy), k % 4, (0.0, 0.3, 2.0)) for k in range(8)]
+    recording = read(b"".join(data), tmp_path)
+    np.testing.assert_allclose(velocity(recording), [moved] * 8, atol=0.002)
+    assert any("beam 2, instrument 2, ship 2, earth 2" in note for note in recording.notes)
+
+
+def test_three_beams_are_enough_and_two_are_not(tmp_path):
+    moved = (0.5, 0.1, -0.05)
+    beams = -trdi_values(moved, BEAM, (0.0, 0.0, 0.0))
+    for k in range(4):
+        three = np.where(np.arange(4) == k, np.nan, beams)
+        np.testing.assert_allclose(
+            velocity(read(pd0_ensemble(values=three, system=BEAM), tmp_path))[0], moved, atol=0.003
+        )
+    two = [*beams[:2], np.nan, np.nan]
+    assert first(read(pd0_ensemble(values=two, system=BEAM), tmp_path), "dvl").columns["dvl_valid"][0] == 0.0
+
+
+def test_attitude_that_no_own_sensor_measured_is_not_taken_out_of_ship_axes(tmp_path):
+    level = read(pd0_ensemble(values=(0.0, -1.0, 0.0, 0.0), rpy=(0.0, 0.3, 1.0)), tmp_path)
+    body = read(pd0_ensemble(values=(0.0, -1.0, 0.0, 0.0), rpy=(0.0, 0.3, 1.0), source=1), tmp_path)
+    np.testing.assert_allclose(velocity(level)[0], [np.cos(0.3), 0.0, np.sin(0.3)], atol=1e-3)
+    np.testing.assert_allclose(velocity(body)[0], [1.0, 0.0, 0.0], atol=1e-9)
+    rpy = (0.1, 0.3, 1.0)  # in earth axes it was used, whoever measured it
+    earth = read(
+        pd0_ensemble(values=-trdi_values((1.0, 0.0, 0.0), EARTH, rpy), system=EARTH, rpy=rpy, source=1), tmp_path
+    )
+    np.testing.assert_allclose(velocity(earth)[0], [1.0, 0.0, 0.0], atol=1e-3)
+
+
+def test_a_water_layer_is_the_velocity_through_water(tmp_path):
+    recording = read(pd0_ensemble(water=(0.1, -0.4, 0.05, 0.0), source=1), tmp_path)
+    np.testing.assert_allclose(velocity(recording, "dvl_water_v")[0], [0.4, -0.1, 0.05])
+    assert "dvl_water" not in sensors(read(pd0_ensemble(), tmp_path))
+
+
+def test_what_is_not_measured_becomes_no_measurement(tmp_path):
+    lost = pd0_ensemble(UNIX + 1, values=(np.nan,) * 4, ranges=(0, 0, 0, 0))
+    silent = pd0_ensemble(UNIX + 2, values=(0, 0, 0, 0), ranges=(0, 0, 0, 0))  # zeros, and no beam heard
+    recording = read(pd0_ensemble() + lost + silent, tmp_path)
+    assert first(recording, "dvl").columns["dvl_valid"].tolist() == [1.0, 0.0, 0.0]
+    assert np.isnan(velocity(recording)[1:]).all()
+    assert len(first(recording, "dvl_altitude").columns["time"]) == 1
+    assert not {"depth", "vehicle_heading", "vehicle_tilt"} & sensors(recording)  # constants
+    assert any("heading is 57.30 deg throughout" in text for text in recording.warnings)
+    nothing = read(pd0_ensemble(bottom=False, depth=1.0) + pd0_ensemble(UNIX + 1, bottom=False, depth=2.0), tmp_path)
+    assert sensors(nothing) == {"depth"}
+    assert any("no bottom track" in text for text in nothing.warnings)
+
+
+def test_far_ranges_use_their_high_byte(tmp_path):
+    recording = read(pd0_ensemble(ranges=(700.0, 700.0, 700.0, 700.0)), tmp_path)
+    assert first(recording, "dvl_altitude").columns["dvl_altitude"][0] == pytest.approx(700.0)
+
+
+def test_a_heading_bias_becomes_the_declination_and_an_alignment_the_mounting(tmp_path):
+    pings = [pd0_ensemble(UNIX + k, rpy=(0, 0, 1.0 + 0.1 * k), system=BEAM, bias=4.5, alignment=45.0) for k in range(3)]
+    recording = read(b"".join(pings), tmp_path)
+    assert recording.settings == {"environment": {"declination_deg": 4.5}, "dvl": {"mount_rpy_deg": [0.0, 0.0, 45.0]}}
+    heading = first(recording, "dvl_heading").columns["dvl_heading"]
+    np.testing.assert_allclose(heading, 1.0 + 0.1 * np.arange(3) - np.deg2rad(4.5), atol=1e-4)
+
+
+def test_corrupt_ensembles_and_bad_dates_are_counted_and_the_rest_is_read(tmp_path):
+    good = [pd0_ensemble(UNIX + k, depth=k) for k in range(5)]
+    spoilt = bytearray(good[1])
+    spoilt[100] ^= 0xFF
+    undated = pd0_ensemble(date=(15, 13, 1, 0, 0, 0, 0))
+    cut = good[4][:200]
+    recording = read(b"noise" + good[0] + bytes(spoilt) + good[2] + undated + good[3] + cut, tmp_path)
+    np.testing.assert_allclose(first(recording, "dvl").columns["time"] - UNIX, [0, 2, 3])
+    counted = {(left.name, left.reason): left.count for left in recording.left}
+    assert counted["ensemble", "a wrong checksum"] == 1
+    assert counted["ensemble", "no valid time"] == 1
+    assert f"{5 + len(spoilt) + len(cut)} bytes belong to no whole ensemble" in recording.warnings
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is empty"),
+        (b"time,depth\n1,2\n" * 50, "in no format that is known"),
+        (pd0_ensemble()[:200], "no whole PD0 ensemble"),
+        (pd0_ensemble(date=(0,) * 7), "valid time"),
+        (pd6_ping()[:30] * 3, "record :TS, :SA and :BI"),
+        (nucleus_record(0xA0, UNIX, [0.0]), "no measurement of a sensor"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_one_clear_line(data, words, tmp_path):
+    with pytest.raises(InputError, match=words) as error:
+        read(data, tmp_path)
+    assert "dive.bin" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("five", [False, True])
+def test_a_dive_comes_back_of_pd4_and_pd5(five, tmp_path):
+    time, moved, rpy, depth = pinged()
+    time = time - time[0] + 86395.0  # over midnight
+    system = EARTH if five else INSTRUMENT
+    turned = rpy * [0.0, 0.0, 1.0]
+    data = [
+        pd4_frame(t % 86400.0, trdi_values(v, system, r), system, rpy=r if five else None, depth=d)
+        for t, v, r, d in zip(time, moved, turned, depth, strict=True)
+    ]
+    recording = read(b"\x7d" + b"".join(data), tmp_path)
+    assert recording.format == "pd4"
+    np.testing.assert_allclose(first(recording, "dvl").columns["time"], time, atol=0.0051)
+    np.testing.assert_allclose(velocity(recording), moved, atol=0.0009)
+    assert recording.clocks[first(recording, "dvl").clock].unix_offset is None
+    assert ("depth" in sensors(recording)) == five
+    if five:
+        np.testing.assert_allclose(first(recording, "dvl_heading").columns["dvl_heading"], rpy[:, 2], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("system", "tilted", "reason"), [(BEAM, False, "beam"), (EARTH, True, "heading"), (SHIP, True, "levelled")]
+)
+def test_pd4_velocities_that_cannot_be_turned_back_are_refused_with_the_reason(system, tilted, reason, tmp_path):
+    recording = read(pd4_frame() * 2 + pd4_frame(system=system, tilted=tilted), tmp_path)
+    assert first(recording, "dvl").columns["dvl_valid"].tolist() == [1.0, 1.0, 0.0]
+    assert any(reason in text and text.startswith("1 velocities") for text in recording.warnings)
+
+
+@pytest.mark.parametrize("axes", [("BI", "BS", "BE"), ("BS",), ("BE",)])
+def test_a_dive_comes_back_of_pd6(axes, tmp_path):
+    time, moved, rpy, depth = pinged()
+    pings = [pd6_ping(t, v, r, d, axes=axes) for t, v, r, d in zip(time, moved, rpy, depth, strict=True)]
+    recording = read(b"".join(pings), tmp_path)
+    assert recording.format == "pd6"
+    np.testing.assert_allclose(first(recording, "dvl").columns["time"], time, atol=0.0051)
+    np.testing.assert_allclose(velocity(recording), moved, atol=0.0009)
+    np.testing.assert_allclose(first(recording, "dvl_heading").columns["dvl_heading"], rpy[:, 2], atol=1e-4)
+    np.testing.assert_allclose(first(recording, "vehicle_tilt").columns["pitch"], rpy[:, 1], atol=1e-4)
+    np.testing.assert_allclose(first(recording, "depth").columns["depth"], depth, atol=0.051)
+    np.testing.assert_allclose(first(recording, "dvl_altitude").columns["dvl_altitude"], 3.0)
+
+
+def test_pd6_without_lock_and_broken_lines_are_counted(tmp_path):
+    data = pd6_ping() + pd6_ping(UNIX + 1, good=False) + b":BI,garbage\r\n\xff\xfe\r\n"
+    recording = read(data, tmp_path)
+    assert first(recording, "dvl").columns["dvl_valid"].tolist() == [1.0, 0.0]
+    assert [left.count for left in recording.left] == [2]
+
+
+def test_a_dive_comes_back_of_a_nortek_dvl(tmp_path):
+    time, moved, _, _ = pinged()
+    data = [dvl_record(t, v) + dvl_record(t, v * 0.5, kind=0x1D) for t, v in zip(time, moved, strict=True)]
+    recording = read(b"".join(data) + dvl_record(UNIX + 99.0, (0, 0, 0), valid=False), tmp_path)
+    assert recording.format == "ad2cp"
+    columns = first(recording, "dvl").columns
+    np.testing.assert_allclose(columns["time"][:-1], time + 0.016, atol=1e-4)  # when the echo came
+    np.testing.assert_allclose(velocity(recording)[:-1], moved, atol=1e-6)
+    np.testing.assert_allclose(columns["dvl_sd"][:-1], 0.003, rtol=1e-5)
+    assert columns["dvl_valid"].tolist() == [1.0] * len(time) + [0.0]
+    np.testing.assert_allclose(velocity(recording, "dvl_water_v"), 0.5 * moved, atol=1e-6)
+
+
+def test_a_signatures_bottom_track_is_the_bottoms_velocity_along_its_beams(tmp_path):
+    sine, cosine = np.sin(np.deg2rad(25.0)), np.cos(np.deg2rad(25.0))
+    forward, starboard, down = 0.5, 0.1, -0.05
+    toward = np.array([forward, -starboard, -forward, starboard]) * sine + down * cosine
+    beams = [round(-1e4 * v) for v in toward]  # the bottom comes nearer
+    own = [round(-1e4 * v) for v in (forward, starboard, down, down)]
+    data = signature_record(UNIX, beams) + signature_record(UNIX + 1, own, system=1)
+    recording = read(
+        data + signature_record(UNIX + 2, beams, heard=False) + signature_record(UNIX + 3, own, 0), tmp_path
+    )
+    np.testing.assert_allclose(velocity(recording)[:2], [[forward, starboard, down]] * 2, atol=2e-4)
+    assert first(recording, "dvl").columns["dvl_valid"].tolist() == [1.0, 1.0, 0.0, 0.0]
+    assert any("ENU" in text for text in recording.warnings)
+
+
+def test_a_nucleus_gives_all_its_sensors(tmp_path):
+    time, moved, rpy, depth = pinged()
+    parts = []
+    for t, v, r, d in zip(time, moved, rpy, depth, strict=True):
+        parts.append(nucleus_record(0x82, t, [0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 20.0]))
+        parts.append(nucleus_record(0x87, t, [0.2, 0.0, 0.4]))
+        parts.append(nucleus_ahrs(t, r, d, declination=3.0))
+        parts.append(nucleus_track(t, v) + nucleus_track(t, v * 0.5, kind=0xBE))
+    parts.append(nucleus_track(UNIX + 99.0, (-32.768,) * 3, status=0))
+    recording = read(b"".join(parts), tmp_path)
+    assert recording.format == "nucleus"
+    assert sensors(recording) == {"imu", "mag", "ahrs", "depth", "dvl", "dvl_altitude", "dvl_water"}
+    imu = first(recording, "imu").columns
+    np.testing.assert_allclose([imu["acc_z"][0], imu["gyr_z"][0]], [-9.8, 0.03], rtol=1e-6)
+    np.testing.assert_allclose(first(recording, "mag").columns["mag_z"], 40.0, rtol=1e-6)
+    yaw = first(recording, "ahrs").columns["ahrs_yaw"]
+    np.testing.assert_allclose(yaw, rpy[:, 2] - np.deg2rad(3.0), atol=1e-6)
+    assert recording.settings == {"environment": {"declination_deg": 3.0}}
+    np.testing.assert_allclose(velocity(recording)[:-1], moved, atol=1e-6)
+    np.testing.assert_allclose(first(recording, "dvl").columns["dvl_sd"][:-1], 0.004, rtol=1e-5)
+    assert np.isnan(velocity(recording)[-1]).all()
+
+
+WHOLE = {
+    "pd0": b"".join(pd0_ensemble(UNIX + k, system=k % 4) for k in range(4)),
+    "pd4": b"".join(pd4_frame(k, rpy=(0, 0, 0) if k % 2 else None) for k in range(4)),
+    "pd6": b"".join(pd6_ping(UNIX + k) for k in range(4)),
+    "ad2cp": b"".join(dvl_record(UNIX + k, (1, 2, 3)) + signature_record(UNIX, (1, 2, 3, 4)) for k in range(3)),
+    "nucleus": nucleus_ahrs(UNIX, (0, 0, 0), 1.0) + nucleus_track(UNIX, (1, 2, 3)),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@settings(max_examples=40)
+@given(
+    changes=st.lists(st.tuples(st.integers(0, 5000), st.binary(max_size=9)), max_size=6),
+    cut=st.integers(0, 5000),
+    tail=st.binary(max_size=60),
+)
+def test_mutated_bytes_are_read_or_refused_in_one_line(name, changes, cut, tail, tmp_path_factory):
+    data = bytearray(WHOLE[name][: 1 + cut])
+    for at, new in changes:
+        data[at % len(data) : at % len(data) + len(new)] = new
+    try:
+        recording = read(bytes(data) + tail, tmp_path_factory.getbasetemp())
+    except InputError as error:
+        assert "\n" not in str(error)
+        return
+    for channel in recording.channels:
+        assert len({len(values) for values in channel.columns.values()}) == 1
+        assert np.isfinite(channel.columns["time"]).all() or channel.sensor == "dvl"
+
+
+def digits(recording: Recording, sensor: str, column: str, unit: float) -> np.ndarray:
+    return np.round(first(recording, sensor).columns[column] / unit).astype(int)
+
+
+def test_a_remus_file_agrees_with_an_independent_decoding():
+    recording = real("remus600_pd0/adcp_auv_51.pd0")
+    expected = YAML(typ="safe").load((DATA / "remus600_pd0" / "adcp_auv_51.expected.yml").read_text())["data"]
+    ensembles = [e for e in expected if e["particle_object"] == "VelocityInst"]
+    tracks = [e for e in expected if e["particle_object"] == "InstBottom"]
+    assert len(tracks) == 51
+    degrees = np.deg2rad(0.01)
+
+    def of(name: str, items: Sequence[dict] = tracks) -> np.ndarray:
+        return np.array([item[name] for item in items])
+
+    for column, name, sign in (
+        ("dvl_vx", "bt_starboard_velocity", -1),  # of the independent decoding: X and Y of the file in this order
+        ("dvl_vy", "bt_forward_velocity", -1),
+        ("dvl_vz", "bt_vertical_velocity", 1),
+    ):
+        np.testing.assert_array_equal(digits(recording, "dvl", column, 0.001), sign * of(name))
+    heading = digits(recording, "vehicle_heading", "heading", degrees)
+    np.testing.assert_array_equal(heading % 36000, of("heading", ensembles))
+    np.testing.assert_array_equal(digits(recording, "vehicle_tilt", "pitch", degrees), of("pitch", ensembles))
+    np.testing.assert_array_equal(digits(recording, "vehicle_tilt", "roll", degrees), of("roll", ensembles))
+    beams = recording.tables["dvl_beams"]
+    for k in range(1, 5):
+        ranges = of(f"bt_beam{k}_range")
+        np.testing.assert_allclose(beams[f"range_{k}"], np.where(ranges > 0, 0.01 * ranges, np.nan))
+        np.testing.assert_array_equal(beams[f"correlation_{k}"], of(f"bt_beam{k}_correlation"))
+    ntp = 2_208_988_800.0  # its times count from 1900
+    np.testing.assert_allclose(beams["time"], of("internal_timestamp") - ntp, atol=1e-3)
+
+
+def test_a_remus_dive_keeps_its_attitude_in_its_own_axes():
+    recording = real("remus600_pd0/adcp.adc.gz")
+    assert len(first(recording, "dvl").columns["time"]) == 4132
+    depth, tilt = first(recording, "depth").columns, first(recording, "vehicle_tilt").columns
+    moved = velocity(recording)
+    descent = np.gradient(depth["depth"], depth["time"])
+    rpy = np.column_stack([tilt["roll"], tilt["pitch"], 0.0 * tilt["roll"]])
+    below = (matrix_from_rpy(rpy) @ moved[:, :, None])[:, 2, 0]  # if the axes are the vehicle's
+    steep = np.isfinite(below) & (np.abs(tilt["pitch"]) > 0.15) & (np.abs(descent) < 1.0)
+    assert np.count_nonzero(steep) > 100
+    assert np.std((descent - below)[steep]) < 0.5 * np.std((descent - moved[:, 2])[steep])  # if they were level
+
+
+def test_a_gliders_corrupt_file_gives_its_good_ensembles():
+    recording = real("glider_pd0/ooi_glider_LB180210_3_corrupted.PD0")
+    assert len(first(recording, "depth").columns["time"]) == 2
+    assert ("ensemble", 1) in {(left.name, left.count) for left in recording.left}
+
+
+@pytest.mark.parametrize(
+    ("name", "tracked", "speed"),
+    [
+        ("adcp_bt/RDI_withBT.000.gz", 901, (0.0, 0.3)),
+        ("adcp_bt/winriver02.PD0.gz", 75, (0.5, 3.5)),
+        ("glider_pd0/dolfyn_vmdas02_os.ENR.gz", None, (4.5, 5.6)),  # a ship, in beam axes
+    ],
+)
+def test_other_pd0_files_move_as_their_vehicles_do(name, tracked, speed):
+    recording = real(name)
+    dvl = first(recording, "dvl").columns
+    if tracked is not None:
+        assert np.count_nonzero(dvl["dvl_valid"]) == tracked
+    low, high = speed
+    assert low <= np.nanmedian(np.linalg.norm(velocity(recording), axis=1)) <= high
+
+
+def test_an_ad2cp_file_agrees_with_its_makers_own_decoding():
+    recording = real("adcp_bt/VelEchoBT01.ad2cp.gz")
+    with gzip.open(DATA / "adcp_bt" / "VelEchoBT01.mat.gz") as file:
+        made = loadmat(file, simplify_cells=True)["Data"]
+    heading = first(recording, "dvl_heading").columns
+    np.testing.assert_allclose(np.rad2deg(heading["dvl_heading"]) % 360.0, made["BottomTrack_Heading"], atol=1e-3)
+    tilt = first(recording, "vehicle_tilt").columns
+    np.testing.assert_allclose(np.rad2deg(tilt["pitch"]), made["BottomTrack_Pitch"], atol=1e-3)
+    np.testing.assert_allclose(np.rad2deg(tilt["roll"]), made["BottomTrack_Roll"], atol=1e-3)
+    days = made["BottomTrack_Time"] - 719529.0  # MATLAB's days
+    np.testing.assert_allclose(heading["time"], 86400.0 * days, atol=1e-3)
+    depth = first(recording, "depth").columns["depth"]
+    np.testing.assert_allclose(depth * 9806.65, 1e4 * made["BottomTrack_Pressure"], rtol=1e-5)
+    assert not first(recording, "dvl").columns["dvl_valid"].any()  # on a bench: figures of merit are none
