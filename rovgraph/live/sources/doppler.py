@@ -8,13 +8,14 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from rovgraph.interchange import nucleus
+from rovgraph.interchange.lines import Refused, shown
 from rovgraph.interchange.nortek_records import NUCLEUS_FAMILIES, find_records
 from rovgraph.interchange.pd4 import SIZES, Frames, decoded
 from rovgraph.interchange.pd6 import Sentences
 from rovgraph.interchange.recording import Channel
 from rovgraph.interchange.trdi_recording import channels_of
 from rovgraph.live.message import Message, readings
-from rovgraph.live.sources.lines import LineDecoder, Refused, shown
+from rovgraph.live.sources.lines import LineDecoder
 from rovgraph.live.sources.source import Chunk, Notify
 
 DAY_S = 86400.0
