@@ -3,6 +3,7 @@
 import json
 import re
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -351,3 +352,77 @@ def _smoothed(results):
     if not folder.exists():
         rg.smooth(rg.read_log(log, config), config).save(folder, figures=False)
     return folder
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time,a\n{0},1,\n{1},1,\n", "Expected 2 fields in line 2, saw 3"),
+        ("time,rov_north\n{0},1\n", "column rov_north: is in the table already"),
+        ("time,a\n", "holds no row below its header"),
+        ("time,a\n,1\n", "column time: no row has a time"),
+        ("time,time\n{0},5\n", "column time stands in the table 2 times"),
+    ],
+)
+def test_a_table_that_can_be_misread_is_refused(folder, tmp_path, text, words):
+    (tmp_path / "table.csv").write_text(text.format(BEGAN + 1.0, BEGAN + 2.0))
+    with pytest.raises(rg.InputError, match=words):
+        rg.tag(tmp_path / "table.csv", folder, tmp_path / "placed.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
+
+
+def test_every_row_of_a_table_is_placed_once_whatever_its_index():
+    table = pd.DataFrame({"time": BEGAN + np.array([1.0, 2.0, 3.0])}, index=[0, 0, 1])
+    frame = tag(table, track()).frame
+    assert frame.index.tolist() == [0, 0, 1]
+    assert frame["rov_north"].to_numpy() == pytest.approx(circle().at(BEGAN + np.arange(1.0, 4.0)).p_n[:, 0], abs=1e-3)
+
+
+def test_stamps_of_pandas_are_dates_and_a_missing_one_is_outside_the_dive():
+    for missing in (pd.Series(pd.to_datetime([BEGAN + 30.0, np.nan], unit="s")), pd.Series([BEGAN + 30.0, None])):
+        tagged = tag(pd.DataFrame({"time": missing}), track())
+        assert tagged.inside.tolist() == [True, False]
+        assert tagged.frame["rov_east"].iloc[0] == pytest.approx(40.0, abs=1e-3)
+
+
+def test_a_heading_just_west_of_north_is_none_of_360_degrees(tmp_path):
+    t = circle()
+    north = replace(t, R_nb=matrix_from_rpy(np.tile([0.0, 0.0, np.deg2rad(-0.0001)], (len(t), 1))))
+    frame = tag(pd.DataFrame({"time": [BEGAN + 1.0]}), Track("north", "smoothed", north, ORIGIN)).frame
+    assert frame["rov_heading"].tolist() == [0.0]
+    text = written("srt", tmp_path, of=Track("north", "smoothed", north)).read_text(encoding="utf-8")
+    assert "heading 000°" in text and "360°" not in text
+
+
+@pytest.fixture
+def folder(tmp_path_factory):
+    """A results folder, as far as exports read it."""
+    out = tmp_path_factory.mktemp("folder")
+    circle().write_csv(out / "trajectory_smoothed.csv")
+    origin = {"lat_deg": ORIGIN[0], "lon_deg": ORIGIN[1]}
+    (out / "summary.json").write_text(json.dumps({"program": "rovgraph", "name": "circle", "origin": origin}))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["a/1.jpg", "b/1.jpg"], "rows 1 and 2 both make a copy 1.jpg"),
+        (["a/1.jpg", "cut.jpg"], "cut.jpg: is no JPEG"),
+        (["a/1.jpg", "p.png"], "p.png: is no JPEG"),
+        (["placed_photos/1.jpg"], "holds the photos that are read"),
+    ],
+)
+def test_photos_are_all_copied_or_none(folder, tmp_path, names, words):
+    pytest.importorskip("piexif")
+    image = pytest.importorskip("PIL.Image")
+    for name in ("a/1.jpg", "b/1.jpg", "placed_photos/1.jpg", "p.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        image.new("RGB", (8, 8)).save(tmp_path / name)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "a/1.jpg").read_bytes()[:3])
+    rows = [f"{BEGAN + k},{name}\n" for k, name in enumerate(names)]
+    (tmp_path / "table.csv").write_text("time,f\n" + "".join(rows))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(rg.InputError, match=words):
+        rg.tag(tmp_path / "table.csv", folder, tmp_path / "placed.csv", exif="f", force=True)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
