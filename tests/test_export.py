@@ -2,6 +2,8 @@
 
 import json
 import re
+import sqlite3
+import warnings
 import zipfile
 from dataclasses import replace
 
@@ -209,6 +211,46 @@ def test_subtitles_follow_the_video_of_the_dive(tmp_path):
     assert (number, stamp) == ("31", "00:00:30,000 --> 00:00:31,000")
     assert place.startswith("N 0.0 m  E 40.0 m ±") and attitude == "heading 180°  depth 4.0 m"
     assert re.fullmatch(r"2026-02-13 \d\d:\d\d:\d\d UTC", utc)
+
+
+def test_a_line_across_the_date_line_stays_whole(tmp_path):
+    across = Track("Taveuni", "smoothed", circle(), (-16.8, 180.0), track().fixes)
+    features = json.loads(written("geojson", tmp_path, of=across).read_text(encoding="utf-8"))["features"]
+    assert {f["geometry"]["type"] for f in features} == {"LineString", "Point", "Polygon"}
+    for feature in features:
+        size = 2 if feature["properties"]["kind"] in ("ellipse", "fix") else 3
+        lon = np.array(feature["geometry"]["coordinates"], float).reshape(-1, size)[:, 0]
+        assert np.abs(lon - 180.0).max() < 0.01
+
+
+@pytest.mark.parametrize("raw", ["line\nbreak", "bell\x07", "\udce9t\udce9"], ids=repr)
+@pytest.mark.parametrize("name", ["geojson", "kml", "gpx", "netcdf", "srt"])
+def test_a_dive_may_be_called_anything_that_a_file_may(tmp_path, name, raw):
+    path = written(name, tmp_path, of=replace(track(), name=raw))
+    if name in ("kml", "gpx"):
+        pytest.importorskip("lxml.etree").parse(str(path))
+
+
+def test_times_that_no_calendar_or_ros_has_are_refused_or_left_out(tmp_path):
+    with pytest.raises(rg.InputError, match="unix_offset: nan is no number of seconds"):
+        track().shifted(float("nan"))
+    microseconds = track().shifted(1e15)
+    assert "<time>" not in written("gpx", tmp_path, of=microseconds).read_text(encoding="utf-8")
+    for name, of in (("rosbag2", microseconds), ("mcap", microseconds), ("mcap", track(start=-30.0))):
+        with pytest.raises(rg.InputError, match="state what to add as --unix-offset"):
+            written(name, tmp_path / name, of=of)
+
+
+def test_coordinates_of_another_place_are_warned_of_and_what_is_no_map_is_refused(tmp_path):
+    pytest.importorskip("pyproj")
+    with pytest.warns(rg.DataWarning, match="WGS 84 / UTM zone 55S is not made for 42.050, 3.120"):
+        written("gpkg", tmp_path / "south", Options(crs="EPSG:32755"))
+    for crs in ("EPSG:4978", "EPSG:5773"):
+        with pytest.raises(rg.InputError, match="is no map's coordinates"):
+            written("gpkg", tmp_path, Options(crs=crs))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        written("gpkg", tmp_path / "pacific", Options(crs="EPSG:3832"), replace(track(), origin=(-17.0, 179.9999)))
 
 
 @pytest.mark.parametrize("name", ["geojson", "kml", "gpx", "gpkg", "nmea", "sbet"])
@@ -426,3 +468,23 @@ def test_photos_are_all_copied_or_none(folder, tmp_path, names, words):
     with pytest.raises(rg.InputError, match=words):
         rg.tag(tmp_path / "table.csv", folder, tmp_path / "placed.csv", exif="f", force=True)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ["gpkg", "shp", "rosbag2"])
+def test_what_a_writers_library_cannot_write_is_refused_in_one_line(tmp_path, monkeypatch, name):
+    for library in ("pyogrio.raw", "rosbags.rosbag2"):
+        pytest.importorskip(library)
+    from pyogrio import errors, raw
+    from rosbags.rosbag2 import Writer
+
+    def full(error):
+        def refuse(*_, **__):
+            raise error("disk is full")
+
+        return refuse
+
+    monkeypatch.setattr(raw, "write", full(errors.FeatureError))
+    monkeypatch.setattr(Writer, "write", full(sqlite3.OperationalError))
+    with pytest.raises(rg.InputError, match=r"cannot be written \(.*disk is full\); choose another --out"):
+        written(name, tmp_path)
+    assert not list(tmp_path.iterdir())
