@@ -2,7 +2,10 @@
 
 import json
 import re
+import sqlite3
+import warnings
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -210,6 +213,46 @@ def test_subtitles_follow_the_video_of_the_dive(tmp_path):
     assert re.fullmatch(r"2026-02-13 \d\d:\d\d:\d\d UTC", utc)
 
 
+def test_a_line_across_the_date_line_stays_whole(tmp_path):
+    across = Track("Taveuni", "smoothed", circle(), (-16.8, 180.0), track().fixes)
+    features = json.loads(written("geojson", tmp_path, of=across).read_text(encoding="utf-8"))["features"]
+    assert {f["geometry"]["type"] for f in features} == {"LineString", "Point", "Polygon"}
+    for feature in features:
+        size = 2 if feature["properties"]["kind"] in ("ellipse", "fix") else 3
+        lon = np.array(feature["geometry"]["coordinates"], float).reshape(-1, size)[:, 0]
+        assert np.abs(lon - 180.0).max() < 0.01
+
+
+@pytest.mark.parametrize("raw", ["line\nbreak", "bell\x07", "\udce9t\udce9"], ids=repr)
+@pytest.mark.parametrize("name", ["geojson", "kml", "gpx", "netcdf", "srt"])
+def test_a_dive_may_be_called_anything_that_a_file_may(tmp_path, name, raw):
+    path = written(name, tmp_path, of=replace(track(), name=raw))
+    if name in ("kml", "gpx"):
+        pytest.importorskip("lxml.etree").parse(str(path))
+
+
+def test_times_that_no_calendar_or_ros_has_are_refused_or_left_out(tmp_path):
+    with pytest.raises(rg.InputError, match="unix_offset: nan is no number of seconds"):
+        track().shifted(float("nan"))
+    microseconds = track().shifted(1e15)
+    assert "<time>" not in written("gpx", tmp_path, of=microseconds).read_text(encoding="utf-8")
+    for name, of in (("rosbag2", microseconds), ("mcap", microseconds), ("mcap", track(start=-30.0))):
+        with pytest.raises(rg.InputError, match="state what to add as --unix-offset"):
+            written(name, tmp_path / name, of=of)
+
+
+def test_coordinates_of_another_place_are_warned_of_and_what_is_no_map_is_refused(tmp_path):
+    pytest.importorskip("pyproj")
+    with pytest.warns(rg.DataWarning, match="WGS 84 / UTM zone 55S is not made for 42.050, 3.120"):
+        written("gpkg", tmp_path / "south", Options(crs="EPSG:32755"))
+    for crs in ("EPSG:4978", "EPSG:5773"):
+        with pytest.raises(rg.InputError, match="is no map's coordinates"):
+            written("gpkg", tmp_path, Options(crs=crs))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        written("gpkg", tmp_path / "pacific", Options(crs="EPSG:3832"), replace(track(), origin=(-17.0, 179.9999)))
+
+
 @pytest.mark.parametrize("name", ["geojson", "kml", "gpx", "gpkg", "nmea", "sbet"])
 def test_a_dive_of_unknown_place_is_refused_with_what_to_do_and_nothing_is_written(tmp_path, name):
     with pytest.raises(rg.InputError, match=r"state environment\.origin_lat_deg"):
@@ -361,3 +404,97 @@ def _smoothed(results):
     if not folder.exists():
         rg.smooth(rg.read_log(log, config), config).save(folder, figures=False)
     return folder
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time,a\n{0},1,\n{1},1,\n", "Expected 2 fields in line 2, saw 3"),
+        ("time,rov_north\n{0},1\n", "column rov_north: is in the table already"),
+        ("time,a\n", "holds no row below its header"),
+        ("time,a\n,1\n", "column time: no row has a time"),
+        ("time,time\n{0},5\n", "column time stands in the table 2 times"),
+    ],
+)
+def test_a_table_that_can_be_misread_is_refused(folder, tmp_path, text, words):
+    (tmp_path / "table.csv").write_text(text.format(BEGAN + 1.0, BEGAN + 2.0))
+    with pytest.raises(rg.InputError, match=words):
+        rg.tag(tmp_path / "table.csv", folder, tmp_path / "placed.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
+
+
+def test_every_row_of_a_table_is_placed_once_whatever_its_index():
+    table = pd.DataFrame({"time": BEGAN + np.array([1.0, 2.0, 3.0])}, index=[0, 0, 1])
+    frame = tag(table, track()).frame
+    assert frame.index.tolist() == [0, 0, 1]
+    assert frame["rov_north"].to_numpy() == pytest.approx(circle().at(BEGAN + np.arange(1.0, 4.0)).p_n[:, 0], abs=1e-3)
+
+
+def test_stamps_of_pandas_are_dates_and_a_missing_one_is_outside_the_dive():
+    for missing in (pd.Series(pd.to_datetime([BEGAN + 30.0, np.nan], unit="s")), pd.Series([BEGAN + 30.0, None])):
+        tagged = tag(pd.DataFrame({"time": missing}), track())
+        assert tagged.inside.tolist() == [True, False]
+        assert tagged.frame["rov_east"].iloc[0] == pytest.approx(40.0, abs=1e-3)
+
+
+def test_a_heading_just_west_of_north_is_none_of_360_degrees(tmp_path):
+    t = circle()
+    north = replace(t, R_nb=matrix_from_rpy(np.tile([0.0, 0.0, np.deg2rad(-0.0001)], (len(t), 1))))
+    frame = tag(pd.DataFrame({"time": [BEGAN + 1.0]}), Track("north", "smoothed", north, ORIGIN)).frame
+    assert frame["rov_heading"].tolist() == [0.0]
+    text = written("srt", tmp_path, of=Track("north", "smoothed", north)).read_text(encoding="utf-8")
+    assert "heading 000°" in text and "360°" not in text
+
+
+@pytest.fixture
+def folder(tmp_path_factory):
+    """A results folder, as far as exports read it."""
+    out = tmp_path_factory.mktemp("folder")
+    circle().write_csv(out / "trajectory_smoothed.csv")
+    origin = {"lat_deg": ORIGIN[0], "lon_deg": ORIGIN[1]}
+    (out / "summary.json").write_text(json.dumps({"program": "rovgraph", "name": "circle", "origin": origin}))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["a/1.jpg", "b/1.jpg"], "rows 1 and 2 both make a copy 1.jpg"),
+        (["a/1.jpg", "cut.jpg"], "cut.jpg: is no JPEG"),
+        (["a/1.jpg", "p.png"], "p.png: is no JPEG"),
+        (["placed_photos/1.jpg"], "holds the photos that are read"),
+    ],
+)
+def test_photos_are_all_copied_or_none(folder, tmp_path, names, words):
+    pytest.importorskip("piexif")
+    image = pytest.importorskip("PIL.Image")
+    for name in ("a/1.jpg", "b/1.jpg", "placed_photos/1.jpg", "p.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        image.new("RGB", (8, 8)).save(tmp_path / name)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "a/1.jpg").read_bytes()[:3])
+    rows = [f"{BEGAN + k},{name}\n" for k, name in enumerate(names)]
+    (tmp_path / "table.csv").write_text("time,f\n" + "".join(rows))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(rg.InputError, match=words):
+        rg.tag(tmp_path / "table.csv", folder, tmp_path / "placed.csv", exif="f", force=True)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ["gpkg", "shp", "rosbag2"])
+def test_what_a_writers_library_cannot_write_is_refused_in_one_line(tmp_path, monkeypatch, name):
+    for library in ("pyogrio.raw", "rosbags.rosbag2"):
+        pytest.importorskip(library)
+    from pyogrio import errors, raw
+    from rosbags.rosbag2 import Writer
+
+    def full(error):
+        def refuse(*_, **__):
+            raise error("disk is full")
+
+        return refuse
+
+    monkeypatch.setattr(raw, "write", full(errors.FeatureError))
+    monkeypatch.setattr(Writer, "write", full(sqlite3.OperationalError))
+    with pytest.raises(rg.InputError, match=r"cannot be written \(.*disk is full\); choose another --out"):
+        written(name, tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from autopilot_files import autopilot_messages, dataflash_of, packed, short_dive, tlog
 from dives import changed, falcon, rms, simulated
 from test_api import command
 
@@ -209,6 +210,20 @@ def test_rows_that_overlap_by_less_than_a_second_are_put_in_order_and_counted():
     kept, said = put_in_order(channel([0.0, 1.0, 0.5, 2.0]), "a.log")
     assert kept.columns["depth"].tolist() == [0.0, 2.0, 1.0, 3.0]
     assert "1 rows behind the time" in said[0]
+
+
+def test_one_wrong_stamp_costs_its_row_alone():
+    for wrong in (4000.0, -50.0, 0.0):
+        time = np.arange(0.0, 100.0, 0.1)
+        time[500] = wrong
+        ordered, said = put_in_order(Channel("depth", {"time": time, "depth": np.ones(1000)}, "depth"), "a.bin")
+        assert ordered.columns["time"].tolist() == np.delete(np.arange(0.0, 100.0, 0.1), 500).tolist()
+        assert "1 of 1000 rows have stamps of another time" in said[0]
+
+
+def test_a_shift_that_is_no_number_is_refused(dive):
+    with pytest.raises(InputError, match="shift dvl: nan is no number of seconds"):
+        merge([autopilot(dive), instrument(dive, 0.0)], {}, {"dvl": float("nan")})
 
 
 def test_a_clock_that_is_set_within_a_file_is_refused():
@@ -450,3 +465,39 @@ def test_a_dive_at_sea_in_two_files_is_joined_by_its_compass():
     assert clock.sd < 0.4
     assert abs(late) < 3.0 * clock.sd
     assert merged.nested_settings()["calibration"]["dvl_time_offset"]["estimate"] is True
+
+
+# From two files of one autopilot
+
+
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory) -> list[Path]:
+    """Two logs of one dive by one autopilot, without a DVL: one with its own clock, one as a ground station has it."""
+    pytest.importorskip("pymavlink")
+    folder = tmp_path_factory.mktemp("boxes")
+    frame = short_dive(5.0)
+    frame = frame.drop(columns=[name for name in frame if name.startswith("dvl")])
+    (folder / "box.BIN").write_bytes(dataflash_of(frame, 0.0, 101_325.0))
+    sent = [(START + time, packed(message)) for time, message in autopilot_messages(frame, 0.0, 101_325.0)]
+    (folder / "box.tlog").write_bytes(tlog(*sent))
+    return [folder / "box.BIN", folder / "box.tlog"]
+
+
+@pytest.mark.parametrize("choice", ["box.BIN", "IMU 0", "imu 0"])
+def test_a_choice_names_a_file_or_what_one_of_several_files_has(boxes, choice):
+    converted = rg.convert(boxes[::-1], choose={"imu": choice}, shift={"depth": 0.0})
+    assert converted.report["columns"]["acc_x"].startswith("box.BIN: IMU 0")
+
+
+def test_a_choice_that_no_file_has_is_refused_with_those_of_all(boxes):
+    with pytest.raises(InputError, match=r"choose imu=IMU 7: .* there are: box\.BIN: IMU 0.*box\.tlog: HIGHRES_IMU"):
+        rg.convert(boxes, choose={"imu": "IMU 7"})
+
+
+def test_a_configuration_to_begin_with_is_written_for_any_sensors_and_any_name(boxes, tmp_path):
+    converted = rg.convert(boxes[0])
+    converted.save(tmp_path / "a\nb.csv", tmp_path / "vehicle.yaml")
+    assert "dvl" not in rg.load_config(tmp_path / "vehicle.yaml").model_fields_set
+    for config_out in ("log.csv", "log.report.json"):
+        with pytest.raises(InputError, match="is to be written twice"):
+            converted.save(tmp_path / "log.csv", tmp_path / config_out)

@@ -10,10 +10,12 @@ from rovgraph.config import Config, completed
 from rovgraph.errors import InputError, collected_warnings, warn
 from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.interchange.account import account, notes
+from rovgraph.interchange.alternatives import SourceMissing
 from rovgraph.interchange.formats import Format, Options, formats, head_of, read_recording, recognise
 from rovgraph.interchange.merging import Merged, merge
 from rovgraph.interchange.own_log import FORMAT as OWN_LOG
 from rovgraph.interchange.own_log import is_own_log
+from rovgraph.interchange.recording import Recording
 from rovgraph.interchange.unknown import is_text, purpose, refusal
 from rovgraph.log import Log
 
@@ -123,6 +125,8 @@ def convert(
     if not files:
         raise InputError("no file was given; expected native files or logs of one dive")
     found = [_format(path, config) for path in files]
+    names = {name for path in files for name in (str(path), path.name, path.stem)}
+    inside = {sensor: source for sensor, source in choose.items() if source not in names}  # of a file's sources
     recordings = []
     for k, (path, format_) in enumerate(zip(files, found, strict=True)):
         progress(f"reading {path.name}", k / len(files))
@@ -130,8 +134,8 @@ def convert(
         def read(done: int, total: int, k: int = k, name: str = path.name) -> None:
             progress(f"reading {name}", (k + done / max(total, 1)) / len(files))
 
-        options = Options(choose, read, config.columns, config.units)
-        recordings.append(read_recording(path, options, format_))
+        options = Options(inside, read, config.columns, config.units)
+        recordings.append(_read(path, options, format_, len(files) == 1))
     progress("joining clocks", 1.0)
     merged = merge(recordings, choose, shift)
     for text in merged.warnings:
@@ -149,6 +153,17 @@ def convert(
         notes=(*notes(merged), *_settings_told(merged, used)),
     )
     return Conversion(merged, log, bare, used)
+
+
+def _read(path: Path, options: Options, format_: Format | None, alone: bool) -> Recording:
+    """A file; where it is one of several, another one may have what was chosen, or else `merge` refuses it."""
+    try:
+        return read_recording(path, options, format_)
+    except SourceMissing as error:
+        if alone:
+            raise
+        others = {sensor: source for sensor, source in options.choose.items() if sensor != error.sensor}
+        return _read(path, replace(options, choose=others), format_, alone)
 
 
 def _settings_told(merged: Merged, used: Mapping[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ import pandas as pd
 from rovgraph.errors import InputError
 from rovgraph.export import Options, Tagged, Track, read_track, write_track
 from rovgraph.export import tag as tag_table
-from rovgraph.export.tagging import geotag
+from rovgraph.export.tagging import column_of, geotag
 
 if TYPE_CHECKING:
     from rovgraph.api.smoothing import Result
@@ -83,38 +83,53 @@ def tag(
     ------
     InputError : a table that cannot be worked with, no row within the dive, no origin for EXIF
     """
+    from rovgraph.report.folder import results_files
+
     table, out = Path(table), Path(out)
     photos = out.with_name(f"{out.stem}_photos")
-    for target in (out, photos) if exif else (out,):
-        if target.exists() and not force:
-            raise InputError(f"{target} exists; choose another --out or give --force")
+    if exif is not None and photos.exists() and not force:
+        raise InputError(f"{photos} exists; choose another --out or give --force")
+    frame = _read_cells(table)
+    track = track_of(results, estimate)
     try:
-        frame = pd.read_csv(table, skipinitialspace=True, dtype=str, keep_default_na=False)  # cells stay as they are
+        files = None if exif is None else [table.parent / name for name in column_of(frame, exif)]
+        tagged = tag_table(frame, track, time, offset)
+    except InputError as error:
+        raise InputError(f"{table}: {error}") from None
+    with results_files([out], force) as [partial]:
+        tagged.frame.to_csv(partial, index=False)
+        if files is not None:
+            _copy_photos(tagged, track, files, photos, partial.parent)
+    return tagged
+
+
+def _read_cells(table: Path) -> pd.DataFrame:
+    """A table whose cells stay as they are, texts."""
+    try:
+        rows = pd.read_csv(
+            table, header=None, skipinitialspace=True, dtype=str, keep_default_na=False, encoding="utf-8-sig"
+        )
     except FileNotFoundError:
         raise InputError(f"{table}: no such file; check the name") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{table}: cannot be read as CSV ({(str(error).splitlines() or [''])[0]})") from None
-    if exif is not None and exif not in frame:
-        raise InputError(f"{table}: column {exif} is not in it; it has {', '.join(map(str, frame.columns[:12]))}")
-    track = track_of(results, estimate)
+    if len(rows) < 2:
+        raise InputError(f"{table}: holds no row below its header")
+    return rows.iloc[1:].set_axis(rows.iloc[0].str.strip(), axis="columns").reset_index(drop=True)
+
+
+def _copy_photos(tagged: Tagged, track: Track, files: Sequence[Path], folder: Path, temporary: Path) -> None:
+    """All photos with their place, in ``folder``, or none; other files in it stay."""
+    if any(file.parent.resolve() == folder.resolve() for file in files):
+        raise InputError(f"{folder}: holds the photos that are read; choose another --out")
+    copies = temporary / folder.name
     try:
-        tagged = tag_table(frame, track, time, offset)
-    except InputError as error:
-        raise InputError(f"{table}: {error}") from None
-    if exif is not None:
-        try:
-            geotag(tagged, track, [table.parent / str(name) for name in frame[exif]], photos)
-        except ImportError:
-            raise InputError("tagging photos needs piexif; install it with: pip install 'rovgraph[maps]'") from None
-    partial = out.with_name(f".{out.name}.partial")
-    try:
-        tagged.frame.to_csv(partial, index=False)
-        partial.replace(out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror or error}); choose another --out") from None
-    finally:
-        partial.unlink(missing_ok=True)
-    return tagged
+        geotag(tagged, track, files, copies)
+    except ImportError:
+        raise InputError("tagging photos needs piexif; install it with: pip install 'rovgraph[maps]'") from None
+    folder.mkdir(exist_ok=True)
+    for copy in copies.iterdir():
+        copy.replace(folder / copy.name)
 
 
 def track_of(results: "Result | Path | str", estimate: str | None = None) -> Track:

@@ -8,7 +8,7 @@ import importlib
 import secrets
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
@@ -130,6 +130,7 @@ def write_track(track: Track, names: Sequence[str], folder: Path, options: Optio
     """
     check_exportable(names, track.name, track.origin, float(track.trajectory.time[0]))
     formats = known_formats(list(dict.fromkeys(names)))
+    track = replace(track, name=_printable(track.name))
     targets = [folder / f"track_{track.estimate}{format_.suffix or '_' + format_.name}" for format_ in formats]
     for target in targets:
         if target.exists() and not force:
@@ -142,6 +143,11 @@ def write_track(track: Track, names: Sequence[str], folder: Path, options: Optio
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from None
     return targets
+
+
+def _printable(name: str) -> str:
+    """A name that XML and UTF-8 can hold: file names may have any bytes."""
+    return "".join(letter if letter.isprintable() else " " for letter in name)
 
 
 def _write(format_: ExportFormat, track: Track, path: Path, options: Options) -> None:

@@ -29,7 +29,7 @@ def document(track: Track, options: Options) -> "simplekml.Kml":
         line = kml.newgxtrack(name=track.name, altitudemode="absolute")
         line.newwhen([stamp.strftime("%Y-%m-%dT%H:%M:%S.%fZ") for stamp in shown.utc])
         line.newgxcoord(coordinates)
-        line.newgxangle([(float(yaw), 0.0, 0.0) for yaw in (np.rad2deg(shown.trajectory.rpy[:, 2]) % 360.0).round(3)])
+        line.newgxangle([(float(yaw), 0.0, 0.0) for yaw in np.rad2deg(shown.trajectory.rpy[:, 2]).round(3) % 360.0])
     else:
         line = kml.newlinestring(name=track.name, altitudemode="absolute", coords=coordinates)
     line.style.linestyle.color, line.style.linestyle.width = LINE, 3

@@ -27,7 +27,7 @@ def point_table(track: Track) -> pd.DataFrame:
             "lat": lat.round(9),
             "lon": lon.round(9),
             "depth": t.p_n[:, 2].round(4),
-            "heading": (rpy[:, 2] % 360.0).round(3),
+            "heading": rpy[:, 2].round(3) % 360.0,
             "pitch": rpy[:, 1].round(3),
             "roll": rpy[:, 0].round(3),
             "speed": np.linalg.norm(t.v_n[:, :2], axis=1).round(4),

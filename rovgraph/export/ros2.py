@@ -4,11 +4,13 @@ ROS has x east, y north, z up and a body with x forward, y left, z up: both are 
 `FRD_TO_FLU`.
 """
 
+import sqlite3
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rovgraph.errors import InputError, in_one_line
 from rovgraph.export.formats import ExportFormat, Options
 from rovgraph.export.track import Track
 from rovgraph.geometry import Array, quaternion_from_matrix, transpose
@@ -18,14 +20,26 @@ FRD_TO_FLU = np.diag([1.0, -1.0, -1.0])
 MAP, BODY = "map", "base_link"
 PATH_POSES = 2000  # at most: a path is one message
 COVARIANCE_KNOWN = 3  # COVARIANCE_TYPE_KNOWN
+LATEST = 2.0**31  # seconds that a stamp of ROS holds
 NO_FIX_TYPE = -1  # STATUS_NO_FIX: it is an estimate, no satellite's
 
 
 def write_bag(track: Track, path: Path, options: Options, plugin: str) -> None:
-    """``/odometry``, ``/path`` and ``/tf``, and ``/fix`` where the origin is known; at keyframes or at a rate."""
+    """``/odometry``, ``/path`` and ``/tf``, and ``/fix`` where the origin is known; at keyframes or at a rate.
+
+    Raises
+    ------
+    InputError : times that ROS does not have
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
+    begin, end = (float(track.trajectory.time[k]) for k in (0, -1))
+    if begin < 0.0 or end >= LATEST:
+        raise InputError(
+            f"{track.name}: its time goes from {begin:g} to {end:g} s, and ROS's from 0 to {LATEST:g} s; state what "
+            "to add as --unix-offset"
+        )
     store = get_typestore(Stores.ROS2_HUMBLE)
     shown = track.at_rate(options.rate)
     messages = Messages(store, shown)
@@ -147,7 +161,10 @@ def _covariance(first: Array, second: Array) -> Array:
 
 def write_sqlite(track: Track, path: Path, options: Options) -> None:
     """A bag folder with an SQLite file."""
-    write_bag(track, path, options, "SQLITE3")
+    try:
+        write_bag(track, path, options, "SQLITE3")
+    except sqlite3.Error as error:  # as of a full disk
+        raise OSError(in_one_line(error)) from error
 
 
 def write_mcap(track: Track, path: Path, options: Options) -> None:

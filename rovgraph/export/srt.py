@@ -16,7 +16,7 @@ def write(track: Track, path: Path, options: Options) -> None:
     shown, start = track.at_rate(rate), track.trajectory.time[0]
     t = shown.trajectory
     where = _places(shown)
-    sd, heading = np.hypot(t.p_sd[:, 0], t.p_sd[:, 1]), np.rad2deg(t.rpy[:, 2]) % 360.0
+    sd, heading = np.hypot(t.p_sd[:, 0], t.p_sd[:, 1]), np.rad2deg(t.rpy[:, 2]).round() % 360.0
     blocks = []
     for k, time in enumerate((t.time - start).tolist()):
         lines = [

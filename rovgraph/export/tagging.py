@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, in_one_line
 from rovgraph.export.points import point_table
 from rovgraph.export.track import Track
 from rovgraph.geometry import Array
@@ -48,12 +48,16 @@ def tag(table: pd.DataFrame, track: Track, column: str = "time", offset: float =
 
     Raises
     ------
-    InputError : no such column, times that cannot be read, no row within the dive
+    InputError : no such column or several, columns that it would add, times that cannot be read, no row within the dive
     """
-    if column not in table:
-        raise InputError(f"column {column} is not in the table; it has {', '.join(map(str, table.columns[:12]))}")
+    times = column_of(table, column)
+    clash = next((str(name) for name in table.columns if str(name).startswith(PLACED)), None)
+    if clash is not None:
+        raise InputError(f"column {clash}: is in the table already; give the table without columns {PLACED}...")
     t = track.trajectory
-    time = _seconds(table[column], track) + offset
+    time = _seconds(times, track) + offset
+    if not np.isfinite(time).any():
+        raise InputError(f"column {column}: no row has a time (the offset is {offset:g} s)")
     inside = (time >= t.time[0]) & (time <= t.time[-1])
     if not inside.any():
         raise InputError(
@@ -62,9 +66,27 @@ def tag(table: pd.DataFrame, track: Track, column: str = "time", offset: float =
         )
     own = Track(track.name, track.estimate, t.at(np.sort(time[inside])), track.origin)
     order = np.argsort(np.argsort(time[inside], kind="stable"), kind="stable")
-    placed = _columns(own).iloc[order].set_axis(table.index[inside])
-    frame = table.join(placed.add_prefix(PLACED))
+    frame = table.copy()
+    for name, values in _columns(own).iloc[order].items():
+        placed = np.full(len(table), np.nan)
+        placed[inside] = values
+        frame[f"{PLACED}{name}"] = placed
     return Tagged(frame, inside, time)
+
+
+def column_of(table: pd.DataFrame, column: str) -> pd.Series:
+    """A column by name.
+
+    Raises
+    ------
+    InputError : no such column, or several
+    """
+    found = [k for k, name in enumerate(table.columns) if name == column]
+    if not found:
+        raise InputError(f"column {column} is not in the table; it has {', '.join(map(str, table.columns[:12]))}")
+    if len(found) > 1:
+        raise InputError(f"column {column} stands in the table {len(found)} times")
+    return table.iloc[:, found[0]]
 
 
 def _columns(track: Track) -> pd.DataFrame:
@@ -81,16 +103,18 @@ def _columns(track: Track) -> pd.DataFrame:
 
 
 def _seconds(times: pd.Series, track: Track) -> Array:
-    numbers = pd.to_numeric(times, errors="coerce")
-    if numbers[times.astype(str).str.strip() != ""].notna().all():  # a row without a time is outside the dive
-        return numbers.to_numpy(float)
-    dates = pd.to_datetime(times.astype(str), utc=True, errors="coerce", format="ISO8601")
-    wrong = np.flatnonzero(dates.isna() & (times.astype(str).str.strip() != ""))
+    texts = times.astype(str).str.strip()
+    stated = times.notna() & (texts != "")  # a row without a time is outside the dive
+    if not pd.api.types.is_datetime64_any_dtype(times):
+        numbers = pd.to_numeric(times, errors="coerce")
+        if numbers[stated].notna().all():
+            return numbers.to_numpy(float)
+    dates = pd.to_datetime(texts.where(stated), utc=True, errors="coerce", format="ISO8601")
+    wrong = np.flatnonzero(dates.isna() & stated)
     if len(wrong):
         raise InputError(
             f"column {times.name}: row {wrong[0] + 1} is {str(times.iloc[wrong[0]])[:30]!r}, expected seconds or a date"
-            " "
-            "such as 2026-05-01T09:30:00Z"
+            " such as 2026-05-01T09:30:00Z"
         )
     if not track.has_utc:
         raise InputError(
@@ -113,24 +137,33 @@ def geotag(tagged: Tagged, track: Track, files: Sequence[Path], folder: Path) ->
 
     Raises
     ------
-    InputError : no origin, a photo that is not there or is no JPEG
+    InputError : no origin, a photo that is not there or is no JPEG, two photos of one name
     """
     import piexif
 
     at = track.trajectory.at(tagged.time)
     lat, lon = Track(track.name, track.estimate, at, track.origin).lat_lon
     chosen = np.flatnonzero(tagged.inside).tolist()
+    row_of: dict[str, int] = {}
     for k in chosen:
         if not files[k].is_file():
             raise InputError(f"{files[k]}: no such photo; names in the table are relative to its folder")
+        if (other := row_of.setdefault(files[k].name, k)) != k:
+            raise InputError(f"{files[k]}: rows {other + 1} and {k + 1} both make a copy {files[k].name}")
     folder.mkdir(parents=True, exist_ok=True)
     for k in chosen:
+        gps = _gps(float(lat[k]), float(lon[k]), float(at.p_n[k, 2]), float(np.rad2deg(at.rpy[k, 2])))
         try:
             exif = piexif.load(str(files[k]))
-            exif["GPS"] = _gps(float(lat[k]), float(lon[k]), float(at.p_n[k, 2]), float(np.rad2deg(at.rpy[k, 2])))
-            piexif.insert(piexif.dump(exif), str(files[k]), str(folder / files[k].name))
-        except (piexif.InvalidImageDataError, ValueError) as error:
-            raise InputError(f"{files[k]}: is no JPEG that can be tagged ({str(error).splitlines()[0]})") from None
+            exif["GPS"] = gps
+            content = piexif.dump(exif)
+            piexif.insert(content, str(files[k]), str(folder / files[k].name))
+        except PermissionError as error:
+            raise InputError(f"{files[k]}: cannot be read ({error.strerror})") from None
+        except OSError:
+            raise
+        except Exception as error:  # whatever a library of others meets in bytes of others
+            raise InputError(f"{files[k]}: is no JPEG that can be tagged ({in_one_line(error)})") from None
     return len(chosen)
 
 
@@ -147,7 +180,7 @@ def _gps(lat: float, lon: float, depth: float, heading: float) -> dict[int, obje
         piexif.GPSIFD.GPSAltitudeRef: below,
         piexif.GPSIFD.GPSAltitude: (round(1000.0 * abs(depth)), 1000),
         piexif.GPSIFD.GPSImgDirectionRef: "T",
-        piexif.GPSIFD.GPSImgDirection: (round(100.0 * (heading % 360.0)), 100),
+        piexif.GPSIFD.GPSImgDirection: (round(100.0 * heading) % 36_000, 100),
         piexif.GPSIFD.GPSMapDatum: "WGS-84",
     }
 

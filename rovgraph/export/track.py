@@ -13,6 +13,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.trajectory import Trajectory, read_trajectory
 
+LATEST_UNIX = 4_102_444_800.0  # 2100: stamps beyond are in other units [s]
 EARLIEST_UNIX = 315_532_800.0  # 1980: no clock of a vehicle that counts from its start gets that far [s]
 CHI2_95 = 5.991  # of two degrees of freedom
 ESTIMATES = ("smoothed", "filtered", "dead_reckoning")
@@ -78,7 +79,7 @@ class Track:
     @property
     def has_utc(self) -> bool:
         """Whether time counts from 1970."""
-        return is_utc(float(self.trajectory.time[0]))
+        return all(map(is_utc, self.trajectory.time[[0, -1]].tolist()))
 
     @property
     def utc(self) -> pd.DatetimeIndex:
@@ -92,7 +93,14 @@ class Track:
         return pd.to_datetime(np.round(self.trajectory.time * 1e6).astype(np.int64), unit="us", utc=True)
 
     def shifted(self, seconds: float) -> "Track":
-        """The same with another zero of time."""
+        """The same with another zero of time.
+
+        Raises
+        ------
+        InputError : no number of seconds
+        """
+        if not np.isfinite(seconds):
+            raise InputError(f"unix_offset: {seconds:g} is no number of seconds")
         fixes = None if self.fixes is None else replace(self.fixes, time=self.fixes.time + seconds)
         return replace(self, trajectory=replace(self.trajectory, time=self.trajectory.time + seconds), fixes=fixes)
 
@@ -135,7 +143,7 @@ def require_place(name: str, origin: tuple[float, float] | None) -> tuple[float,
 
 def is_utc(time: float) -> bool:
     """Whether a time [s] counts from 1970."""
-    return time >= EARLIEST_UNIX
+    return EARLIEST_UNIX <= time < LATEST_UNIX
 
 
 def require_utc(name: str, start: float) -> None:

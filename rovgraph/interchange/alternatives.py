@@ -6,6 +6,19 @@ from pathlib import Path
 from rovgraph.errors import InputError
 
 
+class SourceMissing(InputError):
+    """A file has a sensor, and not the source of it that was chosen; another file may.
+
+    Attributes
+    ----------
+    sensor : name of its stream in a log
+    """
+
+    def __init__(self, text: str, sensor: str) -> None:
+        super().__init__(text)
+        self.sensor = sensor
+
+
 def preferred_first(path: Path, sensor: str, labels: Sequence[str], choose: Mapping[str, str]) -> list[str]:
     """Sources of a sensor with what a user chose in front.
 
@@ -18,13 +31,14 @@ def preferred_first(path: Path, sensor: str, labels: Sequence[str], choose: Mapp
 
     Raises
     ------
-    InputError : none is called so
+    SourceMissing : none is called so
     """
     wanted = choose.get(sensor)
     if wanted is None or not labels:
         return list(labels)
     if not any(_means(wanted, label) for label in labels):
-        raise InputError(f"{path}: {sensor} cannot come from {wanted!r}; choose one of: {', '.join(labels)}")
+        text = f"{path}: {sensor} cannot come from {wanted!r}; choose one of: {', '.join(labels)}"
+        raise SourceMissing(text, sensor)
     return sorted(labels, key=lambda label: not _means(wanted, label))
 
 

@@ -234,6 +234,8 @@ def _stated(
     out: dict[int, float] = {}
     beside: dict[str, float] = {}
     for key, seconds in shift.items():
+        if not np.isfinite(seconds):
+            raise InputError(f"shift {key}: {seconds:g} is no number of seconds")
         by_sensor = {(s.file, s.channel.clock) for s in selected if s.channel.sensor == key}
         files = {k for k, name in enumerate(names) if key in (name, Path(name).stem, recordings[k].path)}
         meant = [a for a in axes if a.file in files or any((a.file, name) in by_sensor for name in a.lines)]

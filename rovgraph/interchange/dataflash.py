@@ -8,7 +8,7 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.interchange import dataflash_channels as channels
-from rovgraph.interchange.alternatives import preferred_first
+from rovgraph.interchange.alternatives import SourceMissing, preferred_first
 from rovgraph.interchange.ardupilot import CLOCK, SPEED_ESTIMATE_AXES, settings
 from rovgraph.interchange.dataflash_channels import Findings, Source
 from rovgraph.interchange.dataflash_messages import FMT, HEAD, INSTANCE, Contents, Messages, read_messages, texts
@@ -115,12 +115,12 @@ def _count_other_imus(path: Path, contents: Contents, findings: Findings) -> Non
 
     Raises
     ------
-    InputError : that which was chosen is not there
+    SourceMissing : that which was chosen is not there
     """
     known = ", ".join(f"IMU {k}" for k in sorted(contents.instances.get("IMU", ())))
     kept = len(contents.messages.get("IMU", ()))
     if known and not kept:
-        raise InputError(f"{path}: the imu that was chosen is not there; choose one of: {known}")
+        raise SourceMissing(f"{path}: the imu that was chosen is not there; choose one of: {known}", "imu")
     if others := contents.counts["IMU"] - kept:
         findings.left["IMU", f"of another instance; choose one of: {known}"] = others
 

@@ -140,7 +140,8 @@ def read_recording(path: Path | str, options: Options | None = None, format_: Fo
                 f"pip install 'rovgraph[{format_.extra}]'"
             ) from None
         except InputError as error:
-            raise InputError(str(error).replace(str(plain), str(path))) from None
+            error.args = (str(error).replace(str(plain), str(path)),)
+            raise
         except Exception as error:  # whatever a damaged file does to a reader
             raise InputError(f"{path}: cannot be read as a {format_.title} ({in_one_line(error)}); damaged?") from error
     said = tuple(text.replace(str(plain), str(path)) for text in recording.warnings)
@@ -153,7 +154,7 @@ def unpacked(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    InputError : no such file, empty, damaged compression
+    InputError : no such file, empty, damaged compression, no space for the copy
     """
     head = _head(path)
     if not head and not path.is_dir():
@@ -168,6 +169,8 @@ def unpacked(path: Path) -> Iterator[Path]:
                 shutil.copyfileobj(packed, out, 1 << 20)
         except (EOFError, zlib.error, gzip.BadGzipFile):
             raise InputError(f"{path}: gzip data are damaged or cut off; copy the file again") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be unpacked into {folder} ({error.strerror}); unpack it first") from None
         yield plain
 
 

@@ -50,6 +50,18 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
 
 def _of_one_epoch(time: NDArray[np.float64]) -> NDArray[np.int64]:
     """Indices of the longest piece without a jump, and of the pieces around it that go on in its order."""
+    kept = np.flatnonzero(~_alone(time))
+    return np.asarray(kept[_longest(time[kept])])
+
+
+def _alone(time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Rows whose stamp is wrong by itself: those before and after it are in order, it is not between them."""
+    before, after = time[:-2], time[2:]
+    outside = (time[1:-1] > after + STEP_BACK) | (time[1:-1] < before - STEP_BACK)
+    return np.pad(outside & (before <= after), 1)[: len(time)]
+
+
+def _longest(time: NDArray[np.float64]) -> NDArray[np.int64]:
     steps = np.diff(time)
     breaks = np.flatnonzero((steps < -STEP_BACK) | (steps > JUMP)) + 1
     pieces = np.split(np.arange(len(time)), breaks)

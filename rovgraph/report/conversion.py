@@ -79,16 +79,17 @@ def starter(config: Config, log: Log, sources: Mapping[str, str], name: str) -> 
         section |= {"origin_lat_deg": log.origin[0], "origin_lon_deg": log.origin[1]}
         sources |= dict.fromkeys(("environment.origin_lat_deg", "environment.origin_lon_deg"), "the first fix")
     for sensor, axes in MOUNTED.items():
-        if sensor in log and "mount_rpy_deg" not in settings.setdefault(sensor, {}):
-            settings[sensor]["mount_rpy_deg"] = [0, 0, 0]
+        if sensor not in log:
+            continue
+        section = settings.setdefault(sensor, {})
+        if "mount_rpy_deg" not in section:
+            section["mount_rpy_deg"] = [0, 0, 0]
             sources[f"{sensor}.mount_rpy_deg"] = f"not known: assumed {axes}; state it"
-        if sensor in log and "lever_arm_m" not in settings[sensor]:
-            settings[sensor]["lever_arm_m"] = [0, 0, 0]
+        if "lever_arm_m" not in section:
+            section["lever_arm_m"] = [0, 0, 0]
             sources[f"{sensor}.lever_arm_m"] = "not known; state it, forward, starboard, down from the vehicle's origin"
-        if not settings[sensor]:
-            del settings[sensor]
     counts = ", ".join(f"{sensor} ({len(stream)})" for sensor, stream in log.streams.items())
-    head = f"# Configuration to begin with, for {name}\n# sensors: {counts}\n"
+    head = f"# Configuration to begin with, for {' '.join(name.split())}\n# sensors: {counts}\n"
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 4096

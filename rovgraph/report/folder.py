@@ -86,9 +86,12 @@ def results_files(paths: Sequence[Path], force: bool = False) -> Iterator[list[P
 
     Raises
     ------
-    InputError : a file exists and ``force`` is not given, or cannot be written; then nothing is kept
+    InputError : a file exists and ``force`` is not given, is there twice, or cannot be written; then nothing is kept
     """
-    for path in paths:
+    places = [_resolved(path) for path in paths]
+    for path, place in zip(paths, places, strict=True):
+        if places.count(place) > 1:
+            raise InputError(f"{path} is to be written twice; choose different names")
         if path.is_dir():
             raise InputError(f"{path} is a folder, not a file; choose another name")
         if path.exists() and not force:
