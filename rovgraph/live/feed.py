@@ -10,6 +10,7 @@ from operator import attrgetter
 from types import TracebackType
 from typing import Self
 
+from rovgraph.live.commands import Command
 from rovgraph.live.message import Message
 from rovgraph.live.sources.source import Source
 from rovgraph.live.warnings import Warnings
@@ -37,7 +38,7 @@ class Feed:
     def __init__(self, sources: Sequence[Source], warnings: Warnings | None = None, size: int = QUEUE) -> None:
         self._sources = tuple(sources)
         self._complaints = warnings or Warnings()
-        self._queue: queue.Queue[Message | None] = queue.Queue(size)  # None = a source has ended
+        self._queue: queue.Queue[Message | Command | None] = queue.Queue(size)  # None = a source has ended
         self._stop = threading.Event()
 
     @property
@@ -50,8 +51,16 @@ class Feed:
         """Whether all arrivals are recorded ones, so that nothing has to do with the host's clock."""
         return all(source.pace not in (None, 1.0) for source in self._sources)
 
-    def __iter__(self) -> Iterator[Message | None]:
-        """Messages in the order of arrival; None whenever nothing came for `TICK_S`."""
+    def offer(self, command: Command) -> bool:
+        """Queue what a person wants behind what has come; from any thread, never waits; whether there was room."""
+        try:
+            self._queue.put_nowait(command)
+        except queue.Full:
+            return False
+        return True
+
+    def __iter__(self) -> Iterator[Message | Command | None]:
+        """Messages in the order of arrival, and commands; None whenever nothing came for `TICK_S`."""
         return self._merged() if self.recorded else self._arriving()
 
     def close(self) -> None:
@@ -66,11 +75,14 @@ class Feed:
     ) -> None:
         self.close()
 
-    def _merged(self) -> Iterator[Message]:
+    def _merged(self) -> Iterator[Message | Command]:
         streams = [source.messages(self._stop) for source in self._sources]
-        yield from streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("arrival"))
+        for message in streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("arrival")):
+            if not self._queue.empty():
+                yield from self._left()
+            yield message
 
-    def _arriving(self) -> Iterator[Message | None]:
+    def _arriving(self) -> Iterator[Message | Command | None]:
         for source in self._sources:
             threading.Thread(target=self._run, args=(source,), name=f"source {source.url}", daemon=True).start()
         running = len(self._sources)
@@ -86,7 +98,7 @@ class Feed:
                 yield message
         yield from self._left()
 
-    def _left(self) -> Iterator[Message]:
+    def _left(self) -> Iterator[Message | Command]:
         """What had come before it was closed."""
         with contextlib.suppress(queue.Empty):
             while True:

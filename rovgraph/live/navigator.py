@@ -136,6 +136,14 @@ class Navigator:
                     self._consider(measurement)
         return rows
 
+    def take_fix(self, north: float, east: float, sd: float) -> tuple[Reading, ...]:
+        """Take a position that a person gives, of this moment, in metres; its reading, to be recorded."""
+        reading = self._intake.fix(north, east, sd)
+        if (measurement := self._intake.measurement(self.time, reading)) is None:
+            return ()
+        self._consider(measurement)
+        return (reading,)
+
     def _hear(self, message: Message) -> None:
         """Note which sensors a source speaks of; the display's thread reads it, so it is replaced, not changed."""
         known = self._heard.get(message.source, frozenset())

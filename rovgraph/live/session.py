@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rovgraph.errors import InputError
+from rovgraph.live.commands import Command, DropMark, RemoveMark, SetPosition
 from rovgraph.live.files import Files
+from rovgraph.live.marks import Marks
 from rovgraph.live.message import Message
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.solution import Solution
@@ -32,6 +34,7 @@ class Session:
     receivers : called with each solution: outputs, the status line
     rate_hz : of solutions
     files : None = nothing is kept
+    marks : that a person drops
     warnings : what sources, outputs and disk complain of
     solution : the newest
     solutions : count
@@ -43,6 +46,7 @@ class Session:
     warnings: Warnings
     rate_hz: float = RATE_HZ
     files: Files | None = None
+    marks: Marks = field(default_factory=Marks)
     solution: Solution | None = None
     solutions: int = 0
     _due: float = -math.inf
@@ -91,7 +95,7 @@ class Session:
         self._resumed = self.navigator.time
         self.navigator.say("start", "resumed", f"goes on from what was received up to {self._resumed:.1f} s")
 
-    def run(self, feed: Iterable[Message | None]) -> None:
+    def run(self, feed: Iterable[Message | Command | None]) -> None:
         """Work off what the sources say."""
         navigator, files = self.navigator, self.files
         with _seldom_collected():
@@ -103,10 +107,12 @@ class Session:
             files.finish(navigator)
             self.write_smoothed()
 
-    def step(self, message: Message | None) -> None:
-        """Take a message, or None where nothing came for a while, and send a solution if one is due."""
+    def step(self, message: Message | Command | None) -> None:
+        """Take a message or command, or None where nothing came for a while, and send a solution if one is due."""
         if message is None:
             self._wait()
+        elif isinstance(message, Command):
+            self._obey(message)
         elif not self._known(message):
             self._take(message)
         if self.navigator.engine is not None and self.navigator.time >= self._due:
@@ -117,7 +123,7 @@ class Session:
         self.navigator.finish()
         self._send()
 
-    def _work_off(self, feed: Iterable[Message | None]) -> None:
+    def _work_off(self, feed: Iterable[Message | Command | None]) -> None:
         navigator, files = self.navigator, self.files
         for message in feed:
             self.step(message)
@@ -141,6 +147,23 @@ class Session:
         if self.files is not None:
             for time, readings in rows:
                 self.files.recorder.write(time, message.arrival, readings)
+
+    def _obey(self, command: Command) -> None:
+        """Do what a person wants; before the first solution nothing is known that it could refer to."""
+        navigator, at = self.navigator, self.solution
+        if at is None:
+            return
+        if isinstance(command, DropMark):
+            mark = self.marks.drop(command.name, at, command.north, command.east)
+            navigator.say("pilot", mark.kind, f"{mark.name}: north {mark.north:.2f} m, east {mark.east:.2f} m")
+        elif isinstance(command, RemoveMark) and (gone := self.marks.remove(command.number)) is not None:
+            navigator.say("pilot", "removed", gone.name)
+        elif isinstance(command, SetPosition):
+            north, east, sd = command.north, command.east, command.sd
+            readings = navigator.take_fix(north, east, sd)
+            if readings and self.files is not None:
+                self.files.recorder.write(navigator.time, host.time(), readings)
+            navigator.say("pilot", "position", f"a fix at north {north:.2f} m, east {east:.2f} m, sd {sd:.2g} m")
 
     def _wait(self) -> None:
         """Time goes on where nothing comes."""
