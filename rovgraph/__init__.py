@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / report, export / studies, live /
+cli / api / report, export, web / studies, live /
 estimators, simulate, evaluate, check, calibrate, interchange / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / gauss_markov, units / geometry, workers, fast_csv / errors, process.
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from rovgraph.api.comparison import compare as compare
     from rovgraph.api.exporting import export as export
     from rovgraph.api.exporting import tag as tag
+    from rovgraph.api.live_page import live_page as live_page
     from rovgraph.api.logs import check as check
     from rovgraph.api.logs import read_log as read_log
     from rovgraph.api.observability import ObservabilityResult as ObservabilityResult
@@ -95,6 +96,7 @@ _HOMES = {
     "compare": "api.comparison",
     "evaluate": "evaluate",
     "export": "api.exporting",
+    "live_page": "api.live_page",
     "load_config": "config",
     "observe": "api.observability",
     "parse_config": "config",

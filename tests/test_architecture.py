@@ -29,14 +29,14 @@ LAYERS = (
     {"graph"},
     {"estimators", "simulate", "evaluate", "check", "calibrate", "interchange"},
     {"studies", "live"},
-    {"report", "export"},
+    {"report", "export", "web"},
     {"api"},
     {"cli"},
 )
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
 
 # library -> the only member that may import it
-CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "typer": "cli"}
+CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "typer": "cli", "starlette": "web", "uvicorn": "web"}
 HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib"}
 
 

@@ -24,7 +24,9 @@ def online(
     output: Annotated[
         list[str] | None, typer.Option("--output", help="where solutions go; default: - unless on a terminal")
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.01, max=200.0, help="solutions per second")] = 5.0,
+    rate: Annotated[
+        float | None, typer.Option(min=0.01, max=200.0, help="solutions per second; default: 5, or 10 with --http")
+    ] = None,
     speed: Annotated[str, typer.Option(help="of files: 1, 10, max")] = "1",
     engine: Annotated[Engine, typer.Option(help="fixed-lag for missions without end, isam2 for all of the track")] = (
         Engine.fixed_lag
@@ -32,6 +34,15 @@ def online(
     resume: Annotated[bool, typer.Option("--resume", help="go on after a crash, with what is in --out")] = False,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="smooth the recording at the end")] = True,
     force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
+    http: Annotated[str | None, typer.Option("--http", help="show a live page at host:port", metavar="ADDRESS")] = None,
+    chart: Annotated[
+        list[Path] | None, typer.Option("--chart", help="below the live page's track: GeoTIFF, GeoJSON, tiles")
+    ] = None,
+    http_origin: Annotated[
+        list[str] | None, typer.Option("--http-origin", help="origin of a page that may frame the live page")
+    ] = None,
+    http_token: Annotated[Path | None, typer.Option("--http-token", help="file that keeps the page's token")] = None,
+    position_sd_limit: Annotated[float, typer.Option(help="metres; beyond it the live page raises an alarm")] = 5.0,
 ) -> None:
     """Estimate while data arrive, on board or at the topside.
 
@@ -39,6 +50,7 @@ def online(
     """
     import sys
 
+    from rovgraph.api.live_page import live_page
     from rovgraph.api.logs import warn_of_unused
     from rovgraph.cli.ending import asked_by_signal, ended_by_signals
     from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
@@ -46,9 +58,10 @@ def online(
     from rovgraph.live.clocks import Clocks
     from rovgraph.live.feed import Feed
     from rovgraph.live.files import Files
+    from rovgraph.live.marks import Marks
     from rovgraph.live.navigator import Navigator
     from rovgraph.live.outputs import open_output
-    from rovgraph.live.session import Session
+    from rovgraph.live.session import PAGE_RATE_HZ, RATE_HZ, Session
     from rovgraph.live.sources import open_sources
     from rovgraph.live.warnings import Warnings
     from rovgraph.report.status import StatusLine
@@ -68,8 +81,16 @@ def online(
     if out is not None:
         prepared(out, force, resume, sources)
         files = Files(out, settings, warnings, resume, anew=engine is Engine.isam2)
+    marks = Marks(out, warnings)
+    page = None
+    if http is not None:
+        charts, origins = chart or (), http_origin or ()
+        page = live_page(http, feed.offer, marks, charts, origins, http_token, position_sd_limit, warnings)
+        _note(f"live page: {page.url}")
+    receivers = [each.send for each in (*outputs, *([page] if page else ()))]
+    rate = rate or (RATE_HZ if page is None else PAGE_RATE_HZ)
     navigator = Navigator(settings, feed.recorded, smooth=engine is Engine.isam2, clocks=Clocks(trust=feed.replayed))
-    session = Session(navigator, [each.send for each in outputs], warnings, rate, files)
+    session = Session(navigator, receivers, warnings, rate, files, marks)
     asked_by_signal(session.want_smoothed)
     with ended_by_signals(feed.close):
         try:
@@ -82,7 +103,7 @@ def online(
                 session.run(feed)
         finally:
             navigator.close()
-            for each in outputs:
+            for each in (*outputs, *([page] if page else ())):
                 each.close()
             if files is not None:
                 files.close()
@@ -94,12 +115,16 @@ def online(
 
 
 def _say(source: str, kind: str, text: str) -> None:
+    _note(f"{source}: {kind}: {text}")
+
+
+def _note(text: str) -> None:
     """A line for a person, wherever that person has gone."""
     import contextlib
     import sys
 
     with contextlib.suppress(OSError, ValueError):
-        print(f"{source}: {kind}: {text}", file=sys.stderr, flush=True)
+        print(text, file=sys.stderr, flush=True)
 
 
 def _tell(solution: "Solution") -> None:
