@@ -36,7 +36,14 @@ LAYERS = (
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
 
 # library -> the only member that may import it
-CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "typer": "cli", "starlette": "web", "uvicorn": "web"}
+CONFINED = {
+    "gtsam": "graph",
+    "numba": "kernels",
+    "matplotlib": "report",
+    "typer": "cli",
+    "starlette": "web",
+    "uvicorn": "web",
+}
 HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib"}
 
 

@@ -161,13 +161,13 @@ def _geotiff(path: Path) -> ImageChart:
         from rasterio.errors import RasterioError
         from rasterio.warp import transform
     except ImportError:
-        raise InputError(
-            f"--chart {path}: needs rasterio; install it with: pip install 'rovgraph[charts]'"
-        ) from None
+        raise InputError(f"--chart {path}: needs rasterio; install it with: pip install 'rovgraph[charts]'") from None
     try:
         with rasterio.open(path) as source:
             if source.crs is None:
-                raise InputError(f"--chart {path}: says no coordinate system; assign one, as gdal_translate -a_srs does")
+                raise InputError(
+                    f"--chart {path}: says no coordinate system; assign one, as gdal_translate -a_srs does"
+                )
             size = max(source.width, source.height)
             shape = [max(1, round(n * min(1.0, LARGEST_PIXELS / size))) for n in (source.height, source.width)]
             bands = source.read(out_shape=(source.count, *shape), resampling=Resampling.average, masked=True)
@@ -224,7 +224,9 @@ def _shapes(thing: dict[str, Any], name: str) -> Iterator[tuple[str, str, Array]
         for geometry in thing["geometries"]:
             yield from _shapes(geometry, name)
     else:
-        depth = {"Point": 0, "MultiPoint": 1, "LineString": 1, "MultiLineString": 2, "Polygon": 2, "MultiPolygon": 3}[kind]
+        depth = {"Point": 0, "MultiPoint": 1, "LineString": 1, "MultiLineString": 2, "Polygon": 2, "MultiPolygon": 3}[
+            kind
+        ]
         form = "point" if "Point" in kind else "area" if "Polygon" in kind else "line"
         whole = 0 if form == "point" else 1  # levels of lists that make one shape
         for vertices in _flattened(thing["coordinates"], depth - whole):

@@ -105,9 +105,10 @@ def _offered(headers: Headers) -> str:
 
 def _security_headers(origins: Collection[str]) -> dict[str, str]:
     """Of every answer: everything that a page loads or runs is ours, and only listed origins may frame it."""
+    framing = " ".join(["'self'", *sorted(origins)])
     policy = (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
-        f"base-uri 'none'; form-action 'none'; frame-ancestors {' '.join(["'self'", *sorted(origins)])}"
+        f"base-uri 'none'; form-action 'none'; frame-ancestors {framing}"
     )
     return {
         "content-security-policy": policy,
