@@ -2,12 +2,14 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from rovgraph.live.outputs import Output
     from rovgraph.live.solution import Solution
+    from rovgraph.web.page import LivePage
 
 
 class Engine(StrEnum):
@@ -50,7 +52,6 @@ def online(
     """
     import sys
 
-    from rovgraph.api.live_page import live_page
     from rovgraph.api.logs import warn_of_unused
     from rovgraph.cli.ending import asked_by_signal, ended_by_signals
     from rovgraph.cli.live_folder import configured, finished, prepared, unfinished
@@ -76,21 +77,17 @@ def online(
         raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
     feed = Feed(opened, warnings)
     wanted = output if output is not None else ([] if sys.stdout.isatty() else ["-"])
-    outputs = [open_output(url, warnings, patient=feed.recorded) for url in wanted]
+    outputs: list[Output | LivePage] = [open_output(url, warnings, patient=feed.recorded) for url in wanted]
+    marks = Marks(out, warnings, resume)
+    watched = chart or (), http_origin or (), http_token, position_sd_limit
+    outputs += [] if http is None else [_page(http, feed.offer, marks, *watched, warnings)]
+    usual_rate = RATE_HZ if http is None else PAGE_RATE_HZ
     files = None
     if out is not None:
         prepared(out, force, resume, sources)
         files = Files(out, settings, warnings, resume, anew=engine is Engine.isam2)
-    marks = Marks(out, warnings)
-    page = None
-    if http is not None:
-        charts, origins = chart or (), http_origin or ()
-        page = live_page(http, feed.offer, marks, charts, origins, http_token, position_sd_limit, warnings)
-        _note(f"live page: {page.url}")
-    receivers = [each.send for each in (*outputs, *([page] if page else ()))]
-    rate = rate or (RATE_HZ if page is None else PAGE_RATE_HZ)
     navigator = Navigator(settings, feed.recorded, smooth=engine is Engine.isam2, clocks=Clocks(trust=feed.replayed))
-    session = Session(navigator, receivers, warnings, rate, files, marks)
+    session = Session(navigator, [each.send for each in outputs], warnings, rate or usual_rate, files, marks)
     asked_by_signal(session.want_smoothed)
     with ended_by_signals(feed.close):
         try:
@@ -103,7 +100,7 @@ def online(
                 session.run(feed)
         finally:
             navigator.close()
-            for each in (*outputs, *([page] if page else ())):
+            for each in outputs:
                 each.close()
             if files is not None:
                 files.close()
@@ -116,6 +113,15 @@ def online(
 
 def _say(source: str, kind: str, text: str) -> None:
     _note(f"{source}: {kind}: {text}")
+
+
+def _page(address: str, *arguments: Any) -> "LivePage":
+    """The live page, and its address for a person."""
+    from rovgraph.api.live_page import live_page
+
+    page = live_page(address, *arguments)
+    _note(f"live page: {page.url}")
+    return page
 
 
 def _note(text: str) -> None:

@@ -45,18 +45,19 @@ class Marks:
 
     Parameters
     ----------
-    folder : of the results, where `MARKS` is read if it is there; None = they are kept in memory
+    folder : of the results; None = they are kept in memory
     warnings : where trouble with the disk goes
+    resume : go on with the marks that are there
 
     Attributes
     ----------
     all : tuple of Mark, oldest first; replaced, never changed, so that any thread may read it
     """
 
-    def __init__(self, folder: Path | None = None, warnings: Warnings | None = None) -> None:
+    def __init__(self, folder: Path | None = None, warnings: Warnings | None = None, resume: bool = False) -> None:
         self._path = None if folder is None else folder / MARKS
         self._warnings = warnings or Warnings()
-        self.all = _read(self._path, self._warnings)
+        self.all = _read(self._path, self._warnings) if self._path is not None and resume else ()
         self._newest = max((mark.number for mark in self.all), default=0)
 
     def drop(self, name: str, at: Solution, north: float | None = None, east: float | None = None) -> Mark:
@@ -93,16 +94,16 @@ class Marks:
             self._warnings.complain(str(self._path), "disk", f"cannot be written ({error.strerror}); free some space")
 
 
-def _read(path: Path | None, warnings: Warnings) -> tuple[Mark, ...]:
+def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:
     """The marks of a run that is resumed; a line that was torn is left out."""
-    if path is None or not path.exists():
+    if not path.exists():
         return ()
     marks = []
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
         for row in csv.DictReader(file):
             try:
                 numbers = [float(row[f.name]) if row[f.name] else None for f in fields(Mark)[3:]]
-                mark = Mark(int(row["number"]), row["kind"], row["name"], *numbers)  # type: ignore[arg-type]
+                mark = Mark(int(row["number"]), row["kind"], row["name"], *numbers)  # type: ignore[arg-type, call-arg]
                 if not all(isinstance(v, float) and math.isfinite(v) for v in (mark.time, mark.north, mark.east)):
                     raise ValueError
                 marks.append(mark)

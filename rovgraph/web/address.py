@@ -67,7 +67,7 @@ def listening(address: Address) -> socket.socket:
         return socket.create_server((address.host, address.port), family=family, backlog=BACKLOG)
     except OSError as error:
         raise InputError(
-            f"--http {address.host}:{address.port}: cannot listen there ({error.strerror or error}); choose another port"
+            f"--http {address.host}:{address.port}: cannot listen there ({error.strerror or error}); choose another"
         ) from None
 
 
@@ -109,6 +109,6 @@ def token_of(path: Path | None) -> str:
         raise InputError(f"--http-token {path}: cannot be used ({error}); choose another file") from None
     if len(token) < SHORTEST_TOKEN or not all(c.isalnum() or c in "-_" for c in token):
         raise InputError(
-            f"--http-token {path}: expected at least {SHORTEST_TOKEN} letters, digits, - or _; delete it to get a new one"
+            f"--http-token {path}: expected at least {SHORTEST_TOKEN} letters, digits, - or _; delete it for a new one"
         )
     return token

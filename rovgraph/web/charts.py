@@ -26,6 +26,7 @@ from rovgraph.live.solution import Solution
 LARGEST_PIXELS = 2048  # of a side, as it is shown
 MOST_VERTICES = 200_000
 LARGEST_FILE = 500 << 20  # [bytes]
+DEPTHS = {"Point": 0, "MultiPoint": 1, "LineString": 1, "MultiLineString": 2, "Polygon": 2, "MultiPolygon": 3}
 Place = Callable[[Array, Array], tuple[Array, Array]]  # latitude, longitude [deg] -> north, east [m]
 
 
@@ -183,7 +184,7 @@ def _png(bands: "np.ma.MaskedArray[Any, Any]") -> bytes:
     """Three bands as colours, one as shades; what is masked is transparent."""
     from rasterio.io import MemoryFile
 
-    shown = bands[:3] if len(bands) >= 3 else np.ma.concatenate([bands[:1]] * 3)
+    shown = bands[:3] if len(bands) >= 3 else bands[[0, 0, 0]]
     if shown.dtype != np.uint8:
         low, high = np.percentile(shown.compressed(), (1, 99)) if shown.count() else (0.0, 1.0)
         shown = np.ma.clip((shown.astype(float) - low) * 255.0 / max(high - low, 1e-12), 0.0, 255.0).astype(np.uint8)

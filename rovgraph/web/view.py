@@ -143,7 +143,8 @@ def _degrees(points: list[Any], at: Solution) -> list[list[float]]:
     north, east, down = np.array(points)[:, 1:4].T
     n, e = float(at.position[0]), float(at.position[1])
     latitude, longitude, _ = pymap3d.ned2geodetic(north - n, east - e, 0.0, at.latitude, at.longitude, 0.0)
-    return np.column_stack([np.round(longitude, 8), np.round(latitude, 8), -down]).tolist()
+    degrees: list[list[float]] = np.column_stack([np.round(longitude, 8), np.round(latitude, 8), -down]).tolist()
+    return degrees
 
 
 def _rounded(value: float) -> float | None:
