@@ -1,5 +1,6 @@
 """The addresses of the page: docs/live-page.md lists them."""
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from importlib.resources import files
@@ -34,11 +35,10 @@ def application(broadcast: Broadcast, charts: Charts, offer: Offer | None) -> St
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        import asyncio
-
         task = asyncio.create_task(broadcast.run())
         yield
         task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
 
     static = str(files("rovgraph.web").joinpath("assets"))
     routes: list[BaseRoute] = [
