@@ -172,8 +172,7 @@ def _geotiff(path: Path) -> ImageChart:
             size = max(source.width, source.height)
             shape = [max(1, round(n * min(1.0, LARGEST_PIXELS / size))) for n in (source.height, source.width)]
             bands = source.read(out_shape=(source.count, *shape), resampling=Resampling.average, masked=True)
-            columns, rows = np.array([0, source.width, 0]), np.array([0, 0, source.height])
-            x, y = source.transform * (columns, rows)
+            x, y = source.xy([0, 0, source.height], [0, source.width, 0], offset="ul")
             longitude, latitude = transform(source.crs, "EPSG:4326", x, y)
     except RasterioError as error:
         raise InputError(f"--chart {path}: is no GeoTIFF that can be read ({str(error)[:200]})") from None

@@ -1,9 +1,8 @@
 """The track so far, in pieces that are encoded once for all pages."""
 
 import json
+import math
 from collections.abc import Iterator
-
-import numpy as np
 
 from rovgraph.live.solution import Solution
 
@@ -18,7 +17,7 @@ def point_of(s: Solution) -> Point:
     """Where a solution is on the map, to the millimetre, and how sure that is [s, m]."""
     return (
         round(s.time, 3),
-        *(round(float(x), 3) for x in s.position),  # type: ignore[return-value]
+        *(round(x, 3) for x in s.position.tolist()),  # type: ignore[return-value]
         float(f"{ellipse_sd(s):.3g}"),
     )
 
@@ -26,7 +25,7 @@ def point_of(s: Solution) -> Point:
 def ellipse_sd(s: Solution) -> float:
     """sd along the longer axis of the horizontal error ellipse [m]."""
     a, b, c = float(s.position_sd[0]) ** 2, float(s.position_sd[1]) ** 2, s.cov_north_east
-    return float(np.sqrt(0.5 * (a + b) + np.hypot(0.5 * (a - b), c)))
+    return math.sqrt(0.5 * (a + b) + math.hypot(0.5 * (a - b), c))
 
 
 class Track:
@@ -48,11 +47,11 @@ class Track:
     def add(self, solution: Solution) -> None:
         """Keep a solution's point, if it is far enough from the last."""
         point = point_of(solution)
-        if not all(np.isfinite(point)):
+        if not all(map(math.isfinite, point)):
             return
         if self._points:
             last = self._points[-1]
-            near = np.hypot(point[1] - last[1], point[2] - last[2]) < STEP_M and abs(point[3] - last[3]) < STEP_M
+            near = math.hypot(point[1] - last[1], point[2] - last[2]) < STEP_M and abs(point[3] - last[3]) < STEP_M
             if near and point[0] - last[0] < STEP_S:
                 return
         self._points.append(point)
