@@ -50,7 +50,7 @@ def run(log, config, folder, commands=()):
 def told(case, tmp_path_factory):
     folder = tmp_path_factory.mktemp("told") / "out"
     begin = case.log["imu"].time[0]
-    here = SetPosition(1.5, -1.0, 0.05)
+    here = SetPosition(0.3, -0.2, 0.05)
     commands = [
         (begin + 12.0, DropMark(NASTY)),
         (begin + 13.0, DropMark("way-point", 7.0, 8.0)),
@@ -65,13 +65,21 @@ def test_a_position_becomes_a_fix_that_moves_the_estimate(case, told, tmp_path):
     first, last = told[1], without
     assert np.linalg.norm(first[-1].position - last[-1].position) > 0.1
     (said,) = [e for s in first for e in s.events if e.source == "pilot" and e.kind == "position"]
-    assert "north 1.50 m, east -1.00 m, sd 0.05 m" in said.text
+    assert said.text == "a fix at north 0.30 m, east -0.20 m, sd 0.05 m"
+
+
+def test_a_position_that_contradicts_the_estimate_is_refused_aloud(case, tmp_path):
+    begin = case.log["imu"].time[0]
+    solutions = run(case.log, case.config, tmp_path / "far", [(begin + 15.0, SetPosition(30.0, 0.0, 0.1))])
+    (said,) = [e for s in solutions for e in s.events if e.source == "pilot"]
+    assert "which rejects it (fix.gate_sd 6)" in said.text
+    assert solutions[-1].sensors["fix"].rejected == 1
 
 
 def test_the_recording_has_it_and_a_replay_gives_the_same_track(case, told, tmp_path):
     folder, solutions = told
     fixes = pd.read_csv(folder / RECORDING)[["fix_north", "fix_east", "fix_sd"]].dropna()
-    assert fixes.to_numpy().tolist() == [[1.5, -1.0, 0.05]]
+    assert fixes.to_numpy().tolist() == [[0.3, -0.2, 0.05]]
     config = case.config.model_copy(update={"columns": {}, "units": {}})
     again = run(read_log(folder / RECORDING, config), config, tmp_path / "again")
     assert len(again) == len(solutions)

@@ -18,6 +18,7 @@ from rovgraph.live.warnings import Warnings
 TICK_S = 0.1  # longest silence of the feed
 WAIT_S = 0.2  # how often a thread that waits looks whether it shall stop
 QUEUE = 10_000  # messages that may wait for the estimator
+COMMANDS = 100  # of persons, likewise
 
 
 class Feed:
@@ -38,7 +39,8 @@ class Feed:
     def __init__(self, sources: Sequence[Source], warnings: Warnings | None = None, size: int = QUEUE) -> None:
         self._sources = tuple(sources)
         self._complaints = warnings or Warnings()
-        self._queue: queue.Queue[Message | Command | None] = queue.Queue(size)  # None = a source has ended
+        self._queue: queue.Queue[Message | None] = queue.Queue(size)  # None = a source has ended
+        self._commands: queue.Queue[Command] = queue.Queue(COMMANDS)
         self._stop = threading.Event()
 
     @property
@@ -52,9 +54,9 @@ class Feed:
         return all(source.pace not in (None, 1.0) for source in self._sources)
 
     def offer(self, command: Command) -> bool:
-        """Queue what a person wants behind what has come; from any thread, never waits; whether there was room."""
+        """Have a command taken before the next message; from any thread, never waits; whether there was room."""
         try:
-            self._queue.put_nowait(command)
+            self._commands.put_nowait(command)
         except queue.Full:
             return False
         return True
@@ -78,8 +80,7 @@ class Feed:
     def _merged(self) -> Iterator[Message | Command]:
         streams = [source.messages(self._stop) for source in self._sources]
         for message in streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("arrival")):
-            if not self._queue.empty():
-                yield from self._left()
+            yield from self._given()
             yield message
 
     def _arriving(self) -> Iterator[Message | Command | None]:
@@ -91,14 +92,21 @@ class Feed:
                 message = self._queue.get(timeout=TICK_S)
             except queue.Empty:
                 yield None
+                yield from self._given()
                 continue
             if message is None:
                 running -= 1
             else:
                 yield message
+            yield from self._given()
         yield from self._left()
 
-    def _left(self) -> Iterator[Message | Command]:
+    def _given(self) -> Iterator[Command]:
+        """Commands that have come."""
+        while not self._commands.empty():
+            yield self._commands.get_nowait()
+
+    def _left(self) -> Iterator[Message]:
         """What had come before it was closed."""
         with contextlib.suppress(queue.Empty):
             while True:

@@ -164,7 +164,11 @@ class Session:
             readings = navigator.take_fix(north, east, sd)
             if readings and self.files is not None:
                 self.files.recorder.write(navigator.time, host.time(), readings)
-            navigator.say("pilot", "position", f"a fix at north {north:.2f} m, east {east:.2f} m, sd {sd:.2g} m")
+            text = f"a fix at north {north:.2f} m, east {east:.2f} m, sd {sd:.2g} m"
+            apart, gate = _sds_apart(command, at), navigator.config.fix.gate_sd
+            if gate is not None and apart > gate:
+                text += f", {apart:.1f} sd from the estimate, which rejects it (fix.gate_sd {gate:g}); give a larger sd"
+            navigator.say("pilot", "position", text)
 
     def _wait(self) -> None:
         """Time goes on where nothing comes."""
@@ -184,6 +188,14 @@ class Session:
             self.files.note(solution.events)
         for receive in self.receivers:
             receive(solution)
+
+
+def _sds_apart(given: SetPosition, at: Solution) -> float:
+    """How far a place is from a solution, in units of what both are uncertain by."""
+    apart = np.array([given.north, given.east]) - at.position[:2]
+    covariance = np.diag(at.position_sd[:2] ** 2 + given.sd**2)
+    covariance[0, 1] = covariance[1, 0] = at.cov_north_east
+    return float(np.sqrt(apart @ np.linalg.solve(covariance, apart)))
 
 
 @contextlib.contextmanager

@@ -10,7 +10,8 @@ export function element(name, text = "", className = "") {
   return made;
 }
 
-export const metres = (v) => (v === null || v === undefined ? "–" : Math.abs(v) < 100 ? v.toFixed(2) : v.toFixed(0));
+export const metres = (v) => (v === null || v === undefined ? "–" : v.toFixed(Math.abs(v) < 10 ? 2 : Math.abs(v) < 1000 ? 1 : 0));
+const spread = (v) => (v === null ? "–" : v < 100 ? `${+v.toPrecision(2)}` : v.toFixed(0));
 export const bearing = (radians) => `${(Math.round(radians * DEG + 360) % 360).toString().padStart(3, "0")}°`;
 
 export function duration(s) {
@@ -34,16 +35,16 @@ export class Gauges {
   show(s) {
     const kinds = new Set(s.limits.map((one) => one.kind));
     const heading = ((s.yaw * DEG) % 360 + 360) % 360;
-    this.gauge("heading", `${heading.toFixed(1)}°`, `heading, sd ${(s.yaw_sd * DEG).toFixed(1)}°`, kinds.has("heading"));
-    this.gauge("depth", `${metres(s.down)} m`, `depth, sd ${metres(s.down_sd)} m`);
+    this.gauge("heading", `${heading.toFixed(1)}°`, `heading, sd ${s.yaw_sd === null ? "–" : spread(s.yaw_sd * DEG)}°`, kinds.has("heading"));
+    this.gauge("depth", `${metres(s.down)} m`, `depth, sd ${spread(s.down_sd)} m`);
     this.gauge("altitude", s.altitude === null ? "–" : `${metres(s.altitude)} m`, "altitude");
     this.gauge("speed", `${s.speed === null ? "–" : s.speed.toFixed(2)} m/s`, "speed");
     this.gauge("sd", `${metres(s.ellipse_sd)} m`, "position sd", kinds.has("position"));
     const lost = s.lock_lost_s > 0;
     const lock = s.lock_lost_s === null ? "–" : lost ? duration(s.lock_lost_s) : "locked";
     this.gauge("lock", lock, lost ? "since bottom lock" : "bottom lock", lost);
-    this.gauge("north", `${metres(s.north)} m`, `north, sd ${metres(s.north_sd)} m`);
-    this.gauge("east", `${metres(s.east)} m`, `east, sd ${metres(s.east_sd)} m`);
+    this.gauge("north", `${metres(s.north)} m`, `north, sd ${spread(s.north_sd)} m`);
+    this.gauge("east", `${metres(s.east)} m`, `east, sd ${spread(s.east_sd)} m`);
     this.gauge("distance", `${metres(s.distance)} m`, "travelled");
     this.gauge("verdict", s.verdict, "verdict", s.verdict === "wrong");
     this.gauge("clock", clock(s.time), "time");
@@ -79,7 +80,7 @@ export class Gauges {
       }
       const cells = rows[0].children;
       const state = h.failed_s > 0 ? `${h.state} ${duration(h.failed_s)}` : h.state;
-      [name, state, duration(h.age), `${h.used}`, `${h.rejected}`].forEach((text, k) => set(cells[k], text));
+      [name, state, duration(h.age), ...(h.used + h.rejected ? [`${h.used}`, `${h.rejected}`] : ["–", "–"])].forEach((text, k) => set(cells[k], text));
       cells[1].className = h.state === "ok" ? "ok" : h.state === "silent" || h.state === "frozen" ? "failed" : "doubtful";
       set(rows[1].children[0], h.reason);
       rows[1].hidden = !h.reason;

@@ -197,7 +197,7 @@ export class LiveMap {
       }
     }
     c.stroke();
-    const [x, y] = [this.width - 20 - step * this.scale, this.height - 76];
+    const [x, y] = [this.width - 20 - step * this.scale, this.height - (this.width < 800 ? 134 : 76)];
     c.strokeStyle = "#000";
     c.lineWidth = 3;
     c.beginPath();
@@ -205,7 +205,6 @@ export class LiveMap {
     c.lineTo(x + step * this.scale, y);
     c.stroke();
     this.drawText(`${+step.toPrecision(2)} m`, x - 6, y - 6, "#000");
-    this.scaleBar = y;
   }
 
   drawMark(mark) {

@@ -244,10 +244,10 @@ at("login").addEventListener("submit", (event) => {
   link.use(at("token").value.trim());
 });
 
-at("legend").append("position sd", ...COLOURS.map((colour, k) => {
+at("legend").append("sd in m ", ...COLOURS.map((colour, k) => {
   const last = k === COLOURS.length - 1;
-  const row = element("span", last ? `over ${colourEnd(k - 1)} m` : `to ${colourEnd(k)} m`);
-  row.style.borderLeftColor = colour;
+  const row = element("span", last ? "more" : `${colourEnd(k)}`);
+  row.style.borderBottomColor = colour;
   return row;
 }));
 document.body.classList.toggle("widget", location.hash.includes("widget"));
