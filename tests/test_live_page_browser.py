@@ -41,7 +41,7 @@ def opened(browser, dive, width):
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     page.on("dialog", lambda dialog: errors.append(dialog.message))
     page.goto(dive[0].url)
-    page.wait_for_function("document.querySelector('#gauges b') !== null", timeout=60_000)
+    page.wait_for_selector("#gauges b", timeout=60_000)
     return page, errors
 
 
@@ -95,7 +95,7 @@ def test_a_page_that_lost_its_server_says_so(browser, dive):
     dive[0].send(solution(1.0))
     page, _ = opened(browser, dive, 400)
     dive[0].close()
-    page.wait_for_function("document.getElementById('connection').className === 'bad'", timeout=20_000)
+    page.wait_for_selector("#connection.bad", timeout=20_000)
     assert "old" in page.inner_text("#connection")
 
 
@@ -107,7 +107,10 @@ def test_an_hours_track_is_drawn_within_a_frame_of_100_ms(browser, dive):
         place, own = np.array([north[k], east[k], 3.0]), np.array([sd[k], sd[k], 0.1])
         dive[0].send(solution(0.3 * k, position=place, position_sd=own))
     page, errors = opened(browser, dive, 1600)
-    page.wait_for_function(f"rovgraph.map.track.length === {HOUR}", timeout=60_000)
+    end = time.monotonic() + 60
+    while page.evaluate("rovgraph.map.track.length") < HOUR:
+        assert time.monotonic() < end
+        page.wait_for_timeout(100)
     page.click("#fit")
     times = page.evaluate(
         """() => Array.from({length: 20}, () => {
