@@ -19,6 +19,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 import rovgraph as rg
+from rovgraph.cli.app import main
 from rovgraph.errors import InputError
 from rovgraph.live.commands import DropMark, RemoveMark, SetPosition
 from rovgraph.live.feed import Feed
@@ -391,6 +392,28 @@ def test_a_token_is_kept_in_its_file_for_its_owner_alone(tmp_path):
 def test_a_port_in_use_is_one_line():
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InputError, match="choose another"):
         rg.live_page(f"127.0.0.1:{taken.getsockname()[1]}")
+
+
+@pytest.mark.parametrize("fault", ["port", "chart", "origin", "limit"])
+def test_the_command_refuses_what_the_library_refuses_and_touches_nothing(monkeypatch, capsys, tmp_path, fault):
+    (tmp_path / "c.geojson").write_text("{")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1] if fault == 'port' else 0}"
+        wrong, options = {
+            "port": ({}, []),
+            "chart": ({"charts": [tmp_path / "c.geojson"]}, ["--chart", tmp_path / "c.geojson"]),
+            "origin": ({"origins": ["*"]}, ["--http-origin", "*"]),
+            "limit": ({"position_sd_limit_m": 0.0}, ["--position-sd-limit", 0]),
+        }[fault]
+        with pytest.raises(InputError) as refused:
+            rg.live_page(address, **wrong)
+        given = ["online", "tcp://127.0.0.1:1", "--http", address, *options, "--out", tmp_path / "new"]
+        monkeypatch.setattr("sys.argv", ["rovgraph", *map(str, given)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.splitlines() == [f"error: {refused.value}"]
+    assert not (tmp_path / "new").exists()
 
 
 # the server, over its socket

@@ -92,7 +92,7 @@ export class LiveMap {
     this.follow = false;
     this.centre = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2];
     const size = Math.max(high[0] - low[0], high[1] - low[1], 2);
-    this.scale = (0.75 * Math.min(this.width, this.height)) / size;
+    this.scale = (0.65 * Math.min(this.width, this.height)) / size;
     this.onMoved();
     this.changed();
   }
