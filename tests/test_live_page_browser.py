@@ -91,6 +91,23 @@ def test_way_point_and_position_go_where_the_map_was_tapped(browser, dive):
     assert errors == []
 
 
+@pytest.mark.parametrize("widget", ["", "#widget"])
+def test_with_a_token_the_page_opens_by_its_address_or_by_asking(browser, widget):
+    with rg.live_page("0.0.0.0:0") as server:
+        server.send(solution(1.0))
+        here = f"http://127.0.0.1:{server.address.port}/"
+        page = browser.new_context().new_page()
+        page.goto(here + widget)
+        page.fill("#token", server.token, timeout=20_000)
+        page.click("#login button")
+        page.wait_for_selector("#gauges b", state="attached", timeout=20_000)
+        assert page.locator("#panels").is_visible() == (not widget)
+        page = browser.new_context().new_page()
+        page.goto(f"{here}#token={server.token}")
+        page.wait_for_selector("#gauges b", timeout=20_000)
+        assert server.token not in page.url
+
+
 def test_a_page_that_lost_its_server_says_so(browser, dive):
     dive[0].send(solution(1.0))
     page, _ = opened(browser, dive, 400)

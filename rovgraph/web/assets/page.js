@@ -8,6 +8,7 @@ import { COLOURS, colourEnd } from "./track.js";
 const SHOWN_EVENTS = 200;
 const STALE_S = 2; // without a solution
 const GATE = 6; // of fixes, fix.gate_sd as it is by default
+const widget = location.hash.includes("widget"); // the map alone, as in Cockpit
 const at = (id) => document.getElementById(id);
 
 const gauges = new Gauges();
@@ -18,6 +19,7 @@ let chartsPlaced = false;
 const link = new Link({
   message(news) {
     at("login").hidden = true;
+    document.body.classList.toggle("widget", widget);
     if (news.type === "begin") {
       map.track.clear();
       at("events").replaceChildren();
@@ -34,6 +36,7 @@ const link = new Link({
   lost() { connection("no connection to rovgraph: what you see is old", true); },
   refused() {
     connection("locked", true);
+    document.body.classList.remove("widget");
     at("login").hidden = false;
   },
 });
@@ -250,7 +253,7 @@ at("legend").append("sd in m ", ...COLOURS.map((colour, k) => {
   row.style.borderBottomColor = colour;
   return row;
 }));
-document.body.classList.toggle("widget", location.hash.includes("widget"));
+document.body.classList.toggle("widget", widget);
 window.rovgraph = { map }; // for tests, and for a look by the developers' tools
 loadChartsNote();
 
