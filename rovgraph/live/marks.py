@@ -66,8 +66,10 @@ class Marks:
         if north is not None and east is not None:
             mark = Mark(self._newest, "waypoint", name, at.time, north, east)
         else:
-            p, sd = at.position.tolist(), at.position_sd.tolist()
-            mark = Mark(self._newest, "mark", name, at.time, *p, *sd[:2], at.latitude, at.longitude)
+            north, east, down = at.position.tolist()
+            north_sd, east_sd, _ = at.position_sd.tolist()
+            place = north, east, down, north_sd, east_sd, at.latitude, at.longitude
+            mark = Mark(self._newest, "mark", name, at.time, *place)
         self.all = (*self.all, mark)
         self._write()
         return mark
@@ -103,7 +105,7 @@ def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:
         for row in csv.DictReader(file):
             try:
                 numbers = [float(row[f.name]) if row[f.name] else None for f in fields(Mark)[3:]]
-                mark = Mark(int(row["number"]), row["kind"], row["name"], *numbers)  # type: ignore[arg-type, call-arg]
+                mark = Mark(int(row["number"]), row["kind"], row["name"], *numbers)  # type: ignore[arg-type]
                 if not all(isinstance(v, float) and math.isfinite(v) for v in (mark.time, mark.north, mark.east)):
                     raise ValueError
                 marks.append(mark)

@@ -183,7 +183,7 @@ def _png(bands: "np.ma.MaskedArray[Any, Any]") -> bytes:
     """Three bands as colours, one as shades; what is masked is transparent."""
     from rasterio.io import MemoryFile
 
-    shown = bands[:3] if len(bands) >= 3 else bands[[0, 0, 0]]
+    shown: Any = bands[:3] if len(bands) >= 3 else bands[[0, 0, 0]]
     if shown.dtype != np.uint8:
         low, high = np.percentile(shown.compressed(), (1, 99)) if shown.count() else (0.0, 1.0)
         shown = np.ma.clip((shown.astype(float) - low) * 255.0 / max(high - low, 1e-12), 0.0, 255.0).astype(np.uint8)

@@ -17,7 +17,7 @@ def point_of(s: Solution) -> Point:
     """Where a solution is on the map, to the millimetre, and how sure that is [s, m]."""
     return (
         round(s.time, 3),
-        *(round(x, 3) for x in s.position.tolist()),  # type: ignore[return-value]
+        *(round(x, 3) for x in s.position.tolist()),
         float(f"{ellipse_sd(s):.3g}"),
     )
 
