@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / pages / report, export / studies, live / interchange /
+cli / api / pages / report, export, web / studies, live / interchange /
 estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / gauss_markov, units / geometry, workers, fast_csv / errors, process.
@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from rovgraph.api.demo import demo as demo
     from rovgraph.api.exporting import export as export
     from rovgraph.api.exporting import tag as tag
+    from rovgraph.api.live_page import live_page as live_page
     from rovgraph.api.logs import check as check
     from rovgraph.api.logs import read_log as read_log
     from rovgraph.api.observability import ObservabilityResult as ObservabilityResult
@@ -105,6 +106,7 @@ _HOMES = {
     "demo": "api.demo",
     "evaluate": "evaluate",
     "export": "api.exporting",
+    "live_page": "api.live_page",
     "load_config": "config",
     "observe": "api.observability",
     "parse_config": "config",

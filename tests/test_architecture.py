@@ -30,7 +30,7 @@ LAYERS = (
     {"estimators", "simulate", "evaluate", "check", "calibrate"},
     {"interchange"},
     {"studies", "live"},
-    {"report", "export"},
+    {"report", "export", "web"},
     {"pages"},
     {"api"},
     {"cli"},
@@ -38,7 +38,15 @@ LAYERS = (
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}
 
 # library -> the only member that may import it
-CONFINED = {"gtsam": "graph", "numba": "kernels", "matplotlib": "report", "jinja2": "pages", "typer": "cli"}
+CONFINED = {
+    "gtsam": "graph",
+    "numba": "kernels",
+    "matplotlib": "report",
+    "jinja2": "pages",
+    "typer": "cli",
+    "starlette": "web",
+    "uvicorn": "web",
+}
 HEAVY = {"numba", "numpy", "scipy", "pandas", "gtsam", "matplotlib", "jinja2"}
 
 

@@ -4,15 +4,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rovgraph.api.live_folder import prepare, settings_of, summarise
+from rovgraph.api.live_page import live_page
 from rovgraph.api.logs import given, warn_of_unused
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.feed import Feed
 from rovgraph.live.files import Files
+from rovgraph.live.marks import Marks
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs import Output, open_output
 from rovgraph.live.session import RATE_HZ, Session
@@ -21,6 +23,9 @@ from rovgraph.live.sources import open_sources
 from rovgraph.live.sources.replay import LogReplay
 from rovgraph.live.warnings import Complain, Warnings
 from rovgraph.log import Log
+
+if TYPE_CHECKING:
+    from rovgraph.web.page import LivePage
 
 AS_FAST_AS_POSSIBLE = float("inf")
 ENGINES = ("fixed-lag", "isam2")
@@ -38,6 +43,7 @@ class LiveRun:
     session : the estimate, the newest solution, and counts of warnings
     feed : messages of the sources
     outputs : where solutions go
+    page : the live page, whose ``url`` a browser opens; None = none
     folder : what is kept; None = nothing
     resume : go on with what is in the folder
     """
@@ -46,6 +52,7 @@ class LiveRun:
     session: Session
     feed: Feed
     outputs: tuple[Output, ...]
+    page: "LivePage | None" = None
     folder: Path | None = None
     resume: bool = False
 
@@ -98,6 +105,8 @@ class LiveRun:
             self.session.navigator.close()
             for output in self.outputs:
                 output.close()
+            if self.page is not None:
+                self.page.close()
             if self.session.files is not None:
                 self.session.files.close()
 
@@ -136,6 +145,8 @@ class Online:
         resume: bool = False,
         force: bool = False,
         complain: Complain | None = None,
+        http: str | None = None,
+        page: Mapping[str, Any] | None = None,
     ) -> LiveRun:
         """Open sources and outputs; iterate over what it returns for the solutions.
 
@@ -149,6 +160,8 @@ class Online:
         force : replace an older folder
         complain : called with source, kind and text of what goes wrong with sources, outputs and disk, from other
             threads too; None = it is only counted
+        http : ``host:port`` of a live page for a browser (docs/live-page.md); None = none
+        page : ``charts``, ``origins``, ``token`` and ``position_sd_limit_m`` of it, as of `rovgraph.live_page`
 
         Raises
         ------
@@ -174,6 +187,10 @@ class Online:
             for url in outputs:
                 receivers.append(open_output(url, warnings, patient=feed.recorded))
                 opened_outputs.callback(receivers[-1].close)
+            marks, watched = Marks(folder, warnings, resume), None
+            if http is not None:
+                watched = live_page(http, feed.offer, marks, warnings=warnings, **(page or {}))
+                opened_outputs.callback(watched.close)
             files = None
             if folder is not None:
                 if not resume:
@@ -181,8 +198,11 @@ class Online:
                 files = Files(folder, config, warnings, resume, anew=self.engine == "isam2")
             opened_outputs.pop_all()
         navigator = self._navigator(config, patient=feed.recorded, trust=feed.replayed)
-        session = Session(navigator, [each.send for each in receivers], warnings, self.rate_hz, files)
-        return LiveRun(sources, session, feed, tuple(receivers), folder, resume)
+        told = [each.send for each in receivers]
+        if watched is not None:
+            told.append(watched.send)
+        session = Session(navigator, told, warnings, self.rate_hz, files, marks)
+        return LiveRun(sources, session, feed, tuple(receivers), watched, folder, resume)
 
     def replay(self, log: Log) -> Iterator[Solution]:
         """The solutions of a log, as if its measurements arrived now; each call starts again.

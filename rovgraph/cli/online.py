@@ -24,7 +24,9 @@ def online(
     output: Annotated[
         list[str] | None, typer.Option("--output", help="where solutions go; default: - unless on a terminal")
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.01, max=200.0, help="solutions per second")] = 5.0,
+    rate: Annotated[
+        float | None, typer.Option(min=0.01, max=200.0, help="solutions per second; default: 5, or 10 with --http")
+    ] = None,
     speed: Annotated[str, typer.Option(help="of files: 1, 10, max")] = "1",
     engine: Annotated[
         Engine, typer.Option(help="fixed-lag for missions of any length, isam2 for the smoothed track too")
@@ -32,6 +34,15 @@ def online(
     resume: Annotated[bool, typer.Option("--resume", help="continue after a crash, with the files in --out")] = False,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="smooth the recording at the end")] = True,
     force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
+    http: Annotated[str | None, typer.Option("--http", help="show a live page at host:port", metavar="ADDRESS")] = None,
+    chart: Annotated[
+        list[Path] | None, typer.Option("--chart", help="below the live page's track: GeoTIFF, GeoJSON, tiles")
+    ] = None,
+    http_origin: Annotated[
+        list[str] | None, typer.Option("--http-origin", help="origin of a page that may frame the live page")
+    ] = None,
+    http_token: Annotated[Path | None, typer.Option("--http-token", help="file that keeps the page's token")] = None,
+    position_sd_limit: Annotated[float, typer.Option(help="metres; beyond it the live page raises an alarm")] = 5.0,
 ) -> None:
     """Estimate while data arrive, on board or at the topside.
 
@@ -41,13 +52,30 @@ def online(
 
     import rovgraph as rg
     from rovgraph.cli.ending import asked_by_signal, ended_by_signals
+    from rovgraph.live.session import PAGE_RATE_HZ, RATE_HZ
     from rovgraph.report.status import StatusLine
 
     believed = None if config is None else rg.load_config(config)
     wanted = output if output is not None else ([] if sys.stdout.isatty() else ["-"])
-    run = rg.Online(believed, rate, engine.value).run(
-        *sources, outputs=wanted, speed=speed, out=out, resume=resume, force=force, complain=_say
+    usual = RATE_HZ if http is None else PAGE_RATE_HZ
+    run = rg.Online(believed, usual if rate is None else rate, engine.value).run(
+        *sources,
+        outputs=wanted,
+        speed=speed,
+        out=out,
+        resume=resume,
+        force=force,
+        complain=_say,
+        http=http,
+        page={
+            "charts": chart or (),
+            "origins": http_origin or (),
+            "token": http_token,
+            "position_sd_limit_m": position_sd_limit,
+        },
     )
+    if run.page is not None:
+        _note(f"live page: {run.page.url}")
     asked_by_signal(run.write_smoothed)
     with ended_by_signals(run.close), StatusLine(waiting=run.waiting) as status:
         for solution in run:

@@ -144,9 +144,14 @@ def _settings(
         for path, value in leaves(recording.settings):
             if path[0] not in OF_INSTRUMENT or feeds.get(path[0]) == k:
                 out.setdefault(".".join(path), (value, name))
+    stamps = {
+        each.channel.sensor: next(c for c in clocks if (c.file, c.name) == (each.file, each.channel.clock))
+        for each in selected
+    }
+    reference = next((stamps[sensor] for sensor in ("imu", "dvl") if sensor in stamps), None)
     for each in selected:
-        clock = next(c for c in clocks if (c.file, c.name) == (each.file, each.channel.clock))
-        if each.channel.sensor in OFFSETS and clock.sd > UNSURE_S:
+        clock = stamps[each.channel.sensor]  # how late it is against the reference is all that an estimate knows of
+        if each.channel.sensor in OFFSETS and clock is not reference and clock.sd > UNSURE_S:
             key = f"calibration.{each.channel.sensor}_time_offset"
             origin = f"clock {clock.name}: {clock.how}"
             out.setdefault(f"{key}.estimate", (True, origin))

@@ -158,7 +158,8 @@ def _notes(pings: Pings) -> Iterator[str]:
     yield f"ensembles by their coordinates: {said}"
     if np.any(pings.system >= SHIP):
         used = int(np.count_nonzero(pings.tilted & (pings.system >= SHIP)))
-        yield f"roll and pitch are taken out of the ship or earth velocities of {used} ensembles"
+        if used:
+            yield f"roll and pitch are taken out of the ship or earth velocities of {used} ensembles"
     error = np.abs(pings.error[np.isfinite(pings.error)])
     if len(error):
         sd = 1.4826 * float(np.median(error))

@@ -10,6 +10,7 @@ from operator import attrgetter
 from types import TracebackType
 from typing import Self
 
+from rovgraph.live.commands import Command
 from rovgraph.live.message import Message
 from rovgraph.live.sources.source import Source
 from rovgraph.live.warnings import Warnings
@@ -17,6 +18,7 @@ from rovgraph.live.warnings import Warnings
 TICK_S = 0.1  # longest silence of the feed
 WAIT_S = 0.2  # how often a thread that waits looks whether it shall stop
 QUEUE = 10_000  # messages that may wait for the estimator
+COMMANDS = 100  # of persons, likewise
 
 
 class Feed:
@@ -38,6 +40,7 @@ class Feed:
         self._sources = tuple(sources)
         self._complaints = warnings or Warnings()
         self._queue: queue.Queue[Message | None] = queue.Queue(size)  # None = a source has ended
+        self._commands: queue.Queue[Command] = queue.Queue(COMMANDS)
         self._stop = threading.Event()
 
     @property
@@ -50,8 +53,16 @@ class Feed:
         """Whether all arrivals are recorded ones, so that nothing has to do with the host's clock."""
         return all(source.pace not in (None, 1.0) for source in self._sources)
 
-    def __iter__(self) -> Iterator[Message | None]:
-        """Messages in the order of arrival; None whenever nothing came for `TICK_S`."""
+    def offer(self, command: Command) -> bool:
+        """Have a command taken before the next message; from any thread, never waits; whether there was room."""
+        try:
+            self._commands.put_nowait(command)
+        except queue.Full:
+            return False
+        return True
+
+    def __iter__(self) -> Iterator[Message | Command | None]:
+        """Messages in the order of arrival, and commands; None whenever nothing came for `TICK_S`."""
         return self._merged() if self.recorded else self._arriving()
 
     def close(self) -> None:
@@ -66,11 +77,13 @@ class Feed:
     ) -> None:
         self.close()
 
-    def _merged(self) -> Iterator[Message]:
+    def _merged(self) -> Iterator[Message | Command]:
         streams = [source.messages(self._stop) for source in self._sources]
-        yield from streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("arrival"))
+        for message in streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("arrival")):
+            yield from self._given()
+            yield message
 
-    def _arriving(self) -> Iterator[Message | None]:
+    def _arriving(self) -> Iterator[Message | Command | None]:
         for source in self._sources:
             threading.Thread(target=self._run, args=(source,), name=f"source {source.url}", daemon=True).start()
         running = len(self._sources)
@@ -79,12 +92,19 @@ class Feed:
                 message = self._queue.get(timeout=TICK_S)
             except queue.Empty:
                 yield None
+                yield from self._given()
                 continue
             if message is None:
                 running -= 1
             else:
                 yield message
+            yield from self._given()
         yield from self._left()
+
+    def _given(self) -> Iterator[Command]:
+        """Commands that have come."""
+        while not self._commands.empty():
+            yield self._commands.get_nowait()
 
     def _left(self) -> Iterator[Message]:
         """What had come before it was closed."""

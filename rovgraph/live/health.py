@@ -56,9 +56,17 @@ class Health:
                 time - watch.time,
                 self.used[sensor],
                 self.rejected[sensor],
+                _failed(watch, time),
             )
             for sensor, watch in watches.items()
         }
 
     def _say(self, time: float, sensor: str, kind: str, text: str) -> None:
         self.events.append(Event(time, sensor, kind, text))
+
+
+def _failed(watch: Watch, time: float) -> float:
+    """How long a sensor has given nothing that can be used [s]."""
+    if watch.state == "ok":
+        return 0.0
+    return time - (watch.time if watch.state == "silent" else watch.entered)

@@ -36,6 +36,7 @@ class Intake:
         self._left_out = left_out
         self._newest: dict[str, float] = {}
         self._sizes: dict[str, int] = {}
+        self._local = False  # whether fixes come in north and east
 
     def timed(self, time: float, readings: tuple[Reading, ...]) -> Sequence[tuple[float, tuple[Reading, ...]]]:
         """Readings with their times, where some sensors are known to be late [s]."""
@@ -51,6 +52,8 @@ class Intake:
                 self.origin = float(values[0]), float(values[1])
             north, east, _ = pymap3d.geodetic2ned(values[0], values[1], 0.0, *self.origin, 0.0)
             sensor, values = "fix", np.array([north, east, values[2]])
+        elif sensor == "fix":
+            self._local = True
         elif sensor == "mag":
             values = self.calibrated(values)
         if len(values) != self._sizes.setdefault(sensor, len(values)):
@@ -62,6 +65,13 @@ class Intake:
             return None
         self._newest[sensor] = max(time, newest)
         return Measurement(time, sensor, values, 0)
+
+    def fix(self, north: float, east: float, sd: float) -> Reading:
+        """A fix at a place [m], in the form in which others come: of a recording with both, one form is ignored."""
+        latitude, longitude = self.geodetic(np.array([north, east, 0.0]))
+        if self._local or latitude is None or longitude is None:
+            return Reading("fix", np.array([north, east, sd]))
+        return Reading(GEODETIC, np.array([latitude, longitude, sd]))
 
     def calibrated(self, field: Array) -> Array:
         """A sample of the magnetometer, shape (3,), as the configuration's calibration has it."""

@@ -36,6 +36,7 @@ from rovgraph.log import Log, Measurement
 if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
 
+ALTITUDE_S = 3.0  # longest age of an altitude
 TICK_S = 0.1  # between looks for sensors that have fallen silent
 NO_GAP_IS_TOO_LONG_S = 1e9
 UNEXPECTED = "began after the first seconds, and is not used"
@@ -88,6 +89,7 @@ class Navigator:
         self._heard: dict[str, frozenset[str]] = {}  # source -> sensors, until the dive begins
         self._distance, self._here = 0.0, np.full(3, np.nan)
         self._arrival, self._ticked = 0.0, -np.inf
+        self._altitude = (-np.inf, np.nan)  # its time, and what it was
         self._located = self.config.start.located  # where the fixes count from
 
     @property
@@ -135,6 +137,14 @@ class Navigator:
                 if (measurement := self._intake.measurement(at, reading)) is not None:
                     self._consider(measurement)
         return rows
+
+    def take_fix(self, north: float, east: float, sd: float) -> tuple[Reading, ...]:
+        """Take a position that a person gives, of this moment, in metres; its reading, to be recorded."""
+        reading = self._intake.fix(north, east, sd)
+        if (measurement := self._intake.measurement(self.time, reading)) is None:
+            return ()
+        self._consider(measurement)
+        return (reading,)
 
     def _hear(self, message: Message) -> None:
         """Note which sensors a source speaks of; the display's thread reads it, so it is replaced, not changed."""
@@ -212,6 +222,7 @@ class Navigator:
             verdict=self.alarms.verdict,
             alarms=self.alarms.active,
             distance=self._travelled(t.p_n[0], t.p_sd[0]),
+            altitude=self._altitude[1] if self.time - self._altitude[0] < ALTITUDE_S else None,
             predicted_s=interval.time - engine.marks[-1].interval.time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
@@ -249,6 +260,8 @@ class Navigator:
     def _consider(self, m: Measurement) -> None:
         """Give a measurement to the engine, unless it is none."""
         self.time = max(self.time, m.time)
+        if m.sensor == "dvl_altitude":
+            self._altitude = m.time, float(m.values[0])
         verdict = self.faults.look(m)
         if m.sensor != "imu" and self.time > self._ticked + TICK_S:  # the IMU's silence is seen by others that go on
             self.faults.tick(self.time)

@@ -11,13 +11,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rovgraph.errors import InputError
+from rovgraph.live.commands import Command, DropMark, RemoveMark, SetPosition
 from rovgraph.live.files import Files
+from rovgraph.live.marks import Marks
 from rovgraph.live.message import Message
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
 
 RATE_HZ = 5.0  # of solutions, about that of pings
+PAGE_RATE_HZ = 10.0  # where a person watches
 COLLECT = (50_000, 20, 50)  # thresholds of the collector: next to nothing here is cyclic
 QUIET_S = 0.5  # without the IMU, after which time goes on by the host's clock
 
@@ -32,6 +35,7 @@ class Session:
     receivers : called with each solution: outputs, the status line
     rate_hz : of solutions
     files : None = nothing is kept
+    marks : that a person drops
     warnings : what sources, outputs and disk complain of
     solution : the newest
     solutions : count
@@ -43,6 +47,7 @@ class Session:
     warnings: Warnings
     rate_hz: float = RATE_HZ
     files: Files | None = None
+    marks: Marks = field(default_factory=Marks)
     solution: Solution | None = None
     solutions: int = 0
     _due: float = -math.inf
@@ -91,12 +96,12 @@ class Session:
         self._resumed = self.navigator.time
         self.navigator.say("start", "resumed", f"goes on from what was received up to {self._resumed:.1f} s")
 
-    def run(self, feed: Iterable[Message | None]) -> None:
+    def run(self, feed: Iterable[Message | Command | None]) -> None:
         """Work off what the sources say."""
         for _ in self.solve(feed):
             pass
 
-    def solve(self, feed: Iterable[Message | None]) -> Iterator[Solution]:
+    def solve(self, feed: Iterable[Message | Command | None]) -> Iterator[Solution]:
         """Work off what the sources say and yield each solution once it has been sent; the disk has all at the end."""
         try:
             with _seldom_collected():
@@ -109,10 +114,12 @@ class Session:
         if (solution := self._end()) is not None:
             yield solution
 
-    def _step(self, message: Message | None) -> Solution | None:
-        """Take a message, or None where nothing came for a while, and send a solution if one is due."""
+    def _step(self, message: Message | Command | None) -> Solution | None:
+        """Take a message or command, or None where nothing came for a while, and send a solution if one is due."""
         if message is None:
             self._wait()
+        elif isinstance(message, Command):
+            self._obey(message)
         elif not self._known(message):
             self._take(message)
         navigator, solution = self.navigator, None
@@ -151,6 +158,27 @@ class Session:
             for time, readings in rows:
                 self.files.recorder.write(time, message.arrival, readings)
 
+    def _obey(self, command: Command) -> None:
+        """Do what a person wants; before the first solution nothing is known that it could refer to."""
+        navigator, at = self.navigator, self.solution
+        if at is None:
+            return
+        if isinstance(command, DropMark):
+            mark = self.marks.drop(command.name, at, command.north, command.east)
+            navigator.say("pilot", mark.kind, f"{mark.name}: north {mark.north:.2f} m, east {mark.east:.2f} m")
+        elif isinstance(command, RemoveMark) and (gone := self.marks.remove(command.number)) is not None:
+            navigator.say("pilot", "removed", gone.name)
+        elif isinstance(command, SetPosition):
+            north, east, sd = command.north, command.east, command.sd
+            readings = navigator.take_fix(north, east, sd)
+            if readings and self.files is not None:
+                self.files.recorder.write(navigator.time, host.time(), readings)
+            text = f"a fix at north {north:.2f} m, east {east:.2f} m, sd {sd:.2g} m"
+            apart, gate = _sds_apart(command, at), navigator.config.fix.gate_sd
+            if gate is not None and apart > gate:
+                text += f", {apart:.1f} sd from the estimate, which rejects it (fix.gate_sd {gate:g}); give a larger sd"
+            navigator.say("pilot", "position", text)
+
     def _wait(self) -> None:
         """Time goes on where nothing comes."""
         now = self.navigator.clocks.now(host.time())
@@ -170,6 +198,14 @@ class Session:
         for receive in self.receivers:
             receive(solution)
         return solution
+
+
+def _sds_apart(given: SetPosition, at: Solution) -> float:
+    """How far a place is from a solution, in units of what both are uncertain by."""
+    apart = np.array([given.north, given.east]) - at.position[:2]
+    covariance = np.diag(at.position_sd[:2] ** 2 + given.sd**2)
+    covariance[0, 1] = covariance[1, 0] = at.cov_north_east
+    return float(np.sqrt(apart @ np.linalg.solve(covariance, apart)))
 
 
 @contextlib.contextmanager

@@ -40,12 +40,14 @@ class SensorHealth:
     state : "ok", "silent", "rejected", "frozen", "no lock"
     age : since its last measurement [s]
     used, rejected : counts since the start
+    failed_s : how long it has been silent, frozen or without lock; 0 where it is not [s]
     """
 
     state: str
     age: float
     used: int
     rejected: int
+    failed_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Solution:
     events : since the last solution
     verdict, alarms : of the estimate now, and what it comes of
     distance : travelled [m]
+    altitude : newest height over the bottom that the DVL reported [m], None where that is older than 3 s
     predicted_s : how far the IMU alone carried it beyond the newest keyframe [s]
     latency_s : from the arrival of the newest measurement to this, or None in a replay
     update_s : time that the newest update took
@@ -86,6 +89,7 @@ class Solution:
     verdict: Verdict = "trusted"
     alarms: tuple[Alarm, ...] = ()
     distance: float = 0.0
+    altitude: float | None = None
     predicted_s: float = 0.0
     latency_s: float | None = None
     update_s: float = 0.0

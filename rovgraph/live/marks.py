@@ -1,0 +1,114 @@
+"""Marks and way-points that a person drops while a dive goes on."""
+
+import csv
+import math
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from rovgraph.live.solution import Solution
+from rovgraph.live.warnings import Warnings
+
+MARKS = "marks.csv"
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A place with a name.
+
+    Attributes
+    ----------
+    number : from 1 on, never used again
+    kind : "mark", where the vehicle was, or "waypoint", a place that was pointed at
+    name : any text
+    time : when it was dropped [s], the estimate's time
+    north, east : [m]
+    down : [m], of a mark
+    north_sd, east_sd : of the estimate at that time, of a mark [m]
+    latitude, longitude : [deg], of a mark, where the origin is known
+    """
+
+    number: int
+    kind: str
+    name: str
+    time: float
+    north: float
+    east: float
+    down: float | None = None
+    north_sd: float | None = None
+    east_sd: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+
+
+class Marks:
+    """The marks of a dive, and their file.
+
+    Parameters
+    ----------
+    folder : of the results; None = they are kept in memory
+    warnings : where trouble with the disk goes
+    resume : go on with the marks that are there
+
+    Attributes
+    ----------
+    all : tuple of Mark, oldest first; replaced, never changed, so that any thread may read it
+    """
+
+    def __init__(self, folder: Path | None = None, warnings: Warnings | None = None, resume: bool = False) -> None:
+        self._path = None if folder is None else folder / MARKS
+        self._warnings = warnings or Warnings()
+        self.all = _read(self._path, self._warnings) if self._path is not None and resume else ()
+        self._newest = max((mark.number for mark in self.all), default=0)
+
+    def drop(self, name: str, at: Solution, north: float | None = None, east: float | None = None) -> Mark:
+        """Add a way-point at a place [m], or a mark where a solution says that the vehicle is."""
+        self._newest += 1
+        if north is not None and east is not None:
+            mark = Mark(self._newest, "waypoint", name, at.time, north, east)
+        else:
+            north, east, down = at.position.tolist()
+            north_sd, east_sd, _ = at.position_sd.tolist()
+            place = north, east, down, north_sd, east_sd, at.latitude, at.longitude
+            mark = Mark(self._newest, "mark", name, at.time, *place)
+        self.all = (*self.all, mark)
+        self._write()
+        return mark
+
+    def remove(self, number: int) -> Mark | None:
+        """Forget a mark; the one that was there."""
+        found = next((mark for mark in self.all if mark.number == number), None)
+        if found is not None:
+            self.all = tuple(mark for mark in self.all if mark is not found)
+            self._write()
+        return found
+
+    def _write(self) -> None:
+        if self._path is None:
+            return
+        partial = self._path.with_name(f".{MARKS}.partial")
+        try:
+            with partial.open("w", encoding="utf-8", newline="") as file:
+                table = csv.DictWriter(file, [f.name for f in fields(Mark)])
+                table.writeheader()
+                table.writerows(asdict(mark) for mark in self.all)
+            partial.replace(self._path)
+        except OSError as error:
+            self._warnings.complain(str(self._path), "disk", f"cannot be written ({error.strerror}); free some space")
+
+
+def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:
+    """The marks of a run that is resumed; a line that was torn is left out."""
+    if not path.exists():
+        return ()
+    marks = []
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        for row in csv.DictReader(file):
+            try:
+                numbers = [float(row[f.name]) if row[f.name] else None for f in fields(Mark)[3:]]
+                mark = Mark(int(row["number"]), row["kind"], row["name"], *numbers)  # type: ignore[arg-type]
+                if not all(isinstance(v, float) and math.isfinite(v) for v in (mark.time, mark.north, mark.east)):
+                    raise ValueError
+                marks.append(mark)
+            except (ValueError, TypeError, KeyError):
+                warnings.complain(str(path), "marks", "a line that is no mark is left out")
+    return tuple(marks)

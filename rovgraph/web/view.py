@@ -1,0 +1,151 @@
+"""What pages see of a dive: its newest state, its track, its events. Belongs to the server's thread."""
+
+import json
+import math
+import time as host
+from collections import deque
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.live.marks import Marks
+from rovgraph.live.outputs.lines import as_dict
+from rovgraph.live.solution import Solution
+from rovgraph.web.track import COLUMNS, Track, ellipse_sd
+
+EVENTS = 1000  # that are kept
+STALE_S = 2.0  # without a solution, after which a page says so
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Beyond these the page raises an alarm.
+
+    Attributes
+    ----------
+    position_sd_m : of the longer axis of the ellipse
+    heading_sd_deg : of the heading
+    """
+
+    position_sd_m: float = 5.0
+    heading_sd_deg: float = 10.0
+
+
+@dataclass(frozen=True)
+class Cursor:
+    """What a page has: points of an edition of the track, and events."""
+
+    edition: int
+    points: int
+    events: int
+
+
+class View:
+    """Takes solutions in the order of time, and says what is new to a page.
+
+    Parameters
+    ----------
+    marks : of the run, which another thread changes
+    limits : of alarms
+    """
+
+    def __init__(self, marks: Marks, limits: Limits) -> None:
+        self.marks = marks
+        self.limits = limits
+        self.newest: Solution | None = None
+        self.track = Track()
+        self.received = -math.inf  # when the newest came, by the host's monotonic clock
+        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
+        self._numbered = 0
+        self._reasons: dict[str, str] = {}  # sensor -> newest event's text
+
+    def take(self, solution: Solution, received: float) -> None:
+        """Take a solution that came at a time of the host's monotonic clock [s]."""
+        self.newest, self.received = solution, received
+        self.track.add(solution)
+        for event in solution.events:
+            self._numbered += 1
+            self._events.append({"number": self._numbered, **event.as_dict()})
+            self._reasons[event.source] = "" if event.kind in ("back", "readmitted", "over") else event.text
+
+    @property
+    def cursor(self) -> Cursor:
+        """Of a page that has everything."""
+        return Cursor(self.track.edition, len(self.track), self._numbered)
+
+    def events(self, since: int = 0) -> list[dict[str, Any]]:
+        """Events after a number, oldest first."""
+        return [event for event in self._events if event["number"] > since]
+
+    def state(self) -> dict[str, Any]:
+        """The newest solution under the names of docs/online-output.md, and what a pilot asks beyond it."""
+        s = self.newest
+        if s is None:
+            return {"time": None}
+        state = as_dict(s)
+        del state["events"]
+        for name, health in s.sensors.items():
+            reason = "" if health.state == "ok" else self._reasons.get(name, "")
+            state["sensors"][name] |= {"failed_s": _rounded(health.failed_s), "reason": reason}
+        dvl = s.sensors.get("dvl")
+        return state | {
+            "age_s": round(host.monotonic() - self.received, 3),
+            "sent": round(host.time(), 3),
+            "speed": _rounded(float(np.linalg.norm(s.velocity))),
+            "ellipse_sd": _rounded(ellipse_sd(s)),
+            "altitude": None if s.altitude is None else _rounded(s.altitude),
+            "lock_lost_s": None if dvl is None else _rounded(dvl.failed_s),
+            "alarms": [{"kind": a.kind, "sensor": a.sensor, "severity": a.severity, "text": a.text} for a in s.alarms],
+            "limits": self._beyond(s),
+            "marks": [asdict(mark) for mark in self.marks.all],
+        }
+
+    def update(self, cursor: Cursor) -> str | None:
+        """What is new since a page was told last, as a message; None where it needs the whole track again."""
+        if cursor.edition != self.track.edition:
+            return None
+        new = {"points": self.track.since(cursor.points), "events": self.events(cursor.events)}
+        return json.dumps({"type": "state", **self.state(), **new}, allow_nan=False, separators=(",", ":"))
+
+    def geojson(self) -> dict[str, Any]:
+        """The track as GeoJSON (RFC 7946) where the origin is known; elsewhere a feature without geometry."""
+        points = self.track.since(0)
+        s = self.newest
+        properties: dict[str, Any] = {"columns": list(COLUMNS), "points": points}
+        geometry = None
+        if s is not None and s.latitude is not None and s.longitude is not None and len(points) > 1:
+            geometry = {"type": "LineString", "coordinates": _degrees(points, s)}
+        return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+    def _beyond(self, s: Solution) -> list[dict[str, str]]:
+        """What is beyond the page's own limits, or silent, or disagrees about the heading."""
+        found = []
+        sd, heading = ellipse_sd(s), math.degrees(float(s.rpy_sd[2]))
+        if not sd <= self.limits.position_sd_m:
+            found.append({"kind": "position", "text": f"position sd {sd:.1f} m, limit {self.limits.position_sd_m:g} m"})
+        if not heading <= self.limits.heading_sd_deg:
+            limit = self.limits.heading_sd_deg
+            found.append({"kind": "heading", "text": f"heading sd {heading:.1f}°, limit {limit:g}°"})
+        for name, health in s.sensors.items():
+            if name in HEADING_STREAMS and health.state == "rejected":
+                found.append({"kind": "heading", "text": f"{name} disagrees with the heading"})
+            elif health.state in ("silent", "no lock"):
+                found.append({"kind": "silence", "text": f"{name}: {health.state} for {health.failed_s:.0f} s"})
+        return found
+
+
+def _degrees(points: list[Any], at: Solution) -> list[list[float]]:
+    """Longitude, latitude and height of points, by a solution whose place is known both ways."""
+    import pymap3d
+
+    north, east, down = np.array(points)[:, 1:4].T
+    n, e = float(at.position[0]), float(at.position[1])
+    latitude, longitude, _ = pymap3d.ned2geodetic(north - n, east - e, 0.0, at.latitude, at.longitude, 0.0)
+    degrees: list[list[float]] = np.column_stack([np.round(longitude, 8), np.round(latitude, 8), -down]).tolist()
+    return degrees
+
+
+def _rounded(value: float) -> float | None:
+    return float(f"{value:.5g}") if math.isfinite(value) else None

@@ -1,0 +1,530 @@
+"""The live page: what pages are told, what they may ask, and who is kept out."""
+
+import asyncio
+import json
+import re
+import socket
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+import rovgraph as rg
+from rovgraph.cli.app import main
+from rovgraph.errors import InputError
+from rovgraph.live.commands import DropMark, RemoveMark, SetPosition
+from rovgraph.live.feed import Feed
+from rovgraph.live.marks import Marks
+from rovgraph.live.solution import Event, SensorHealth, Solution
+from rovgraph.web import broadcast as broadcasting
+from rovgraph.web import track as tracking
+from rovgraph.web.address import parse_address, parse_origin, token_of
+from rovgraph.web.app import application
+from rovgraph.web.broadcast import Broadcast
+from rovgraph.web.charts import Charts, read_charts
+from rovgraph.web.guard import Guard
+from rovgraph.web.requests import BURST, LARGEST_BODY
+from rovgraph.web.track import PIECE, Track
+from rovgraph.web.view import Limits, View
+
+NASTY = "</script><script>alert(1)</script> \"quotes' & δύτης 潜水"
+TOKEN = "a-token-of-24-characters"
+HERE = {"host": "127.0.0.1:8080"}
+OWN = {**HERE, "origin": "http://127.0.0.1:8080"}
+
+
+def solution(time: float = 0.0, north: float = 0.0, **changes: object) -> Solution:
+    known = Solution(
+        time,
+        np.array([north, 2.0, 3.0]),
+        np.array([0.3, 0.4, 0.0]),
+        np.array([0.0, 0.0, 0.5]),
+        np.array([0.3, 0.4, 0.1]),
+        np.full(3, 0.01),
+        np.full(3, 0.02),
+        0.0,
+        calibration={"dvl_yaw": (0.77, 0.01)},
+        sensors={"dvl": SensorHealth("ok", 0.1, 10, 1), "mag": SensorHealth("ok", 0.1, 10, 0)},
+    )
+    return replace(known, **changes)
+
+
+class Server:
+    """The application without a socket."""
+
+    def __init__(self, token: str | None = None, origins: tuple[str, ...] = (), charts: Charts | None = None) -> None:
+        self.marks, self.commands = Marks(), []
+        self.view = View(self.marks, Limits())
+        self.broadcast = Broadcast(self.view)
+        app = application(self.broadcast, charts or Charts(()), lambda command: self.commands.append(command) or True)
+        self.client = TestClient(Guard(app, token, origins), base_url="http://127.0.0.1:8080")
+
+    def show(self, *solutions: Solution) -> None:
+        for one in solutions:
+            self.view.take(one, time.monotonic())
+
+
+@pytest.fixture
+def server():
+    return Server()
+
+
+# what pages are told
+
+
+def test_the_state_has_the_solution_and_what_a_pilot_asks_beyond_it(server):
+    lost = SensorHealth("no lock", 0.1, 10, 3, failed_s=7.0)
+    events = (Event(1.0, "dvl", "no lock", NASTY),)
+    server.show(solution(1.0, events=events, sensors={"dvl": lost}, altitude=4.5))
+    state = server.client.get("/api/state").json()
+    assert (state["north"], state["speed"], state["altitude"], state["lock_lost_s"]) == (0.0, 0.5, 4.5, 7.0)
+    assert state["sensors"]["dvl"] | {"state": "no lock", "rejected": 3, "reason": NASTY} == state["sensors"]["dvl"]
+    assert state["limits"] == [{"kind": "silence", "text": "dvl: no lock for 7 s"}]
+    assert server.client.get("/api/events").json()[0]["text"] == NASTY
+    assert server.client.get("/api/events?since=1").json() == []
+    assert server.client.get("/api/events?since=x").status_code == 422
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        ({"position_sd": np.array([6.0, 0.1, 0.1])}, "position"),
+        ({"position_sd": np.full(3, np.nan)}, "position"),
+        ({"rpy_sd": np.array([0.0, 0.0, 0.3])}, "heading"),
+        ({"sensors": {"mag": SensorHealth("rejected", 0.1, 1, 9)}}, "heading"),
+        ({"sensors": {"depth": SensorHealth("silent", 9.0, 1, 0, 9.0)}}, "silence"),
+    ],
+)
+def test_the_page_raises_an_alarm_beyond_its_limits(server, change, kind):
+    server.show(solution())
+    assert server.view.state()["limits"] == []
+    server.show(solution(1.0, **change))
+    assert [one["kind"] for one in server.view.state()["limits"]] == [kind]
+
+
+def test_the_track_is_geojson_where_the_origin_is_known(server):
+    server.show(*(solution(float(k), 10.0 * k) for k in range(3)))
+    assert server.client.get("/api/track.geojson").json()["geometry"] is None
+    server.show(solution(3.0, 30.0, latitude=58.0, longitude=15.0))
+    track = server.client.get("/api/track.geojson").json()
+    first, *_, last = track["geometry"]["coordinates"]
+    assert last == pytest.approx([15.0, 58.0, -3.0], abs=1e-6)
+    assert (58.0 - first[1]) * 111_370 == pytest.approx(30.0, rel=2e-3)
+    assert len(track["properties"]["points"]) == 4
+
+
+def test_a_track_of_any_length_stays_bounded_and_in_order(monkeypatch):
+    monkeypatch.setattr(tracking, "MOST", 11 * PIECE)
+    track = Track()
+    for k in range(11 * PIECE + 10):
+        track.add(solution(0.1 * k, 0.2 * k))
+    assert len(track) < 11 * PIECE and track.edition == 1
+    points = [point for piece in track.pieces() for point in json.loads(piece)]
+    assert len(points) == len(track) > 5 * PIECE
+    assert (np.diff([point[0] for point in points]) > 0).all()
+
+
+def test_metrics_are_read_by_prometheus(server):
+    from prometheus_client.parser import text_string_to_metric_families
+
+    server.show(solution(sensors={NASTY: SensorHealth("silent", 9.0, 1, 2)}))
+    families = {f.name: f.samples for f in text_string_to_metric_families(server.client.get("/metrics").text)}
+    assert families["rovgraph_position_sd_metres"][0].value == pytest.approx(0.4)
+    states = {s.labels["state"]: s.value for s in families["rovgraph_sensor_state"]}
+    assert states["silent"] == 1.0 and sum(states.values()) == 1.0
+    assert families["rovgraph_measurements"][1].labels == {"sensor": NASTY, "outcome": "rejected"}
+
+
+def test_blueos_and_cockpit_find_the_page(server):
+    service = server.client.get("/register_service").json()
+    assert service["works_in_relative_paths"] is True
+    extras = server.client.get(service["extras"]["cockpit"]).json()
+    assert extras["target_system"] == "Cockpit" and extras["widgets"][0]["iframe_url"].startswith("/")
+    page = server.client.get("/").text
+    assert re.findall(r'(?:src|href)="(/|https?:|//)', page) == []
+
+
+# what pages may ask
+
+
+def test_commands_reach_the_estimator_as_they_were_meant(server):
+    server.show(solution())
+    for path, body in (("marks", {"name": NASTY}), ("marks", {"name": "w\n", "north": 1, "east": 2.5})):
+        assert server.client.post(f"/api/{path}", json=body, headers=OWN).status_code == 202
+    assert server.client.post("/api/position", json={"north": 1, "east": 2, "sd": 3}, headers=OWN).status_code == 202
+    assert server.client.delete("/api/marks/7", headers=OWN).status_code == 202
+    assert server.commands == [DropMark(NASTY), DropMark("w", 1.0, 2.5), SetPosition(1.0, 2.0, 3.0), RemoveMark(7)]
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("marks", "{"),
+        ("marks", '{"name": 1}'),
+        ("marks", '{"north": 1}'),
+        ("marks", '{"other": 1}'),
+        ("position", '{"north": 1, "east": 2}'),
+        ("position", '{"north": NaN, "east": 2, "sd": 1}'),
+        ("position", '{"north": 1e9, "east": 2, "sd": 1}'),
+        ("position", '{"north": 1, "east": 2, "sd": 0}'),
+        ("position", '{"north": true, "east": 2, "sd": 1}'),
+    ],
+)
+def test_a_command_that_cannot_be_meant_is_refused_in_one_line(server, path, body):
+    server.show(solution())
+    answer = server.client.post(f"/api/{path}", content=body, headers={**OWN, "content-type": "application/json"})
+    assert answer.status_code == 422
+    assert "\n" not in answer.json()["error"]
+    assert server.commands == []
+
+
+def test_before_the_first_position_nothing_can_be_marked(server):
+    assert server.client.post("/api/marks", json={}, headers=OWN).status_code == 409
+
+
+# who is kept out
+
+
+def test_a_flood_of_commands_is_cut_off(server):
+    server.show(solution())
+    statuses = [server.client.post("/api/marks", json={}, headers=OWN).status_code for _ in range(3 * BURST)]
+    assert statuses[:BURST] == [202] * BURST
+    assert statuses.count(429) > BURST
+    assert len(server.commands) < 2 * BURST
+
+
+def test_a_body_that_is_too_large_is_refused(server):
+    server.show(solution())
+    answer = server.client.post("/api/marks", json={"name": "x" * LARGEST_BODY}, headers=OWN)
+    assert answer.status_code == 413
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:8081", "https://127.0.0.1"])
+def test_another_site_changes_nothing_and_hears_nothing(server, origin):
+    server.show(solution())
+    foreign = {**HERE, "origin": origin}
+    assert (
+        server.client.post("/api/position", json={"north": 1, "east": 2, "sd": 3}, headers=foreign).status_code == 403
+    )
+    assert server.client.delete("/api/marks/1", headers=foreign).status_code == 403
+    for path in ("/live", "/cockpit"):
+        with pytest.raises(WebSocketDisconnect), server.client.websocket_connect(path, headers=foreign):
+            pass
+    form = server.client.post("/api/marks", content="{}", headers={**OWN, "content-type": "text/plain"})
+    assert form.status_code == 415
+    assert server.commands == []
+
+
+def test_a_name_that_points_here_is_not_this_computer(server):
+    for host in ("evil.example", "evil.example:8080", "127.0.0.1.evil.example"):
+        assert server.client.get("/api/state", headers={"host": host}).status_code == 403
+    for host in ("localhost:1", "127.0.0.1", "[::1]:8080"):
+        assert server.client.get("/api/state", headers={"host": host}).status_code == 200
+
+
+def test_elsewhere_a_token_is_needed_and_is_taken_from_headers_alone():
+    server = Server(TOKEN)
+    server.show(solution())
+    paths = ("/api/state", "/api/track.geojson", "/api/events", "/metrics", "/api/charts")
+    for path in paths:
+        assert server.client.get(path).status_code == 401
+        assert server.client.get(f"{path}?token={TOKEN}").status_code == 401
+        assert server.client.get(path, headers={"authorization": f"Bearer {TOKEN}x"}).status_code == 401
+        assert server.client.get(path, headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+    assert server.client.post("/api/marks", json={}, headers=OWN).status_code == 401
+    assert server.client.get("/").status_code == server.client.get("/assets/page.js").status_code == 200
+    with pytest.raises(WebSocketDisconnect), server.client.websocket_connect("/live", headers=OWN):
+        pass
+
+
+def test_the_token_is_compared_in_constant_time(monkeypatch):
+    compared = []
+    monkeypatch.setattr("hmac.compare_digest", lambda a, b: compared.append((a, b)) or False)
+    Server(TOKEN).client.get("/api/state", headers={"authorization": f"Bearer {TOKEN}"})
+    assert compared == [(TOKEN.encode(), TOKEN.encode())]
+
+
+def test_cockpit_reads_values_without_a_token_only_where_its_origin_is_named():
+    with rg.live_page("0.0.0.0:0", origins=["http://192.168.2.2"]) as page:
+        page.send(solution())
+        url = f"ws://127.0.0.1:{page.address.port}"
+        with connect(f"{url}/cockpit", origin="http://192.168.2.2", open_timeout=20) as link:
+            assert link.recv(timeout=20) == "rovgraph-north-m=0"
+        for path, origin in (("/cockpit", "http://192.168.2.3"), ("/live", "http://192.168.2.2")):
+            with pytest.raises(InvalidStatus), connect(f"{url}{path}", origin=origin, open_timeout=20):
+                pass
+        protocols = [Subprotocol("rovgraph"), Subprotocol(f"token.{page.token}")]
+        with connect(f"{url}/live", subprotocols=protocols, open_timeout=20) as link:
+            assert link.subprotocol == "rovgraph"
+
+
+def test_every_answer_forbids_foreign_code_and_foreign_frames():
+    server = Server(None, ("http://192.168.2.2",))
+    for path in ("/", "/assets/page.js", "/api/state", "/nowhere"):
+        policy = server.client.get(path).headers["content-security-policy"]
+        rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+        assert rules["default-src"] == "'none'" and rules["script-src"] == "'self'" and rules["style-src"] == "'self'"
+        assert rules["frame-ancestors"] == "'self' http://192.168.2.2"
+        assert "unsafe" not in policy
+    page = server.client.get("/").text
+    assert not re.search(r"<script(?![^>]*src=)|\son\w+=|\sstyle=", page)
+    assets = Path(broadcasting.__file__).parent / "assets"
+    assert not any(re.search(r"innerHTML|\beval\(|new Function|https?://", f.read_text()) for f in assets.glob("*.js"))
+
+
+@pytest.mark.parametrize(
+    "path", ["/assets/../page.py", "/assets/%2e%2e/page.py", "/assets/..%2fpage.py", "/assets//etc/passwd", "/../x"]
+)
+def test_no_path_leaves_the_assets(server, path):
+    assert server.client.get(path).status_code == 404
+
+
+def test_tiles_that_lead_out_of_their_folder_are_not_served(tmp_path):
+    secret = tmp_path / "secret.png"
+    secret.write_bytes(b"secret")
+    folder = tmp_path / "tiles" / "3" / "4"
+    folder.mkdir(parents=True)
+    (folder / "5.png").write_bytes(b"tile")
+    (folder / "6.png").symlink_to(secret)
+    server = Server(charts=read_charts([tmp_path / "tiles"]))
+    assert server.client.get("/api/charts/0/3/4/5.png").content == b"tile"
+    for path in ("3/4/6", "3/4/7", "../../secret", "3/4/..%2f..%2f..%2fsecret"):
+        assert server.client.get(f"/api/charts/0/{path}.png").status_code == 404
+
+
+# charts
+
+
+def test_charts_are_placed_once_the_origin_is_known(tmp_path):
+    ring = [[15.0, 58.0], [15.001, 58.0], [15.001, 58.001], [15.0, 58.0]]
+    shapes = [
+        {"type": "Feature", "properties": {"name": NASTY}, "geometry": {"type": "Polygon", "coordinates": [ring]}},
+        {"type": "Feature", "properties": None, "geometry": {"type": "Point", "coordinates": [15.0, 58.0, 7.0]}},
+    ]
+    (tmp_path / "c.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": shapes}))
+    server = Server(charts=read_charts([tmp_path / "c.geojson"]))
+    assert "origin" in server.client.get("/api/charts").json()["missing"]
+    server.show(solution(0.0, 100.0, latitude=58.0, longitude=15.0))
+    area, point = server.client.get("/api/charts").json()["charts"][0]["shapes"]
+    assert area["name"] == NASTY and area["form"] == "area"
+    assert point["points"][0] == pytest.approx([100.0, 2.0], abs=0.01)
+    assert area["points"][2][0] - area["points"][1][0] == pytest.approx(111.4, rel=2e-3)
+
+
+def test_a_geotiff_lies_where_its_coordinates_say(tmp_path):
+    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: no GeoTIFF was read")
+    place = rasterio.transform.from_origin(500_000.0, 6_429_000.0, 2.0, 2.0)
+    values = np.arange(60, dtype=np.float32).reshape(1, 6, 10)
+    with rasterio.open(
+        tmp_path / "c.tif", "w", driver="GTiff", height=6, width=10, count=1, dtype="float32", crs="EPSG:32633",
+        transform=place, nodata=0.0,
+    ) as file:  # fmt: skip
+        file.write(values)
+    server = Server(charts=read_charts([tmp_path / "c.tif"]))
+    server.show(solution(latitude=58.0, longitude=15.0))
+    (chart,) = server.client.get("/api/charts").json()["charts"]
+    corner, right, below = np.array(chart["corners"])
+    assert np.linalg.norm(right - corner) == pytest.approx(20.0, rel=2e-3)
+    assert np.linalg.norm(below - corner) == pytest.approx(12.0, rel=2e-3)
+    image = server.client.get("/api/charts/0.png").content
+    with rasterio.MemoryFile(image) as memory, memory.open() as png:
+        assert png.shape == (6, 10) and png.read(4)[0, 0] == 0 and png.read(4)[1:].min() == 255
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("c.tif", b"II*\0broken", "no GeoTIFF"),
+        ("c.geojson", b'{"type": "Feature"', "no GeoJSON"),
+        ("c.geojson", b'{"type": "Point", "coordinates": [500000, 6400000]}', "degrees"),
+        ("c.geojson", b'{"type": "FeatureCollection", "features": []}', "vertices"),
+        ("c.bmp", b"", "expected a GeoTIFF"),
+    ],
+)
+def test_a_broken_chart_is_refused_in_one_line(tmp_path, name, content, says):
+    if name.endswith(".tif"):
+        pytest.importorskip("rasterio", reason="rasterio is not installed: no GeoTIFF was read")
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=says) as error:
+        read_charts([tmp_path / name])
+    assert "\n" not in str(error.value) and name in str(error.value)
+
+
+# addresses
+
+
+@pytest.mark.parametrize("text", ["", "a:b", "127.0.0.1:99999", "http://127.0.0.1:80", "127.0.0.1:80/x", "nonsense"])
+def test_an_address_that_is_none_is_refused(text):
+    with pytest.raises(InputError, match="--http"):
+        parse_address(text)
+
+
+@pytest.mark.parametrize("text", ["*", "http://a b", "http://a; script-src *", "ftp://a", "http://a/x"])
+def test_an_origin_that_is_none_is_refused(text):
+    with pytest.raises(InputError, match="--http-origin"):
+        parse_origin(text)
+
+
+def test_only_the_loopback_goes_without_a_token():
+    assert [parse_address(a).loopback for a in ("8080", "127.0.0.5:1", "[::1]:1", "localhost:1")] == [True] * 4
+    assert not any(parse_address(a).loopback for a in ("0.0.0.0:1", "[::]:1", "192.168.2.2:1", "boat.local:1"))
+
+
+def test_a_token_is_kept_in_its_file_for_its_owner_alone(tmp_path):
+    path = tmp_path / "token"
+    token = token_of(path)
+    assert token_of(path) == token and len(token) >= 24
+    assert path.stat().st_mode & 0o077 == 0
+    path.write_text("short")
+    with pytest.raises(InputError, match="--http-token"):
+        token_of(path)
+
+
+def test_a_port_in_use_is_one_line():
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InputError, match="choose another"):
+        rg.live_page(f"127.0.0.1:{taken.getsockname()[1]}")
+
+
+@pytest.mark.parametrize("fault", ["port", "chart", "origin", "limit"])
+def test_the_command_refuses_what_the_library_refuses_and_touches_nothing(monkeypatch, capsys, tmp_path, fault):
+    (tmp_path / "c.geojson").write_text("{")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1] if fault == 'port' else 0}"
+        wrong, options = {
+            "port": ({}, []),
+            "chart": ({"charts": [tmp_path / "c.geojson"]}, ["--chart", tmp_path / "c.geojson"]),
+            "origin": ({"origins": ["*"]}, ["--http-origin", "*"]),
+            "limit": ({"position_sd_limit_m": 0.0}, ["--position-sd-limit", 0]),
+        }[fault]
+        with pytest.raises(InputError) as refused:
+            rg.live_page(address, **wrong)
+        given = ["online", "tcp://127.0.0.1:1", "--http", address, *options, "--out", tmp_path / "new"]
+        monkeypatch.setattr("sys.argv", ["rovgraph", *map(str, given)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.splitlines() == [f"error: {refused.value}"]
+    assert not (tmp_path / "new").exists()
+
+
+# the server, over its socket
+
+
+@pytest.fixture
+def page():
+    with rg.live_page("127.0.0.1:0", Feed([]).offer) as shown:
+        yield shown
+
+
+def live(shown):
+    return connect(f"ws://127.0.0.1:{shown.address.port}/live", open_timeout=20, max_size=None)
+
+
+def until(link, kind):
+    while (news := json.loads(link.recv(timeout=20)))["type"] != kind:
+        pass
+    return news
+
+
+def test_a_page_that_comes_back_gets_the_whole_track(page):
+    for k in range(PIECE + 100):
+        page.send(solution(0.1 * k, float(k)))
+    end = time.monotonic() + 20
+    while len(page.broadcast.view.track) < PIECE + 100 and time.monotonic() < end:
+        time.sleep(0.02)
+    for _ in range(2):
+        with live(page) as link:
+            news = [json.loads(link.recv(timeout=20)) for _ in range(4)]
+        assert [one["type"] for one in news] == ["begin", "track", "track", "state"]
+        assert [p[1] for one in news for p in one.get("points", [])] == list(range(PIECE + 100))
+
+
+def test_what_is_new_comes_once_and_soon(page):
+    with live(page) as link:
+        until(link, "begin")
+        points, delays = [], []
+        for k in range(30):
+            page.send(solution(0.1 * k, float(k), events=(Event(0.1 * k, "dvl", "kind", str(k)),)))
+            sent = time.monotonic()
+            while not points or points[-1][1] != k:
+                news = until(link, "state")
+                points += news["points"]
+            delays.append(time.monotonic() - sent)
+            time.sleep(0.01)
+        assert [p[1] for p in points] == list(range(30))
+        assert np.percentile(delays, 50) < 0.15
+
+
+def test_a_page_that_speaks_is_closed(page):
+    with live(page) as link:
+        link.send("x")
+        with pytest.raises(ConnectionClosed, match="1008"):
+            while True:
+                link.recv(timeout=20)
+
+
+def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(page, monkeypatch):
+    monkeypatch.setattr(broadcasting, "STALL_S", 0.5)
+    text = "x" * 20_000
+    with socket.create_connection(("127.0.0.1", page.address.port)) as deaf, live(page) as link:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.sendall(
+            b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+        )
+        end, k = time.monotonic() + 40, 0
+        while not page.broadcast.dropped:
+            assert time.monotonic() < end
+            k += 1
+            page.send(solution(float(k), float(k), events=(Event(float(k), "dvl", "kind", text),) * 20))
+            while True:
+                if until(link, "state")["time"] == float(k):
+                    break
+        assert page.broadcast.pages == 1
+        assert httpx.get(page.address.url + "api/state", timeout=20).json()["time"] == float(k)
+
+
+def test_the_estimator_only_queues_and_never_waits(page):
+    """Also while the server's thread is stuck."""
+    stuck = threading.Event()
+    asyncio.run_coroutine_threadsafe(_block(stuck), _loop(page))
+    begin = time.thread_time()
+    for k in range(1000):
+        page.send(solution(float(k)))
+    assert time.thread_time() - begin < 1.0
+    stuck.set()
+
+
+async def _block(stuck: threading.Event) -> None:
+    stuck.wait(20)
+
+
+def _loop(page) -> asyncio.AbstractEventLoop:
+    end = time.monotonic() + 20
+    while page.broadcast._loop is None:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    return page.broadcast._loop
+
+
+def test_a_header_that_is_too_long_is_refused(page):
+    with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
+        link.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"x" * 100_000)
+        assert b"400" in link.recv(100)
+
+
+def test_too_many_pages_are_turned_away(page, monkeypatch):
+    monkeypatch.setattr(broadcasting, "MOST_PAGES", 1)
+    with live(page) as link:
+        until(link, "begin")
+        with pytest.raises(InvalidStatus), live(page):
+            pass
