@@ -1,6 +1,6 @@
 """An estimate while data arrive: what ``rovgraph online`` does."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -198,7 +198,7 @@ class Online:
                 files = Files(folder, config, warnings, resume, anew=self.engine == "isam2")
             opened_outputs.pop_all()
         navigator = self._navigator(config, patient=feed.recorded, trust=feed.replayed)
-        told = [each.send for each in receivers]
+        told: list[Callable[[Solution], None]] = [each.send for each in receivers]
         if watched is not None:
             told.append(watched.send)
         session = Session(navigator, told, warnings, self.rate_hz, files, marks)
