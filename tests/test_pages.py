@@ -160,6 +160,17 @@ def test_what_is_no_results_folder_is_refused_in_a_line_and_an_old_page_stays(ow
     assert not own.exists() or (own / "report.html").read_text() == before
 
 
+def test_every_compass_is_shown_with_the_curve_that_was_estimated(own):
+    """The vehicle's own heading, too."""
+    assert "dvl_heading: deviation" in page_of(own)
+    for name in ("residuals.csv", "calibration.csv"):
+        text = (own / name).read_text()
+        (own / name).write_text(text.replace("dvl_heading", "vehicle_heading").replace("dvl_compass", "vehicle_compass"))
+    html = page_of(own)
+    assert "vehicle_heading: deviation" in html
+    assert "No deviation curve was estimated" not in html
+
+
 def test_results_of_another_version_are_shown_with_a_note(own):
     summary = json.loads((own / "summary.json").read_text())
     kept = {k: summary[k] for k in ("program", "verdict", "main_estimate")}
