@@ -149,6 +149,10 @@ def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
         (lambda f: (f / "residuals.csv").write_text("time,sensor\n1,dvl\n"), "column component is missing"),
         (lambda f: (f / "trajectory_smoothed.csv").write_text("time,north,east\n"), "no rows with a time"),
         (shutil.rmtree, "no such folder"),
+        (lambda f: summary_with(f, alarms="x"), "incomplete or of another version"),
+        (lambda f: summary_with(f, end={"north_m": "x"}), "incomplete or of another version"),
+        (lambda f: summary_with(f, sensors={"dvl": None}), "incomplete or of another version"),
+        (lambda f: (f / "dvl.csv").write_text("time,lock,altitude,figure_of_merit,row\nx,1,1,1,1\n"), "incomplete or"),
     ],
 )
 def test_what_is_no_results_folder_is_refused_in_a_line_and_an_old_page_stays(own, spoil, said):
@@ -205,6 +209,9 @@ def test_dives_side_by_side_show_each_and_name_what_is_no_dive(folder, tmp_path)
     with pytest.raises(rg.InputError, match="only dives are set side by side"):
         report(folder, second, out=out, force=True)
     assert out.read_text() == html
+    summary_with(second, main_estimate="smoothed", sensors="x")
+    with pytest.raises(rg.InputError, match="incomplete or of another version"):
+        report(folder, second, out=out, force=True)
 
 
 def test_dives_about_known_origins_stand_where_they_were(own, tmp_path):
