@@ -66,7 +66,7 @@ def test_csv_round_trip_keeps_values_and_sds(trajectory, tmp_path):
 
 
 def test_csv_keeps_tenths_of_a_millimetre_in_the_coordinates_of_a_grid(trajectory, tmp_path):
-    far = replace(trajectory, p_n=trajectory.p_n + [6_470_000.123456, 540_000.0, 0.0])
+    far = replace(trajectory, p_n=trajectory.p_n + np.array([6_470_000.123456, 540_000.0, 0.0]))
     far.write_csv(tmp_path / "far.csv")
     np.testing.assert_allclose(read_trajectory(tmp_path / "far.csv").p_n, far.p_n, rtol=0, atol=1e-4)
 
