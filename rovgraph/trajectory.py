@@ -17,6 +17,7 @@ from rovgraph.errors import InputError, warn
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
 
+FAR = 1000.0  # from the origin, in which seven digits are a tenth of a millimetre [m]
 POSITION = ["north", "east", "down"]
 ATTITUDE = ["roll", "pitch", "yaw"]
 VELOCITY = ["v_north", "v_east", "v_down"]
@@ -153,6 +154,10 @@ class Trajectory:
         """
         frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
         decimals = {"time": 4}
+        far = [
+            name for name in POSITION if name in frame and frame[name].abs().max() >= FAR and frame[name].notna().all()
+        ]
+        decimals |= dict.fromkeys(far, 4)  # seven digits of a grid's northing are a metre
         if origin is not None:
             frame["lat"], frame["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre

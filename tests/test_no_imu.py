@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from dives import (
     Simulated,
+    altered,
     as_log,
     attitude_errors,
     batch,
@@ -29,6 +30,7 @@ from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.live.startup import Startup
 from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.log.frozen import frozen_stretches
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import known
 from rovgraph.trajectory import Trajectory
@@ -142,6 +144,27 @@ def test_measurements_one_by_one_and_a_whole_log_give_the_same_keyframes(dive):
     one_by_one = batch(case.log, config)
     assert len(whole.intervals) > SECONDS
     same(whole.intervals, one_by_one.intervals)
+
+
+@pytest.mark.parametrize("sensor", ["dvl", "vehicle_heading", "vehicle_tilt"])
+def test_a_value_held_while_the_vehicle_moves_is_frozen(dive, sensor):
+    case, config = dive
+    assert frozen_stretches(case.log, config) == []
+    stream, data = case.log[sensor], case.log[sensor].data.copy()
+    held = (stream.time >= 40.0) & (stream.time < 80.0)
+    data[held] = data[held][0]
+    (found,) = frozen_stretches(altered(case.log, sensor, data), config)
+    assert (found.sensor, found.first, found.last) == (sensor, *stream.time[held][[0, -1]])
+
+
+def test_a_heading_that_is_held_leaves_a_track_as_certain_as_it_is(dive):
+    case, config = dive
+    stream, data = case.log["vehicle_heading"], case.log["vehicle_heading"].data.copy()
+    held = (stream.time >= 40.0) & (stream.time < 80.0)
+    data[held] = data[held][0]
+    done = smooth(altered(case.log, "vehicle_heading", data), config)
+    assert done.verdict != "trusted"
+    assert nees(done.estimates[0].trajectory, case, -1)[0] < chi2.ppf(0.99, 3)
 
 
 def test_an_imu_that_is_left_out_changes_nothing(dive):

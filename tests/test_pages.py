@@ -12,7 +12,7 @@ import pytest
 import rovgraph as rg
 from rovgraph.api.reporting import report
 from rovgraph.pages.page import render
-from rovgraph.pages.parts import Panel, Section, line
+from rovgraph.pages.parts import Panel, Section, line, packed
 from rovgraph.pages.reporting import page_of
 from rovgraph.pages.sensors import autocorrelation
 from rovgraph.pages.source import Track
@@ -149,6 +149,10 @@ def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
         (lambda f: (f / "residuals.csv").write_text("time,sensor\n1,dvl\n"), "column component is missing"),
         (lambda f: (f / "trajectory_smoothed.csv").write_text("time,north,east\n"), "no rows with a time"),
         (shutil.rmtree, "no such folder"),
+        (lambda f: summary_with(f, alarms="x"), "incomplete or of another version"),
+        (lambda f: summary_with(f, end={"north_m": "x"}), "incomplete or of another version"),
+        (lambda f: summary_with(f, sensors={"dvl": None}), "incomplete or of another version"),
+        (lambda f: (f / "dvl.csv").write_text("time,lock,altitude,figure_of_merit,row\nx,1,1,1,1\n"), "incomplete or"),
     ],
 )
 def test_what_is_no_results_folder_is_refused_in_a_line_and_an_old_page_stays(own, spoil, said):
@@ -158,6 +162,52 @@ def test_what_is_no_results_folder_is_refused_in_a_line_and_an_old_page_stays(ow
         report(own)
     assert "\n" not in str(refusal.value)
     assert not own.exists() or (own / "report.html").read_text() == before
+
+
+def test_every_compass_is_shown_with_the_curve_that_was_estimated(own):
+    """The vehicle's own heading, too."""
+    assert "dvl_heading: deviation" in page_of(own)
+    for name in ("residuals.csv", "calibration.csv"):
+        text = (own / name).read_text()
+        (own / name).write_text(
+            text.replace("dvl_heading", "vehicle_heading").replace("dvl_compass", "vehicle_compass")
+        )
+    html = page_of(own)
+    assert "vehicle_heading: deviation" in html
+    assert "No deviation curve was estimated" not in html
+
+
+def with_track(path, change):
+    table = pd.read_csv(path / "trajectory_smoothed.csv")
+    change(table)
+    table.to_csv(path / "trajectory_smoothed.csv", index=False)
+
+
+def widen(table):
+    """The start is known to 30 m."""
+    for name in ("north_sd", "east_sd"):
+        table[name] = np.hypot(table[name], 30.0)
+
+
+def test_a_start_that_is_hardly_known_is_what_limits_a_track(own):
+    assert "the position at the start, known" not in page_of(own)
+    with_track(own, widen)
+    assert "What limits it: the position at the start, known to 30 m" in page_of(own)
+
+
+def test_a_dive_without_a_dvl_is_not_limited_by_its_dvl(own):
+    residuals = pd.read_csv(own / "residuals.csv")
+    residuals[residuals["sensor"] != "dvl"].to_csv(own / "residuals.csv", index=False)
+    (own / "dvl.csv").unlink()
+    html = page_of(own)
+    assert "no DVL was used" in html
+    assert "errors of the DVL" not in html
+
+
+def test_a_wrong_track_is_not_said_to_be_right_within_metres(own):
+    assert "99 times in 100" in page_of(own)
+    summary_with(own, verdict="wrong")
+    assert "99 times in 100" not in page_of(own)
 
 
 def test_results_of_another_version_are_shown_with_a_note(own):
@@ -194,6 +244,9 @@ def test_dives_side_by_side_show_each_and_name_what_is_no_dive(folder, tmp_path)
     with pytest.raises(rg.InputError, match="only dives are set side by side"):
         report(folder, second, out=out, force=True)
     assert out.read_text() == html
+    summary_with(second, main_estimate="smoothed", sensors="x")
+    with pytest.raises(rg.InputError, match="incomplete or of another version"):
+        report(folder, second, out=out, force=True)
 
 
 def test_dives_about_known_origins_stand_where_they_were(own, tmp_path):
@@ -215,6 +268,16 @@ def test_thinning_keeps_extremes_ends_and_gaps():
     assert {0, 12_345, 77_777, 99_999} <= set(some.tolist())
     assert np.isnan(values[some]).any()
     assert (np.diff(some) > 0).all()
+
+
+def test_numbers_far_from_zero_keep_their_digits():
+    north = 6.47e6 + np.linspace(0.0, 50.0, 200)
+    for values in (north, north[3:4]):
+        text = packed(values)
+        assert text[0] == ":"
+        np.testing.assert_array_equal(np.frombuffer(base64.b64decode(text[1:]), "<f8"), values)
+    for values in (north - north[0], [3.0, 3.0], [np.nan], [], np.linspace(0.0, 1e6)):
+        np.testing.assert_array_equal(np.frombuffer(base64.b64decode(packed(values)), "<f4"), np.float32(values))
 
 
 def test_separation_of_two_estimates_that_share_their_data_has_unit_variance():

@@ -1,6 +1,7 @@
 """A trajectory survives its files, its interpolation and its uncertainty."""
 
 import gzip
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -62,6 +63,12 @@ def test_csv_round_trip_keeps_values_and_sds(trajectory, tmp_path):
     np.testing.assert_allclose(back.rpy_sd, trajectory.rpy_sd, rtol=1e-5)
     np.testing.assert_allclose(back.v_sd, trajectory.v_sd, rtol=1e-6)
     np.testing.assert_allclose(back.cov_p[:, 0, 1], trajectory.cov_p[:, 0, 1], rtol=1e-6)
+
+
+def test_csv_keeps_tenths_of_a_millimetre_in_the_coordinates_of_a_grid(trajectory, tmp_path):
+    far = replace(trajectory, p_n=trajectory.p_n + np.array([6_470_000.123456, 540_000.0, 0.0]))
+    far.write_csv(tmp_path / "far.csv")
+    np.testing.assert_allclose(read_trajectory(tmp_path / "far.csv").p_n, far.p_n, rtol=0, atol=1e-4)
 
 
 def test_csv_has_the_columns_of_the_contract(trajectory, tmp_path):

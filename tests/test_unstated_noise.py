@@ -1,6 +1,7 @@
 """Noise that the configuration does not state: it is found, said and applied, and healthy dives have none."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from dives import altered, batch, changed, falcon, simulated, true_at
 from rovgraph.calibration import TABLE
 from rovgraph.config import parse_config
 from rovgraph.engine.chain import Chain
-from rovgraph.engine.lasting import LASTING, find_lasting
+from rovgraph.engine.lasting import LASTING, find_lasting, unity
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.unstated_noise import noise_factor
 from rovgraph.gauss_markov import stationary_walk
@@ -162,3 +163,13 @@ def test_fixes_that_jump_for_a_minute_do_not_spoil_the_search():
     summary = dive.estimates[0].summary
     assert nees(case, dive, "smoothed") < 3.0
     assert summary["stretches_taken_out"] or "noise_found" in summary
+
+
+def test_times_in_which_everything_was_rejected_do_not_count_as_agreement():
+    time, r = np.arange(400.0), np.random.default_rng(1).standard_normal((400, 1))
+    H = np.ones((400, 1, 1))
+    part = SimpleNamespace(time=time[:120], normalised=lambda _: r[:120])
+    whole = SimpleNamespace(time=time, normalised=lambda _: r)
+    alone = unity(part, None, H[:120], np.full(120, True))
+    assert unity(whole, None, H, time < 120.0) == pytest.approx(alone)
+    assert unity(whole, None, H, np.full(400, False)) == 1.0

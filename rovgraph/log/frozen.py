@@ -64,6 +64,8 @@ def frozen_stretches(log: Log, config: Config) -> list[FrozenStretch]:
     found += _held_depth(log, config)
     for sensor in ("ahrs", "dvl_heading"):
         found += _held_heading(log, config, sensor)
+    for sensor in ("dvl", "vehicle_heading", "vehicle_tilt") if "imu" not in log else ():
+        found += _held_in_motion(log, sensor)
     return sorted(found, key=lambda stretch: stretch.first)
 
 
@@ -125,6 +127,23 @@ def _held(log: Log, sensor: str) -> Iterator[FrozenStretch]:
         first, last = float(stream.time[a]), float(stream.time[b])
         if values[a].any() and np.isfinite(values[a]).all() and _alive(log, first, last):
             yield FrozenStretch(sensor, first, last, b - a + 1, False, "the IMU shows motion")
+
+
+def _held_in_motion(log: Log, sensor: str) -> Iterator[FrozenStretch]:
+    """Values without the noise that they have otherwise, while the DVL moves: all that a log without an IMU shows."""
+    if not {sensor, "dvl"} <= log.sensors:
+        return
+    stream = _valid(log[sensor])
+    values = stream.data[:, :3]
+    long = _long(stream, values)
+    if not _shows_noise(values, long):
+        return
+    for a, b in long:
+        first, last = float(stream.time[a]), float(stream.time[b])
+        speeds = np.linalg.norm(_between(log, "dvl", first, last)[:, :3], axis=1)
+        speed = float(np.median(speeds[np.isfinite(speeds)])) if np.isfinite(speeds).any() else 0.0
+        if speed > ABRUPT_SPEED:
+            yield FrozenStretch(sensor, first, last, b - a + 1, False, f"it moves at {speed:.2f} m/s without any noise")
 
 
 def _held_depth(log: Log, config: Config) -> Iterator[FrozenStretch]:

@@ -10,7 +10,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.pages.page import render
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Table, Trace, line, points
-from rovgraph.pages.source import DiveSource, Source
+from rovgraph.pages.source import DiveSource, Source, damage_named
 from rovgraph.pages.thinning import extremes
 from rovgraph.pages.track import origin
 from rovgraph.pages.verdict import limits
@@ -32,13 +32,14 @@ def campaign_page(folders: Sequence[Path]) -> str:
     ------
     InputError : one of them is none, or cannot be read
     """
-    dives = {name: _dive(folder) for name, folder in zip(_names(folders), folders, strict=True)}
-    sections = [
-        Section("dives", "Dives", (), [_table(dives)], {"What limited each": _limited(dives)}),
-        Section("map", "Map of all", *_map(dives)),
-        Section("drift", "Uncertainty and drift", (), [*_growth(dives)]),
-        Section("calibration", "Calibration of each", (), [_calibrations(dives)]),
-    ]
+    with damage_named(*folders):
+        dives = {name: _dive(folder) for name, folder in zip(_names(folders), folders, strict=True)}
+        sections = [
+            Section("dives", "Dives", (), [_table(dives)], {"What limited each": _limited(dives)}),
+            Section("map", "Map of all", *_map(dives)),
+            Section("drift", "Uncertainty and drift", (), [*_growth(dives)]),
+            Section("calibration", "Calibration of each", (), [_calibrations(dives)]),
+        ]
     return render(f"{len(dives)} dives side by side", sections)
 
 

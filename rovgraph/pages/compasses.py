@@ -5,12 +5,13 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
+from rovgraph.calibration import TABLE
 from rovgraph.geometry import Array
 from rovgraph.pages.parts import Item, Missing, Panel, Section, line, packed, points
 from rovgraph.pages.source import DiveSource
 from rovgraph.pages.thinning import spread
 
-CURVES = {"ahrs": "ahrs_deviation", "dvl_heading": "dvl_compass_deviation"}  # sensor -> its deviation variable
+CURVES = {v.sensors[0]: name for name, v in TABLE.items() if name.endswith("_deviation")}  # sensor -> its curve
 MOST = 3000
 ALL_ROUND = np.linspace(0.0, 360.0, 181)
 

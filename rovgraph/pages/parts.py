@@ -11,9 +11,20 @@ from numpy.typing import ArrayLike
 Trace = dict[str, Any]  # of Plotly, whose arrays are packed; "t" holds the times of points that stand over no time
 
 
+RESOLVED = 1e-4  # of the range of what is drawn, or of its unit
+
+
 def packed(values: ArrayLike) -> str:
-    """Numbers as base64 of little-endian float32, which the browser reads without parsing."""
-    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode("ascii")
+    """Numbers as base64 of little-endian float32, which the browser reads without parsing.
+
+    Numbers far from zero, such as northings of a grid, are float64 behind a colon.
+    """
+    numbers = np.asarray(values, float)
+    known = numbers[np.isfinite(numbers)]
+    off = np.abs(known - known.astype(np.float32)).max(initial=0.0)
+    far = off > 0.0 and off > RESOLVED * max(float(np.ptp(known)), 1.0)
+    text = base64.b64encode(numbers.astype("<f8" if far else "<f4").tobytes()).decode("ascii")
+    return f":{text}" if far else text
 
 
 def line(name: str, x: ArrayLike, y: ArrayLike, colour: str, **look: Any) -> Trace:

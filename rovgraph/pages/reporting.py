@@ -6,7 +6,7 @@ from rovgraph.errors import InputError
 from rovgraph.pages.about import PAGE
 from rovgraph.pages.dive import dive_page
 from rovgraph.pages.page import write
-from rovgraph.pages.source import DiveSource, Source
+from rovgraph.pages.source import DiveSource, Source, damage_named
 from rovgraph.pages.studies import study_page_of
 
 
@@ -18,15 +18,13 @@ def page_of(folder: Path) -> str:
     InputError : no results folder of rovgraph, a file that cannot be read, or a command without a page
     """
     source = Source.read(folder)
-    if "main_estimate" in source.summary:
-        return dive_page(DiveSource(source.folder, source.summary))
-    maker = study_page_of(source)
-    if maker is None:
-        raise InputError(f"{folder}: holds no results that have a page; give a results folder of smooth or a study")
-    try:
+    with damage_named(folder):
+        if "main_estimate" in source.summary:
+            return dive_page(DiveSource(source.folder, source.summary))
+        maker = study_page_of(source)
+        if maker is None:
+            raise InputError(f"{folder}: holds no results that have a page; give a results folder of smooth or a study")
         return maker(source)
-    except (KeyError, TypeError, IndexError) as error:
-        raise InputError(f"{folder}: is incomplete or of another version ({error!r}); make the results again") from None
 
 
 def write_page(folder: Path) -> None:

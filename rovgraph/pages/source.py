@@ -1,7 +1,8 @@
 """A results folder, read back."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,17 @@ from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import CHI2_99
 
 KINDS = ("smoothed", "filtered", "dead_reckoning")
+
+
+@contextmanager
+def damage_named(*folders: Path) -> Iterator[None]:
+    """Makes what is missing or of another kind in results folders an `InputError`."""
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        where = " or ".join(map(str, folders))
+        reason = f"is incomplete or of another version ({error!r})"
+        raise InputError(f"{where}: {reason}; make the results again") from None
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from rovgraph.report.units import plus_minus
 
 ALIKE = 0.97  # a radius at the end of this part of the largest is said once
 LOPSIDED = 1.5  # ratio of sd across and along beyond which one of them limits
+MOST = 0.5  # of the variance: where that much is older than the way since the last fix, the way is not what limits
 SHORT = 0.2  # displacement, as a part of the distance, below which directions say little
 
 GOOD = {
@@ -37,6 +38,8 @@ def verdict_section(source: DiveSource) -> Section:
 def how_good(source: DiveSource) -> str:
     """The verdict and how far off the vehicle may be, in a sentence or two."""
     words = GOOD.get(str(source.summary.get("verdict")), "The verdict is not known.")
+    if source.summary.get("verdict") == "wrong":
+        return words  # its standard deviations are those of a dive that did not happen
     reach = source.main.ellipses[0]
     if not np.isfinite(reach).any():
         return f"{words} How far it may be off is not known."
@@ -100,6 +103,14 @@ def _by_direction(source: DiveSource) -> tuple[str, str]:
     distance = float(np.hypot(*ahead))
     steps = np.hypot(np.diff(main["north"][origin : worst + 1]), np.diff(main["east"][origin : worst + 1]))
     since = "the last position fix" if origin else "the start"
+    known = float(main.horizontal_sd[origin])
+    if known**2 > MOST * main.horizontal_sd[worst] ** 2:
+        return _position_there(source, known, since)
+    if not {"dvl", "dvl_water"} & _used(source):
+        return (
+            f"the errors of the inertial unit, which grow fast since {since}, as no DVL was used",
+            "use a DVL, or take position fixes more often",
+        )
     noise = (
         f"the small errors of the DVL's velocity, which add up over the way since {since}",
         "take a position fix now and then, or pass a place twice that a camera or a sonar knows again",
@@ -124,6 +135,25 @@ def _by_direction(source: DiveSource) -> tuple[str, str]:
             "take position fixes at both ends of a long straight line, and state the sound speed",
         )
     return noise
+
+
+def _position_there(source: DiveSource, known: float, since: str) -> tuple[str, str]:
+    """Where most of the uncertainty stood at the last fix, or at the start, already."""
+    if since == "the start":
+        return (
+            f"the position at the start, known to {_metres(known)} (one standard deviation)",
+            "take a position fix at the start, or state start.position_sd_m where it is known better",
+        )
+    return (
+        f"the position fixes, which tell the position to {_metres(known)} (one standard deviation)",
+        "take better fixes, or state fix.sd_m where they are better than that",
+    )
+
+
+def _used(source: DiveSource) -> set[str]:
+    """Sensors of which a measurement counted; all that the summary names where residuals are missing."""
+    rows = source.residuals
+    return {*(source.summary.get("sensors") or {})} if rows is None else {*rows.loc[rows["weight"] > 0, "sensor"]}
 
 
 def _last_fix_before(source: DiveSource, time: float) -> int:

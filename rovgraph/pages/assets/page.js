@@ -7,9 +7,10 @@
   let now = 0; // time of the cursor, in the unit of the page's clock
   let range = null; // of every time axis; null = the whole dive
 
-  const unpack = (text) => {
-    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const unpack = (text) => { // float64 behind a colon, else float32
+    const far = text[0] === ":", bytes = Uint8Array.from(atob(far ? text.slice(1) : text), (c) => c.charCodeAt(0));
     const view = new DataView(bytes.buffer);
+    if (far) return Float64Array.from({ length: bytes.length / 8 }, (_, i) => view.getFloat64(8 * i, true));
     return Float32Array.from({ length: bytes.length / 4 }, (_, i) => view.getFloat32(4 * i, true));
   };
   const unpackAll = (packed) => Object.fromEntries(Object.entries(packed).map(([k, v]) => [k, unpack(v)]));
@@ -34,7 +35,7 @@
     const i = before(times, t), j = Math.min(i + 1, times.length - 1);
     return Math.abs(times[j] - t) < Math.abs(times[i] - t) ? j : i;
   };
-  const number = (v) => (Number.isFinite(v) ? String(+v.toPrecision(4)) : "unknown");
+  const number = (v) => (Number.isFinite(v) ? String(Math.abs(v) < 1000 ? +v.toPrecision(4) : +v.toFixed(1)) : "unknown");
 
   // ---- drawing -------------------------------------------------------------------------------
   const axis = (title, log, ticks) => ({
@@ -60,17 +61,18 @@
     }
     return layout;
   };
-  const traceOf = (trace) => {
+  const traceOf = (panel, trace) => {
+    const digits = panel.kind === "map" ? ".2f" : ".5g";
     const arrays = { x: unpack(trace.x), y: unpack(trace.y) };
     if (trace.t) arrays.t = unpack(trace.t);
-    return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : "%{x:.5g}, %{y:.5g}", ...trace, ...arrays };
+    return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : `%{x:${digits}}, %{y:${digits}}`, ...trace, ...arrays };
   };
 
   const draw = async (figure) => {
     const key = figure.dataset.panel;
     if (drawn.has(key)) return;
     const panel = data.panels[key], plot = figure.querySelector(".plot");
-    const series = panel.traces.map(traceOf);
+    const series = panel.traces.map((trace) => traceOf(panel, trace));
     const entry = { panel, plot, series, readout: figure.querySelector(".readout") };
     drawn.set(key, entry);
     const options = { responsive: true, displaylogo: false, scrollZoom: false,
