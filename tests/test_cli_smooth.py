@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from dives import falcon, simulated
 
+import rovgraph as rg
 from rovgraph.cli.app import main
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
@@ -79,6 +80,21 @@ def shipped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     finally:
         sys.argv = before
     return out
+
+
+def test_force_does_not_replace_a_folder_that_holds_the_log_or_the_configuration(tmp_path, monkeypatch, capsys):
+    dive = rg.simulate("circle", rg.Config(), 1, rg.Choices(duration=40.0))
+    dive.save(tmp_path / "dive")
+    (tmp_path / "log.csv").write_bytes((tmp_path / "dive" / "log.csv").read_bytes())
+    before = sorted((tmp_path / "dive").iterdir())
+    for log in ("dive/log.csv", "log.csv"):
+        given = ["--config", tmp_path / "dive" / "config.yaml", "--out", tmp_path / "dive", "--force"]
+        assert run(monkeypatch, "smooth", tmp_path / log, *given) == 2
+        assert "which would be replaced; choose another --out" in one_line(capsys)
+    result = rg.smooth(rg.read_log(tmp_path / "dive" / "log.csv", rg.Config()), rg.Config(), "smoothed")
+    with pytest.raises(rg.InputError, match="which would be replaced"):
+        result.save(tmp_path / "dive", force=True)
+    assert sorted((tmp_path / "dive").iterdir()) == before
 
 
 def test_the_results_folder_holds_everything_that_is_promised(shipped):
@@ -283,6 +299,7 @@ HELD = """
 import contextlib, sys, time
 import rovgraph.cli.progress
 import rovgraph.report.results
+import rovgraph as rg
 from rovgraph.cli.app import main
 
 def hold(*given):

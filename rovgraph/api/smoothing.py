@@ -136,7 +136,7 @@ class Result:
         from rovgraph.report.results import write_results
 
         began = time.perf_counter()
-        with results_folder(Path(path), force) as folder:
+        with results_folder(Path(path), force, [Path(self.log.source)]) as folder:
             if figures:
                 from rovgraph.report.figures import draw_figures  # loads matplotlib
 

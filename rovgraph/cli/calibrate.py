@@ -49,7 +49,7 @@ def magnetometer(
     from rovgraph.report.calibrations import write_magnetometer
     from rovgraph.report.folder import check_writable, results_folder
 
-    check_writable(out, force)
+    check_writable(out, force, [log, config])
     settings = load_config(config)
     found = calibrate_magnetometer(read_log(log, settings.with_raw_magnetometer()), settings, method.value)
     with results_folder(out, force) as folder:
@@ -75,7 +75,7 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
     from rovgraph.report.calibrations import write_noise
     from rovgraph.report.folder import check_writable, results_folder
 
-    check_writable(out, force)
+    check_writable(out, force, [log, config])
     settings = load_config(config)
     recorded = read_log(log, settings)
     found = calibrate_noise(recorded, settings)

@@ -52,7 +52,7 @@ def compare(
     chosen = range(first_seed, first_seed + seeds)
     select(names)
     require_one(files[0] if files else None, reference, scenario, chosen, duration)
-    check_writable(out, force)
+    check_writable(out, force, [*(files or []), config, reference])
     settings = None if config is None else rg.load_config(config)
     dive_log = read_files(files, settings, choose, shift) if files else None
     track = None if reference is None else rg.read_reference(reference)

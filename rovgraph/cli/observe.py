@@ -35,7 +35,7 @@ def observe(
 
     out = Path("observed-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
-    check_writable(out, force)
+    check_writable(out, force, [*files, config])
     dive_log = read_files(files, settings, choose, shift)
     with progress_bar() as progress:
         result = rg.observe(dive_log, settings, listed(estimate), progress)

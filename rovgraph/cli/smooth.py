@@ -64,7 +64,7 @@ def smooth(
     out = Path("results-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     known_formats(export or [])
-    check_writable(out, force)
+    check_writable(out, force, [*files, config])
     began = time.perf_counter()
     dive_log = read_files(files, settings, choose, shift)
     check_exportable(export or [], dive_log.source, dive_log.origin, dive_log.start)

@@ -20,8 +20,14 @@ SUMMARY = "summary.json"
 STAMP = {"program": "rovgraph", "version": __version__}  # in every summary: the folder is ours
 
 
-def check_writable(path: Path, force: bool) -> None:
+def check_writable(path: Path, force: bool, inputs: Sequence[Path | None] = ()) -> None:
     """Refuse early what `results_folder` would refuse after the work.
+
+    Parameters
+    ----------
+    path : the folder to make
+    force : replace an older results folder
+    inputs : files that are read, which the folder must not hold; None = an option that was not given
 
     Raises
     ------
@@ -29,6 +35,9 @@ def check_writable(path: Path, force: bool) -> None:
     """
     with _one_line(path):
         path = _resolved(path)
+        for each in inputs:
+            if each is not None and _resolved(each).is_relative_to(path) and path.is_dir():
+                raise InputError(f"{each}: lies in {path}, which would be replaced; choose another --out")
         _check_target(path, force)
         parent = _nearest_existing(path.parent)
         if not parent.is_dir():
@@ -39,13 +48,14 @@ def check_writable(path: Path, force: bool) -> None:
 
 
 @contextlib.contextmanager
-def results_folder(path: Path, force: bool = False) -> Iterator[Path]:
+def results_folder(path: Path, force: bool = False, inputs: Sequence[Path] = ()) -> Iterator[Path]:
     """A temporary folder that becomes ``path`` when the block ends without an error.
 
     Parameters
     ----------
     path : the folder to make, its parents too
     force : replace an older results folder; nothing else is ever replaced
+    inputs : as of `check_writable`
 
     Yields
     ------
@@ -55,7 +65,7 @@ def results_folder(path: Path, force: bool = False) -> Iterator[Path]:
     ------
     InputError : as `check_writable`; or writing failed (a full disk), and nothing is kept
     """
-    check_writable(path, force)
+    check_writable(path, force, inputs)
     final = _resolved(path)
     temporary = _hidden(_nearest_existing(final.parent), "partial")
     made = [p for p in final.parents if not p.exists()]
