@@ -269,7 +269,8 @@ def test_the_command_writes_what_smooth_takes(run, turned, tmp_path):
     code, text, err = run(path, "--config", tmp_path / "vehicle.yaml", "--out", out)
     assert (code, err) == (0, "")
     assert "centre (hard iron)" in text
-    assert {p.name for p in out.iterdir()} == {"config.yaml", "magnetometer.png", "magnetometer.yaml", "summary.json"}
+    names = {"config.yaml", "magnetometer.png", "magnetometer.yaml", "report.html", "summary.json"}
+    assert {p.name for p in out.iterdir()} == names
     summary = json.loads((out / "summary.json").read_text())
     assert summary["program"] == "rovgraph" and summary["disturbances"] == []
     whole = load_config(out / "config.yaml")

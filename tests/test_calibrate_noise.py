@@ -279,7 +279,16 @@ def test_the_command_writes_what_smooth_takes(run, tmp_path):
     code, text, err = run(path, "-c", tmp_path / "vehicle.yaml", "--out", out)
     assert (code, err) == (0, "")
     assert "gyr_z" in text
-    names = {"allan.csv", "allan.png", "config.yaml", "noise.yaml", "spectra.csv", "spectra.png", "summary.json"}
+    names = {
+        "allan.csv",
+        "allan.png",
+        "config.yaml",
+        "noise.yaml",
+        "report.html",
+        "spectra.csv",
+        "spectra.png",
+        "summary.json",
+    }
     assert {p.name for p in out.iterdir()} == names
     assert json.loads((out / "summary.json").read_text())["program"] == "rovgraph"
     piece, whole = load_config(out / "noise.yaml"), load_config(out / "config.yaml")

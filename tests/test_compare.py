@@ -58,7 +58,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_folder_holds_tables_summary_and_figures(compared):
-    tables = {"table.csv", "runs.csv", "misalignment.csv", "velocity.csv", "summary.json", "config.yaml"}
+    tables = {"report.html", "table.csv", "runs.csv", "misalignment.csv", "velocity.csv", "summary.json", "config.yaml"}
     figures = {"errors.png", "end_points.png", "velocity.png", "misalignment.png"}
     assert {p.name for p in compared.iterdir()} == tables | figures
 

@@ -278,7 +278,14 @@ def test_observe_and_plan_hand_over(recorded, tmp_path, monkeypatch, capsys):
     config = ("--config", recorded / "config.yaml")
     assert command(monkeypatch, "observe", recorded / "log.csv", *config, "--out", tmp_path / "seen") == 0
     names = {p.name for p in (tmp_path / "seen").iterdir()}
-    assert names == {"observability.json", "summary.json", "config.yaml", "learning.png", "correlation.png"}
+    assert names == {
+        "report.html",
+        "observability.json",
+        "summary.json",
+        "config.yaml",
+        "learning.png",
+        "correlation.png",
+    }
     content = json.loads((tmp_path / "seen" / "observability.json").read_text())
     entry = content["components"]["dvl_yaw"]
     assert entry["sd"] < entry["prior_sd"]
@@ -292,7 +299,7 @@ def test_observe_and_plan_hand_over(recorded, tmp_path, monkeypatch, capsys):
     assert [r["manoeuvre"] for r in planned["ranking"]] == ["accelerate-and-stop", "straight"]
     assert all(r["sd"]["dvl_yaw"] < entry["sd"] for r in planned["ranking"])
     assert {p.name for p in (tmp_path / "plan").iterdir()} == {
-        "plan.json", "summary.json", "config.yaml", "ranking.png", "path.png",
+        "report.html", "plan.json", "summary.json", "config.yaml", "ranking.png", "path.png",
     }  # fmt: skip
     assert "accelerate-and-stop" in capsys.readouterr().out
 

@@ -112,7 +112,7 @@ def test_showing_only_keeps_and_a_thread_draws_four_times_a_second(monkeypatch):
             waits.add(timeout)
             return super().wait(timeout)
 
-    monkeypatch.setattr("rovgraph.report.status.status", drawn)
+    monkeypatch.setattr(sys.modules["rovgraph.report.status"], "status", drawn)
     monkeypatch.setattr("rich.live.Event", Done)
     with StatusLine(Console(file=io.StringIO(), force_terminal=True)) as line:
         for k in range(1000):

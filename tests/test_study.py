@@ -300,7 +300,8 @@ def test_the_command_writes_everything_and_shows_coverage_of_each_cell(
     code, shown, errors = run("--config", short, "--out", out)
     assert (code, errors) == (0, "")
     assert {p.name for p in out.iterdir()} == {
-        "study.yaml", "runs.csv", "history.csv", "cells.csv", "summary.json", "coverage.png", "error.png", "sd.png",
+        "report.html", "study.yaml", "runs.csv", "history.csv", "cells.csv", "summary.json", "coverage.png",
+        "error.png", "sd.png",
     }  # fmt: skip
     for cell in read_study(short).all_cells():
         line = next(text for text in shown.splitlines() if text.strip().startswith(cell.id))

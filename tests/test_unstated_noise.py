@@ -60,6 +60,7 @@ def test_every_sensor_has_one_error_that_lasts():
         "ahrs": "ahrs_error",
         "dvl_heading": "dvl_compass_error",
         "dvl": "dvl_error",
+        "vehicle_heading": "vehicle_compass_error",
     }
     assert all(np.isfinite(TABLE[name].time_constant) for name in LASTING.values())
 

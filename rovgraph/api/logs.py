@@ -50,7 +50,7 @@ def read_log(
     if config is None:
         warn_of_unused(*files)
     alone = len(files) == 1 and not choose and not shift
-    if alone and is_plain_log(files[0], Config() if config is None else config):
+    if alone and is_plain_log(files[0], config_or_defaults(config)):
         return library.read_log(files[0], config)
     return convert(files, config, choose, shift, progress).log
 

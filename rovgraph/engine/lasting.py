@@ -34,7 +34,12 @@ LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time
 ENOUGH = 30  # measurements
 LIKELY = 3.0  # gain of log likelihood, at the optimum without the error, that is worth a look
 WINDOW_S = 20.0  # over which residuals are summed
-WORTH_A_LOOK = {"ahrs": 0.5, "dvl_heading": 0.5, "fix": 1.0}  # least `unity`; the track takes a DVL's error along
+WORTH_A_LOOK = {
+    "ahrs": 0.5,
+    "dvl_heading": 0.5,
+    "vehicle_heading": 0.5,
+    "fix": 1.0,
+}  # least `unity`; the track takes a DVL's error along
 CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
 SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
 LONGEST = {"dvl": 0.5}  # time constant in the length of the dive, 1 where none stands here
