@@ -38,7 +38,7 @@ dives in which a warning names the cause. The warnings of the same dives without
 |---|---|
 | right | every NEES is at most 2, and the sd is at most 1.5 times that of the healthy dive |
 | wide | every NEES is at most 2, and the sd is larger |
-| loud | some NEES is above 2, and the cause is named in 19 of 20 dives, or the log is refused |
+| loud | some NEES is above 2, and 19 of 20 dives name the cause, are refused, or are by themselves within 2 |
 | no trace | as a lie, but nothing in the log can show the fault: the reasons stand below the table |
 | lie | some NEES is above 2, and the cause is not named |
 

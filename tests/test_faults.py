@@ -235,6 +235,8 @@ NAMED = ("warning: dvl: frozen for 60.0 s",)
         (dives(9.0, 18, said=NAMED) + dives(9.0, 2), "lie"),
         (dives(9.0, refused=True), "loud"),
         (dives(9.0, 10, refused=True) + dives(9.0, 10), "lie"),
+        (dives(9.0, 10, said=NAMED) + dives(1.0, 10), "loud"),  # a dive that is right needs no warning
+        (dives(9.0, 10, said=NAMED) + dives(2.1, 10), "lie"),
     ],
 )
 def test_outcomes(results, verdict):

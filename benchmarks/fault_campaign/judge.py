@@ -313,13 +313,19 @@ def judge(
         if not wrong:
             verdicts.append("wide" if wider.intersection(kinds) else "right")
         else:
-            told = np.mean([a or r.refused for a, r in zip(share, results, strict=True)])
+            told = np.mean([a or r.refused or _right(r, kinds) for a, r in zip(share, results, strict=True)])
             said = _lines_of(command, [r.said for r in results if not r.refused])
             hidden = no_trace is not None and no_trace.excuses(wrong, said)
             verdicts.append("loud" if told >= NAMED_IN else "no trace" if hidden else "lie")
     warned = float(np.mean([any(line.startswith("warning") for line in lines) for lines in new]))
     verdict = min(verdicts, key=WORST_FIRST.index)
     return Outcome(verdict, averages, rms, sd, min(named), warned, refused, len(results))
+
+
+def _right(result: Result, kinds: Sequence[str]) -> bool:
+    """Whether a dive by itself needs no warning."""
+    values = [value for kind in kinds for value in result.nees.get(kind, {}).values()]
+    return bool(values) and max(values) <= HONEST_NEES
 
 
 def _lines_of(command: str, messages: Sequence[Sequence[str]]) -> list[list[str]]:
