@@ -79,8 +79,8 @@ def main() -> int:
         arguments.json.write_text(json.dumps({n: asdict(o) for n, o in outcomes.items()}, indent=1), encoding="utf-8")
     if arguments.markdown is not None:
         arguments.markdown.write_text(page(cases, outcomes, arguments), encoding="utf-8")
-    verdicts = {case: outcomes[case.name].verdict for case in cases}
-    return int(any(v == "lie" or (case.healthy and v != "right") for case, v in verdicts.items()))
+    verdicts = [(case.healthy, outcomes[case.name].verdict) for case in cases]
+    return int(any(verdict == "lie" or (healthy and verdict != "right") for healthy, verdict in verdicts))
 
 
 def page(cases: list[Case], outcomes: dict[str, Outcome], arguments: argparse.Namespace) -> str:

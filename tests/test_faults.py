@@ -14,6 +14,7 @@ import pytest
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import faults  # noqa: E402
 from fault_campaign import earth  # noqa: E402
 from fault_campaign.campaign import keep_dive, read_dives, run, table  # noqa: E402
 from fault_campaign.cases import CASES, FAULTS, HEALTHY  # noqa: E402
@@ -22,7 +23,6 @@ from fault_campaign.judge import QUANTITIES, Dive, NoTrace, Result, honest_nees,
 from fault_campaign.motion import Motion, Profile, mounting, strapdown  # noqa: E402
 from fault_campaign.scenarios import SCENARIOS, make_motion  # noqa: E402
 from fault_campaign.vehicle import configuration, make_vehicle  # noqa: E402
-from faults import page  # noqa: E402
 
 AT_ONCE = np.zeros(1)
 REST = Motion(20.0, Profile(0.7), (Profile(), Profile(), Profile()), depth=3.0)
@@ -268,10 +268,26 @@ def test_the_page_gives_the_reason_of_a_fault_without_a_trace():
     case = CASES["depth of a wrong surface"]
     outcome = replace(judge(dives(9.0), "frozen"), nees={})
     asked = Namespace(seeds=20, version=None, online=False)
-    assert case.no_trace.why not in page([case], {case.name: outcome}, asked)
-    told = page([case], {case.name: replace(outcome, verdict="no trace")}, asked)
+    assert case.no_trace.why not in faults.page([case], {case.name: outcome}, asked)
+    told = faults.page([case], {case.name: replace(outcome, verdict="no trace")}, asked)
     assert "1 no trace, 0 lie." in told
     assert f"*{case.name}*: {case.no_trace.why}" in told
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict", "code"),
+    [
+        ("survey", "right", 0),
+        ("survey", "wide", 1),
+        ("depth of a wrong surface", "no trace", 0),
+        ("depth of a wrong surface", "lie", 1),
+    ],
+)
+def test_the_exit_code_is_1_for_a_lie_and_for_a_healthy_dive_that_is_not_right(name, verdict, code, monkeypatch):
+    outcome = replace(judge(dives(1.0), "frozen"), verdict=verdict, nees={})
+    monkeypatch.setattr(faults, "run", lambda *_: {name: outcome})
+    monkeypatch.setattr(sys, "argv", ["faults.py", "--cases", name])
+    assert faults.main() == code
 
 
 def test_what_one_command_says_is_no_excuse_for_the_other():
