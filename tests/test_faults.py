@@ -1,4 +1,4 @@
-"""The fault campaign: its simulator proves itself without rovgraph, its judge tells four outcomes apart."""
+"""The fault campaign: its simulator proves itself without rovgraph, its judge tells the outcomes apart."""
 
 import ast
 import re

@@ -21,7 +21,8 @@ def unchecked(config: Config, sources: Collection[str], present: Collection[str]
     sources : heading sources in use
     present : streams of the log
     """
-    priors, start, lines = beliefs(config), config.start, []
+    priors, start = beliefs(config), config.start
+    lines: list[str] = []
     if "fix" not in present:
         rests = [_held_by(priors[OFFSETS[source]]) for source in sources]
         if start.heading_deg is not None:
