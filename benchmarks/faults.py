@@ -18,7 +18,7 @@ from pathlib import Path
 
 from fault_campaign.campaign import Outcome, run, table
 from fault_campaign.cases import CASES, Case
-from fault_campaign.judge import HONEST_NEES, honest_nees
+from fault_campaign.judge import HONEST_NEES, WORST_FIRST, honest_nees
 
 from rovgraph.workers import cores
 
@@ -38,15 +38,16 @@ dives in which a warning names the cause. The warnings of the same dives without
 |---|---|
 | right | every NEES is at most 2, and the sd is at most 1.5 times that of the healthy dive |
 | wide | every NEES is at most 2, and the sd is larger |
-| loud | some NEES is above 2, and the cause is named in 19 of 20 dives, or the log is refused |
+| loud | some NEES is above 2, and 19 of 20 dives name the cause, are refused, or are by themselves within 2 |
+| no trace | as a lie, but nothing in the log can show the fault: the reasons stand below the table |
 | lie | some NEES is above 2, and the cause is not named |
 
 {limit}*Reported by* says who reported such a fault: `audit` is an audit of rovgraph with another simulator and \
 recorded dives, others are issue trackers of drivers, autopilots and navigation software.
 
-Some faults cannot be observed in a log: a constant error of the heading without fixes, and a constant error of the \
-depth. Only wider priors cover those. A wrongly stated mounting of the IMU is another: the body's axes are those of \
-the IMU as stated, so heading and `dvl_yaw` have its error, and the track does not.
+A fault leaves *no trace* if its log is that of another dive without a fault. Only wider priors cover it. `smooth` \
+prints what heading and depth rest on where nothing checks them, with the prior's sd; the outcome counts only if it \
+does, and only for the quantities that the reason concerns: every other must be right.
 
 Run the campaign whenever the estimator changes. `--cases` selects some of them, `--jobs` sets the number of \
 processes, `--json` writes all figures, `--keep` continues an interrupted campaign, `--online` replays each log \
@@ -78,8 +79,8 @@ def main() -> int:
         arguments.json.write_text(json.dumps({n: asdict(o) for n, o in outcomes.items()}, indent=1), encoding="utf-8")
     if arguments.markdown is not None:
         arguments.markdown.write_text(page(cases, outcomes, arguments), encoding="utf-8")
-    good = {True: {"right"}, False: {"right", "wide", "loud"}}
-    return int(any(outcomes[case.name].verdict not in good[case.healthy] for case in cases))
+    verdicts = [(case.healthy, outcomes[case.name].verdict) for case in cases]
+    return int(any(verdict == "lie" or (healthy and verdict != "right") for healthy, verdict in verdicts))
 
 
 def page(cases: list[Case], outcomes: dict[str, Outcome], arguments: argparse.Namespace) -> str:
@@ -91,6 +92,8 @@ def page(cases: list[Case], outcomes: dict[str, Outcome], arguments: argparse.Na
         some = [case for case in cases if case.healthy == healthy]
         if some:
             parts += [f"## {title}\n", count(some, outcomes) + "\n", table(some, outcomes) + "\n"]
+        hidden = [case for case in some if outcomes[case.name].verdict == "no trace"]
+        parts += [f"*{case.name}*: {case.no_trace.why}\n" for case in hidden if case.no_trace]
     return "\n".join(parts)
 
 
@@ -105,7 +108,7 @@ def _limit(seeds: int) -> str:
 def count(cases: list[Case], outcomes: dict[str, Outcome]) -> str:
     """How many of each outcome."""
     verdicts = Counter(outcomes[case.name].verdict for case in cases)
-    return ", ".join(f"{verdicts[verdict]} {verdict}" for verdict in ("right", "wide", "loud", "lie")) + "."
+    return ", ".join(f"{verdicts[verdict]} {verdict}" for verdict in reversed(WORST_FIRST)) + "."
 
 
 def _progress(done: float) -> None:

@@ -1,6 +1,7 @@
 """What a time without any data does to a track. Figures are in benchmarks/README.md.
 
 python benchmarks/silences.py simulated --seeds 5
+python benchmarks/silences.py dvl --seeds 100
 python benchmarks/silences.py recorded LOG --config CONFIG --reference REFERENCE --after 600
 """
 
@@ -14,7 +15,7 @@ from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.evaluate import evaluate, read_reference
-from rovgraph.geometry import log_rotation, transpose
+from rovgraph.geometry import Array, log_rotation, transpose
 from rovgraph.log import Log, read_log
 from rovgraph.simulate import Style, Truth, Waves, scenario, simulate
 from rovgraph.simulate.named import falcon
@@ -23,14 +24,16 @@ EARLY = [(begin, seconds) for begin in (8.0, 15.0, 25.0) for seconds in (3.0, 5.
 RECORDED = [(900.0, 9.0), (1500.0, 20.0), (2100.0, 6.0)]
 LIVELY = Style(waves=Waves(heave=0.05, roll=0.1, pitch=0.08))
 SETTLED_S = 10.0  # after the silence
+DVL_SILENT_S = (1.0, 600.0)  # its logarithm is uniform
+BEFORE_S, AFTER_S, RETURNED_S = 60.0, 40.0, 5.0  # of a silence of the DVL: what is heard around it, and the return
 
 
-def silenced(log: Log, silences: list[tuple[float, float]]) -> Log:
-    """A log without what was measured in some times: since its beginning, and how long [s]."""
+def silenced(log: Log, silences: list[tuple[float, float]], sensors: tuple[str, ...] = ()) -> Log:
+    """A log without what was measured in some times: since its beginning, and how long [s]; of all or some sensors."""
     streams, start = {}, float(log["imu"].time[0])
     for name, stream in log.streams.items():
         heard = np.ones(len(stream), bool)
-        for begin, seconds in silences:
+        for begin, seconds in silences if name in sensors or not sensors else ():
             heard &= (stream.time - start < begin) | (stream.time - start >= begin + seconds)
         streams[name] = stream.take(heard)
     return Log(log.source, streams, log.origin)
@@ -63,6 +66,43 @@ def early(seeds: int) -> None:
     print(f"more than 5 pings kept out in {np.sum(pings > 5)}, more than 20 fields in {np.sum(fields > 20)}")
 
 
+def dvl(seeds: int) -> None:
+    """The filter where its DVL returns after 1 to 600 s, a dive each.
+
+    A jump is what the returning pings change of the position's error, measured by the sd from before them.
+    """
+    config, lines = falcon(), []
+    for seed in range(1, seeds + 1):
+        rng = np.random.default_rng([2, seed])
+        seconds = float(np.exp(rng.uniform(*np.log(DVL_SILENT_S))))
+        path = scenario("falcon", BEFORE_S + seconds + AFTER_S, None, LIVELY)
+        dive = simulate(path, Truth(config, dvl_rate=4.0), rng)
+        log = silenced(Log.from_frame(dive.log_frame), [(BEFORE_S, seconds)], ("dvl",))
+        filtered = smooth(log, config, "filtered").estimates[0]
+        track, truth = filtered.trajectory, dive.truth
+        at = np.array([np.interp(track.time, truth.time, p) for p in truth.p_n.T]).T
+        error, back = (track.p_n - at)[:, :2], track.time[0] + BEFORE_S + seconds
+        before = int(np.flatnonzero(track.time < back)[-1])
+        after = (track.time >= back) & (track.time < back + RETURNED_S)
+        jumps = in_sd(error[after] - error[before], track.cov_p[before, :2, :2])
+        settled = track.time >= back + RETURNED_S
+        late = in_sd(error[settled], track.cov_p[settled, :2, :2])
+        rejected = int(filtered.summary["nis"]["dvl"]["rejected"])
+        lines.append((seconds, jumps.max(), late.max(), np.mean(late**2) / 2.0, rejected))
+        print(f"seed {seed}: {' '.join(f'{x:.2f}' for x in lines[-1])}", flush=True)
+    silent, jump, off, nees, pings = np.array(lines).T
+    span = f"{silent.min():.0f} to {silent.max():.0f} s"
+    print(f"{len(lines)} dives, DVL silent for {span}, median {np.median(silent):.0f} s")
+    print(f"largest jump of the position at its return: median {np.median(jump):.1f} sd, at most {jump.max():.1f} sd")
+    print(f"error of the position afterwards: at most {off.max():.1f} sd, NEES {nees.mean():.2f}")
+    print(f"pings rejected: {pings.sum():.0f}, at most {pings.max():.0f} in a dive")
+
+
+def in_sd(error: Array, covariance: Array) -> Array:
+    """Mahalanobis distances of errors, shape (n, 2), with one covariance or one each."""
+    return np.asarray(np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])))
+
+
 def recorded(path: Path, config: Config, reference: Path, after: float) -> None:
     """A recorded dive with and without silences."""
     log = read_log(path, config)
@@ -75,7 +115,7 @@ def recorded(path: Path, config: Config, reference: Path, after: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["simulated", "recorded"])
+    parser.add_argument("what", choices=["simulated", "dvl", "recorded"])
     parser.add_argument("log", nargs="?", type=Path)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--config", type=Path)
@@ -84,6 +124,8 @@ def main() -> None:
     given = parser.parse_args()
     if given.what == "simulated":
         early(given.seeds)
+    elif given.what == "dvl":
+        dvl(given.seeds)
     else:
         recorded(given.log, load_config(given.config), given.reference, given.after)
 

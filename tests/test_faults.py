@@ -1,8 +1,9 @@
-"""The fault campaign: its simulator proves itself without rovgraph, its judge tells four outcomes apart."""
+"""The fault campaign: its simulator proves itself without rovgraph, its judge tells the outcomes apart."""
 
 import ast
 import re
 import sys
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +14,12 @@ import pytest
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import faults  # noqa: E402
 from fault_campaign import earth  # noqa: E402
 from fault_campaign.campaign import keep_dive, read_dives, run, table  # noqa: E402
 from fault_campaign.cases import CASES, FAULTS, HEALTHY  # noqa: E402
 from fault_campaign.instruments import at_arm, dvl, log_table, sample  # noqa: E402
-from fault_campaign.judge import Dive, Result, honest_nees, judge, nees, run_dive  # noqa: E402
+from fault_campaign.judge import QUANTITIES, Dive, NoTrace, Result, honest_nees, judge, nees, run_dive  # noqa: E402
 from fault_campaign.motion import Motion, Profile, mounting, strapdown  # noqa: E402
 from fault_campaign.scenarios import SCENARIOS, make_motion  # noqa: E402
 from fault_campaign.vehicle import configuration, make_vehicle  # noqa: E402
@@ -154,6 +156,38 @@ def test_scenarios_stay_in_the_water_and_differ_by_seed():
         assert motion.heading(AT_ONCE) != make_motion(name, np.random.default_rng(2)).heading(AT_ONCE)
 
 
+@pytest.mark.parametrize(
+    ("name", "healthy"),
+    [
+        ("heading 90 degrees off", {"heading": Profile(0.7 + np.pi / 2.0)}),
+        ("depth of a wrong surface", {"depth": 3.0 + 8.3}),
+    ],
+)
+def test_a_fault_without_a_trace_is_the_log_of_another_healthy_dive(name, healthy):
+    """Sample by sample, but for what no such IMU sees of the Earth's rate and of gravity's change with depth."""
+    case, logs = CASES[name], []
+    for motion, faulty in ((REST, True), (replace(REST, **healthy), False)):
+        vehicle = make_vehicle(case.grade, case.aids)
+        vehicle.ahrs.curve_sd = 0.0  # a deviation changes with the heading
+        if faulty and case.on_vehicle is not None:
+            case.on_vehicle(vehicle)
+        streams, _ = sample(motion, vehicle, np.random.default_rng(4))
+        if faulty and case.on_log is not None:
+            case.on_log(streams, motion, np.random.default_rng(5))
+        logs.append(streams)
+    for sensor, stream in logs[0].items():
+        difference = stream - logs[1][sensor]
+        if sensor == "ahrs":
+            difference["ahrs_yaw"] = np.angle(np.exp(1j * difference["ahrs_yaw"]))
+        assert difference.abs().max().max() < (2e-4 if sensor == "imu" else 1e-9), sensor
+
+
+def test_only_a_fault_can_be_without_a_trace_and_its_reason_names_quantities():
+    reasons = [case.no_trace for case in HEALTHY + FAULTS if case.no_trace]
+    assert not any(case.no_trace for case in HEALTHY)
+    assert all(r.why and r.quantities and set(r.quantities) <= set(QUANTITIES) for r in reasons)
+
+
 # --- the judge -----------------------------------------------------------------------------------
 
 
@@ -201,10 +235,59 @@ NAMED = ("warning: dvl: frozen for 60.0 s",)
         (dives(9.0, 18, said=NAMED) + dives(9.0, 2), "lie"),
         (dives(9.0, refused=True), "loud"),
         (dives(9.0, 10, refused=True) + dives(9.0, 10), "lie"),
+        (dives(9.0, 10, said=NAMED) + dives(1.0, 10), "loud"),  # a dive that is right needs no warning
+        (dives(9.0, 10, said=NAMED) + dives(2.1, 10), "lie"),
     ],
 )
 def test_outcomes(results, verdict):
     assert judge(results, "frozen", dives(1.0)).verdict == verdict
+
+
+UNSEEN = NoTrace("the same equations", ("position",), "rests on")
+RESTS = ("assumed: rests on the prior",)
+
+
+@pytest.mark.parametrize(
+    ("results", "no_trace", "verdict"),
+    [
+        (dives(9.0, said=RESTS), UNSEEN, "no trace"),
+        (dives(9.0, said=RESTS), None, "lie"),
+        (dives(9.0), UNSEEN, "lie"),  # it is not said what the position rests on
+        (dives(9.0), replace(UNSEEN, rests_on=""), "no trace"),
+        (dives(9.0, said=RESTS), replace(UNSEEN, quantities=("depth",)), "lie"),  # depth is no excuse for the position
+        (dives(9.0, 19, said=RESTS) + dives(9.0, 1), UNSEEN, "lie"),
+        (dives(9.0, said=RESTS + NAMED), UNSEEN, "loud"),
+        (dives(1.0, said=RESTS), UNSEEN, "right"),
+    ],
+)
+def test_what_no_log_can_show_is_neither_right_nor_a_lie(results, no_trace, verdict):
+    assert judge(results, "frozen", dives(1.0, said=RESTS), no_trace).verdict == verdict
+
+
+def test_the_page_gives_the_reason_of_a_fault_without_a_trace():
+    case = CASES["depth of a wrong surface"]
+    outcome = replace(judge(dives(9.0), "frozen"), nees={})
+    asked = Namespace(seeds=20, version=None, online=False)
+    assert case.no_trace.why not in faults.page([case], {case.name: outcome}, asked)
+    told = faults.page([case], {case.name: replace(outcome, verdict="no trace")}, asked)
+    assert "1 no trace, 0 lie." in told
+    assert f"*{case.name}*: {case.no_trace.why}" in told
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict", "code"),
+    [
+        ("survey", "right", 0),
+        ("survey", "wide", 1),
+        ("depth of a wrong surface", "no trace", 0),
+        ("depth of a wrong surface", "lie", 1),
+    ],
+)
+def test_the_exit_code_is_1_for_a_lie_and_for_a_healthy_dive_that_is_not_right(name, verdict, code, monkeypatch):
+    outcome = replace(judge(dives(1.0), "frozen"), verdict=verdict, nees={})
+    monkeypatch.setattr(faults, "run", lambda *_: {name: outcome})
+    monkeypatch.setattr(sys, "argv", ["faults.py", "--cases", name])
+    assert faults.main() == code
 
 
 def test_what_one_command_says_is_no_excuse_for_the_other():

@@ -33,7 +33,7 @@ DEG = np.deg2rad(1.0)
 G = 9.81
 
 
-def still(rpy_deg, heading_deg=30.0, noise=0.0, seconds=10.0, gyr=(0.0, 0.0, 0.0), seed=0):
+def still(rpy_deg, heading_deg=30.0, noise=0.0, seconds=10.0, gyr=(0.0, 0.0, 0.0), seed=0, **sensors):
     """A log at rest at some attitude, with pings and a compass that stay still too."""
     rng = np.random.default_rng(seed)
     R = matrix_from_rpy(np.deg2rad(rpy_deg))
@@ -41,7 +41,7 @@ def still(rpy_deg, heading_deg=30.0, noise=0.0, seconds=10.0, gyr=(0.0, 0.0, 0.0
     at = np.arange(0.1, seconds, 0.2)
     pings = np.tile([0.0, 0.0, 0.0, 1.0, np.nan], (len(at), 1))
     heading = np.full((len(at), 1), np.deg2rad(heading_deg))
-    log = level_log(seconds, acc, np.asarray(gyr, float), dvl=(at, pings), dvl_heading=(at, heading))
+    log = level_log(seconds, acc, np.asarray(gyr, float), dvl=(at, pings), dvl_heading=(at, heading), **sensors)
     return altered(log, "imu", log["imu"].data + noise * rng.standard_normal(log["imu"].data.shape))
 
 
@@ -118,6 +118,36 @@ def test_what_was_null_is_filled_in_and_said():
     np.testing.assert_allclose([start.roll_deg, start.pitch_deg, start.heading_deg], [5, -3, 77], atol=0.01)
     assert any(line.startswith("start.heading_deg 77.0, from dvl_heading") for line in b.assumptions)
     assert rpy[2] == pytest.approx(77.0, abs=0.01)
+
+
+def rests_on(log, yaml=""):
+    """What the lines on unchecked quantities say: of the heading, of the depth; "" where there is none."""
+    lines = initialise(log, parse_config(yaml)).assumptions
+    found = [[line for line in lines if f"constant error of the {what}" in line] for what in ("heading", "depth")]
+    assert max(map(len, found)) <= 1, lines
+    return ["".join(some).partition("rests on ")[2] for some in found]
+
+
+LEVEL, AT = (0.0, 0.0, 0.0), np.arange(0.0, 10.0, 0.5)
+DEPTH = {"depth": (AT, np.full((20, 1), 3.0))}
+FIXES = {"fix": (AT, np.tile([0.0, 0.0, 1.0], (20, 1)))}
+
+
+def test_what_heading_and_depth_rest_on_is_said_where_nothing_checks_them():
+    yaml = "calibration: {dvl_compass_offset: {sd_deg: 2}}"
+    assert rests_on(still(LEVEL), yaml) == ["dvl_compass_offset, sd 2 deg", ""]
+    assert rests_on(still(LEVEL, **DEPTH), yaml) == ["dvl_compass_offset, sd 2 deg", "depth_offset, sd 0.2 m"]
+    exact = "calibration: {dvl_compass_offset: {estimate: false}, depth_offset: {estimate: false}}"
+    assert rests_on(still(LEVEL, **DEPTH), exact) == [
+        "dvl_compass_offset, taken as exact",
+        "depth_offset, taken as exact",
+    ]
+    stated = "start: {heading_deg: 20, heading_sd_deg: 3}"
+    assert rests_on(still(LEVEL), stated)[0] == "dvl_compass_offset, sd 5 deg; start.heading_deg, sd 3 deg"
+
+
+def test_nothing_is_said_of_what_a_fix_or_a_stated_start_checks():
+    assert rests_on(still(LEVEL, **FIXES, **DEPTH), "start: {down_m: 3}") == ["", ""]
 
 
 # heading

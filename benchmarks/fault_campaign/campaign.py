@@ -73,7 +73,8 @@ def run(
                 keep_dive(kept, futures[future], future.result())
                 progress(count / len(tasks))
     results = {case.name: [done[case.name, seed, online] for seed in range(seeds)] for case in wanted}
-    return {c.name: judge(results[c.name], c.says, () if c.healthy else results[twins[c.setting].name]) for c in cases}
+    healthy = {c.name: () if c.healthy else results[twins[c.setting].name] for c in cases}
+    return {c.name: judge(results[c.name], c.says, healthy[c.name], c.no_trace) for c in cases}
 
 
 def run_named(name: str, seed: int, online: bool) -> Result:

@@ -14,7 +14,7 @@ import pandas as pd
 
 from fault_campaign import earth
 from fault_campaign.instruments import Streams
-from fault_campaign.judge import Clock, on_time
+from fault_campaign.judge import Clock, NoTrace, on_time
 from fault_campaign.motion import Motion, mounting
 from fault_campaign.vehicle import Vehicle
 
@@ -27,6 +27,23 @@ AUDIT = "audit"  # found with another simulator and recorded dives
 AHRS_DEPTH = ("ahrs", "depth")
 WAVES = "survey, waves"
 WITH_FIXES = ("ahrs", "depth", "fix")
+TURNED = NoTrace(
+    "Turned as a whole about the vertical, the dive obeys the same equations. Only position fixes, or a gyro that "
+    "measures the Earth's rate, know where north is.",
+    ("position", "heading"),
+    "constant error of the heading",
+)
+LIFTED = NoTrace(
+    "Shifted as a whole along the vertical, the dive obeys the same equations: gravity changes by 0.003 mm/s² a metre. "
+    "Only a start at a known depth shows the offset.",
+    ("depth",),
+    "constant error of the depth",
+)
+OTHER_AXES = NoTrace(
+    "A log has the angles between its sensors. Which axes are the vehicle's is stated by `imu.mount_rpy_deg` alone, "
+    "so heading and `dvl_yaw` have its error, and the track does not.",
+    ("heading", "dvl_yaw"),
+)
 
 
 @dataclass(frozen=True)
@@ -45,6 +62,7 @@ class Case:
     clock : how late the clock is that stamps the estimate, as a function of the stamp [s]
     dvl_rate : pings per second, where it is not 5
     second_file : sensors in a file of their own, replayed by `rovgraph online` beside the other
+    no_trace : why nothing in the log can show the fault
     """
 
     name: str
@@ -61,6 +79,7 @@ class Case:
     clock: Clock = on_time
     dvl_rate: float | None = None
     second_file: Sequence[str] = ()
+    no_trace: NoTrace | None = None
 
     @property
     def healthy(self) -> bool:
@@ -492,7 +511,7 @@ FAULTS: tuple[Case, ...] = (
     Case("dvl clock jumps", "by 2 s", CLOCK + r"|jump|\bset\b", on_log=jump("dvl", 90.0, 2.0)),
     # the IMU
     Case("imu tilted", "mounted 2, 1, 3 degrees off", MOUNT + "|tilt",
-         on_vehicle=change("imu", mount_rpy_deg=(2.0, 1.0, 3.0))),
+         on_vehicle=change("imu", mount_rpy_deg=(2.0, 1.0, 3.0)), no_trace=OTHER_AXES),
     Case("gyro scale 0.5 %", "held", r"gyr.*scale|scale.*gyr", scenario="eights",
          on_vehicle=change("imu", gyr_matrix=1.005 * np.eye(3))),
     Case("gyro not orthogonal", "1 %", r"orthogonal|gyr.*scale|scale.*gyr", on_vehicle=change("imu", gyr_matrix=SKEW)),
@@ -507,7 +526,7 @@ FAULTS: tuple[Case, ...] = (
     Case("depth offset", "2 m after 60 s", r"depth.*(offset|jump|disagree|contradict|reject|shift)", scenario="dives",
          on_log=add("depth", ["depth"], [2.0], 60.0, np.inf)),
     Case("depth of a wrong surface", "818 hPa: 8.3 m too deep throughout", r"depth.*(surface|offset|pressure)",
-         on_vehicle=change("depth", offset=8.3)),
+         on_vehicle=change("depth", offset=8.3), no_trace=LIFTED),
     Case("fixes 2 s late", "USBL", CLOCK, aids=WITH_FIXES, scenario="transit", on_log=fix_late),
     Case("fixes correlated", "over 30 s", r"fix.*(correlat|reject|disagree|contradict)|autocorrel", aids=WITH_FIXES,
          on_log=correlated("fix", ["fix_north", "fix_east"], 1.0, 30.0)),
@@ -577,7 +596,7 @@ FAULTS: tuple[Case, ...] = (
     Case("heading ENU", "anticlockwise from east", r"ENU|anticlockwise|sign|mirror|follow", "robot_localization",
          on_log=ahrs_map(lambda yaw: np.mod(0.5 * np.pi - yaw, 2.0 * np.pi))),
     Case("heading 90 degrees off", "north at west", r"heading|ahrs|turned", "MicroStrain",
-         on_log=ahrs_map(lambda yaw: np.mod(yaw + 0.5 * np.pi, 2.0 * np.pi))),
+         on_log=ahrs_map(lambda yaw: np.mod(yaw + 0.5 * np.pi, 2.0 * np.pi)), no_trace=TURNED),
     Case("heading 90 degrees off, fixes", "north at west", r"(heading|ahrs).*(fix|offset|turned|off)", "MicroStrain",
          aids=WITH_FIXES, on_log=ahrs_map(lambda yaw: np.mod(yaw + 0.5 * np.pi, 2.0 * np.pi))),
     Case("heading in degrees", "as radians", r"(unit|degree|deg\b|rad)", "robot_localization",

@@ -28,7 +28,7 @@ WIDER = 1.5  # times the sd of the healthy dive
 NAMED_IN = 0.95  # of the seeds, for a fault to count as named
 SETTLED_S = 10.0
 COMMANDS = {"smooth": ("smoothed", "filtered"), "online": ("online",)}  # and their estimates
-WORST_FIRST = ("lie", "loud", "wide", "right")
+WORST_FIRST = ("lie", "no trace", "loud", "wide", "right")
 QUANTITIES = ("position", "depth", "heading", "dvl_yaw", "dvl_scale")
 
 
@@ -57,6 +57,30 @@ class Result:
     sd: dict[str, float] = field(default_factory=dict)
     said: tuple[str, ...] = ()
     refused: bool = False
+
+
+@dataclass(frozen=True)
+class NoTrace:
+    """Why nothing in a log can show a fault: it is, word for word, the log of another dive without one.
+
+    Attributes
+    ----------
+    why : the physical reason
+    quantities : of `QUANTITIES`, that are wrong by it; the others must be right
+    rests_on : regular expression; a line of every dive that matches it says what those quantities rest on
+    """
+
+    why: str
+    quantities: tuple[str, ...]
+    rests_on: str = ""
+
+    def excuses(self, wrong: set[str], messages: Sequence[Sequence[str]]) -> bool:
+        """Whether ``wrong`` quantities are those that cannot be right, and each dive's messages say what they rest on.
+
+        A dive that rests on nothing else than what is stated about it (``rests_on`` empty) need not repeat that.
+        """
+        said = not self.rests_on or all(any(re.search(self.rests_on, line) for line in lines) for lines in messages)
+        return said and wrong <= set(self.quantities)
 
 
 def run_command(arguments: Sequence[str]) -> tuple[int, str]:
@@ -220,7 +244,7 @@ class Outcome:
 
     Attributes
     ----------
-    verdict : right, wide, loud, or a lie
+    verdict : right, wide, loud, no trace, or a lie
     nees : estimate -> quantity -> mean over the seeds
     rms, sd : estimate -> root of the mean square over the seeds [m]
     named : part of the seeds in which the cause was named, by the command that names it less often
@@ -258,7 +282,9 @@ def template(line: str) -> str:
     return re.sub(r"[-+]?\d[\d.,e+-]*", "#", line)
 
 
-def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) -> Outcome:
+def judge(
+    results: Sequence[Result], says: str, healthy: Sequence[Result] = (), no_trace: NoTrace | None = None
+) -> Outcome:
     """The outcome of a case: the worse one of the two commands', each with its own estimates and messages.
 
     Parameters
@@ -266,6 +292,7 @@ def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) 
     results : one per seed
     says : regular expression; a message that matches it names the cause
     healthy : the same dives without the fault; what is said of them is no warning, and their sd is what is possible
+    no_trace : why nothing in the logs can show the fault; None where something can
     """
     usual = {template(line) for result in healthy for line in result.said}
     new = [[line for line in r.said if template(line) not in usual] for r in results]
@@ -279,18 +306,31 @@ def judge(results: Sequence[Result], says: str, healthy: Sequence[Result] = ()) 
     for command, kinds in COMMANDS.items():
         if not any(kind in averages for kind in kinds):
             continue
-        lines = [[line for line in some if line.startswith("online: ") == (command == "online")] for some in new]
-        share = _naming(says, lines)
+        share = _naming(says, _lines_of(command, new))
         named.append(float(np.mean(share)))
-        largest = max(v for kind in kinds for v in averages.get(kind, {}).values())
-        if largest <= honest_nees(sum(not r.refused for r in results)):
+        limit = honest_nees(sum(not r.refused for r in results))
+        wrong = {q for kind in kinds for q, value in averages.get(kind, {}).items() if value > limit}
+        if not wrong:
             verdicts.append("wide" if wider.intersection(kinds) else "right")
         else:
-            told = np.mean([a or r.refused for a, r in zip(share, results, strict=True)])
-            verdicts.append("loud" if told >= NAMED_IN else "lie")
+            told = np.mean([a or r.refused or _right(r, kinds) for a, r in zip(share, results, strict=True)])
+            said = _lines_of(command, [r.said for r in results if not r.refused])
+            hidden = no_trace is not None and no_trace.excuses(wrong, said)
+            verdicts.append("loud" if told >= NAMED_IN else "no trace" if hidden else "lie")
     warned = float(np.mean([any(line.startswith("warning") for line in lines) for lines in new]))
     verdict = min(verdicts, key=WORST_FIRST.index)
     return Outcome(verdict, averages, rms, sd, min(named), warned, refused, len(results))
+
+
+def _right(result: Result, kinds: Sequence[str]) -> bool:
+    """Whether a dive by itself needs no warning."""
+    values = [value for kind in kinds for value in result.nees.get(kind, {}).values()]
+    return bool(values) and max(values) <= HONEST_NEES
+
+
+def _lines_of(command: str, messages: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Of each dive's messages those of one command."""
+    return [[line for line in lines if line.startswith("online: ") == (command == "online")] for lines in messages]
 
 
 def _naming(says: str, messages: Sequence[Sequence[str]]) -> list[bool]:

@@ -15,6 +15,12 @@ from rovgraph.instruments import Instrument
 from rovgraph.sensors import innovation
 from rovgraph.state import POSE, Jacobians, State
 
+OFFSETS = {  # heading stream -> the calibration variable of its constant error
+    "mag": "mag_offset",
+    "ahrs": "ahrs_offset",
+    "dvl_heading": "dvl_compass_offset",
+    "vehicle_heading": "vehicle_compass_offset",
+}
 MOST_STEPS, FOUND_WITHIN = 10, 1e-6  # of the search for a turn [-, rad]
 
 
@@ -42,9 +48,7 @@ def trusted_first(config: Config, sources: list[str]) -> list[str]:
     sources : of `rovgraph.instruments.HEADING_STREAMS`
     """
     priors = beliefs(config)
-    offset = {"mag": "mag_offset", "ahrs": "ahrs_offset", "dvl_heading": "dvl_compass_offset"}
-    offset["vehicle_heading"] = "vehicle_compass_offset"
-    return sorted(sources, key=lambda s: priors[offset[s]].sd if priors[offset[s]].estimate else 0.0)
+    return sorted(sources, key=lambda s: priors[OFFSETS[s]].sd if priors[OFFSETS[s]].estimate else 0.0)
 
 
 def solve_turn(instrument: Instrument, z: Array, R_nb: Array, calibration: Mapping[str, Array]) -> Array:

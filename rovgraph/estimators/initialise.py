@@ -16,6 +16,7 @@ from rovgraph.engine.noise_floor import NOISIER
 from rovgraph.engine.preintegration import scatter
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
+from rovgraph.estimators.unchecked import unchecked
 from rovgraph.estimators.without_imu import TILT, first_tilt, no_bias, with_motion_model
 from rovgraph.geometry import Array, earth_rate_n, level_from_force, matrix_from_rpy, rpy_from_matrix
 from rovgraph.instruments import Instrument, heading_sources, instruments
@@ -72,6 +73,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     used = own + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
+    assumptions += unchecked(config, sources, present)
 
     first = level(log, config)
     bias, bias_sd = no_bias() if has_constant_velocity(config) else _bias(config, first, assumptions)
