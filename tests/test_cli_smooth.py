@@ -298,7 +298,7 @@ def test_a_read_only_place_is_refused_before_the_work(monkeypatch, capsys, tmp_p
 HELD = """
 import contextlib, sys, time
 import rovgraph.cli.progress
-import rovgraph.report.results
+import rovgraph.report.results as results
 import rovgraph as rg
 from rovgraph.cli.app import main
 
@@ -313,7 +313,7 @@ def progress_bar():
 if sys.argv.pop(1) == "estimating":
     rovgraph.cli.progress.progress_bar = progress_bar
 else:
-    rovgraph.report.results.write_results = hold
+    results.write_results = hold
 main()
 """
 
