@@ -298,7 +298,7 @@ def test_a_read_only_place_is_refused_before_the_work(monkeypatch, capsys, tmp_p
 HELD = """
 import contextlib, sys, time
 import rovgraph.cli.progress
-import rovgraph.report.results as results
+from rovgraph.report import results
 import rovgraph as rg
 from rovgraph.cli.app import main
 
