@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import click
 from mkdocs.config.defaults import MkDocsConfig
@@ -19,6 +20,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import rovgraph as rg
+from rovgraph import extend
 from rovgraph.cli.app import app
 
 ROOT = Path(__file__).parents[2]
@@ -100,7 +102,8 @@ def api_reference() -> str:
     ------
     PluginError : one of them, or a public method, has no docstring
     """
-    bare = [where for name in rg.__all__ for where in _undocumented(name, getattr(rg, name))]
+    public = {name: getattr(rg, name) for name in rg.__all__} | dict(_extension_points())
+    bare = [where for name, what in public.items() for where in _undocumented(name, what)]
     if bare:
         raise PluginError(f"public names without a docstring: {', '.join(bare)}")
     parts = ["# API, name by name\n\nAll names of `import rovgraph as rg`; [api.md](api.md) shows how they are used.\n"]
@@ -109,7 +112,17 @@ def api_reference() -> str:
         parts.append(_entry(f"{what.__module__}.{what.__qualname__}", f"rg.{name}"))
     parts.append("# What they return\n")
     parts += [_entry(path, path.rpartition(".")[2]) for path in RETURNED]
+    parts.append("# For extensions: rovgraph.extend\n")
+    parts += [_entry(f"{what.__module__}.{what.__qualname__}", f"extend.{name}") for name, what in _extension_points()]
     return "\n".join(parts)
+
+
+def _extension_points() -> Iterator[tuple[str, Any]]:
+    """Classes and functions of `rovgraph.extend`, but for `Config`, which stands above."""
+    for name in extend.__all__:
+        what = getattr(extend, name)
+        if (inspect.isclass(what) or inspect.isfunction(what)) and what is not rg.Config:
+            yield name, what
 
 
 def _entry(path: str, heading: str) -> str:
