@@ -24,13 +24,15 @@ from rovgraph import extend
 from rovgraph.cli.app import app
 
 ROOT = Path(__file__).parents[2]
-ELSEWHERE = {  # page -> file of the project
+ELSEWHERE = {  # page or file of the site -> file of the project
     "index.md": "README.md",
     "changelog.md": "CHANGELOG.md",
     "licence.md": "LICENSE",
     "benchmarks.md": "benchmarks/README.md",
     "falcon.md": "data/falcon/README.md",
+    "bluerov2.yaml": "configs/bluerov2.yaml",
 }
+FOLDERS = {"examples": "examples.md"}  # folder of the project -> page that shows it
 RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
     "rovgraph.estimators.estimate.Estimate",
     "rovgraph.estimators.estimate.CalibrationEstimate",
@@ -39,7 +41,7 @@ RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
     "rovgraph.live.solution.Solution",
     "rovgraph.live.solution.Event",
 )
-FIRST = ("smooth", "residuals", "mountings", "own_sensor", "live")  # of the examples, others by name
+FIRST = ("smooth", "residuals", "mountings", "native_files", "own_sensor", "live")  # of the examples, others by name
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)(#[^)\s]*)?\)")
 
 
@@ -56,6 +58,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Let links between files of the project be links between pages."""
     source = ROOT / ELSEWHERE.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     pages = {ROOT / path: name for name, path in ELSEWHERE.items()}
+    pages |= {ROOT / folder: name for folder, name in FOLDERS.items()}
 
     def on_the_site(link: re.Match[str]) -> str:
         target = Path(os.path.normpath(source.parent / link[1]))
