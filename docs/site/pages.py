@@ -133,10 +133,14 @@ def _entry(path: str, heading: str) -> str:
 
 
 def _undocumented(name: str, what: object) -> Iterator[str]:
-    if not (what.__doc__ or "").strip():
+    """The name, and public methods and properties, that neither have a docstring nor stand among the attributes."""
+    about = (what.__doc__ or "").strip()
+    if not about:
         yield name
     if inspect.isclass(what) and what.__module__.startswith("rovgraph"):
         for member, value in vars(what).items():
             callable_or_property = inspect.isfunction(value) or isinstance(value, property | classmethod | staticmethod)
-            if callable_or_property and not member.startswith("_") and not inspect.getdoc(getattr(what, member)):
+            if member.startswith("_") or not callable_or_property or inspect.getdoc(getattr(what, member)):
+                continue
+            if not re.search(rf"^ *([\w, ]+, )?{member}(, [\w, ]+)? :", about, re.MULTILINE):
                 yield f"{name}.{member}"
