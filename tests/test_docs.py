@@ -201,6 +201,7 @@ def drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_an_example_says_what_it_promises_and_draws_its_figure(path, remembered, drawing, monkeypatch, capsys):
     known = set(SENSORS)
     monkeypatch.setattr(rg, "smooth", remembered)
+    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything anew
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rg.DataWarning)
         try:
