@@ -119,7 +119,7 @@ def test_reference_with_repeated_empty_and_unsorted_rows_is_mended_with_warnings
         reference = read_reference(path)
     assert reference.time.tolist() == [0, 1, 3] and reference.p_n[:, 0].tolist() == [0, 1, 3]
     assert sorted(str(w.message).split(": ")[1].split(" were")[0] for w in caught) == [
-        "1 rows with a time that was there before",
+        "1 rows with a repeated time",
         "1 rows without time, north or east",
     ]
 

@@ -186,7 +186,7 @@ def test_no_complaint_is_lost_between_threads():
         ("udpin:127.0.0.1:14550", ["was mavlink:udpin:127.0.0.1:14550 meant"]),
         ("dive.tlog", ["was mavlink:dive.tlog meant"]),
         ("/dev/ttyUSB0", ["nmea:/dev/ttyUSB0"]),
-        ("", ["no source of this form"]),
+        ("", ["unknown kind of source"]),
         ("tcp://host", ["expected tcp://host:port"]),
         ("tcp://host:0", ["expected tcp://host:port"]),
         ("tcp://host:70000", ["expected tcp://host:port"]),
@@ -1094,7 +1094,7 @@ def test_logs_of_different_epochs_are_refused_before_any_solution_and_both_are_n
     imu, dvl = tmp_path / "imu.csv", tmp_path / "dvl.csv"
     imu.write_text("time,acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z\n1,0,0,-9.8,0,0,0\n2,0,0,-9.8,0,0,0\n")
     dvl.write_text("time,dvl_vx,dvl_vy,dvl_vz\n1700000001,1,0,0\n1700000002,1,0,0\n")
-    with pytest.raises(InputError, match=r"dvl\.csv: its times.*imu\.csv.*clocks of different epochs"):
+    with pytest.raises(InputError, match=r"dvl\.csv: its times.*imu\.csv.*clocks have different epochs"):
         open_sources([f"file:{imu}", f"file:{dvl}"])
 
 

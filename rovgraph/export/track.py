@@ -90,7 +90,7 @@ class Track:
         """
         if not self.has_utc:
             raise InputError(
-                f"{self.name}: its time begins at {self.trajectory.time[0]:g} s, which is no Unix time, and this "
+                f"{self.name}: its time begins at {self.trajectory.time[0]:g} s, which is not Unix time, and this "
                 "format needs one; add the Unix time of 0 s to the log's times (or give it as --unix-offset)"
             )
         return pd.to_datetime(np.round(self.trajectory.time * 1e6).astype(np.int64), unit="us", utc=True)
