@@ -193,10 +193,10 @@ def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert command(monkeypatch, "demo") == 0
     said = capsys.readouterr().out
-    assert "verdict: trusted" in said and f"{Path('demo/results/track.png')}: " in said
+    assert "verdict: trusted" in said and f"{Path('demo/results/report.html')}: " in said
     done = rg.demo("demo", force=True)  # in the same place, which the summary names
     assert f"{done.metrics.rms_m:.3f} m" in said and done.metrics.rms_m < 0.1
-    assert done.result.verdict == "trusted" and (done.results / "track.png").is_file()
+    assert done.result.verdict == "trusted" and (done.results / "report.html").is_file()
     assert command(monkeypatch, "demo") == 2
     assert "demo exists; choose another --out or give --force" in capsys.readouterr().err
 

@@ -187,7 +187,7 @@ def test_foreign_names_and_units_become_ours(tmp_path):
     [
         ({"units": {"gyr": "deg"}}, "unknown unit 'deg', nearest is 'deg/s'"),
         ({"units": {"gyro": "deg/s"}}, "gyro is not a column or group with a unit, nearest is gyr"),
-        ({"units": {"thruster_1": "m"}}, "thruster_1 is no column"),
+        ({"units": {"thruster_1": "m"}}, "thruster_1 is not a column"),
         ({"columns": {"gyro_x": "a"}}, "gyro_x is unknown, nearest is gyr_x"),
         ({"columns": {"gyr_x": "dept"}}, "the log has no 'dept', nearest is 'depth'"),
     ],
