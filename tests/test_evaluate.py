@@ -60,7 +60,7 @@ def test_from_counts_from_the_trajectorys_beginning():
 @pytest.mark.parametrize(
     ("start", "said"),
     [
-        (5000.0, "from 5000 s on: the trajectory lasts 100.0 s, nothing of it is left"),
+        (5000.0, "from 5000 s on: the trajectory lasts only 100.0 s"),
         (-5.0, "from -5 s on: expected 0 or more"),
         (np.nan, "from nan s on: expected 0 or more"),
     ],
