@@ -256,7 +256,7 @@ def test_a_reader_that_goes_away_does_not_end_the_estimate(dive, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["tpc://h:1"], "was tcp://host:port meant?"),
+        (["tpc://h:1"], "did you mean tcp://host:port?"),
         (["file:nowhere.csv"], "nowhere.csv"),
         (["-", "-"], "given twice"),
         (["-", "--resume"], "--out"),
