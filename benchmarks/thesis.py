@@ -347,7 +347,7 @@ def invariant(seed: int, seconds: float) -> list[Row]:
         "InvariantEKFNavState, writing into its covariance": set_covariance,
         "InvariantEKFGal3, dimension": lambda: str(gtsam.InvariantEKFGal3(gtsam.Gal3(), np.eye(10)).dimension()),
     }
-    return [{"tried": what, "came of it": _came_of(attempt)} for what, attempt in tried.items()]
+    return [{"tried": what, "result": _came_of(attempt)} for what, attempt in tried.items()]
 
 
 def _came_of(attempt: Callable[[], str]) -> str:
@@ -481,7 +481,7 @@ STUDIES = {
             "end error [m]": ("end_m", "mean", ".2f"),
         },
     ),
-    "invariant": Study(invariant, ("tried", "came of it"), {}, seeds=1),
+    "invariant": Study(invariant, ("tried", "result"), {}, seeds=1),
     "field": Study(
         field,
         ("headings", "field", "believed"),

@@ -10,9 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import rovgraph as rg
-from rovgraph.geometry import Array
-from rovgraph.sensors import Column, Instrument, Observed, Sensor, instrument, register, settings
-from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
+from rovgraph import extend
+from rovgraph.extend import BIAS, POSE, VELOCITY, Array, Instrument, Jacobians, State
 
 BEACON_N = np.array([5.0, 12.0, 8.0])  # north, east, down [m]
 
@@ -36,16 +35,16 @@ class BeaconRange:
 
 
 def believed(config: rg.Config, origin_b: Array) -> Instrument:
-    own = settings(config, "beacon")
-    return instrument(own, BeaconRange(), own.sd, ("range",))
+    own = extend.settings(config, "beacon")
+    return extend.instrument(own, BeaconRange(), own.sd, ("range",))
 
 
-register(
-    Sensor(
+extend.register(
+    extend.Sensor(
         name="beacon",
-        columns=(Column("beacon", "length"),),
+        columns=(extend.Column("beacon", "length"),),
         instrument=believed,
-        observes=Observed("position", (0, 1)),
+        observes=extend.Observed("position", (0, 1)),
         may_begin_later=True,
         simulated_hz=1.0,
     )

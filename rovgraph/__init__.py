@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api / pages / report, export, web / studies, live / interchange /
+cli / api, extend / pages / report, export, web / studies, live / interchange /
 estimators, simulate, evaluate, check, calibrate / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / gauss_markov, units / geometry, workers, fast_csv / errors, process.

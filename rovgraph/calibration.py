@@ -60,6 +60,7 @@ class Variable:
 
     @property
     def dim(self) -> int:
+        """Number of components."""
         return len(self.components)
 
     @property

@@ -97,7 +97,7 @@ def evaluate(
     if not start >= 0.0:
         raise InputError(f"comparing from {start:g} s on: expected 0 or more after the trajectory's first epoch")
     if (lasts := float(trajectory.time[-1] - trajectory.time[0])) < start:
-        raise InputError(f"comparing from {start:g} s on: the trajectory lasts {lasts:.1f} s, nothing of it is left")
+        raise InputError(f"comparing from {start:g} s on: the trajectory lasts only {lasts:.1f} s")
     if not end > start:
         raise InputError(f"comparing from {start:g} to {end:g} s: the end is not after the start")
     first, last = trajectory.time[0] + start, trajectory.time[0] + end
@@ -225,7 +225,7 @@ def read_reference(path: Path | str) -> Trajectory:
     known = known.sort_values("time", kind="stable")
     single = known.drop_duplicates("time")
     _warn(path, len(table) - len(known), "without time, north or east")
-    _warn(path, len(known) - len(single), "with a time that was there before")
+    _warn(path, len(known) - len(single), "with a repeated time")
     return parse_trajectory(pd.DataFrame(single), str(path))
 
 

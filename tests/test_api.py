@@ -193,10 +193,10 @@ def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert command(monkeypatch, "demo") == 0
     said = capsys.readouterr().out
-    assert "verdict: trusted" in said and f"{Path('demo/results/track.png')}: " in said
+    assert "verdict: trusted" in said and f"{Path('demo/results/report.html')}: " in said
     done = rg.demo("demo", force=True)  # in the same place, which the summary names
     assert f"{done.metrics.rms_m:.3f} m" in said and done.metrics.rms_m < 0.1
-    assert done.result.verdict == "trusted" and (done.results / "track.png").is_file()
+    assert done.result.verdict == "trusted" and (done.results / "report.html").is_file()
     assert command(monkeypatch, "demo") == 2
     assert "demo exists; choose another --out or give --force" in capsys.readouterr().err
 
@@ -373,9 +373,9 @@ T = np.arange(3.0)
 BAD_FRAMES = {
     "no time": (pd.DataFrame({"depth": T}), "no column time"),
     "a time in the index": (pd.DataFrame({"depth": T}, index=pd.Index(T, name="time")), "no column time"),
-    "text": (pd.DataFrame({"time": T, "depth": ["1", "deep", "2"]}), "line 3, column depth: 'deep' is no number"),
-    "lists": (pd.DataFrame({"time": T, "depth": [[1], [2], [3]]}), r"column depth: '\[1\]' is no number"),
-    "mixed objects": (pd.DataFrame({"time": T, "depth": [1.0, {}, None]}), "column depth: '{}' is no number"),
+    "text": (pd.DataFrame({"time": T, "depth": ["1", "deep", "2"]}), "line 3, column depth: 'deep' is not a number"),
+    "lists": (pd.DataFrame({"time": T, "depth": [[1], [2], [3]]}), r"column depth: '\[1\]' is not a number"),
+    "mixed objects": (pd.DataFrame({"time": T, "depth": [1.0, {}, None]}), "column depth: '{}' is not a number"),
     "dates": (pd.DataFrame({"time": pd.date_range("2024-01-01", periods=3), "depth": T}), "time holds dates"),
     "time zones": (
         pd.DataFrame({"time": pd.date_range("2024-01-01", periods=3, tz="Europe/Oslo"), "depth": T}),
@@ -388,7 +388,7 @@ BAD_FRAMES = {
     "durations": (pd.DataFrame({"time": pd.to_timedelta(T, unit="s"), "depth": T}), "time holds durations"),
     "a mix with complex numbers": (
         pd.DataFrame({"time": T, "depth": pd.Series([1j, 2.0, None], dtype=object)}),
-        "column depth: '1j' is no number",
+        "column depth: '1j' is not a number",
     ),
     "complex numbers": (pd.DataFrame({"time": T, "depth": T + 1j}), "depth holds complex numbers"),
     "a name twice": (pd.DataFrame(np.ones((3, 3)), columns=["time", "depth", "depth"]), "column 'depth' twice"),

@@ -32,7 +32,7 @@ LAYERS = (
     {"studies", "live"},
     {"report", "export", "web"},
     {"pages"},
-    {"api"},
+    {"api", "extend"},
     {"cli"},
 )
 LEVEL = {member: level for level, members in enumerate(LAYERS) for member in members}

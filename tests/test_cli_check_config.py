@@ -156,7 +156,7 @@ def test_what_is_no_file_is_one_line_and_code_2(run, tmp_path, name):
         ("columns: {gyro_x: a}", "nearest is gyr_x"),
         ("columns: {gyr_x: nothing}", "the log has no 'nothing'"),
         ("unit: {gyr: deg/s}", "nearest known key is units"),
-        ("units: [", "no valid YAML"),
+        ("units: [", "not valid YAML"),
     ],
 )
 def test_a_wrong_configuration_is_one_line_and_code_2(run, log, tmp_path, text, said):

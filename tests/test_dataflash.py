@@ -278,7 +278,7 @@ def test_a_clock_that_goes_back_leaves_the_longest_run(tmp_path):
     recording = read(writer.bytes(), tmp_path)
     assert len(first(recording, "imu").columns["time"]) == 50
     assert len(first(recording, "ahrs").columns["time"]) == 1
-    assert any("started anew 1 times" in warning for warning in recording.warnings)
+    assert any("restarted 1 times" in warning for warning in recording.warnings)
 
 
 # Damage

@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 from typer.main import get_command
 
 import rovgraph as rg
+from rovgraph import extend
 from rovgraph.cli.app import app, main
 from rovgraph.sensors import SENSORS, unregister
 
@@ -26,7 +27,7 @@ DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 HOW_TO = ("own-log", "mounting", "compass", "noise", "windows", "on-board", "estimators", "uncertainty")
 RUN = tuple(DOCS / f"{name}.md" for name in (*HOW_TO, "troubleshooting"))
-ELSEWHERE = ("waterlinked://", "turns.csv", "still.csv")  # instruments, and logs that other tests have
+ELSEWHERE = ("waterlinked://", "turns.csv", "still.csv", "dive.BIN")  # instruments, and files that other tests have
 PROCESSES = ("plan", "compare")  # what starts some, which takes long
 EXAMPLES = {  # what each of them has to say
     "smooth": r"verdict: trusted\n143 m in 480 s",
@@ -37,6 +38,7 @@ EXAMPLES = {  # what each of them has to say
     "own_sensor": r"without ranges: 0\.97 m rms.*\nwith ranges: 0\.17 m rms",
     "live": r"start: heading from mag, dvl_heading\n(.*\n)*6\d solutions, the last at \[6\.",
     "export": r"xarray.Dataset",
+    "native_files": r"dvl.csv: .* by acceleration .*\ntrusted, .* m rms\nmaps",
 }
 
 
@@ -107,7 +109,9 @@ def test_the_command_line_knows_every_command_of_the_manuals():
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dive as the manuals name its files: log.csv, vehicle.yaml, reference.csv, and the README's dive1.yaml."""
     folder = tmp_path_factory.mktemp("manual")
-    config = rg.parse_config("calibration: {dvl_yaw: {estimate: true, sd_deg: 5}}")
+    config = rg.parse_config(
+        "calibration: {dvl_yaw: {estimate: true, sd_deg: 5}}\nenvironment: {origin_lat_deg: 58.3, origin_lon_deg: 11.4}"
+    )
     rg.simulate("square", config, seed=1, choices=rg.Choices(duration=40)).save(folder / "dive")
     for name, here in (("log.csv", "log.csv"), ("config.yaml", "vehicle.yaml"), ("truth.csv", "reference.csv")):
         shutil.move(folder / "dive" / name, folder / here)
@@ -156,6 +160,15 @@ def test_the_example_of_the_readme_runs(folder, monkeypatch):
     assert tried == 5 and failed == 0
 
 
+def test_extensions_and_examples_import_public_modules_only():
+    """What the manuals promise to keep: `rovgraph`, `rovgraph.extend`, and the command line's `main`."""
+    texts = [(DOCS / f"{name}.md").read_text(encoding="utf-8") for name in ("own-sensor", "formats", "export", "api")]
+    texts += [path.read_text(encoding="utf-8") for path in (*(ROOT / "examples").glob("*.py"), DOCS / "tutorial.py")]
+    modules = {module for text in texts for module in re.findall(r"^(?:from|import) (rovgraph[\w.]*)", text, re.M)}
+    assert modules == {"rovgraph", "rovgraph.extend", "rovgraph.cli.app"}
+    assert all(hasattr(extend, name) for name in extend.__all__)
+
+
 @pytest.fixture(scope="module")
 def remembered() -> Callable[..., rg.Result]:
     """`rg.smooth`, which does not do the same work twice: three examples smooth the same dive."""
@@ -188,6 +201,7 @@ def drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_an_example_says_what_it_promises_and_draws_its_figure(path, remembered, drawing, monkeypatch, capsys):
     known = set(SENSORS)
     monkeypatch.setattr(rg, "smooth", remembered)
+    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything anew
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rg.DataWarning)
         try:

@@ -60,7 +60,7 @@ def test_from_counts_from_the_trajectorys_beginning():
 @pytest.mark.parametrize(
     ("start", "said"),
     [
-        (5000.0, "from 5000 s on: the trajectory lasts 100.0 s, nothing of it is left"),
+        (5000.0, "from 5000 s on: the trajectory lasts only 100.0 s"),
         (-5.0, "from -5 s on: expected 0 or more"),
         (np.nan, "from nan s on: expected 0 or more"),
     ],
@@ -119,7 +119,7 @@ def test_reference_with_repeated_empty_and_unsorted_rows_is_mended_with_warnings
         reference = read_reference(path)
     assert reference.time.tolist() == [0, 1, 3] and reference.p_n[:, 0].tolist() == [0, 1, 3]
     assert sorted(str(w.message).split(": ")[1].split(" were")[0] for w in caught) == [
-        "1 rows with a time that was there before",
+        "1 rows with a repeated time",
         "1 rows without time, north or east",
     ]
 

@@ -261,7 +261,7 @@ def test_a_dive_of_unknown_place_is_refused_with_what_to_do_and_nothing_is_writt
 
 
 def test_what_needs_utc_says_so(tmp_path):
-    with pytest.raises(rg.InputError, match="no Unix time"):
+    with pytest.raises(rg.InputError, match="not Unix time"):
         written("sbet", tmp_path, of=track(start=5.0))
     assert not list(tmp_path.iterdir())
     assert (written("sbet", tmp_path, of=track(start=5.0).shifted(BEGAN)) / "sbet.out").stat().st_size > 0
@@ -324,7 +324,7 @@ def test_tables_get_the_place_at_each_rows_time():
 def test_dates_are_times_too_where_the_dive_has_unix_time():
     table = pd.DataFrame({"time": pd.to_datetime([BEGAN + 30.0], unit="s", utc=True).strftime("%Y-%m-%dT%H:%M:%SZ")})
     assert tag(table, track()).frame["rov_east"].iloc[0] == pytest.approx(40.0, abs=1e-3)
-    with pytest.raises(rg.InputError, match="holds dates, and the dive's time is no Unix time"):
+    with pytest.raises(rg.InputError, match="holds dates, and the dive's time is not Unix time"):
         tag(table, track(start=0.0))
 
 

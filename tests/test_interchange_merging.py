@@ -162,7 +162,7 @@ def test_a_shift_of_a_sensor_moves_its_clock_and_beside_the_imu_that_sensor_alon
     assert times(merged, "dvl_vx") == pytest.approx(dive.loc[dive["dvl_vx"].notna(), "time"].to_numpy(), abs=1e-9)
     alone = merge([autopilot(dive)], {}, {"mag": 0.5})
     assert times(alone, "mag_x")[0] - times(alone, "acc_x")[0] == pytest.approx(0.5)
-    with pytest.raises(InputError, match=r"shift sonar: is neither a sensor nor a file; there are auto\.bin, dvl, "):
+    with pytest.raises(InputError, match=r"shift sonar: is neither a sensor nor a file; known are auto\.bin, dvl, "):
         merge([autopilot(dive), instrument(dive, 3.2)], {}, {"sonar": 1.0})
     with pytest.raises(InputError, match="its clock is that of the log"):
         merge([autopilot(dive), instrument(dive, 3.2)], {}, {"auto.bin": 1.0})
@@ -423,7 +423,7 @@ def test_the_format_of_the_manual_reads_its_file(tmp_path, dive):
 
 HOSTILE = {
     "torn": (b"TOY{", "cannot be read as a toy DVL .*damaged"),
-    "binary": (b"\x7fELF\x02\x01\xff\xfe\x00\x81" * 9, "is binary data in no format that is known; .*toy DVL"),
+    "binary": (b"\x7fELF\x02\x01\xff\xfe\x00\x81" * 9, "is binary data in an unknown format; .*toy DVL"),
     "zip": (b"PK\x03\x04rest", "is a ZIP archive; unpack it first"),
     "track": (b"time,north,east\n0,1,2\n", "is a track, not a log; rovgraph evaluate"),
     "empty": (b"", "is empty"),

@@ -189,7 +189,7 @@ def test_a_torn_header_is_written_again(tmp_path, cut):
 def test_a_file_that_is_no_recording_is_refused_and_left_as_it_is(tmp_path, content):
     path = tmp_path / "r.csv"
     path.write_text(content)
-    with pytest.raises(InputError, match="no recording that can be continued"):
+    with pytest.raises(InputError, match="not a recording that can be continued"):
         Recorder(path)
     assert path.read_text() == content
 
@@ -314,7 +314,7 @@ def test_any_damage_to_a_checkpoint_is_found(folder, data):
     else:
         content[place] ^= data.draw(st.integers(1, 255))
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"delete it to start anew|is no checkpoint|go on with the rovgraph") as error:
+    with pytest.raises(InputError, match=r"to start again|is not a checkpoint|continue with the version") as error:
         read_checkpoint(path)
     assert "\n" not in str(error.value)
 

@@ -181,12 +181,12 @@ def test_no_complaint_is_lost_between_threads():
 @pytest.mark.parametrize(
     ("url", "words"),
     [
-        ("tpc://host:1", ["was tcp://host:port meant", "waterlinked://host"]),
-        ("waterlink://host", ["was waterlinked://host[:port] meant"]),
-        ("udpin:127.0.0.1:14550", ["was mavlink:udpin:127.0.0.1:14550 meant"]),
-        ("dive.tlog", ["was mavlink:dive.tlog meant"]),
+        ("tpc://host:1", ["did you mean tcp://host:port?", "waterlinked://host"]),
+        ("waterlink://host", ["did you mean waterlinked://host[:port]?"]),
+        ("udpin:127.0.0.1:14550", ["did you mean mavlink:udpin:127.0.0.1:14550?"]),
+        ("dive.tlog", ["did you mean mavlink:dive.tlog?"]),
         ("/dev/ttyUSB0", ["nmea:/dev/ttyUSB0"]),
-        ("", ["no source of this form"]),
+        ("", ["unknown kind of source"]),
         ("tcp://host", ["expected tcp://host:port"]),
         ("tcp://host:0", ["expected tcp://host:port"]),
         ("tcp://host:70000", ["expected tcp://host:port"]),
@@ -220,7 +220,7 @@ def test_a_url_that_cannot_be_is_refused_in_one_line_that_helps(url, words):
 def test_a_file_without_its_scheme_is_recognised(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("dive.csv").write_text("time,depth\n1,2\n")
-    with pytest.raises(InputError, match=r"was file:dive\.csv meant"):
+    with pytest.raises(InputError, match=r"did you mean file:dive\.csv?"):
         open_source("dive.csv")
 
 
@@ -1104,7 +1104,7 @@ def test_logs_of_different_epochs_are_refused_before_any_solution_and_both_are_n
     imu, dvl = tmp_path / "imu.csv", tmp_path / "dvl.csv"
     imu.write_text("time,acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z\n1,0,0,-9.8,0,0,0\n2,0,0,-9.8,0,0,0\n")
     dvl.write_text("time,dvl_vx,dvl_vy,dvl_vz\n1700000001,1,0,0\n1700000002,1,0,0\n")
-    with pytest.raises(InputError, match=r"dvl\.csv: its times.*imu\.csv.*clocks of different epochs"):
+    with pytest.raises(InputError, match=r"dvl\.csv: its times.*imu\.csv.*clocks have different epochs"):
         open_sources([f"file:{imu}", f"file:{dvl}"])
 
 

@@ -83,7 +83,7 @@ def test_blanks_around_names_and_cells_are_no_part_of_them(tmp_path):
     np.testing.assert_array_equal(log["depth"].data, [[5], [6]])
     np.testing.assert_array_equal(log["fix"].data, [[7, 8, 0.5]])
     assert log["dvl_altitude"].time.tolist() == [1]
-    with pytest.raises(InputError, match="line 3, column depth: 'deep' is no number"):
+    with pytest.raises(InputError, match="line 3, column depth: 'deep' is not a number"):
         read_log(write(tmp_path, "time, depth\n1,\t5\n2, deep \n"))
 
 
@@ -186,8 +186,8 @@ def test_foreign_names_and_units_become_ours(tmp_path):
     ("mapping", "said"),
     [
         ({"units": {"gyr": "deg"}}, "unknown unit 'deg', nearest is 'deg/s'"),
-        ({"units": {"gyro": "deg/s"}}, "gyro is no column or group that has a unit, nearest is gyr"),
-        ({"units": {"thruster_1": "m"}}, "thruster_1 is no column"),
+        ({"units": {"gyro": "deg/s"}}, "gyro is not a column or group with a unit, nearest is gyr"),
+        ({"units": {"thruster_1": "m"}}, "thruster_1 is not a column"),
         ({"columns": {"gyro_x": "a"}}, "gyro_x is unknown, nearest is gyr_x"),
         ({"columns": {"gyr_x": "dept"}}, "the log has no 'dept', nearest is 'depth'"),
     ],
@@ -217,7 +217,7 @@ HOSTILE = {
     "header only": ("time,depth\n", "no rows"),
     "ragged, long": ("time,depth\n1,2\n3,4,5\n6,7\n", "line 3 has 3 cells, expected 2"),
     "ragged, short": ("time,depth\n1,2\n3\n6,7\n", "line 3 has 1 cells, expected 2"),
-    "word": ("time,depth\n1,2\n3,deep\n", "line 3, column depth: 'deep' is no number"),
+    "word": ("time,depth\n1,2\n3,deep\n", "line 3, column depth: 'deep' is not a number"),
     "word in time": ("time,depth\n12:30:00,2\n", "line 2, column time: '12:30:00'"),
     "no time": ("Time,depth\n1,2\n", "no column time; columns found: Time, depth; .* {time: 'Time'}"),
     "no time at all": ("time,depth\n,2\n", "column time is empty"),

@@ -145,7 +145,7 @@ def test_an_autopilot_that_starts_anew_leaves_its_longest_run(tmp_path):
     sent = [(next(times), message, sender) for _, message, sender in attitudes(60, 500.0) + attitudes(150, 1.0)]
     recording = read(written(sent), tmp_path)
     assert len(first(recording, "ahrs").columns["time"]) == 150
-    assert any("started anew 1 times" in warning for warning in recording.warnings)
+    assert any("restarted 1 times" in warning for warning in recording.warnings)
 
 
 def test_a_slow_imu_is_said_and_its_rates_are_those_of_the_attitude(tmp_path):

@@ -256,7 +256,7 @@ def test_a_reader_that_goes_away_does_not_end_the_estimate(dive, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["tpc://h:1"], "was tcp://host:port meant?"),
+        (["tpc://h:1"], "did you mean tcp://host:port?"),
         (["file:nowhere.csv"], "nowhere.csv"),
         (["-", "-"], "given twice"),
         (["-", "--resume"], "--out"),
@@ -285,7 +285,7 @@ def test_folders_that_hold_something_else_are_not_replaced(capsys, dive, tmp_pat
     (foreign / "thesis.tex").write_text("years of work")
     log = f"file:{dive / 'log.csv'}"
     assert "exists" in refused(capsys, "online", log, "--out", foreign)
-    assert "no results folder" in refused(capsys, "online", log, "--out", foreign, "--force")
+    assert "not a results folder" in refused(capsys, "online", log, "--out", foreign, "--force")
     assert "nothing to resume" in refused(capsys, "online", log, "--speed", "max", "--out", foreign, "--resume")
     assert "would be replaced" in refused(capsys, "online", log, "--out", dive, "--force")
     assert [p.name for p in foreign.iterdir()] == ["thesis.tex"]

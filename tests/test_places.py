@@ -367,7 +367,7 @@ def test_names_of_places_may_be_numbers_or_texts(tmp_path, name):
 
 @pytest.mark.parametrize("sd", [0.0, -1.0])
 def test_an_sd_of_0_or_less_is_taken_as_not_known(sd):
-    with pytest.warns(DataWarning, match="place_sd: 1 times 0 or less, taken as not known.* first in line 3"):
+    with pytest.warns(DataWarning, match="place_sd: 1 times 0 or less, taken as unknown.* first in line 3"):
         stream = Log.from_frame(table(place_id=[1, 2, 1], place_sd=[0.1, sd, 0.1]))["place"]
     np.testing.assert_array_equal(stream["place_sd"], [0.1, np.nan, 0.1])
 

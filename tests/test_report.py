@@ -266,7 +266,7 @@ def test_force_spares_what_is_not_ours(tmp_path, summary):
     (home / "thesis.tex").write_text("years of work")
     if summary is not None:
         (home / "summary.json").write_text(summary)
-    with pytest.raises(InputError, match="no results folder"), results_folder(home, force=True):
+    with pytest.raises(InputError, match="not a results folder"), results_folder(home, force=True):
         pytest.fail("work was begun")
     assert (home / "thesis.tex").exists()
 

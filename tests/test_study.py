@@ -77,7 +77,7 @@ def quick_run(task):
         ("cells: [{estimator: '4.5'}]", "estimator 4.5 works with both compasses; give heading: mag+dvl"),
         ("cells: [{duration_s: 60, cut_s: 30}]", "60 s less 30 s at both ends leaves too little to log"),
         ("vehicle: nowhere.yaml", "nowhere.yaml: cannot be read"),
-        ("grid: [", "no valid YAML"),
+        ("grid: [", "not valid YAML"),
     ],
 )
 def test_a_study_that_cannot_be_is_refused_in_one_line(text, complaint, tmp_path):

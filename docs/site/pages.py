@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import click
 from mkdocs.config.defaults import MkDocsConfig
@@ -19,16 +20,19 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import rovgraph as rg
+from rovgraph import extend
 from rovgraph.cli.app import app
 
 ROOT = Path(__file__).parents[2]
-ELSEWHERE = {  # page -> file of the project
+ELSEWHERE = {  # page or file of the site -> file of the project
     "index.md": "README.md",
     "changelog.md": "CHANGELOG.md",
     "licence.md": "LICENSE",
     "benchmarks.md": "benchmarks/README.md",
     "falcon.md": "data/falcon/README.md",
+    "bluerov2.yaml": "configs/bluerov2.yaml",
 }
+FOLDERS = {"examples": "examples.md"}  # folder of the project -> page that shows it
 RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
     "rovgraph.estimators.estimate.Estimate",
     "rovgraph.estimators.estimate.CalibrationEstimate",
@@ -37,7 +41,7 @@ RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
     "rovgraph.live.solution.Solution",
     "rovgraph.live.solution.Event",
 )
-FIRST = ("smooth", "residuals", "mountings", "own_sensor", "live")  # of the examples, others by name
+FIRST = ("smooth", "residuals", "mountings", "native_files", "own_sensor", "live")  # of the examples, others by name
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)(#[^)\s]*)?\)")
 
 
@@ -54,6 +58,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Let links between files of the project be links between pages."""
     source = ROOT / ELSEWHERE.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     pages = {ROOT / path: name for name, path in ELSEWHERE.items()}
+    pages |= {ROOT / folder: name for folder, name in FOLDERS.items()}
 
     def on_the_site(link: re.Match[str]) -> str:
         target = Path(os.path.normpath(source.parent / link[1]))
@@ -100,7 +105,8 @@ def api_reference() -> str:
     ------
     PluginError : one of them, or a public method, has no docstring
     """
-    bare = [where for name in rg.__all__ for where in _undocumented(name, getattr(rg, name))]
+    public = {name: getattr(rg, name) for name in rg.__all__} | dict(_extension_points())
+    bare = [where for name, what in public.items() for where in _undocumented(name, what)]
     if bare:
         raise PluginError(f"public names without a docstring: {', '.join(bare)}")
     parts = ["# API, name by name\n\nAll names of `import rovgraph as rg`; [api.md](api.md) shows how they are used.\n"]
@@ -109,7 +115,17 @@ def api_reference() -> str:
         parts.append(_entry(f"{what.__module__}.{what.__qualname__}", f"rg.{name}"))
     parts.append("# What they return\n")
     parts += [_entry(path, path.rpartition(".")[2]) for path in RETURNED]
+    parts.append("# For extensions: rovgraph.extend\n")
+    parts += [_entry(f"{what.__module__}.{what.__qualname__}", f"extend.{name}") for name, what in _extension_points()]
     return "\n".join(parts)
+
+
+def _extension_points() -> Iterator[tuple[str, Any]]:
+    """Classes and functions of `rovgraph.extend`, but for `Config`, which stands above."""
+    for name in extend.__all__:
+        what = getattr(extend, name)
+        if (inspect.isclass(what) or inspect.isfunction(what)) and what is not rg.Config:
+            yield name, what
 
 
 def _entry(path: str, heading: str) -> str:
@@ -117,10 +133,14 @@ def _entry(path: str, heading: str) -> str:
 
 
 def _undocumented(name: str, what: object) -> Iterator[str]:
-    if not (what.__doc__ or "").strip():
+    """The name, and public methods and properties, that neither have a docstring nor stand among the attributes."""
+    about = (what.__doc__ or "").strip()
+    if not about:
         yield name
     if inspect.isclass(what) and what.__module__.startswith("rovgraph"):
         for member, value in vars(what).items():
             callable_or_property = inspect.isfunction(value) or isinstance(value, property | classmethod | staticmethod)
-            if callable_or_property and not member.startswith("_") and not inspect.getdoc(getattr(what, member)):
+            if member.startswith("_") or not callable_or_property or inspect.getdoc(getattr(what, member)):
+                continue
+            if not re.search(rf"^ *([\w, ]+, )?{member}(, [\w, ]+)? :", about, re.MULTILINE):
                 yield f"{name}.{member}"

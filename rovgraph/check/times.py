@@ -43,7 +43,7 @@ def presence(log: Log, config: Config) -> Iterator[Finding]:
     """Sensors that are missing, and what that means."""
     for sensor in SENSORS.values():
         if sensor.name == "imu" and motion_model(config, log.sensors) == "constant_velocity":
-            used = "no IMU is used: between measurements the vehicle goes on as it went (motion.model)"
+            used = "no IMU is used: between measurements velocity and attitude are nearly constant (motion.model)"
             yield Finding(sensor.name, "ok", used)
         elif sensor.if_missing is not None and sensor.name not in log:
             yield Finding(sensor.name, *sensor.if_missing)
@@ -64,7 +64,7 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
     for sensor, stream in log.streams.items():
         inside = np.mean((stream.time >= first) & (stream.time <= last))
         if inside == 0.0:
-            text = "no time in common with the IMU; are the clocks of different epochs? Put them on one"
+            text = "no time in common with the IMU; do the clocks have different epochs? Put them on one clock"
             shift = shift_of_epoch(log, config, sensor)
             if shift is not None:
                 delay = config.delay_s.get(sensor, 0.0) + shift[0]

@@ -28,7 +28,7 @@ def demo(
     show_metrics(done.metrics, "smoothed track against the truth")
     typer.echo(f"""
 Look next at
-  {done.results / "track.png"}: the track with its uncertainty
+  {done.results / "report.html"}: the dive as a page, in any browser
   {done.results / "residuals.png"}: every measurement against its prediction
   {out / "config.yaml"}: what the estimator was told about the vehicle
 For your own log: rovgraph check LOG, then rovgraph smooth LOG --config CONFIG""")

@@ -56,7 +56,7 @@ def misalignment(
     if out is None:
         raise InputError("--out is needed: a folder for the results")
     if scheduler is not None and jobs is not None:
-        raise InputError("--jobs goes without --scheduler; a cluster has as many workers as it has")
+        raise InputError("--jobs cannot be combined with --scheduler; the cluster decides the number of workers")
     engine = Local(jobs) if scheduler is None else Cluster(scheduler)
     results = open_results(out, plan, resume)
     began = time.perf_counter()

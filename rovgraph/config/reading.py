@@ -225,7 +225,7 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
         problem = str(getattr(error, "problem", None) or error or "cannot be parsed").splitlines()[0]
-        raise InputError(f"{source}{where}: no valid YAML ({problem})") from None
+        raise InputError(f"{source}{where}: not valid YAML ({problem})") from None
     if data is None:
         return {}
     if not isinstance(data, dict):

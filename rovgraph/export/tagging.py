@@ -118,7 +118,7 @@ def _seconds(times: pd.Series, track: Track) -> Array:
         )
     if not track.has_utc:
         raise InputError(
-            f"column {times.name}: holds dates, and the dive's time is no Unix time; give seconds of the dive's clock"
+            f"column {times.name}: holds dates, and the dive's time is not Unix time; give seconds of the dive's clock"
         )
     return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), dtype=float)
 

@@ -159,7 +159,7 @@ def require_utc(name: str, start: float) -> None:
     """
     if not is_utc(start):
         raise InputError(
-            f"{name}: its time begins at {start:g} s, which is no Unix time, and this format needs one; "
+            f"{name}: its time begins at {start:g} s, which is not Unix time, and this format needs one; "
             "add the Unix time of 0 s to the log's times (or give it as --unix-offset)"
         )
 

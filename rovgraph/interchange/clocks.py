@@ -241,7 +241,7 @@ def _stated(
         meant = [a for a in axes if a.file in files or any((a.file, name) in by_sensor for name in a.lines)]
         if not meant and not files:
             known = sorted(sensors | set(names))
-            raise InputError(f"shift {key}: is neither a sensor nor a file; there are {', '.join(known)}")
+            raise InputError(f"shift {key}: is neither a sensor nor a file; known are {', '.join(known)}")
         if any(axis is base for axis in meant):
             if key in sensors:
                 beside[key] = float(seconds)

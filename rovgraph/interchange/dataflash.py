@@ -136,7 +136,7 @@ def _one_boot(messages: dict[str, Messages], findings: Findings) -> dict[str, Me
     first, end, resets = longest_boot(densest.place[order], time)
     if not resets:
         return messages
-    findings.warnings.append(f"the autopilot was started anew {resets} times in the log; the longest run is read")
+    findings.warnings.append(f"the autopilot restarted {resets} times in the log; the longest run is read")
     kept = {"PARM": messages["PARM"]} if "PARM" in messages else {}
     for name, m in messages.items():
         within = np.logical_and(m.place >= first, m.place < end)

@@ -129,7 +129,7 @@ def read_recording(path: Path | str, options: Options | None = None, format_: Fo
     format_ = recognise(path) if format_ is None else format_
     if format_ is None:
         known = ", ".join(each.title for each in formats())
-        raise InputError(f"{path}: is in no format that is known; expected one of: {known}")
+        raise InputError(f"{path}: is in an unknown format; expected one of: {known}")
     with unpacked(path) as plain:
         try:
             recording = format_.read(plain, options)

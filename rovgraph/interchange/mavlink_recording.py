@@ -110,7 +110,7 @@ class _Vehicle:
         dense = max(booted, key=len)
         first, end, resets = longest_boot(dense.place, dense.stamp)
         if resets:
-            self.warnings.append(f"the autopilot was started anew {resets} times; the longest run is read")
+            self.warnings.append(f"the autopilot restarted {resets} times; the longest run is read")
             self._rows = {key: rows.within(first, end) for key, rows in self._rows.items()}
             dense = dense.within(first, end)
         clock = receiver_clock(dense.place, dense.received, dense.stamp)

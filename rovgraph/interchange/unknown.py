@@ -48,4 +48,4 @@ def is_text(head: bytes) -> bool:
 
 def refusal(path: Path, titles: Sequence[str]) -> str:
     """Why a file that is no table of text cannot be read."""
-    return f"{path}: is binary data in no format that is known; expected one of: {', '.join(titles)}"
+    return f"{path}: is binary data in an unknown format; expected one of: {', '.join(titles)}"

@@ -73,15 +73,15 @@ def read_checkpoint(path: Path | str) -> dict[str, Any]:
         raise InputError(f"{path}: checkpoint cannot be read ({error.strerror}); check the name") from None
     head, _, body = content.partition(b"\n")
     if not head.startswith(NAME):
-        raise InputError(f"{path}: is no checkpoint of rovgraph; give another file")
+        raise InputError(f"{path}: is not a checkpoint of rovgraph; give another file")
     version, _, digest = head.removeprefix(NAME + b" ").partition(b" ")
     if version.isdigit() and int(version) != VERSION:
         raise InputError(
             f"{path}: checkpoint of version {int(version)}, expected {VERSION}; "
-            "go on with the rovgraph that wrote it, or delete it to start anew"
+            "continue with the version that wrote it, or delete it to start again"
         )
     if not version.isdigit() or digest != _digest(body):
-        raise InputError(f"{path}: checkpoint is damaged, its checksum differs; delete it to start anew")
+        raise InputError(f"{path}: checkpoint is damaged, its checksum differs; delete it to start again")
     return _decoded(body)
 
 

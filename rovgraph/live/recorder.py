@@ -166,7 +166,7 @@ def _continue(path: Path, file: int, first_line: bytes) -> None:
     """Check the header, or write it, and cut off a last line that is torn or blank after a power cut."""
     found = os.read(file, len(first_line))
     if not first_line.startswith(found):
-        raise InputError(f"{path}: is no recording that can be continued, line 1 differs; choose another file")
+        raise InputError(f"{path}: is not a recording that can be continued, line 1 differs; choose another file")
     if found != first_line:
         os.ftruncate(file, 0)
         os.write(file, first_line)

@@ -187,7 +187,7 @@ def _add_local_fixes(
         )
     unset = (lat == 0.0) & (lon == 0.0)
     if unset.any():
-        warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0, no fix; left out")
+        warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0 are invalid and left out")
         lat[unset] = np.nan
     valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
     cells["fix_north"], cells["fix_east"] = lat * np.nan, lon * np.nan
@@ -198,7 +198,7 @@ def _add_local_fixes(
     if (away := float(np.median(np.hypot(north, east)))) > FARTHEST:
         raise InputError(
             f"{source}: fixes lie {away / 1e3:.0f} km from environment.origin_lat_deg, origin_lon_deg = "
-            f"{origin[0]:g}, {origin[1]:g}; correct them, or leave them out for the first fix"
+            f"{origin[0]:g}, {origin[1]:g}; correct them, or remove these keys to use the first fix"
         )
     cells["fix_north"][valid], cells["fix_east"][valid] = north, east
     return origin
@@ -259,7 +259,7 @@ def _known_sd(column: str, sd: Array, line: Lines, source: str) -> None:
     unknown = sd <= 0.0
     if unknown.any():
         warn(
-            f"{source}: {column}: {unknown.sum()} times 0 or less, taken as not known; "
+            f"{source}: {column}: {unknown.sum()} times 0 or less, taken as unknown; "
             f"the configuration's sd holds there; first in line {line[np.argmax(unknown)]}"
         )
         sd[unknown] = np.nan

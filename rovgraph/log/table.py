@@ -64,7 +64,7 @@ class Table:
         if bad.size:
             cell = _shortened(repr(str(cells.iloc[bad[0]])), 30)
             raise InputError(
-                f"{self.source}: line {self.line[bad[0]]}, column {name}: {cell} is no number; "
+                f"{self.source}: line {self.line[bad[0]]}, column {name}: {cell} is not a number; "
                 f"leave a cell empty where there is no value ({_count(bad.size, 'such cell')})"
             )
         return values.to_numpy(dtype=float, na_value=np.nan)

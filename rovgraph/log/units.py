@@ -75,7 +75,7 @@ def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
         columns = by_group.get(key, (key,) if key in kinds else ())
         if not columns:
             near = nearest(key, [*by_group, *kinds])
-            raise InputError(f"{source}: units: {key} is no column or group that has a unit, nearest is {near}")
+            raise InputError(f"{source}: units: {key} is not a column or group with a unit, nearest is {near}")
         known = [unit for c in columns for unit in UNITS[kinds[c]]]
         if unit != signed and key == "time":
             raise InputError(f"{source}: units: time: {signed!r} has a sign, and time does not run backwards")

@@ -64,7 +64,7 @@ class Source:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(f"{path}: cannot be read ({reason}); make the results again") from None
         if not isinstance(summary, dict) or summary.get("program") != STAMP["program"]:
-            raise InputError(f"{path}: is no summary of rovgraph; give a results folder of rovgraph")
+            raise InputError(f"{path}: is not a summary of rovgraph; give a results folder of rovgraph")
         return Source(folder, summary)
 
     @property

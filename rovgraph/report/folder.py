@@ -136,7 +136,7 @@ def _check_target(path: Path, force: bool) -> None:
     if not force:
         raise InputError(f"{path} exists; choose another --out or give --force")
     if not _is_ours(path):
-        raise InputError(f"{path} is no results folder of rovgraph, --force does not replace it; choose another --out")
+        raise InputError(f"{path} is not a results folder of rovgraph, so --force keeps it; choose another --out")
 
 
 def _is_ours(folder: Path) -> bool:

@@ -101,7 +101,7 @@ def drive(vehicle: Hydrodynamics, sea: Sea, pilot: Pilot, start: ArrayLike, dura
             before = rate
             if not -WILDEST < min(state[:6]) <= max(state[:6]) < WILDEST:
                 raise InputError(
-                    f"vehicle: at {now:.1f} s the motion leaves all bounds; steps of {STEP_S} s are too long "
+                    f"vehicle: at {now:.1f} s the motion diverges; steps of {STEP_S} s are too long "
                     "for drag, inertia or thrust as large or small as these"
                 )
     first, last = settling * _SUBSTEPS, (settling + ticks) * _SUBSTEPS

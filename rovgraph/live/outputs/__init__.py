@@ -48,5 +48,5 @@ def open_output(url: str, warnings: Warnings | None = None, patient: bool = Fals
     if where.scheme == "-":
         return StandardOutput(where, warnings, patient)
     if where.scheme not in _OUTPUTS:
-        raise InputError(f"output {url!r} is of no known form; known are {', '.join(FORMS.values())}")
+        raise InputError(f"output {url!r} is of an unknown form; known are {', '.join(FORMS.values())}")
     return _OUTPUTS[where.scheme](where, warnings)

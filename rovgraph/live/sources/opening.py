@@ -130,7 +130,7 @@ def _unknown(address: Address) -> InputError:
         meant = f"nmea:{address.url} or mavlink:{address.url}"
     else:
         meant = FORMS[nearest(address.scheme or address.url, FORMS)]
-    return InputError(f"{address.url}: no source of this form; was {meant} meant? {known}")
+    return InputError(f"{address.url}: unknown kind of source; did you mean {meant}? {known}")
 
 
 def _standard_input(address: Address, notify: Notify, config: Config, pace: float) -> Source:
@@ -192,7 +192,7 @@ def _mavlink(address: Address, notify: Notify, config: Config, pace: float) -> S
     if not (recorded or serial or inner.scheme in ("tcp", "udp", "udpin")):
         raise InputError(
             f"{address.url}: expected mavlink:udpin:host:port, mavlink:tcp:host:port, mavlink:/dev/ttyACM0 "
-            "or mavlink:file.tlog; nothing is sent to a vehicle, so a connection that has to speak first is none"
+            "or mavlink:file.tlog; nothing is sent to a vehicle, so a connection that must send first is not supported"
         )
     options = address.take(
         _MAVLINK_OPTIONS | ({"speed": _pace} if recorded else {}) | ({"baud": _baud} if serial else {})

@@ -62,7 +62,7 @@ def refuse_other_epochs(replays: Sequence[LogReplay]) -> None:
         if first > end or last < begin:
             raise InputError(
                 f"{other.url}: its times, {first:.1f} to {last:.1f} s, have none in common with those of {base.url}, "
-                f"{begin:.1f} to {end:.1f} s; are the clocks of different epochs? Put both files on one clock"
+                f"{begin:.1f} to {end:.1f} s; do the clocks have different epochs? Put both files on one clock"
             )
 
 

@@ -1,0 +1,61 @@
+"""What a package of your own imports to add a sensor, a format to read, or a format to write.
+
+The names below stay as they are within a major version, as those of ``import rovgraph`` do; every other module is
+internal and may change with any release. docs/own-sensor.md, docs/formats.md and docs/export.md show their use.
+"""
+
+from rovgraph.calibration import Variable
+from rovgraph.config import Config, SensorSettings
+from rovgraph.export.formats import ExportFormat
+from rovgraph.export.formats import Options as ExportOptions
+from rovgraph.export.track import Track
+from rovgraph.geometry import Array, rotate, skew
+from rovgraph.interchange.formats import Format
+from rovgraph.interchange.formats import Options as ReadingOptions
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.sensors import (
+    Column,
+    Instrument,
+    Level,
+    Observed,
+    Sensor,
+    SensorModel,
+    instrument,
+    register,
+    settings,
+    unregister,
+)
+from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
+
+__all__ = [
+    "BIAS",
+    "POSE",
+    "VELOCITY",
+    "Array",
+    "Channel",
+    "Clock",
+    "Column",
+    "Config",
+    "ExportFormat",
+    "ExportOptions",
+    "Format",
+    "Instrument",
+    "Jacobians",
+    "Left",
+    "Level",
+    "Observed",
+    "ReadingOptions",
+    "Recording",
+    "Sensor",
+    "SensorModel",
+    "SensorSettings",
+    "State",
+    "Track",
+    "Variable",
+    "instrument",
+    "register",
+    "rotate",
+    "settings",
+    "skew",
+    "unregister",
+]
