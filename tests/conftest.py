@@ -1,11 +1,16 @@
 """What holds for all tests."""
 
+import signal
+
 import pytest
 from hypothesis import HealthCheck, settings
 
 # how long an example takes says something about the machine only
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
+
+# whoever starts the tests in the background has them ignore SIGINT, and so would every command that they interrupt
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 LONGEST = ("test_consistency", "test_online", "test_thesis_study", "test_compare", "test_batch", "test_fixed_lag")
 

@@ -185,7 +185,7 @@ def test_corrupt_ensembles_and_bad_dates_are_counted_and_the_rest_is_read(tmp_pa
     ("data", "words"),
     [
         (b"", "is empty"),
-        (b"time,depth\n1,2\n" * 50, "in no format that is known"),
+        (b"nothing that anyone has seen\n" * 50, "in an unknown format"),
         (pd0_ensemble()[:200], "no whole PD0 ensemble"),
         (pd0_ensemble(date=(0,) * 7), "valid time"),
         (pd6_ping()[:30] * 3, "record :TS, :SA and :BI"),

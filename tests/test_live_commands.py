@@ -2,6 +2,7 @@
 
 import csv
 import json
+from contextlib import closing
 
 import numpy as np
 import pandas as pd
@@ -40,9 +41,8 @@ def run(log, config, folder, commands=()):
         while due and solution.time >= due[0][0]:
             assert feed.offer(due.pop(0)[1])
 
-    Session(navigator, [receive], warnings, files=files, marks=marks).run(feed)
-    files.close()
-    navigator.close()
+    with closing(files), closing(navigator):
+        Session(navigator, [receive], warnings, files=files, marks=marks).run(feed)
     return solutions
 
 
@@ -110,7 +110,6 @@ def test_a_torn_file_of_marks_loses_its_last_line_only(told, tmp_path):
 def test_a_command_before_the_first_solution_does_nothing(case):
     navigator = Navigator(case.config, clocks=Clocks(trust=True))
     session = Session(navigator, [], Warnings())
-    session.step(SetPosition(1.0, 2.0, 3.0))
-    session.step(DropMark("x"))
-    assert session.marks.all == () and not navigator.left_out
-    navigator.close()
+    with closing(navigator):
+        assert not list(session.solve([SetPosition(1.0, 2.0, 3.0), DropMark("x")]))
+        assert session.marks.all == () and not navigator.left_out

@@ -143,7 +143,7 @@ def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
         (lambda f: [p.unlink() for p in f.glob("trajectory_*.csv")], "no trajectory_smoothed.csv"),
         (lambda f: (f / "summary.json").unlink(), "has no summary.json"),
         (lambda f: (f / "summary.json").write_text("{"), "cannot be read"),
-        (lambda f: (f / "summary.json").write_text("[1]"), "no summary of rovgraph"),
+        (lambda f: (f / "summary.json").write_text("[1]"), "is not a summary of rovgraph"),
         (lambda f: (f / "summary.json").write_text('{"program": "rovgraph"}'), "no results that have a page"),
         (lambda f: (f / "residuals.csv").write_text(""), "is empty"),
         (lambda f: (f / "residuals.csv").write_text("time,sensor\n1,dvl\n"), "column component is missing"),

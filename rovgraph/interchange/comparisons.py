@@ -154,7 +154,7 @@ class Accelerations:
     velocity: Signal
     way: Signal
     information = ARM_INFORMATION
-    floor_s = 0.08  # 12 simulated dives of two minutes: 0.06 s rms, 0.12 s at most
+    floor_s = 0.01
 
     @property
     def window(self) -> float:

@@ -154,12 +154,9 @@ def unpacked(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    InputError : no such file, empty, damaged compression, no space for the copy
+    InputError : no such file, damaged compression, no space for the copy
     """
-    head = _head(path)
-    if not head and not path.is_dir():
-        raise InputError(f"{path}: is empty, expected a recording")
-    if not head.startswith(b"\x1f\x8b"):
+    if not _head(path).startswith(b"\x1f\x8b"):
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -179,7 +176,7 @@ def head_of(path: Path) -> bytes:
 
     Raises
     ------
-    InputError : no such file, or it cannot be read
+    InputError : no such file, empty, or it cannot be read
     """
     head = _head(path)
     if not head.startswith(b"\x1f\x8b"):
@@ -196,8 +193,11 @@ def _head(path: Path) -> bytes:
         return b""
     try:
         with path.open("rb") as file:
-            return file.read(HEAD)
+            head = file.read(HEAD)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the name") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if not head:
+        raise InputError(f"{path}: is empty, expected a recording")
+    return head
