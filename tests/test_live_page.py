@@ -472,6 +472,36 @@ def test_a_page_that_speaks_is_closed(page):
                 link.recv(timeout=20)
 
 
+class SpeaksAsItIsTold:
+    """A page's socket that says something at the very moment when the first message has gone out."""
+
+    def __init__(self):
+        self.scope, self.closed = {}, None
+        self.gone = asyncio.Event()
+
+    async def accept(self, subprotocol):
+        asyncio.get_running_loop().call_later(0.01, self.gone.set)
+
+    async def send_text(self, text):
+        await self.gone.wait()
+
+    async def receive_text(self):
+        await self.gone.wait()
+
+    async def close(self, code):
+        self.closed = code
+
+
+def test_a_page_that_speaks_while_it_is_told_something_is_closed_too():
+    async def serve():
+        socket = SpeaksAsItIsTold()
+        async with asyncio.timeout(5.0):
+            await Broadcast(View(Marks(), Limits())).serve(socket)
+        return socket.closed
+
+    assert asyncio.run(serve()) == 1008
+
+
 def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(page, monkeypatch):
     monkeypatch.setattr(broadcasting, "STALL_S", 0.5)
     text = "x" * 20_000

@@ -145,7 +145,7 @@ def test_killed_twice_and_resumed_it_goes_on_where_it_was(tmp_path):
                     received = pd.read_csv(out / "received.csv")["time"]
                     assert received.iloc[-1] > server.sent - 1.0 * speed
                 else:
-                    until(server.done.is_set)
+                    until(lambda run=run: server.clients > run and server.done.is_set())
                     process.send_signal(signal.SIGINT)
                     assert process.wait(START_S) == 0
                 solutions += reader.all()

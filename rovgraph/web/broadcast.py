@@ -59,7 +59,8 @@ class Broadcast:
         self._loop = asyncio.get_running_loop()
         while True:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._arrived.wait(), IDLE_S)
+                async with asyncio.timeout(IDLE_S):
+                    await self._arrived.wait()
             self._woken = False
             self._arrived.clear()
             await self._take()
@@ -115,7 +116,8 @@ class Broadcast:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             with contextlib.suppress(Exception):  # it may be gone, or not read this either
-                await asyncio.wait_for(socket.close(1008), 0.2)
+                async with asyncio.timeout(0.2):
+                    await socket.close(1008)
 
     async def _feed(self, socket: WebSocket) -> None:
         view, cursor = self.view, None
@@ -139,7 +141,8 @@ class Broadcast:
             await self._news.wait_for(lambda: self._edition != edition)
 
     async def _send(self, socket: WebSocket, text: str) -> None:
-        await asyncio.wait_for(socket.send_text(text), STALL_S)
+        async with asyncio.timeout(STALL_S):  # wait_for of Python 3.11 may lose the cancellation by `_hold`
+            await socket.send_text(text)
 
 
 async def _silence(socket: WebSocket) -> None:
