@@ -126,6 +126,7 @@ def after_silences(seeds: range) -> tuple[int, Array, Array]:
     return kept_out, np.array(tilt), np.array(heading)
 
 
+@pytest.mark.slow
 def test_after_a_silence_no_sensor_is_kept_out_for_long_and_attitude_is_as_sure_as_it_says():
     kept_out, tilt, heading = after_silences(range(2, 6))
     assert kept_out < 20  # of some 9000; a sensor that is not let in again makes a hundred in one dive

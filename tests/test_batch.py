@@ -201,6 +201,7 @@ def with_outliers(log: Log, share: float, seed: int) -> Log:
     return altered(log, "dvl", data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("calibration", [{}, HELD], ids=["estimated", "held"])
 def test_a_fifth_of_gross_outliers_costs_at_most_half_of_the_accuracy(calibration):
     """Over ten dives: in a few, an error that is small by chance would be the measure."""
@@ -212,6 +213,7 @@ def test_a_fifth_of_gross_outliers_costs_at_most_half_of_the_accuracy(calibratio
     assert rms(np.array(spoilt)) < 1.5 * rms(np.array(clean))
 
 
+@pytest.mark.slow
 def test_without_loss_and_gate_outliers_ruin_the_track():
     """What the test above guards against does happen."""
     case = simulated(falcon(calibration=HELD), 80.0, seed=1)

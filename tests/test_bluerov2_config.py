@@ -43,6 +43,7 @@ def test_its_presets_are_there():
     assert config.calibration.dvl_scale.sd == pytest.approx(0.0101)
 
 
+@pytest.mark.slow
 def test_a_dive_recorded_by_the_autopilot_is_smoothed_with_it(tmp_path):
     path = tmp_path / "dive.BIN"
     frame = short_dive(5.0)

@@ -239,6 +239,7 @@ def test_a_dive_without_places_is_smoothed_where_gtsam_is_missing(recorded):
     assert {"trajectory_smoothed.csv", "trajectory_filtered.csv"} <= written
 
 
+@pytest.mark.slow
 def test_a_dive_with_places_says_in_one_line_that_gtsam_is_missing(recorded):
     done = smoothed_without_gtsam(recorded, "places.csv")
     assert done.returncode == 2

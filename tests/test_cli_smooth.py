@@ -221,6 +221,7 @@ def test_a_dvl_frozen_at_zero_for_a_minute_warns_and_is_left_out(monkeypatch, ca
     assert (error < 4.0 * sd).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_twenty_percent_gross_outliers_cost_less_than_half_as_much_again(monkeypatch, tmp_path, config, seed):
     clean = pd.read_csv(SHIPPED / "log.csv.gz", nrows=25_000)
@@ -341,6 +342,7 @@ def test_ctrl_c_in_the_middle_leaves_nothing_and_exits_130(tmp_path, config, sho
     assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.exists(), reason="the Ictineu log is not beside the checkout")
 def test_the_real_dive_meets_its_targets(tmp_path, monkeypatch):
     from rovgraph.evaluate import evaluate, read_reference

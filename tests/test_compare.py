@@ -86,6 +86,7 @@ def test_rows_are_in_the_order_of_runs_and_of_the_registry(compared):
     assert pd.read_csv(compared / "table.csv")["estimator"].tolist() == names
 
 
+@pytest.mark.slow
 def test_the_same_seeds_give_the_same_table_whatever_the_jobs(compared, tmp_path):
     assert run(*DIVES, "--seeds", 2, "--estimators", FEW, "--jobs", 2, "--out", tmp_path / "out") == 0
     for name in ("runs", "table", "misalignment", "velocity"):

@@ -142,6 +142,7 @@ def run_all(
     return len(texts)
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_how_to_pages_do_their_work(folder, monkeypatch, capsys):
     assert run_all(lambda text: text.split()[1] not in PROCESSES, folder, monkeypatch, capsys) >= 10
 
@@ -216,6 +217,7 @@ def test_an_example_says_what_it_promises_and_draws_its_figure(path, remembered,
         assert len(json.loads(Path("track.geojson").read_text())["features"]) > 2000
 
 
+@pytest.mark.slow
 def test_the_tutorial_goes_from_a_wrong_track_to_one_that_is_right(drawing, capsys):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rg.DataWarning)

@@ -48,6 +48,7 @@ def test_ratios_are_of_what_it_was_to_what_it_is_and_judged_by_the_target(engine
     assert engine.Line("x", "s", 40.0, 1.0, engine.times_less(40)).row(False).endswith("|  |")
 
 
+@pytest.mark.slow
 def test_processor_time_and_memory_are_those_of_the_command_and_an_error_is_its_last_line(engine):
     checkout = engine.Checkout(engine.ROOT, "now.py")
     spins = "import time\nwhile time.process_time() < 0.3: pass\nx = b'x' * 10**8\nprint('done')"
@@ -81,6 +82,7 @@ def test_a_commit_is_checked_out_for_as_long_as_it_is_measured(engine, tmp_path,
         pass
 
 
+@pytest.mark.slow
 def test_overheads_are_measured_beside_their_references():
     found = rows("overheads.py", "--rows", "recorder", "checkpoint")
     assert [row[0] for row in found] == ["1000 rows recorded", "a checkpoint of 50 arrays"]

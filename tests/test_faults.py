@@ -346,6 +346,7 @@ def test_perfect_instruments_give_the_true_track():
     assert result.rms["filtered"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_campaign_of_two_cases_prints_their_rows():
     """A clock of another epoch is refused with its cause; the dive without the fault is estimated."""
     fault, healthy = CASES["dvl of another epoch"], CASES["survey"]

@@ -70,6 +70,7 @@ def test_in_order_it_is_the_filter_of_a_recorded_dive(beginning, measurements, r
     same(live(beginning, measurements)[1], reference.filtered, 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", [HOLD, 0.0])
 def test_the_order_of_arrival_within_300_ms_changes_nothing(beginning, measurements, reference, hold):
     first, rest = measurements[:50], measurements[50:]

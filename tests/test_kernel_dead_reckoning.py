@@ -175,6 +175,7 @@ def test_without_pings_it_stays_level_by_the_speed_that_it_had():
     assert np.rad2deg(np.abs(rpy_from_matrix(R)[:, 0])).max() < 5.0  # the gyro by itself is 34 degrees off
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="it is what this test starts")
 def test_these_tests_pass_in_plain_python():
     subprocess.run(

@@ -382,6 +382,7 @@ def test_a_coasting_vehicle_goes_on_and_rights_itself():
     np.testing.assert_allclose(np.diag(S)[9:], np.repeat(case.densities[2:4] ** 2 * t, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="this is that run")
 def test_kernels_are_plain_python_without_the_compiler():
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

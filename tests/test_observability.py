@@ -274,6 +274,7 @@ def recorded(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_observe_and_plan_hand_over(recorded, tmp_path, monkeypatch, capsys):
     config = ("--config", recorded / "config.yaml")
     assert command(monkeypatch, "observe", recorded / "log.csv", *config, "--out", tmp_path / "seen") == 0

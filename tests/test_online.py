@@ -240,6 +240,7 @@ def test_bad_input_is_counted_and_said_once_and_the_estimate_goes_on(lines, case
     assert summary(out)["time"] > 38.0
 
 
+@pytest.mark.slow
 def test_a_reader_that_goes_away_does_not_end_the_estimate(dive, tmp_path):
     out = tmp_path / "out"
     options = ["-c", dive / "config.yaml", "--speed", "max", "--no-refine", "--out", out]
@@ -324,6 +325,7 @@ class Full:
         self._csv(trajectory, path, more)
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_for_a_while_costs_nothing(case, tmp_path, monkeypatch):
     monkeypatch.setattr("rovgraph.live.files.KEEP_S", 0.0)
     said: list[str] = []

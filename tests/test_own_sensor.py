@@ -159,6 +159,7 @@ def test_it_is_received_and_recorded_online(depth2, tmp_path):
     assert read_log(tmp_path / "recording.csv")["depth2"].data.tolist() == [[3.5]]
 
 
+@pytest.mark.slow
 def test_a_command_reports_its_calibration(case, folder):
     """By the page's script, in a process of its own."""
     write_dive(folder, case.dive, started(case), {})

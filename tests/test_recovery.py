@@ -53,6 +53,7 @@ def test_a_dvl_that_is_back_after_a_long_silence_is_taken_at_once_and_moves_noth
     assert jump[10:].max() < 9.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["one point", "swapped"])
 def test_fixes_that_are_wrong_for_minutes_do_not_draw_the_filter(wrong):
     case = simulated(falcon(), 200.0, seed=4, dvl_rate=4.0, fix_interval=2.0)

@@ -129,6 +129,7 @@ def test_vattern_is_reached_against_any_current_that_is_drawn(current):
     assert np.linalg.norm(ends[1, :2] - END_N) < 1.0
 
 
+@pytest.mark.slow
 def test_run_of_vattern_comes_with_the_seed():
     durations = [simulated("vattern", seed)[0].path.duration for seed in (3, 4, 5)]
     assert sorted(durations) == [250.0, 250.0, 500.0]

@@ -248,6 +248,7 @@ def test_a_process_that_dies_costs_nothing_but_its_own_task(tmp_path):
     assert came == {k: k * k for k in range(12) if k not in (7, 9)}
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_the_middle_leaves_a_complete_result(short, tmp_path):
     plan = read_study(short).model_copy(update={"runs": 1})
     killed = []
@@ -266,6 +267,7 @@ def test_a_worker_killed_in_the_middle_leaves_a_complete_result(short, tmp_path)
     assert tables.runs["error_deg"].tolist() == expected
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path):
     distributed = pytest.importorskip("distributed")
     came = {}

@@ -671,6 +671,7 @@ def dives_of_many_kinds() -> list[tuple[Log, Config]]:
     return [(short, config), (altered(short, "dvl", dvl), config), (silent, config), (half, config), (slow, other)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", ["4.1", "4.1-no-accelerometer", "4.3a 4.3b 4.3c", "4.4a 4.4b 4.4c", "4.5"])
 def test_filters_side_by_side_do_what_each_does_alone(names):
     asked = [FilterJob(FILTERS[name], *dive) for dive in dives_of_many_kinds() for name in names.split()]

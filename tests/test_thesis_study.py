@@ -51,7 +51,10 @@ def quick(monkeypatch):
 SECONDS = {"model": 18, "online": 18, "frames": 32, "misalignment": 18, "invariant": 1, "field": 18}
 
 
-@pytest.mark.parametrize("name", SECONDS)
+LONG = ("model", "frames")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in SECONDS])
 def test_each_study_prints_its_table(name, quick, capsys):
     text = study().main([name, "--seeds", "1", "--first", "2", "--seconds", str(SECONDS[name]), "--jobs", "1"])
     assert capsys.readouterr().out.strip() == text
