@@ -1,5 +1,6 @@
 """What holds for all tests."""
 
+import importlib
 import signal
 
 import pytest
@@ -11,6 +12,13 @@ settings.load_profile("any machine")
 
 # whoever starts the tests in the background has them ignore SIGINT, and so would every command that they interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Kernels are compiled once, before there are workers that would each do it."""
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        importlib.import_module("rovgraph.kernels.filtering")
+
 
 LONGEST = ("test_consistency", "test_online", "test_thesis_study", "test_compare", "test_batch", "test_fixed_lag")
 

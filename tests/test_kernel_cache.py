@@ -96,3 +96,24 @@ def test_without_numba_one_line_says_what_to_install(command, tmp_path):
     assert "pip install 'numba" in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_missing_modules_are_compiled_by_processes_of_their_own_and_nothing_else(tmp_path):
+    few = ["rovgraph.kernels.chain", "rovgraph.kernels.linear_chain"]
+    code = (
+        "from rovgraph.kernels import compile as c; c.__dict__['_modules'] = lambda: " + repr(few) + "; "
+        "c.os.sched_getaffinity = lambda pid: {0, 1}; c.cache_folder('rovgraph.kernels.chain')"
+    )
+    done = run(code, ROVGRAPH_CACHE_DIR=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    kept = sorted(folder.name.split("-")[1] for folder in tmp_path.iterdir())
+    assert kept == ["chain", "linear_chain"]
+    assert all(any(folder.rglob("*.nbc")) for folder in tmp_path.iterdir())
+
+
+def test_modules_with_kernels_are_those_that_decorate_one():
+    from rovgraph.kernels.compile import LONGEST_FIRST, _modules
+
+    names = [name.rpartition(".")[2] for name in _modules()]
+    assert names[: len(LONGEST_FIRST)] == list(LONGEST_FIRST)
+    assert {"chain", "weighting"} < set(names) and not {"compile", "rotations"} & set(names)
