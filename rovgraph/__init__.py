@@ -48,6 +48,10 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from rovgraph.api.calibration import MagnetometerResult as MagnetometerResult
+    from rovgraph.api.calibration import NoiseResult as NoiseResult
+    from rovgraph.api.calibration import calibrate_magnetometer as calibrate_magnetometer
+    from rovgraph.api.calibration import calibrate_noise as calibrate_noise
     from rovgraph.api.comparison import ComparisonResult as ComparisonResult
     from rovgraph.api.comparison import compare as compare
     from rovgraph.api.conversion import Conversion as Conversion
@@ -70,6 +74,7 @@ if TYPE_CHECKING:
     from rovgraph.api.simulation import simulate as simulate
     from rovgraph.api.smoothing import Result as Result
     from rovgraph.api.smoothing import smooth as smooth
+    from rovgraph.api.studies import study_misalignment as study_misalignment
     from rovgraph.config import Config as Config
     from rovgraph.config import load_config as load_config
     from rovgraph.config import parse_config as parse_config
@@ -93,13 +98,17 @@ _HOMES = {
     "Demo": "api.demo",
     "InputError": "errors",
     "Log": "log",
+    "MagnetometerResult": "api.calibration",
     "Metrics": "evaluate",
+    "NoiseResult": "api.calibration",
     "ObservabilityResult": "api.observability",
     "Online": "api.online",
     "PlanResult": "api.observability",
     "Result": "api.smoothing",
     "SimulatedDive": "api.simulation",
     "Trajectory": "trajectory",
+    "calibrate_magnetometer": "api.calibration",
+    "calibrate_noise": "api.calibration",
     "check": "api.logs",
     "compare": "api.comparison",
     "convert": "api.conversion",
@@ -118,6 +127,7 @@ _HOMES = {
     "report_check": "api.reporting",
     "simulate": "api.simulation",
     "smooth": "api.smoothing",
+    "study_misalignment": "api.studies",
     "tag": "api.exporting",
 }
 __all__ = list(_HOMES)

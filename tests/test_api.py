@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from folders import same_files, same_tables
 
 import rovgraph as rg
 from rovgraph.api.demo import CHOICES, SCENARIO, SEED
@@ -32,23 +33,6 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
         except SystemExit as end:
             return int(end.code or 0)
     return 0
-
-
-def without_times(summary: Path) -> dict[str, object]:
-    content = json.loads(summary.read_text(encoding="utf-8"))
-    del content["seconds"]
-    return content
-
-
-def same_files(one: Path, other: Path) -> None:
-    """Two folders hold the same bytes, but for the times that the work took."""
-    names = sorted(path.name for path in one.iterdir())
-    assert names == sorted(path.name for path in other.iterdir()) and names
-    for name in names:
-        if name == "summary.json" and "seconds" in json.loads((one / name).read_text(encoding="utf-8")):
-            assert without_times(one / name) == without_times(other / name)
-        else:
-            assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
 @pytest.fixture(scope="module")
@@ -290,7 +274,88 @@ def test_a_run_that_cannot_be_is_refused_and_leaves_no_output_open(tmp_path):
         rg.Online().run("tcp://127.0.0.1:5", resume=True)
 
 
+@pytest.mark.slow
+def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path):
+    options = ["--scenario", "circle", "--duration", 40, "--seeds", 1, "--estimators", "dead-reckoning", "--jobs", 1]
+    assert command(monkeypatch, "compare", *options, "-o", tmp_path / "command") == 0
+    twin = rg.compare(scenario="circle", seeds=[1], duration=40.0, estimators=["dead-reckoning"], jobs=1)
+    twin.save(tmp_path / "twin")
+    same_tables(tmp_path / "command", tmp_path / "twin", "cpu_per_s")
+    names = {path.name for path in (tmp_path / "command").iterdir()}
+    assert names == {path.name for path in (tmp_path / "twin").iterdir()}
+
+
+def test_report_and_check_write_the_pages_that_the_commands_write(monkeypatch, tmp_path, faulty, config, result):
+    result.save(tmp_path / "dive", figures=False)
+    assert command(monkeypatch, "report", tmp_path / "dive", "-o", tmp_path / "command.html") == 0
+    rg.report(tmp_path / "dive", out=tmp_path / "twin.html")
+    assert (tmp_path / "command.html").read_bytes() == (tmp_path / "twin.html").read_bytes()
+    page = ["--page", tmp_path / "check-command.html"]
+    assert command(monkeypatch, "check", faulty, "-c", SHIPPED / "config.yaml", *page) == 0
+    with pytest.warns(rg.DataWarning):
+        rg.report_check(rg.check(rg.read_log(faulty, config), config), tmp_path / "check-twin.html")
+    assert (tmp_path / "check-command.html").read_bytes() == (tmp_path / "check-twin.html").read_bytes()
+
+
+def test_convert_writes_what_the_command_writes(monkeypatch, tmp_path, short):
+    for name, columns in (("imu.csv", IMU), ("dvl.csv", ("dvl_vx", "dvl_vy", "dvl_vz"))):
+        short[["time", *columns]].dropna().head(2000).to_csv(tmp_path / name, index=False)
+    files = [tmp_path / "imu.csv", tmp_path / "dvl.csv"]
+    for folder in ("command", "twin"):
+        (tmp_path / folder).mkdir()
+    out = tmp_path / "command"
+    options = ["-o", out / "log.csv", "--config-out", out / "vehicle.yaml", "--shift", "dvl=0"]
+    assert command(monkeypatch, "convert", *files, *options) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rg.DataWarning)
+        rg.convert(files, shift={"dvl": 0.0}).save(tmp_path / "twin" / "log.csv", tmp_path / "twin" / "vehicle.yaml")
+    same_files(out, tmp_path / "twin")
+
+
+def test_config_prints_the_effective_configuration(monkeypatch, capsys, config):
+    assert command(monkeypatch, "config", SHIPPED / "config.yaml") == 0
+    assert capsys.readouterr().out == config.to_yaml()
+
+
+# configurations
+
+
+def test_a_changed_configuration_keeps_what_is_not_named(config):
+    changed = config.changed(dvl={"mount_rpy_deg": [180, 0, 10]}, units={"depth": "cm"}, name="other")
+    assert changed.dvl.mount_rpy_deg == (180.0, 0.0, 10.0) and changed.name == "other"
+    assert changed.dvl.lever_arm_m == config.dvl.lever_arm_m and changed.imu == config.imu
+    assert changed.units == {**config.units, "depth": "cm"}
+    assert config.changed() == config and config.changed(dvl=None).dvl == rg.Config().dvl
+    twice = rg.Config().changed(delay_s={"dvl": 0.1}).changed(delay_s={"fix": 2.0})
+    assert twice.delay_s == {"dvl": 0.1, "fix": 2.0}
+
+
+def test_a_changed_preset_fills_in_its_own_numbers_and_leaves_those_that_were_stated():
+    first = rg.parse_config("imu: {preset: xsens-mti-300, noise: {acc: 0.5}}")
+    other = first.changed(imu={"preset": "vectornav-vn-100"})
+    assert other.imu.noise.gyr == rg.parse_config("imu: {preset: vectornav-vn-100}").imu.noise.gyr
+    assert other.imu.noise.acc == 0.5
+    assert first.changed(imu={"preset": None}).imu.noise.gyr == rg.Config().imu.noise.gyr
+
+
+def test_a_change_that_cannot_be_is_one_line_with_the_nearest_key(config):
+    with pytest.raises(rg.InputError, match=r"lever_arm_m"):
+        config.changed(dvl={"lever_arm": [0, 0, 0]})
+    with pytest.raises(rg.InputError, match=r"dvl"):
+        config.changed(dvl=3.0)
+    with pytest.raises(rg.InputError, match="nearest is vectornav-vn-100"):
+        config.changed(imu={"preset": "vectornav-vn-10"})
+
+
 # results
+
+
+def test_the_page_alone_is_the_page_of_the_folder(tmp_path, result):
+    page = result.report(tmp_path / "dive.html")
+    result.save(tmp_path / "dive", figures=False)
+    assert page.stat().st_size == pytest.approx((tmp_path / "dive" / "report.html").stat().st_size, rel=0.02)
+    with pytest.raises(rg.InputError, match=r"dive\.html exists"):
+        result.report(tmp_path / "dive.html")
 
 
 def test_a_result_has_track_calibration_and_covariance(result):

@@ -9,7 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+from folders import same_files
 
+import rovgraph as rg
 from rovgraph.calibrate import calibrate_magnetometer
 from rovgraph.calibrate.turns import calibrate_turns
 from rovgraph.cli import app
@@ -277,6 +279,18 @@ def test_the_command_writes_what_smooth_takes(run, turned, tmp_path):
     assert (whole.name, whole.imu.lever_arm_m) == ("mine", (0.1, 0.2, 0.3))
     assert whole.imu.mag == load_config(out / "magnetometer.yaml").imu.mag
     assert whole.imu.mag.centre == pytest.approx(summary["centre"], rel=1e-4)
+
+
+def test_the_library_writes_what_the_command_writes_and_wants_samples_as_measured(run, turned, tmp_path):
+    path, settings = write(turned, tmp_path / "log.csv"), tmp_path / "vehicle.yaml"
+    settings.write_text("imu: {mag: {centre: [1, 2, 3]}}\n")
+    assert run(path, "--config", settings, "--out", tmp_path / "command")[0] == 0
+    config = load_config(settings)
+    found = rg.calibrate_magnetometer(rg.read_log(path, config.with_raw_magnetometer()), config)
+    found.save(tmp_path / "twin")
+    same_files(tmp_path / "command", tmp_path / "twin")
+    with pytest.raises(rg.InputError, match="calibrated as it was read; read it with"):
+        rg.calibrate_magnetometer(rg.read_log(path, config), config)
 
 
 def test_results_are_not_overwritten_silently(run, turned, tmp_path):

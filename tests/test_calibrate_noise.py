@@ -6,7 +6,9 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
+from folders import same_files
 
+import rovgraph as rg
 from rovgraph.calibrate import calibrate_noise
 from rovgraph.calibrate.allan import allan
 from rovgraph.calibrate.spectrum import spectrum
@@ -295,6 +297,13 @@ def test_the_command_writes_what_smooth_takes(run, tmp_path):
     assert piece.imu.noise.gyr == whole.imu.noise.gyr == pytest.approx(GYR, rel=0.1)
     assert (whole.name, whole.imu.noise.gyr_walk) == ("mine", 2e-5)  # the log is too short to know better
     assert piece.imu.noise.gyr_walk == Config().imu.noise.gyr_walk
+
+
+def test_the_library_writes_what_the_command_writes(run, tmp_path):
+    path = write(at_rest(90.0), tmp_path / "log.csv")
+    assert run(path, "--out", tmp_path / "command")[0] == 0
+    rg.calibrate_noise(rg.read_log(path)).save(tmp_path / "twin")
+    same_files(tmp_path / "command", tmp_path / "twin")
 
 
 def test_a_log_that_moves_is_one_line_and_code_2(run, tmp_path):

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from folders import same_files
 from scipy.stats import chi2
 from tasks import errand
 
+import rovgraph as rg
 from rovgraph.cli.app import main
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.studies.engines import Cluster, Local
@@ -311,6 +313,16 @@ def test_the_command_writes_everything_and_shows_coverage_of_each_cell(
     code, _, errors = run("--config", short, "--out", out)
     assert (code, errors) == (2, f"error: {out} exists; give --resume to go on with it, or choose another --out\n")
     assert run("--config", short, "--out", out, "--resume")[0] == 0
+
+
+def test_the_library_writes_what_the_command_writes(run, short, tmp_path, monkeypatch, without_dives):
+    monkeypatch.setattr("rovgraph.studies.engines.Local", lambda jobs: Here())
+    assert run("--config", short, "--out", tmp_path / "command")[0] == 0
+    tables = rg.study_misalignment(short, tmp_path / "twin")
+    same_files(tmp_path / "command", tmp_path / "twin")
+    assert len(tables.runs) == len(pd.read_csv(tmp_path / "twin" / "runs.csv"))
+    with pytest.raises(rg.InputError, match="cannot be combined"):
+        rg.study_misalignment(short, tmp_path / "other", jobs=1, scheduler="tcp://127.0.0.1:9")
 
 
 def test_an_interrupt_says_how_to_go_on(run, short, tmp_path, monkeypatch, without_dives):

@@ -35,7 +35,7 @@ def report(*results: Path | str, out: Path | str | None = None, force: bool = Fa
     if out is None:
         path = folders[0] / PAGE if len(folders) == 1 else Path(CAMPAIGN)
     else:
-        path = _free(Path(out), force, "--out")
+        path = free_page(Path(out), force, "--out")
     html = page_of(folders[0]) if len(folders) == 1 else campaign_page(folders)
     write(path, html)
     return path
@@ -54,12 +54,12 @@ def report_check(found: Report, out: Path | str, force: bool = False) -> Path:
     ------
     InputError : the page exists, or cannot be written
     """
-    path = _free(Path(out), force, "--page")
+    path = free_page(Path(out), force, "--page")
     write(path, check_page(found.as_dict(), found.source))
     return path
 
 
-def _free(path: Path, force: bool, option: str) -> Path:
+def free_page(path: Path, force: bool, option: str) -> Path:
     """A path that may be written.
 
     Raises

@@ -160,6 +160,32 @@ class Result:
                 write_page(folder)
             return summary
 
+    def report(self, out: Path | str = "report.html", force: bool = False) -> Path:
+        """Write the dive's page alone, where you keep no results folder: the page that `save` puts there.
+
+        Parameters
+        ----------
+        out : the page
+        force : replace an older file
+
+        Returns
+        -------
+        Path : the page
+
+        Raises
+        ------
+        InputError : the page exists, or cannot be written
+        """
+        from tempfile import TemporaryDirectory
+
+        from rovgraph.api.reporting import free_page, report
+
+        page = free_page(Path(out), force, "out")
+        with TemporaryDirectory() as temporary:
+            folder = Path(temporary) / page.stem
+            self.save(folder, figures=False, page=False)
+            return report(folder, out=page, force=True)
+
     def _estimate(self, kind: str) -> Estimate:
         found = next((estimate for estimate in self.dive.estimates if estimate.kind == kind), None)
         if found is None:

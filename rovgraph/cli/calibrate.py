@@ -42,21 +42,16 @@ def magnetometer(
     """
     from rich.console import Console
 
-    from rovgraph.calibrate import calibrate_magnetometer
-    from rovgraph.config import load_config
-    from rovgraph.log import read_log
-    from rovgraph.pages.reporting import write_page
-    from rovgraph.report.calibrations import write_magnetometer
-    from rovgraph.report.folder import check_writable, results_folder
+    import rovgraph as rg
+    from rovgraph.report.folder import check_writable
 
     check_writable(out, force, [log, config])
-    settings = load_config(config)
-    found = calibrate_magnetometer(read_log(log, settings.with_raw_magnetometer()), settings, method.value)
-    with results_folder(out, force) as folder:
-        write_magnetometer(folder, found, settings)
-        write_page(folder)
+    settings = rg.load_config(config)
+    recorded = rg.read_log(log, settings.with_raw_magnetometer())
+    result = rg.calibrate_magnetometer(recorded, settings, method.value)
+    result.save(out, force)
     console = Console()
-    console.print(_magnetometer_table(found))
+    console.print(_magnetometer_table(result.found))
     console.print(f"for the configuration: {out / 'magnetometer.yaml'}", highlight=False, markup=False)
 
 
@@ -68,24 +63,17 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
     """
     from rich.console import Console
 
-    from rovgraph.calibrate import calibrate_noise
-    from rovgraph.config import load_config
-    from rovgraph.log import read_log
-    from rovgraph.pages.reporting import write_page
-    from rovgraph.report.calibrations import write_noise
-    from rovgraph.report.folder import check_writable, results_folder
+    import rovgraph as rg
+    from rovgraph.report.folder import check_writable
 
     check_writable(out, force, [log, config])
-    settings = load_config(config)
-    recorded = read_log(log, settings)
-    found = calibrate_noise(recorded, settings)
-    with results_folder(out, force) as folder:
-        write_noise(folder, found, settings)
-        write_page(folder)
+    settings = rg.load_config(config)
+    result = rg.calibrate_noise(rg.read_log(log, settings), settings)
+    result.save(out, force)
     console = Console()
-    for table in _noise_tables(found):
+    for table in _noise_tables(result.found):
         console.print(table)
-    for line in found.remarks:
+    for line in result.found.remarks:
         console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
     console.print(f"for the configuration: {out / 'noise.yaml'}", highlight=False, markup=False)
 

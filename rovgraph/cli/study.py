@@ -29,47 +29,30 @@ def misalignment(
 
     Example: rovgraph study misalignment --config configs/studies/quick.yaml --out quick
     """
-    import time
-
     from rich.console import Console
 
+    import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
     from rovgraph.errors import InputError
-    from rovgraph.pages.reporting import write_page
-    from rovgraph.report.figure_study import draw_study
     from rovgraph.report.narrow import fitting
-    from rovgraph.report.study import plan_table, study_table, write_study
-    from rovgraph.studies.engines import Cluster, Local
-    from rovgraph.studies.misalignment import chosen, open_results, read_study
-    from rovgraph.studies.misalignment import study as library
-    from rovgraph.studies.misalignment.ledger import kept_so_far
+    from rovgraph.report.study import plan_table, study_table
+    from rovgraph.studies.misalignment import read_study
 
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDE)
-    plan = read_study(config)
-    cells = chosen(plan, only)
     if show:
-        for part in fitting(plan_table(plan), console):
+        for part in fitting(plan_table(read_study(config)), console):
             console.print(part)
         return
     if out is None:
         raise InputError("--out is needed: a folder for the results")
-    if scheduler is not None and jobs is not None:
-        raise InputError("--jobs cannot be combined with --scheduler; the cluster decides the number of workers")
-    engine = Local(jobs) if scheduler is None else Cluster(scheduler)
-    results = open_results(out, plan, resume)
-    began = time.perf_counter()
     try:
         with progress_bar() as progress:
-            tables = library(plan, results, cells, engine, lambda done: progress("making dives", done))
+            tables = rg.study_misalignment(config, out, resume, only, jobs, scheduler, progress)
     except KeyboardInterrupt:
         console.print(f"interrupted; {out} keeps every run that was made, --resume goes on", highlight=False)
         raise typer.Exit(130) from None
-    with kept_so_far(out):  # its rows are on disk already
-        write_study(out, tables, {"scheduler": scheduler, "seconds": time.perf_counter() - began})
-        draw_study(out, tables)
-        write_page(out)
     for part in fitting(study_table(tables), console):
         console.print(part)
     for row in tables.runs.dropna(subset="failure").drop_duplicates("cell").itertuples():

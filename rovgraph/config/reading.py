@@ -1,7 +1,7 @@
 """`Config`, and how it is read, written and described."""
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
@@ -14,7 +14,7 @@ from ruamel.yaml.error import YAMLError
 from rovgraph.calibration import CONSIDERED, MOUNT, TABLE, Belief, Variable
 from rovgraph.config.error_messages import complaint
 from rovgraph.config.grades import warn_of_mixed_grades
-from rovgraph.config.presets import with_presets
+from rovgraph.config.presets import with_presets, without_presets
 from rovgraph.config.priors import Calibration, calibration_entry
 from rovgraph.config.registered import add_key, remove_key
 from rovgraph.config.sections import (
@@ -95,6 +95,28 @@ class Config(Section):
     def to_yaml(self) -> str:
         """The effective configuration, every key written out."""
         return yaml_text(self.model_dump(mode="json"))
+
+    def changed(self, **keys: Any) -> "Config":
+        """The same configuration with other values of some keys; the keys that are not named stay.
+
+        >>> config = Config().changed(dvl={"mount_rpy_deg": [180, 0, -45]}, units={"gyr": "deg/s"})
+        >>> config.dvl.mount_rpy_deg
+        (180.0, 0.0, -45.0)
+
+        Parameters
+        ----------
+        keys : keys and values as in YAML, sections as dicts; a section given as None gets its defaults
+
+        Raises
+        ------
+        InputError : an unknown key (with the nearest known one), a value of the wrong kind
+
+        Warns
+        -----
+        DataWarning : noise of one grade beside a bias prior of another
+        """
+        stated = without_presets(self.model_dump(exclude_unset=True), keys)
+        return _parse_config(merged(stated, keys), "changed")
 
     def with_raw_magnetometer(self) -> "Config":
         """The same without a calibration of the magnetometer: its samples are what they are."""
@@ -196,6 +218,20 @@ def parse_config(text: str, source: str = "configuration") -> Config:
     if not isinstance(text, str):
         raise InputError(f"{source}: expected YAML text, found a {type(text).__name__}")
     return _parse_config(_parse_yaml(text, source), source)
+
+
+def merged(stated: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested keys and values with others in their place; dicts are merged, whatever else is replaced.
+
+    >>> merged({"dvl": {"preset": "a", "ping_due_s": 1}}, {"dvl": {"preset": "b"}, "name": "dive"})
+    {'dvl': {'preset': 'b', 'ping_due_s': 1}, 'name': 'dive'}
+    """
+    out = dict(stated)
+    for key, value in keys.items():
+        before = out.get(key)
+        nested = isinstance(value, Mapping)
+        out[key] = merged(before if isinstance(before, Mapping) else {}, value) if nested else value
+    return out
 
 
 def _parse_config(data: dict[str, Any], source: str) -> Config:

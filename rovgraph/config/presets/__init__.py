@@ -129,6 +129,34 @@ def with_presets(data: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
+def without_presets(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys and values without what a preset filled in, where the changes name another preset or take it away.
+
+    A key that holds the preset's own number counts as filled in.
+    """
+    for kind in KINDS:
+        change = changes.get(kind, {})
+        name = (data.get(kind) or {}).get("preset")
+        if (
+            isinstance(name, str)
+            and name in presets()
+            and (change is None or (isinstance(change, Mapping) and "preset" in change))
+        ):
+            for fact in presets()[name].facts:
+                data = _without(data, fact.key.split("."), fact.value)
+    return data
+
+
+def _without(data: dict[str, Any], path: list[str], value: Any) -> dict[str, Any]:
+    """A copy without the key at a path, if it has that value."""
+    head, *rest = path
+    if head not in data:
+        return data
+    if rest:
+        return {**data, head: _without(data[head], rest, value)}
+    return {key: own for key, own in data.items() if key != head or own != value}
+
+
 def _named(section: Mapping[str, Any]) -> bool:
     return isinstance(section.get("preset"), str)
 
