@@ -18,6 +18,7 @@ from folders import same_files, same_tables
 import rovgraph as rg
 from rovgraph.api.demo import CHOICES, SCENARIO, SEED
 from rovgraph.cli.app import main
+from rovgraph.studies.plan import Sensors
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
 IMU = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
@@ -283,6 +284,16 @@ def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path):
     same_tables(tmp_path / "command", tmp_path / "twin", "cpu_per_s")
     names = {path.name for path in (tmp_path / "command").iterdir()}
     assert names == {path.name for path in (tmp_path / "twin").iterdir()}
+
+
+def test_plan_writes_what_the_command_writes(monkeypatch, tmp_path):
+    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything anew
+    options = ["--manoeuvres", "straight,turn", "--duration", 60, "--imu-rate", 20, "--dvl-rate", 2]
+    assert command(monkeypatch, "plan", *options, "--estimate", "dvl_yaw", "-o", tmp_path / "command") == 0
+    sensors = Sensors(20.0, 2.0, None)
+    twin = rg.plan(rg.Config(), duration=60.0, manoeuvres=["straight"], estimate=["dvl_yaw"], sensors=sensors)
+    twin.save(tmp_path / "twin")
+    same_files(tmp_path / "command", tmp_path / "twin")
 
 
 def test_report_and_check_write_the_pages_that_the_commands_write(monkeypatch, tmp_path, faulty, config, result):

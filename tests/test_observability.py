@@ -198,6 +198,17 @@ def test_sd_never_grows_with_more_data(straight):
     assert (np.diff(seen.relative, axis=0) < 1e-9).all()
 
 
+def test_components_by_themselves_are_as_sure_as_among_the_others(straight):
+    whole = examined(straight[1], ONE_COMPASS, noisy=False)
+    labels = whole.labels[::-2]
+    some, k = whole.of(labels), [whole.labels.index(label) for label in labels]
+    assert some.labels == labels
+    np.testing.assert_allclose(some.sd, whole.sd[k], rtol=1e-9)
+    np.testing.assert_allclose(some.covariance, whole.covariance[np.ix_(k, k)], rtol=1e-7)
+    assert some.correlation.shape == (len(k), len(k) + 9)
+    np.testing.assert_array_equal(np.diag(some.correlation), np.diag(whole.correlation)[k])
+
+
 def test_a_plan_predicts_what_noisy_dives_show():
     config = changed(UNBIASED, calibration={"ahrs_deviation": {"estimate": False}})
     one = Manoeuvre("accelerate-and-stop", 0.4)

@@ -91,6 +91,21 @@ class Observability:
         """Of each component: observable, weak or unobservable."""
         return [verdict(ratio) for ratio in self.ratio.tolist()]
 
+    def of(self, labels: Sequence[str]) -> "Observability":
+        """Some of the components, in that order; the others stay as unknown as they are."""
+        kept, count = [self.labels.index(label) for label in labels], len(self.labels)
+        here = np.ix_(kept, kept)
+        return Observability(
+            tuple(labels),
+            tuple(self.variables[i] for i in kept),
+            self.prior_sd[kept],
+            self.claimed_sd[kept],
+            data_information(relative_covariance(self.information)[here], np.ones(len(kept))),
+            self.correlation[np.ix_(kept, [*kept, *range(count, self.correlation.shape[1])])],
+            self.time,
+            self.relative[:, kept],
+        )
+
     def correlated(self, beyond: float = 0.5) -> list[tuple[str, str, float]]:
         """Pairs with their correlation, the strongest first."""
         names, c = (*self.labels, *OTHER_LABELS), len(self.labels)

@@ -164,8 +164,10 @@ def plan(
     goals, known = dict(goals or {}), known or Known.nothing()
     _check(goals, [label for b in beliefs(config).values() if b.estimate for label in b.variable.labels])
     work = partial(predicted, config=config, duration=duration, sensors=sensors or Sensors())
-    seen = in_workers(work, candidates, min(cores(), len(candidates)), progress)
-    labels = seen[0].labels
+    each = in_workers(work, candidates, min(cores(), len(candidates)), progress)
+    # what is considered is estimated where a manoeuvre shows it, which others may not do
+    labels = tuple(label for label in each[0].labels if all(label in one.labels for one in each))
+    seen = [one.of(labels) for one in each]
     _check(goals, labels)
     already = known.information(labels, seen[0].prior_sd)
     predictions = [_with(already, one, candidate) for one, candidate in zip(seen, candidates, strict=True)]
