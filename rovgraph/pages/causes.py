@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-HEADING = ("mag", "ahrs", "dvl_heading", "vehicle_heading", "hard_iron", "soft_iron", "field_", "dvl_compass")
-HEADING += ("ahrs_", "mag_", "vehicle_compass", "start attitude")
+HEADING = (
+    *("mag", "ahrs", "dvl_heading", "vehicle_heading", "hard_iron", "soft_iron", "field_"),
+    *("dvl_compass", "vehicle_compass", "start attitude"),
+)
 
 
 @dataclass(frozen=True)
