@@ -64,7 +64,7 @@ def _covariance_with(root: SquareRoot, keyframe: int, u: Array, held: int) -> tu
     """
     (n, d), c = root.conditionals.shape[:2], len(root.border)
     free, later = c - held, root.conditionals[keyframe:]
-    inverse = transpose(np.linalg.inv(later[:, :, :d]))
+    inverse = transpose(np.asarray(np.linalg.inv(later[:, :, :d]), dtype=float))
     onward = -inverse[1:] @ transpose(later[:-1, :, d : 2 * d])
     z = np.zeros((n, d, u.shape[1]))
     z[keyframe] = inverse[0] @ u

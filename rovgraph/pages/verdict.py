@@ -81,8 +81,8 @@ def _cause(source: DiveSource) -> tuple[str, str]:
             "keep the DVL within its range of the bottom, or take a position fix after each silence",
         )
     if found:
-        cause, share = found
-        return f"{cause.text}: {100 * share:.0f} % of the position's variance where it is largest", cause.advice
+        limit, share = found
+        return f"{limit.text}: {100 * share:.0f} % of the position's variance where it is largest", limit.advice
     return _by_direction(source)
 
 
