@@ -5,11 +5,14 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.unknowns import unknowns
+from rovgraph.engine.variance_sources import variance_sources
 from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
@@ -19,6 +22,7 @@ from rovgraph.estimators.unstated_noise import UnstatedNoise, find_noise
 from rovgraph.estimators.unstated_noise import changed as with_noise
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
+from rovgraph.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
@@ -98,7 +102,23 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
         dive, best = _solve(log, config, frozen, estimate, progress)
         if more[-1].lasts:
             break
+    if isinstance(best, ChainOptimum):
+        dive = _with_main(dive, variance_sources=_sources_where_largest(dive.estimates[0].trajectory, best))
     return _saying(dive, found) if found else dive
+
+
+def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, object]:
+    """What brings the horizontal variance, at the keyframe where it is largest; see `variance_sources`."""
+    variance = track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1]
+    keyframe = int(np.searchsorted(best.chain.rows.time, track.time[np.argmax(variance)]))
+    keyframe = min(keyframe, len(best.intervals) - 1)
+    return {"time_s": float(best.chain.rows.time[keyframe]), "m2": variance_sources(best, keyframe)}
+
+
+def _with_main(dive: Dive, **more: object) -> Dive:
+    """The dive with more in the summary of its main estimate."""
+    main = dive.estimates[0]
+    return replace(dive, estimates=[replace(main, summary={**main.summary, **more}), *dive.estimates[1:]])
 
 
 def _solve(
@@ -134,9 +154,7 @@ def _solve(
 def _saying(dive: Dive, found: list[UnstatedNoise]) -> Dive:
     """A dive that says what noise was found in it."""
     beginning = replace(dive.beginning, assumptions=[*(one.text for one in found), *dive.beginning.assumptions])
-    main = dive.estimates[0]
-    main = replace(main, summary={**main.summary, "noise_found": [asdict(one) for one in found]})
-    return replace(dive, beginning=beginning, estimates=[main, *dive.estimates[1:]])
+    return replace(_with_main(dive, noise_found=[asdict(one) for one in found]), beginning=beginning)
 
 
 def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.pages.causes import largest_cause
 from rovgraph.pages.parts import Section, Table
 from rovgraph.pages.source import DiveSource, Track
 from rovgraph.report.units import plus_minus
@@ -72,13 +73,24 @@ def _cause(source: DiveSource) -> tuple[str, str]:
     track = source.main
     if not np.isfinite(track.horizontal_sd).any() or len(track) < 3:
         return "", ""
+    found = largest_cause(_variance_sources(source))
     silent = _share_in_silence(source, track)
-    if silent > 0.5:
+    if silent > 0.5 and not (found and found[0].known):
         return (
             f"{100 * silent:.0f} % of what the variance grew fell into times in which the DVL did not see the bottom",
             "keep the DVL within its range of the bottom, or take a position fix after each silence",
         )
+    if found:
+        limit, share = found
+        return f"{limit.text}: {100 * share:.0f} % of the position's variance where it is largest", limit.advice
     return _by_direction(source)
+
+
+def _variance_sources(source: DiveSource) -> dict[str, float]:
+    """Source -> variance [m^2], as the estimate found it; empty where it did not."""
+    estimate = (source.summary.get("estimates") or {}).get(source.main.kind) or {}
+    found = estimate.get("variance_sources") or {}
+    return {str(name): float(variance) for name, variance in (found.get("m2") or {}).items()}
 
 
 def _share_in_silence(source: DiveSource, track: Track) -> float:

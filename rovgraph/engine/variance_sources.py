@@ -1,0 +1,140 @@
+"""Where the variance of a position comes from: how much of it each sensor's noise and each prior brings.
+
+The optimum is linear in the whitened errors e of all rows, which are independent with unit variance. With A their
+Jacobian and s = (A'A)^-1 u the covariance of all variables with the position along u,
+
+    error along u = s' A' e,   so   variance along u = sum over rows of (A_i s)^2,
+
+and each term is what row i brings. What is considered, not estimated (Schmidt), adds the square of its effect times
+its prior's variance.
+"""
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from rovgraph.calibration import TABLE
+from rovgraph.engine.chain import Chain, ChainStep
+from rovgraph.engine.chain_information import SquareRoot
+from rovgraph.engine.chain_layout import COLUMNS, MOTION
+from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.measurements import Block
+from rovgraph.engine.widened_chain import widened
+from rovgraph.geometry import Array, transpose
+from rovgraph.kernels import chain_posterior
+from rovgraph.state import State
+
+POSITION = slice(3, 6)  # in a keyframe's block
+STEP = 1e-2  # of a standard deviation, of central differences
+PRIOR = {"attitude": slice(0, 3), "position": POSITION, "velocity": slice(6, 9), "bias": slice(9, 15)}
+
+
+def variance_sources(best: ChainOptimum, keyframe: int) -> dict[str, float]:
+    """Variance of a keyframe's north plus that of its east, by source, the largest first [m^2].
+
+    Sources are sensors by their names ("imu" for the noise of its samples), ``start attitude``, ``start position``,
+    ``start velocity`` and ``start bias`` for the priors of the first keyframe, and calibration variables for their
+    priors and walks. Their sum is the variance of the estimate, at the IMU.
+    """
+    names, chain = best.unknowns.considered, best.chain
+    wide = widened(chain, best.state, names) if names else chain
+    root = wide.eliminate(best.state, best.solution.gates)
+    held = sum(TABLE[name].dim for name in names)
+    u = np.zeros((wide.layout.d, 2))
+    u[POSITION] = best.state.R_nb[keyframe].T[:, :2]
+    found: dict[str, float] = {}
+    x, y = _covariance_with(root, keyframe, u, held)
+    for own_x, own_y in zip(np.moveaxis(x, 2, 0), y.T, strict=True):
+        step = ChainStep(np.ascontiguousarray(own_x), own_y)
+        for source, variance in [*_of_noise(wide, best.state, step), *_of_measurements(wide, best, step)]:
+            found[source] = found.get(source, 0.0) + variance
+    if held:
+        effect = u.T @ _by_held(root, held)[keyframe]
+        sd = np.concatenate([np.full(TABLE[name].dim, best.beliefs[name].sd) for name in names])
+        brought = np.sum((effect * sd) ** 2, axis=0)
+        ends = np.cumsum([TABLE[name].dim for name in names])
+        for name, part in zip(names, np.split(brought, ends[:-1]), strict=True):
+            found[name] = found.get(name, 0.0) + float(part.sum())
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _covariance_with(root: SquareRoot, keyframe: int, u: Array, held: int) -> tuple[Array, Array]:
+    """Covariance of all variables with u' x of a keyframe, shapes (n, d, m) and (c, m), for u of shape (d, m).
+
+    R'z = u forwards from the keyframe, then R s = z backwards; the border's last components are held.
+    """
+    (n, d), c = root.conditionals.shape[:2], len(root.border)
+    free, later = c - held, root.conditionals[keyframe:]
+    inverse = transpose(np.asarray(np.linalg.inv(later[:, :, :d]), dtype=float))
+    onward = -inverse[1:] @ transpose(later[:-1, :, d : 2 * d])
+    z = np.zeros((n, d, u.shape[1]))
+    z[keyframe] = inverse[0] @ u
+    for k, carry in enumerate(onward, keyframe + 1):
+        z[k] = carry @ z[k - 1]
+    y = np.zeros((c, u.shape[1]))
+    if free:
+        rest = -np.einsum("kdc,kdm->cm", later[:, :, 2 * d : 2 * d + free], z[keyframe:])
+        R = root.border[:free, :free]
+        y[:free] = solve_triangular(R, solve_triangular(R, rest, trans="T"))
+    chain_posterior.back_substitute(root.conditionals, y, z)
+    return z, y
+
+
+def _by_held(root: SquareRoot, held: int) -> Array:
+    """Derivative of the keyframes by what is held in the border, shape (n, d, held)."""
+    free, (n, d) = len(root.border) - held, root.conditionals.shape[:2]
+    y = np.zeros((len(root.border), held))
+    y[free:] = np.eye(held)
+    if free:
+        y[:free] = -solve_triangular(root.border[:free, :free], root.border[:free, free:-1])
+    x = np.zeros((n, d, held))
+    chain_posterior.back_substitute(root.conditionals, y, x)
+    return x
+
+
+def _of_noise(chain: Chain, point: State, step: ChainStep) -> list[tuple[str, float]]:
+    """What the IMU's noise, priors and walks bring: their residuals are differenced along the step."""
+    ahead, behind = (chain.moved(point, step, sign * STEP / _size(step)) for sign in (1.0, -1.0))
+    scale = (_size(step) / (2 * STEP)) ** 2
+    out = [("imu", scale * _squares(chain.rows.motion_residuals(ahead) - chain.rows.motion_residuals(behind)))]
+    starts, priors = (a - b for a, b in zip(chain.prior_residuals(ahead), chain.prior_residuals(behind), strict=True))
+    out += [(f"start {name}", scale * _squares(starts[part])) for name, part in PRIOR.items()]
+    ends = np.cumsum([TABLE[name].dim for name in chain.unknowns.estimated])
+    for name, part in zip(chain.unknowns.estimated, np.split(priors, ends[:-1]), strict=False):
+        out.append((name, scale * _squares(part)))
+    walks, at = chain.walk_residuals(ahead) - chain.walk_residuals(behind), 0
+    for name in chain.layout.walking:
+        out.append((name, scale * _squares(walks[:, at : at + TABLE[name].dim])))
+        at += TABLE[name].dim
+    return out
+
+
+def _of_measurements(chain: Chain, best: ChainOptimum, step: ChainStep) -> list[tuple[str, float]]:
+    """What each sensor's noise brings, by its weighted Jacobians."""
+    return [
+        (sensor, _squares(_along(chain, block, block.weighted(state, best.solution.gates[sensor])[1], step)))
+        for sensor, block, state in chain.seen(best.state, best.chain.blocks)
+    ]
+
+
+def _along(chain: Chain, block: Block, H: dict[str, Array], step: ChainStep) -> Array:
+    """Derivative of whitened measurements along a step, shape (n, dim)."""
+    own, total = step.x[block.keyframe], np.zeros(block.z.shape)
+    for name, by in H.items():
+        if name in COLUMNS:
+            move = own[:, :MOTION][:, COLUMNS[name]]
+        elif name in chain.layout.places:
+            border, part = chain.layout.places[name]
+            move = np.broadcast_to(step.y[part], (len(own), part.stop - part.start)) if border else own[:, part]
+        else:
+            continue
+        total += np.einsum("nij,nj->ni", by, move)
+    return total
+
+
+def _size(step: ChainStep) -> float:
+    """Largest displacement [m]; it makes the steps of differences small."""
+    return float(np.abs(step.x[:, POSITION]).max())
+
+
+def _squares(values: Array) -> float:
+    return float(np.vdot(values, values))
