@@ -6,8 +6,10 @@ python tests/test_alarms.py 1 6 [PATH] prints what is said of every broken dive 
 import json
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from broken import BROKEN, late
 from dives import (
@@ -26,7 +28,7 @@ from dives import (
 from test_places import circle
 
 from rovgraph.cli.app import main
-from rovgraph.config import mount_matrix
+from rovgraph.config import load_config, mount_matrix
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Statistic, find_alarms, verdict_of
@@ -36,8 +38,10 @@ from rovgraph.estimators.dive import Dive, smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import rotate, transpose
+from rovgraph.log import Log
 
 SECONDS = 200.0
+SHIPPED, SHIPPED_S = Path(__file__).parents[1] / "data" / "falcon", 160.0
 
 # what breaks -> the verdict, the kind of the alarm that names it, and words of its line
 SAID = {
@@ -115,6 +119,16 @@ def test_a_dvl_whose_z_axis_points_the_other_way_gets_its_mounting():
     assert dive.verdict == "wrong"
     true = list(case.config.dvl.mount_rpy_deg)
     assert any(f"state dvl.mount_rpy_deg: {true}" in line for line in dive.warnings), dive.warnings
+
+
+@pytest.mark.slow
+def test_a_considered_mounting_that_is_turned_by_90_degrees_makes_the_dive_wrong():
+    frame, stated = pd.read_csv(SHIPPED / "log.csv.gz"), load_config(SHIPPED / "config.yaml")
+    turned = {"dvl": {"mount_rpy_deg": [180.0, 0.0, 135.0]}, "calibration": {"dvl_yaw": {"estimate": "considered"}}}
+    config = changed(stated, graph={"find_noise": False}, **turned)
+    dive = smooth(Log.from_frame(frame[frame["time"] < SHIPPED_S]), config, "smoothed")
+    assert dive.verdict == "wrong"
+    assert "check dvl.mount_rpy_deg" in dive.warnings[0], dive.warnings
 
 
 @pytest.mark.parametrize(("name", "off"), [("dvl_scale", 0.02), ("dvl_pitch", 0.03), ("gyr_scale", 0.005)])

@@ -12,7 +12,10 @@ from dives import batch, changed, exact, kept, simulated, true_at
 from rovgraph.calibration import TABLE
 from rovgraph.cli import app
 from rovgraph.config import Config
+from rovgraph.engine.filter import FilterEngine
 from rovgraph.errors import InputError
+from rovgraph.estimators.eskf.reinitialisation import reinitialised
+from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.observability import (
     UNOBSERVABLE,
     UNOBSERVABLE_ABOVE,
@@ -161,6 +164,17 @@ def test_what_is_held_keeps_its_doubt_in_the_track():
     doubt = np.sqrt(held.trajectory.cov_p[-1, 1, 1] - fixed.trajectory.cov_p[-1, 1, 1])
     gone = np.linalg.norm(true_at(case, held.trajectory.time).p_n[[0, -1]].T @ [-1.0, 1.0])
     assert doubt == pytest.approx(np.deg2rad(5.0) * gone, rel=0.05)  # 5 degrees across the way that was gone
+
+
+def test_a_filter_goes_on_without_what_noise_feigned(straight):
+    """Reinitialised from a dive that does not show the misalignment, it has the prior of it."""
+    case, dive = straight
+    engine = FilterEngine(initialise(case.log, ONE_COMPASS))
+    known, _ = reinitialised(engine, dive.intervals, dive.state)
+    belief, (column,) = engine.beliefs["dvl_yaw"], np.r_[engine.layout.columns["dvl_yaw"]]
+    assert known.state.calibration["dvl_yaw"] == belief.mean
+    assert np.sqrt(known.covariance[column, column]) == pytest.approx(belief.sd)
+    assert dive.state.calibration["dvl_yaw"] != belief.mean
 
 
 def test_figure8_with_fixes_and_unbiased_heading_shows_the_misalignment():

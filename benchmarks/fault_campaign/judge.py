@@ -248,7 +248,7 @@ class Outcome:
     nees : estimate -> quantity -> mean over the seeds
     rms, sd : estimate -> root of the mean square over the seeds [m]
     named : part of the seeds in which the cause was named, by the command that names it less often
-    warned : part of the seeds with any warning that the healthy dive does not have
+    warned : part of the seeds with any warning or alarm that the healthy dive does not have
     refused : part of the seeds that were refused
     seeds : how many
     """
@@ -317,7 +317,7 @@ def judge(
             said = _lines_of(command, [r.said for r in results if not r.refused])
             hidden = no_trace is not None and no_trace.excuses(wrong, said)
             verdicts.append("loud" if told >= NAMED_IN else "no trace" if hidden else "lie")
-    warned = float(np.mean([any(line.startswith("warning") for line in lines) for lines in new]))
+    warned = float(np.mean([any(line.startswith(("warning", "alarm: ")) for line in lines) for lines in new]))
     verdict = min(verdicts, key=WORST_FIRST.index)
     return Outcome(verdict, averages, rms, sd, min(named), warned, refused, len(results))
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.optimum import Optimum, joint_prior_sd
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
 
@@ -122,3 +122,21 @@ def spuriously_observable(unknowns: Unknowns, claimed: Mapping[str, Array], rela
     """
     constant = [name for name in SPURIOUSLY_OBSERVABLE if name in relative and not unknowns.walks[name]]
     return [n for n in constant if (relative[n] > UNOBSERVABLE_ABOVE).all() and (claimed[n] < STILL).any()]
+
+
+def without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
+    """The optimum, and the sd of its calibration at the end as a part of the prior's, without spurious information.
+
+    What noise moves further than the data justify is considered.
+
+    Returns
+    -------
+    Optimum : the dive
+    dict : name -> ndarray, shape (dim,), of what was estimated
+    """
+    names = best.unknowns.estimated
+    sd = {name: np.sqrt(np.diag(best.covariances(name)[-1])) for name in names}
+    before = joint_prior_sd(best, len(best.intervals) - 1)
+    relative = relative_sd(best, sd, before)
+    held = spuriously_observable(best.unknowns, {name: sd[name] / before[name] for name in sd}, relative)
+    return (best.considering(held) if held else best), relative

@@ -18,7 +18,7 @@ from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
-from rovgraph.estimators.observability import relative_sd, spuriously_observable
+from rovgraph.estimators.observability import without_what_noise_moves
 from rovgraph.estimators.optimum import optimum
 from rovgraph.estimators.results import (
     bias_histories,
@@ -158,7 +158,7 @@ def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
 
 def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
-    best, relative = _without_what_noise_moves(best)
+    best, relative = without_what_noise_moves(best)
     states, intervals = best.state, best.intervals
     trajectory = body_trajectory(
         intervals, states, b.config.imu.lever_arm_m, best.covariances(POSE), best.covariances(VELOCITY)
@@ -221,16 +221,3 @@ def _joint_calibration(best: Optimum) -> dict[str, Any] | None:
         "prior_sd": np.concatenate([prior[name] for name in names]).tolist(),
         "covariance": best.knowledge([end]).calibration[0].tolist(),
     }
-
-
-def _without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
-    """The optimum, and the sd of its calibration as a part of the prior's, without spurious information.
-
-    What noise moves further than the data justify is considered.
-    """
-    names = best.unknowns.estimated
-    sd = {name: np.sqrt(np.diag(best.covariances(name)[-1])) for name in names}
-    before = joint_prior_sd(best, len(best.intervals) - 1)
-    relative = relative_sd(best, sd, before)
-    held = spuriously_observable(best.unknowns, {name: sd[name] / before[name] for name in sd}, relative)
-    return (best.considering(held) if held else best), relative

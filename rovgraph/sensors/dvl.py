@@ -22,16 +22,28 @@ TIME_OFFSET = "dvl_time_offset"  # of the stamps of all that a ping measures
 def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
     """Cause and remedy where velocities agree with the IMU once their axes are named otherwise.
 
+    Left-handed axes are a mounting after one sign is reversed: the one that leaves the smallest turn.
+
     Parameters
     ----------
     H : ndarray, shape (3, 3), signed permutation that turns measured velocities into right ones
     R_bs : ndarray, shape (3, 3), mounting as configured, or as it fits
     """
-    named = ["-" * int(row.min() < 0.0) + VELOCITIES[int(np.abs(row).argmax())] for row in H]
     if np.linalg.det(H) > 0.0:
-        rpy = [round(float(a), 1) + 0.0 for a in np.rad2deg(rpy_from_matrix((R_bs @ H)[None])[0])]
-        return "it is mounted in another way", f"state dvl.mount_rpy_deg: {rpy}"
-    return f"its axes are left-handed, {', '.join(named)} are right", "change those signs in the log, no mounting can"
+        return "it is mounted in another way", f"state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ H)}"
+    named = ["-" * int(row.min() < 0.0) + VELOCITIES[int(np.abs(row).argmax())] for row in H]
+    wrong = int(np.diagonal(H).argmin())
+    turn = H.copy()
+    turn[:, wrong] *= -1.0
+    remedy = f"put a minus before the unit of {VELOCITIES[wrong]}, units: {{{VELOCITIES[wrong]}: -m/s}}"
+    if not np.array_equal(turn, np.eye(3)):
+        remedy += f", and state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ turn)}"
+    return f"its axes are left-handed, {', '.join(named)} are right", remedy
+
+
+def _rpy_deg(R_bs: Array) -> list[float]:
+    """Roll, pitch and yaw as dvl.mount_rpy_deg has them."""
+    return [round(float(a), 1) + 0.0 for a in np.rad2deg(rpy_from_matrix(R_bs[None])[0])]
 
 
 def dvl_mounting(state: State) -> Array:

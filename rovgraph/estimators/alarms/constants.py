@@ -116,7 +116,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             evidence.end,
             abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
             HELD,
-            HELD_FAR_OFF,
+            FAR_MOVED if belief.considered else HELD_FAR_OFF,  # the prior's sd is all that the track's sd has of it
             f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements put it "
             f"{factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)} from that",
             _remedy_of_held(r, evidence.beginning.config),
@@ -194,7 +194,7 @@ def _sensor_of(name: str) -> str:
 def _key_of(name: str) -> str:
     """What to look at in the configuration where a calibration variable is far off."""
     if name in ("dvl_roll", "dvl_pitch", "dvl_yaw"):
-        return "dvl.mount_rpy_deg and the signs of the DVL's axes"
+        return "dvl.mount_rpy_deg and the signs of the DVL's axes (rovgraph check names them)"
     if name == "dvl_lever_arm":
         return "dvl.lever_arm_m and imu.lever_arm_m"
     if name in TIME_OFFSETS:
@@ -220,6 +220,8 @@ def _remedy_of_held(r: Released, config: Config) -> str:
         )
     if r.name == "gyr_scale":
         return "estimate calibration.gyr_scale, or calibrate the gyro"
+    if r.name == "dvl_yaw":
+        return f"check {_key_of(r.name)}, or estimate calibration.dvl_yaw"
     if r.name in ("dvl_roll", "dvl_pitch"):
         return f"DVL and IMU are tilted to each other: check imu.mount_rpy_deg, or estimate calibration.{r.name}"
     return f"estimate calibration.{r.name}"

@@ -11,6 +11,7 @@ from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.remembered_places import RememberedPlace
+from rovgraph.estimators.observability import without_what_noise_moves
 from rovgraph.estimators.optimum import optimum
 from rovgraph.state import PLACE_DIM, State
 
@@ -34,7 +35,7 @@ def reinitialised(
     """
     initial, layout = engine.initial, engine.layout
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
-    best = optimum(intervals, initial, states, calibration, rows)
+    best, _ = without_what_noise_moves(optimum(intervals, initial, states, calibration, rows))
     names, size = (*best.unknowns.estimated, *best.unknowns.considered), layout.size
     known = np.concatenate([np.arange(15)] + [np.r_[layout.columns[name]] for name in names])
     places = remembered(best, initial.config.place.remembered)
