@@ -23,7 +23,11 @@ PD0_AXES = {"beam": BEAM, "earth": EARTH}
 
 
 def config() -> rg.Config:
-    return rg.parse_config("{graph: {find_noise: false}, environment: {field_norm: 50.0}}")
+    """What files know is stated, so that a log of ours has it, too."""
+    return rg.parse_config(
+        "{graph: {find_noise: false}, environment: {field_norm: 50.0, declination_deg: 0.0},"
+        " imu: {mount_rpy_deg: [0, 0, 0]}, dvl: {mount_rpy_deg: [0, 0, 0]}}"
+    )
 
 
 @cache
@@ -48,9 +52,8 @@ def sensors(*names: str) -> pd.DataFrame:
 
 def tracks_apart(files: list[Path], frame: pd.DataFrame, shift: dict[str, float], begin: float) -> np.ndarray:
     """Position from native files less that from the log itself, at the keyframes of the latter, shape (n, 3) [m]."""
-    native = rg.smooth(rg.read_log(files, config(), shift=shift), config(), "smoothed")
-    direct = rg.smooth(rg.Log.from_frame(frame, native.config), native.config, "smoothed")  # with what the files know
-    expected, got = direct.smoothed.trajectory, native.smoothed.trajectory
+    expected = rg.smooth(rg.Log.from_frame(frame, config()), config(), "smoothed").smoothed.trajectory
+    got = rg.smooth(rg.read_log(files, config(), shift=shift), config(), "smoothed").smoothed.trajectory
     assert got.time[-1] - got.time[0] == pytest.approx(60.0, abs=0.3)
     assert np.ptp(expected.p_n[:, 0]) > 10.0
     return np.column_stack([np.interp(expected.time, got.time - begin, got.p_n[:, k]) for k in range(3)]) - expected.p_n
@@ -63,9 +66,9 @@ def as_dataflash(folder: Path, frame: pd.DataFrame) -> Path:
 
 
 def test_a_dataflash_log(tmp_path):
-    frame = sensors("acc", "gyr", "mag", "ahrs", "depth", "dvl")
+    frame = sensors("acc", "gyr", "ahrs", "depth", "dvl")
     apart = tracks_apart([as_dataflash(tmp_path, frame)], frame, {}, 0.0)
-    assert rms(apart) < 0.001, rms(apart)
+    assert rms(np.linalg.norm(apart, axis=1)) < 0.001
 
 
 def telemetry(sent: list[tuple[float, object]]) -> bytes:
@@ -83,7 +86,7 @@ def test_a_telemetry_log_and_a_recording_of_blueos(written: Callable[..., bytes]
     path = tmp_path / "dive.log"
     path.write_bytes(written([(START + t, message) for t, message in autopilot_messages(late, 0.0, SURFACE)]))
     apart = tracks_apart([path], frame, {}, START + 10.0)
-    assert rms(apart) < 0.001, rms(apart)
+    assert rms(np.linalg.norm(apart, axis=1)) < 0.001
 
 
 @pytest.mark.parametrize("form", ROS_FORMS)
@@ -91,7 +94,7 @@ def test_a_ros_bag(form, tmp_path):
     frame = sensors("acc", "gyr", "mag", "depth", "dvl")
     kind, name = ROS_FORMS[form]
     apart = tracks_apart([write(tmp_path / name, kind, of_dive(frame))], frame, {}, START)
-    assert rms(apart) < 0.001, rms(apart)
+    assert rms(np.linalg.norm(apart, axis=1)) < 0.001
 
 
 def test_a_ros_bag_is_converted_with_the_mountings_of_its_transforms_and_smoothed(tmp_path, monkeypatch):
@@ -122,7 +125,7 @@ def test_a_ros_bag_is_converted_with_the_mountings_of_its_transforms_and_smoothe
 
 
 def test_water_linked_json_beside_an_autopilot(tmp_path):
-    frame = sensors("acc", "gyr", "mag", "ahrs", "depth")
+    frame = sensors("acc", "gyr", "ahrs", "depth")
     pings = sensors("dvl")
     velocities = pings.rename(columns={f"dvl_v{axis}": f"v{axis}" for axis in "xyz"})[["vx", "vy", "vz"]]
     lines = [
@@ -131,13 +134,13 @@ def test_water_linked_json_beside_an_autopilot(tmp_path):
     ]
     (tmp_path / "dvl.jsonl").write_bytes(b"".join(lines))
     files = [as_dataflash(tmp_path, frame), tmp_path / "dvl.jsonl"]
-    apart = tracks_apart(files, sensors("acc", "gyr", "mag", "ahrs", "depth", "dvl"), {"dvl.jsonl": -START}, 0.0)
-    assert rms(apart) < 0.001, rms(apart)
+    apart = tracks_apart(files, sensors("acc", "gyr", "ahrs", "depth", "dvl"), {"dvl.jsonl": -START}, 0.0)
+    assert rms(np.linalg.norm(apart, axis=1)) < 0.001
 
 
 @pytest.mark.parametrize("axes", PD0_AXES)
 def test_pd0_beside_an_autopilot(axes, tmp_path):
-    frame = sensors("acc", "gyr", "mag", "ahrs", "depth")
+    frame = sensors("acc", "gyr", "ahrs", "depth")
     truth = sensors("ahrs").interpolate().set_index("time")
     ensembles = []
     for time, *v in sensors("dvl_v")[["time", "dvl_vx", "dvl_vy", "dvl_vz"]].to_numpy():
@@ -146,5 +149,5 @@ def test_pd0_beside_an_autopilot(axes, tmp_path):
         ensembles.append(pd0_ensemble(START + time, -trdi_values(v, PD0_AXES[axes], rpy), PD0_AXES[axes], gimballed))
     (tmp_path / "dive.pd0").write_bytes(b"".join(ensembles))
     files = [as_dataflash(tmp_path, frame), tmp_path / "dive.pd0"]
-    apart = tracks_apart(files, sensors("acc", "gyr", "mag", "ahrs", "depth", "dvl"), {"dive.pd0": -START}, 0.0)
-    assert rms(apart) < 0.001, rms(apart)
+    apart = tracks_apart(files, sensors("acc", "gyr", "ahrs", "depth", "dvl"), {"dive.pd0": -START}, 0.0)
+    assert rms(np.linalg.norm(apart, axis=1)) < 0.001

@@ -26,8 +26,10 @@ def stamp(message: Any) -> float:
     """
     if not hasattr(message, "microseconds") or not hasattr(message, "posix_time"):
         raise Unusable("a message of that type, but not of a Nucleus")
-    delay = getattr(message, "dt_xyz", math.nan)
-    return message.timestamp + 1e-6 * message.microseconds + (delay if abs(delay) < LONGEST_DELAY_S else 0.0)
+    delay = float(getattr(message, "dt_xyz", math.nan))
+    return (
+        float(message.timestamp) + 1e-6 * float(message.microseconds) + (delay if abs(delay) < LONGEST_DELAY_S else 0.0)
+    )
 
 
 def declination_deg(message: Any) -> float:
