@@ -86,7 +86,7 @@ def test_a_telemetry_log_and_a_recording_of_blueos(written: Callable[..., bytes]
     path = tmp_path / "dive.log"
     path.write_bytes(written([(START + t, message) for t, message in autopilot_messages(late, 0.0, SURFACE)]))
     apart = tracks_apart([path], frame, {}, START + 10.0)
-    assert rms(np.linalg.norm(apart, axis=1)) < 0.001
+    assert rms(np.linalg.norm(apart, axis=1)) < 0.02  # attitude is stamped in whole milliseconds
 
 
 @pytest.mark.parametrize("form", ROS_FORMS)
@@ -150,4 +150,4 @@ def test_pd0_beside_an_autopilot(axes, tmp_path):
     (tmp_path / "dive.pd0").write_bytes(b"".join(ensembles))
     files = [as_dataflash(tmp_path, frame), tmp_path / "dive.pd0"]
     apart = tracks_apart(files, sensors("acc", "gyr", "ahrs", "depth", "dvl"), {"dive.pd0": -START}, 0.0)
-    assert rms(np.linalg.norm(apart, axis=1)) < 0.001
+    assert rms(np.linalg.norm(apart, axis=1)) < 0.03  # stamps are of 10 ms, velocities of 1 mm/s
