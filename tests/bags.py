@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from rovgraph.interchange.rosbag_messages import DEFINITIONS
+from rovgraph.interchange.rosbag import ALL_DEFINITIONS
 
 START = 1_700_000_000.0
 SURFACE, SEA, GRAVITY = 101_325.0, 1025.0, 9.80665
@@ -33,7 +33,7 @@ class Sent(NamedTuple):
 def store(form: str) -> Any:
     found = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     tf = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
-    for name, text in (DEFINITIONS | (tf if form == "ros1" else {})).items():
+    for name, text in (ALL_DEFINITIONS | (tf if form == "ros1" else {})).items():
         found.register(get_types_from_msg(text, name))
     return found
 
@@ -80,6 +80,11 @@ def pressure(time: float, pascal: float) -> Sent:
     return Sent(time, "/pressure", "sensor_msgs/msg/FluidPressure", fields, "pressure_link")
 
 
+def mag(time: float, microtesla: Any) -> Sent:
+    fields = {"magnetic_field": xyz(*(1e-6 * v for v in microtesla)), "magnetic_field_covariance": np.zeros(9)}
+    return Sent(time, "/imu/mag", "sensor_msgs/msg/MagneticField", fields, "imu_link")
+
+
 def transform(parent: str, child: str, xyzw: Any = (0, 0, 0, 1), at: Any = (0, 0, 0)) -> Sent:
     moved = {"translation": xyz(*at), "rotation": dict(zip("xyzw", map(float, xyzw), strict=True))}
     stamped = {"header": {"frame_id": parent}, "child_frame_id": child, "transform": moved}
@@ -87,12 +92,14 @@ def transform(parent: str, child: str, xyzw: Any = (0, 0, 0, 1), at: Any = (0, 0
 
 
 def of_dive(frame: pd.DataFrame) -> list[Sent]:
-    """Messages with what a log's rows hold of IMU, DVL and depth; the pressure's sensor is still at the surface."""
+    """Messages with what a log's rows hold of IMU, magnetometer, DVL and depth; pressure is absolute."""
     sent = []
     for row in frame.to_dict("records"):
         time = row["time"]
         if row["acc_x"] == row["acc_x"]:
             sent.append(imu(time, [row[f"acc_{a}"] for a in "xyz"], [row[f"gyr_{a}"] for a in "xyz"]))
+        if row["mag_x"] == row["mag_x"]:
+            sent.append(mag(time, [row[f"mag_{a}"] for a in "xyz"]))
         if row["dvl_vx"] == row["dvl_vx"]:
             sent.append(marine_dvl(time, [row[f"dvl_v{a}"] for a in "xyz"]))
         if row["depth"] == row["depth"]:

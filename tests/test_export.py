@@ -135,14 +135,15 @@ def test_a_gis_layer_is_where_the_track_is_in_any_coordinates(tmp_path, name, cr
     assert layer["heading_sd"].iloc[-1] > 0.0
 
 
-def test_nmea_is_read_back_to_two_centimetres(tmp_path):
+def test_nmea_is_read_back_and_no_sentence_is_too_long(tmp_path):
     pynmea2 = pytest.importorskip("pynmea2")
     lines = written("nmea", tmp_path, Options(rate=2.0)).read_text(encoding="ascii").split()
     sentences = [pynmea2.parse(line, check=True) for line in lines]
     gga = [s for s in sentences if s.sentence_type == "GGA"]
     assert len(gga) == 121 and {s.sentence_type for s in sentences} == {"GGA", "HDT", "VTG"}
     elapsed = BEGAN + 0.5 * np.arange(121)
-    assert off([s.latitude for s in gga], [s.longitude for s in gga], elapsed) < 0.02
+    assert off([s.latitude for s in gga], [s.longitude for s in gga], elapsed) < WITHIN_M
+    assert max(map(len, lines)) + len("\r\n") <= 82  # NMEA 0183
     vtg = next(s for s in sentences[180:] if s.sentence_type == "VTG")
     assert float(vtg.spd_over_grnd_kmph) == pytest.approx(3.6 * 20.0 * 2.0 * np.pi / 60.0, abs=0.02)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymap3d import geodetic2ned
 from recordings import check_refused_or_whole, close
 from wire import sentence
 
@@ -82,15 +83,91 @@ def test_heading_pitch_and_roll_of_one_sentence(tmp_path):
     close(np.rad2deg(got), [85.9, -0.9, 0.8])
 
 
-def test_of_several_talkers_one_can_be_chosen_and_the_ships_acoustic_positions_are_no_fixes(tmp_path):
+def test_of_several_talkers_one_can_be_chosen(tmp_path):
     both = [gga(f"12000{k}.00", 0.1 * k, talker) for k in range(5) for talker in ("GP", "UB")]
-    usbl = sentence("PSIMSSB,120000.00,B01,A,,C,H,M,1.0,2.0,30.0,0.1,N,,")
-    data = b"".join([*both, usbl, gga("120006.00", 0.7, quality=0), b"$GPGGA,broken*00\r\n", b"\xff\x00\n"])
+    data = b"".join([*both, gga("120006.00", 0.7, quality=0), b"$GPGGA,broken*00\r\n", b"\xff\x00\n"])
     recording = read(data, tmp_path, fix="UBGGA")
     assert [channel.source for channel in recording.channels] == ["UBGGA", "GPGGA"]
     assert "not of the ship" in recording.warnings[0]
-    assert {each.name: each.count for each in recording.left if each.name != "lines"} == {"PSIMSSB": 1, "GPGGA": 1}
+    assert {each.name: each.count for each in recording.left if each.name != "lines"} == {"GPGGA": 1}
     assert sum(each.count for each in recording.left if each.name == "lines") == 2
+
+
+# Acoustic positions relative to a ship
+
+
+def usbl(clock: str, axes: str, x: float, y: float, name: str = "B01", status: str = "A", kind: str = "C") -> bytes:
+    return sentence(f"PSIMSSB,{clock},{name},{status},,{kind},{axes},M,{x:.3f},{y:.3f},30.0,0.5,N,,")
+
+
+def under_way(*more: bytes, heading: bytes = sentence("HEHDT,120.0,T")) -> bytes:
+    """A ship that goes north by 1.5 m/s; after the fix of each second the other sentences."""
+    meter = 1.0 / 1853.75  # minutes of latitude, at 50 degrees
+    seconds = range(20)
+    said = [
+        gga(f"1200{k:02d}.00", 1.0 + 1.5 * k * meter) + heading + b"".join(more).replace(b"??", b"%02d" % k)
+        for k in seconds
+    ]
+    return b"".join([rmc("115959.00", "020324"), *said])
+
+
+def off(recording: Recording, north: float, east: float) -> float:
+    """Largest distance of fixes from a place relative to the ship's path [m]."""
+    fix = first(recording, "fix").columns
+    began = MIDNIGHT + 12 * 3600.0
+    start = 50.0 + 1.0 / 60.0
+    got = geodetic2ned(fix["fix_lat"], fix["fix_lon"], 0.0, start, 8.1, 0.0)
+    return float(np.hypot(got[0] - 1.5 * (fix["time"] - began) - north, got[1] - east).max())
+
+
+@pytest.mark.parametrize(("axes", "x", "y"), [("N", 30.0, -40.0), ("E", -40.0, 30.0), ("H", None, None)])
+@pytest.mark.parametrize("hours", [0, 2])
+def test_positions_relative_to_a_ship_become_fixes_at_their_own_times(axes, x, y, hours, tmp_path):
+    """The ship's fixes are of one second, the acoustic ones are sent with the next; their clock may be local time."""
+    turn = np.deg2rad(120.0)
+    if x is None:  # starboard and ahead
+        x, y = 30.0 * -np.sin(turn) + -40.0 * np.cos(turn), 30.0 * np.cos(turn) + -40.0 * np.sin(turn)
+    sent = [
+        gga(f"1200{k:02d}.00", 1.0 + 1.5 * k / 1853.75)
+        + sentence("HEHDT,120.0,T")
+        + usbl(f"{12 + hours}00{max(k - 1, 0):02d}.40", axes, x, y)
+        for k in range(20)
+    ]
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    assert [channel.source for channel in recording.channels] == ["PSIMSSB B01", "GPGGA", "GPRMC"]
+    assert off(recording, 30.0, -40.0) < 0.3  # of 1e-4 minutes of the ship's fixes
+    close(first(recording, "fix").columns["time"][1:] % 1.0, 0.4, atol=1e-3)
+    close(first(recording, "fix").columns["fix_sd"], 0.5)
+    assert "is added to GPGGA" in recording.warnings[0]
+    assert {each.name for each in recording.left} == {"HEHDT"}
+
+
+def test_the_transponder_with_most_positions_is_preferred_and_others_can_be_chosen(tmp_path):
+    data = under_way(usbl("1200??.00", "N", 1.0, 1.0)) + usbl("120019.00", "N", 5.0, 5.0, "B02")
+    assert first(read(data, tmp_path), "fix").source == "PSIMSSB B01"
+    for chosen in ("PSIMSSB B02", "GPGGA"):
+        assert first(read(data, tmp_path, fix=chosen), "fix").source == chosen
+    assert first(read(data, tmp_path, ahrs="HEHDT"), "ahrs").source == "HEHDT"
+
+
+def test_acoustic_positions_that_cannot_be_placed_are_counted(tmp_path):
+    bad = [
+        usbl("120019.00", "N", 1.0, 1.0, status="V"),
+        usbl("120019.00", "N", 1.0, 1.0, kind="U"),
+        usbl("121019.00", "N", 1.0, 1.0),  # ten minutes after the ship's last fix
+    ]
+    recording = read(under_way() + b"".join(bad) + usbl("120019.00", "H", 1.0, 1.0), tmp_path)
+    assert first(recording, "fix").source == "PSIMSSB B01"
+    assert len(first(recording, "fix").columns["time"]) == 1
+    assert {each.reason for each in recording.left if each.name.startswith("PSIMSSB")} == {
+        "the system marks it as not OK",
+        "not in Cartesian coordinates relative to a ship",
+        "the ship's position, or her heading (HDT), is not known",
+    }
+    without = read(under_way(usbl("1200??.00", "H", 1.0, 1.0), heading=b""), tmp_path)
+    assert first(without, "fix").source == "GPGGA"
+    with pytest.raises(InputError, match="neither fixes nor headings"):
+        read(usbl("120019.00", "N", 1.0, 1.0) * 5, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -107,6 +184,7 @@ def test_a_file_without_use_is_refused_by_what_it_holds(data, said, tmp_path):
 
 BASE = b"".join(
     [gga("120000.00", 0.1), sentence("HEHDT,90.0,T"), rmc("120001.00", "020324"), gga("120002.00", 0.2)] * 3
+    + [usbl("120001.50", "H", 3.0, 4.0), usbl("120001.60", "N", 3.0, 4.0, "B02")]
 )
 
 

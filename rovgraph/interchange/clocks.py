@@ -19,6 +19,7 @@ from rovgraph.interchange.recording import Channel, Recording
 from rovgraph.interchange.selection import Selected, file_names
 from rovgraph.interchange.synchronise import Offset, find_offset
 
+UNKNOWN_ZONE_S = 1800.0  # sd of a clock that may show local time
 AGREE_S = 0.5  # stamps that motion contradicts by less stay: a sensor may be late by as much
 SYSTEMATIC_S = 0.06  # by motion 12 simulated dives of two minutes were off by that, rms, where it claims 0.01 s
 SURE = 3.0  # standard deviations of a contradiction
@@ -90,6 +91,11 @@ class _Axis:
     lines: Mapping[str, Line]
     sources: Mapping[str, tuple[str, float]]
 
+    @property
+    def least_sd(self) -> float:
+        """Of the clock that is known best, against Unix time [s]."""
+        return min(sd for _, sd in self.sources.values())
+
     def channels(self, recording: Recording) -> list[Channel]:
         """Of all sensors, on the common time."""
         own = [channel for channel in recording.channels if channel.clock in self.lines]
@@ -147,10 +153,11 @@ def join_clocks(
         before = len(waiting)
         for axis in list(waiting):
             channels = axis.channels(recordings[axis.file])
-            result = _joined(axis, base, channels, pool, stated.get(id(axis)), motion_of)
+            unix_sd = float(np.hypot(*(each.least_sd for each in (axis, base))))
+            result = _joined(axis, base, channels, pool, stated.get(id(axis)), motion_of, unix_sd)
             if result is None:
                 continue
-            line, sd, drift_sd, how, text = result
+            line, sd, drift_sd, how, text = result  # sd: of the clock that is known best
             said += [f"{names[axis.file]}: {text}"] if text else []
             joined.append((axis, line, sd, drift_sd, how))
             pool.append(_known([_moved(channel, line) for channel in channels], motion_of))
@@ -163,7 +170,9 @@ def join_clocks(
             source, own_sd = axis.sources[name]
             told = ", ".join(text for text in (source if base.unix else "", how) if text) or "the log's clock"
             lines = (own, line)
-            out.append(JoinedClock(axis.file, name, lines, float(np.hypot(own_sd, sd)), drift_sd, told))
+            shared = 0.0 if axis is base else axis.least_sd  # by all clocks of the file: that is in sd
+            beyond = float(np.sqrt(max(own_sd**2 - shared**2, 0.0)))
+            out.append(JoinedClock(axis.file, name, lines, float(np.hypot(beyond, sd)), drift_sd, told))
     return [clock for clock in out if (clock.file, clock.name) in needed], beside, base.unix, said
 
 
@@ -259,6 +268,7 @@ def _joined(
     pool: Sequence[_Joined],
     stated: float | None,
     motion_of: MotionOf,
+    unix_sd: float,
 ) -> tuple[Line, float, float, str, str] | None:
     """Onto the base's time: the line, its sd and that of its drift, how it was found, and a warning; None = not yet."""
     if stated is not None:
@@ -269,13 +279,16 @@ def _joined(
     line = None if offset is None else _line(offset)
     agrees = offset is None or abs(offset.seconds) < max(AGREE_S, SURE * offset.sd)
     if axis.unix and base.unix and agrees and _overlap(_span(channels), pool):
-        seen = "" if offset is None else f"; motion agrees to {offset.seconds:+.2f} s (sd {offset.sd:.2f} s)"
-        return Line(), 0.0, 0.0, f"Unix time{seen}", ""
+        if offset is None and unix_sd < UNKNOWN_ZONE_S:
+            return Line(), unix_sd, 0.0, "Unix time", ""
+        if offset is not None and unix_sd <= np.hypot(offset.sd, SYSTEMATIC_S):
+            seen = f"; motion agrees to {offset.seconds:+.2f} s (sd {offset.sd:.2f} s)"
+            return Line(), unix_sd, 0.0, f"Unix time{seen}", ""
     if offset is None or line is None:
         return None
     how = f"{offset.how}, explained {offset.explained:.0%} over {offset.overlap:.0f} s"
     text = ""
-    if axis.unix and base.unix:
+    if axis.unix and base.unix and not agrees:
         text = (
             f"its Unix time is {offset.seconds:+.2f} s (sd {offset.sd:.2f} s) from that of the other files by {how}: "
             "corrected; --shift states another"

@@ -5,11 +5,13 @@ search goes on with the next byte, so that noise costs no good frame. In a telem
 before each frame.
 """
 
+import mmap
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from rovgraph.errors import InputError
 
+Content = bytes | mmap.mmap
 V1, V2 = 0xFE, 0xFD
 MARKERS = (bytes([V1]), bytes([V2]))
 SIGNED = 0x01
@@ -33,7 +35,7 @@ def dialect() -> Any:
     return ardupilotmega
 
 
-def frame_length(data: bytes | bytearray, start: int) -> int | None:
+def frame_length(data: Content | bytearray, start: int) -> int | None:
     """Bytes of the frame that begins with the marker at ``start``; None where too few are there to tell."""
     if len(data) < start + 3:
         return None
@@ -111,7 +113,7 @@ class Frames:
         self._sane = False
 
 
-def frames_with_times(content: bytes) -> Iterator[tuple[bytes, float]]:
+def frames_with_times(content: Content) -> Iterator[tuple[bytes, float]]:
     """Frames of a telemetry log with the times of their arrival [s]; what stands between them comes too."""
     start = lost = 0
     arrival = 0.0
@@ -133,22 +135,22 @@ def frames_with_times(content: bytes) -> Iterator[tuple[bytes, float]]:
         yield content[lost:], arrival
 
 
-def _arrival(content: bytes, start: int, end: int, before: float) -> float:
+def _arrival(content: Content, start: int, end: int, before: float) -> float:
     """The time of a frame [s]; that of the one before it where neither that nor the next is near."""
     time = _time(content, start)
     near = [before] + ([_time(content, end)] if begins(content, end) else [])
     return time if not before or min(abs(time - other) for other in near) < JUMP_S else before
 
 
-def _time(content: bytes, start: int) -> float:
+def _time(content: Content, start: int) -> float:
     return 1e-6 * int.from_bytes(content[start : start + TIME], "big")
 
 
-def begins(content: bytes, start: int) -> bool:
+def begins(content: Content, start: int) -> bool:
     """Whether a time and the beginning of a frame may stand here."""
     marker = content[start + TIME : start + TIME + 1]
     return marker in MARKERS and EARLIEST < _time(content, start) < LATEST
 
 
-def _begins_within(content: bytes, start: int, end: int) -> bool:
+def _begins_within(content: Content, start: int, end: int) -> bool:
     return any(begins(content, at) for at in range(start, end))

@@ -20,6 +20,7 @@ from rovgraph.log import Log
 from rovgraph.log.streams import LABEL, all_columns
 
 OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
+STAMP_DIGITS = 6  # of a second, as a log is written
 UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
 OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix")  # sensors with a calibration variable for it
 
@@ -87,7 +88,8 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
     for each in selected:
         clock = by_name[each.file, each.channel.clock]
         columns = {name: np.asarray(values) for name, values in each.channel.columns.items()}
-        columns["time"] = clock(columns["time"]) + beside.get(each.channel.sensor, 0.0)
+        time = clock(columns["time"]) + beside.get(each.channel.sensor, 0.0)
+        columns["time"] = np.round(time, STAMP_DIGITS)  # equal stamps stay equal, and a written log is read the same
         frames.append(pd.DataFrame(columns))
     frame = pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
     others = {str(name) for name in frame} - set(all_columns())

@@ -12,6 +12,7 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
+from rovgraph.interchange import nmea_usbl as usbl
 from rovgraph.interchange.alternatives import preferred_first
 from rovgraph.interchange.fixes import new_fixes
 from rovgraph.interchange.formats import Options
@@ -33,7 +34,7 @@ from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 
 UTC, DAY = "UTC of the sentences", "time of day of the sentences"
 ATTITUDE = "PTNTHPR"  # True North's heading, pitch, roll
-SHIP = ("PSIMSSB", "PSIMLBP", "PUSBA", "PSONLLD")  # of acoustic systems: relative to the ship, or not decoded
+SHIP = ("PSIMLBP", "PUSBA", "PSONLLD")  # of acoustic systems: relative to the ship, or not decoded
 NOON_S, DAY_S = 43_200.0, 86_400.0
 LONGEST = 1 << 12
 FEW = 3  # whole sentences that make a file one of these
@@ -75,6 +76,12 @@ def _is_sentence(line: bytes) -> bool:
     return True
 
 
+def _ship(fixes: Channel, heading: Channel | None) -> usbl.Ship:
+    where, none = fixes.columns, np.empty(0)
+    pointing = (none, none) if heading is None else (heading.columns["time"], heading.columns["ahrs_yaw"])
+    return usbl.Ship(where["time"], where["fix_lat"], where["fix_lon"], *pointing)
+
+
 class _Sentences:
     """Takes sentences one by one; rows know their place in the file."""
 
@@ -92,6 +99,9 @@ class _Sentences:
         try:
             kind, text = sentence_of(line)
             name = text[1:].partition(",")[0]
+            if kind == usbl.KIND:
+                self._relative(name, text)
+                return
             if kind not in (*FIXES, *HEADINGS, *DATES, ATTITUDE):
                 why = "relative to a ship: no fix of the vehicle" if kind in SHIP else "no measurement that a log has"
                 self._left[name, why] += 1
@@ -129,6 +139,16 @@ class _Sentences:
         heading, pitch, roll = np.deg2rad([np.nan if v is None else v for v in values])
         self._add("ahrs", name, heading, roll, pitch)
 
+    def _relative(self, name: str, text: str) -> None:
+        """A position relative to the ship."""
+        parsed(text)
+        try:
+            transponder, values = usbl.relative_position(text, self._times.last)
+        except Refused as refused:
+            self._left[name, refused.text] += 1
+        else:
+            self._add(usbl.KIND, f"{name} {transponder}".strip(), *values)
+
     def _add(self, sensor: str, name: str, *values: float) -> None:
         self._rows.setdefault((sensor, name), array("d")).extend((self._place, *values))
 
@@ -155,7 +175,13 @@ class _Sentences:
             for channel in self._channels(path, sensor, place, time, clock, options)
         ]
         notes = [] if self._times.dated else ["no sentence has a date: times count from midnight of the first day"]
+        said: list[str] = []
+        if any(sensor == usbl.KIND for sensor, _ in self._rows):
+            channels, said = self._of_vehicle(path, channels, place, time, clock, options)
+        if not channels:
+            raise InputError(f"{path}: holds neither fixes nor headings of the vehicle; other sentences: {found}")
         settings, warnings = self._look(channels)
+        warnings = said + warnings
         left = tuple(Left(name, count, why) for (name, why), count in sorted(self._left.items()))
         clocks = {clock.name: clock}
         return Recording(str(path), format_, tuple(channels), clocks, left, settings, tuple(notes), tuple(warnings))
@@ -167,7 +193,8 @@ class _Sentences:
         rank = (ATTITUDE, *HEADINGS, *FIXES)
         order = sorted(names, key=lambda n: (rank.index(n if n == ATTITUDE else n[-3:]), -len(names[n])))
         made = []
-        for name in preferred_first(path, sensor, order, options.choose):
+        later = sensor == "fix" and any(of == usbl.KIND for of, _ in self._rows)  # chosen beside the transponders
+        for name in order if later else preferred_first(path, sensor, order, options.choose):
             table = np.frombuffer(names[name]).reshape(-1, 4)
             table = table[(table[:, 0] >= place[0]) & (table[:, 0] <= place[-1])]
             when = np.interp(table[:, 0], place, time)
@@ -182,6 +209,49 @@ class _Sentences:
                 frame = "" if sensor == "fix" else "the instrument's, " + ("true north" if "HDT" in name else _NORTH)
                 made.append(Channel(sensor, {"time": when, **columns}, name, frame, clock.name))
         self._left = +self._left
+        return made
+
+    def _of_vehicle(
+        self, path: Path, channels: list[Channel], place: Array, time: Array, clock: Clock, options: Options
+    ) -> tuple[list[Channel], list[str]]:
+        """Fixes of transponders before the ship's own; the ship's headings are not the vehicle's, unless chosen."""
+        fixes = {channel.source: channel for channel in channels if channel.sensor == "fix"}
+        headings = {channel.source: channel for channel in channels if channel.sensor == "ahrs"}
+        names = {name: rows for (of, name), rows in self._rows.items() if of == usbl.KIND}
+        if not fixes:
+            for name, rows in names.items():
+                self._left[name, "relative to a ship whose fixes are not in the file"] += len(rows) // 6
+            return channels, []
+        own = next((name for name in fixes if name != options.choose.get("fix")), next(iter(fixes)))
+        true = next((channel for name, channel in headings.items() if name.endswith("HDT")), None)
+        made = self._transponders(names, _ship(fixes[own], true), place, time, clock)
+        labels = [*sorted(made, key=lambda name: -len(names[name])), *fixes]
+        order = preferred_first(path, "fix", labels, options.choose)
+        said = []
+        if order[0] in made:
+            said.append(f"{order[0]} is added to {own}: see that it counts from the antenna of that receiver")
+        if "ahrs" in options.choose:
+            return [*headings.values(), *((made | fixes)[name] for name in order)], said
+        for name, channel in headings.items():
+            why = "of the ship, as acoustic positions are relative to her; choose ahrs=NAME if it is the vehicle's"
+            self._left[name, why] += len(channel.columns["time"])
+        return [(made | fixes)[name] for name in order], said
+
+    def _transponders(
+        self, names: "dict[str, array[float]]", ship: usbl.Ship, place: Array, time: Array, clock: Clock
+    ) -> dict[str, Channel]:
+        """Fixes of each transponder."""
+        made = {}
+        for name, rows in names.items():
+            at, late, x, y, orientation, sd = np.frombuffer(rows).reshape(-1, 6).T
+            when = time[np.searchsorted(place, at, "right") - 1] + late
+            lat, lon = usbl.positions(ship, when, x, y, orientation)
+            known = np.isfinite(lat)
+            if not known.all():
+                self._left[name, "the ship's position, or her heading (HDT), is not known"] += int((~known).sum())
+            if known.any():
+                columns = {"fix_lat": lat[known], "fix_lon": lon[known], "fix_sd": sd[known]}
+                made[name] = Channel("fix", {"time": when[known], **columns}, name, "", clock.name)
         return made
 
     def _look(self, channels: list[Channel]) -> tuple[dict[str, Any], list[str]]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rovgraph.errors import InputError
+from rovgraph.interchange import rosbag_nucleus as nucleus
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Left, Recording
 from rovgraph.interchange.rosbag_frames import Frames
@@ -25,6 +26,8 @@ MCAP = b"\x89MCAP0\r\n"
 SQLITE = b"SQLite format 3\0"
 METADATA = "metadata.yaml"
 STORAGES = (".mcap", ".db3")
+ALL_READERS = READERS | nucleus.READERS
+ALL_DEFINITIONS = DEFINITIONS | nucleus.DEFINITIONS
 OFTEN = 2000  # messages between reports of progress
 _REMEDY = "bring it in order with 'rosbag reindex' (ROS 1), 'ros2 bag reindex' (ROS 2) or 'mcap recover' (MCAP)"
 
@@ -100,7 +103,7 @@ class _Bag:
         wanted = {}
         for each in storage.connections:
             static = each.msgtype == TF and each.topic.endswith("tf_static")
-            if not static and each.msgtype not in READERS:
+            if not static and each.msgtype not in ALL_READERS:
                 self._left[f"{each.topic} ({each.msgtype})", "no measurement of a sensor"] += each.msgcount
             elif (decode := _decoder(each, ros1)) is None:
                 self._left[f"{each.topic} ({each.msgtype})", "no definition of its type in the bag"] += each.msgcount
@@ -138,13 +141,17 @@ class _Bag:
 
 
 def _take(topic: Topic, message: Any, received: int) -> None:
-    stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+    if topic.type in nucleus.READERS:
+        stamp, topic.clock = nucleus.stamp(message), nucleus.CLOCK
+        topic.declination_deg = topic.declination_deg or nucleus.declination_deg(message)
+    else:
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        topic.frame = topic.frame or message.header.frame_id
     if topic.type in LATER and hasattr(message, "time_of_validity") and stamp:
         took = latency(message)
         stamp -= took
         topic.latencies += took > 0.0
-    topic.frame = topic.frame or message.header.frame_id
-    for sensor, values in READERS[topic.type](message):
+    for sensor, values in ALL_READERS[topic.type](message):
         rows = topic.rows.setdefault(sensor, array("d"))
         row = (stamp, 1e-9 * received, *values)
         assert len(row) == 2 + len(COLUMNS[sensor])
@@ -163,7 +170,7 @@ def _decoder(connection: Any, ros1: bool) -> Any:
             store.register(get_types_from_msg(definition.data, kind))
         else:
             store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-            own = {n: t for n, t in DEFINITIONS.items() if n.partition("/")[0] == kind.partition("/")[0]}
+            own = {n: t for n, t in ALL_DEFINITIONS.items() if n.partition("/")[0] == kind.partition("/")[0]}
             for name, text in own.items():
                 store.register(get_types_from_msg(text, name))
     except Exception:  # whatever stands in the bag

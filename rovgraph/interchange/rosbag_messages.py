@@ -143,7 +143,8 @@ READERS: dict[str, Callable[[Any], Iterator[Said]]] = {
     "nav_msgs/msg/Odometry": _twist,
 }
 GENERAL = ("geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")  # velocities of anything
-DOWN = ("dvl_msgs/", "waterlinked_a50_ros_driver/", "marine_acoustic_msgs/", "acoustic_msgs/")  # z down, by definition
+# z down, by definition; the last are those of a Nucleus
+DOWN = ("dvl_msgs/", "waterlinked_a50_ros_driver/", "marine_acoustic_msgs/", "acoustic_msgs/", "interfaces/")
 LATER = ("dvl_msgs/msg/DVL",)  # their header is of arrival, and they say how long the report took
 
 

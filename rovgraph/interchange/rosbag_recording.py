@@ -20,6 +20,7 @@ from rovgraph.interchange.receiver import receiver_clock
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.rosbag_frames import FRD_OF_FLU, Frames, Mounting
 from rovgraph.interchange.rosbag_messages import COLUMNS, DOWN, GENERAL
+from rovgraph.interchange.rosbag_nucleus import CLOCK as NUCLEUS
 
 HEADERS, RECORDER = "headers of messages", "recorder"
 SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
@@ -40,6 +41,8 @@ class Topic:
     frame : that its messages name
     rows : sensor -> stamp [s], arrival [s] and `COLUMNS`, row after row
     latencies : messages whose stamp is of arrival, less the time that they say they took
+    clock : that its stamps share with other topics ("" = that of headers)
+    declination_deg : that an instrument has added to its heading
     """
 
     name: str
@@ -47,6 +50,8 @@ class Topic:
     frame: str = ""
     rows: "dict[str, array[float]]" = field(default_factory=dict)
     latencies: int = 0
+    clock: str = ""
+    declination_deg: float = 0.0
 
     def table(self, sensor: str) -> Array:
         """Rows of a sensor, shape (n, 2 + columns)."""
@@ -122,7 +127,8 @@ class _Made:
 
     def _columns(self, sensor: str, topic: Topic, values: Array) -> dict[str, Array]:
         if sensor == "depth":
-            return {"depth": self._depth(topic, values[:, 0])}
+            told = topic.clock == NUCLEUS  # others tell pressure
+            return {"depth": values[:, 0] if told else self._depth(topic, values[:, 0])}
         if sensor == "ahrs":
             return self._attitude(topic, values)
         return dict(zip(COLUMNS[sensor], values.T, strict=True))
@@ -144,8 +150,10 @@ class _Made:
         apart = float(np.median((received - stamp)[keep]))
         if abs(apart) <= APART_S:
             return keep, stamp[keep], HEADERS
-        name = f"{HEADERS} of {topic.name}"
+        name = topic.clock or f"{HEADERS} of {topic.name}"
         offset = float((received - stamp)[keep].min())
+        if name in self.clocks:
+            offset = min(offset, self.clocks[name].unix_offset or offset)
         self.clocks[name] = Clock(name, offset, LATENCY_SD_S, "least of (received - stamp) by the recorder")
         self.warnings.append(f"{topic.name}: headers are {apart:+.1f} s apart from the recorder's clock, so of another")
         return keep, stamp[keep], name
@@ -199,10 +207,14 @@ class _Made:
 
         whole = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < 0.01
         R_ws = Rotation.from_quat(np.where(whole[:, None], xyzw, [0.0, 0.0, 0.0, 1.0])).as_matrix()
-        acc = np.nanmedian(topic.table("imu")[:, 2:5], axis=0)
-        up = float(np.median(R_ws[:, 2, :] @ acc))
-        if up < 0.0:
-            self.notes.append(f"{topic.name}: gravity says that its orientation is relative to NED, not to ENU")
+        up = -1.0
+        if topic.clock == NUCLEUS:
+            self.notes.append(f"{topic.name}: heading less the declination that the instrument has added")
+        else:
+            acc = np.nanmedian(topic.table("imu")[:, 2:5], axis=0)
+            up = float(np.median(R_ws[:, 2, :] @ acc))
+            if up < 0.0:
+                self.notes.append(f"{topic.name}: gravity says that its orientation is relative to NED, not to ENU")
         angles = rpy_from_matrix(R_ws if up < 0.0 else NED_OF_ENU @ R_ws)
         self.notes.append(f"{topic.name}: its yaw is taken relative to magnetic north")
         return {
@@ -225,6 +237,8 @@ class _Made:
             self.warnings.append(f"no DVL in the bag; other topics: {names}")
         else:
             self.settings["dvl"] = self._dvl_mounting(at[dvl], self._mountings[dvl])
+        if "ahrs" in first and (declination := at["ahrs"].declination_deg):
+            self.settings.setdefault("environment", {})["declination_deg"] = round(declination, 3)
         if (mounting := self._mountings.get("depth")) is not None:
             self.settings["depth"] = {"lever_arm_m": mounting.settings()["lever_arm_m"]}
         if "mag" in first and "imu" in first and at["mag"].frame != at["imu"].frame:

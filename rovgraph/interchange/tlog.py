@@ -1,5 +1,6 @@
 """MAVLink telemetry logs (``.tlog``): what a ground station has received."""
 
+import mmap
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,12 @@ class TelemetryLog:
         mavlink = dialect()
         parser = mavlink.MAVLink(None)
         gatherer = Gatherer()
-        content = path.read_bytes()
         done = 0
-        for data, received in frames_with_times(content):
-            done += TIME + len(data)
-            options.progress(min(done, len(content)), len(content))
-            _take(gatherer, mavlink, parser, data, received)
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            for data, received in frames_with_times(content):
+                done += TIME + len(data)
+                options.progress(min(done, len(content)), len(content))
+                _take(gatherer, mavlink, parser, data, received)
         return recording(path, self.name, gatherer, RECEIVER, options)
 
 

@@ -91,9 +91,9 @@ def _bearing(angle: float) -> str:
 
 
 def _degrees_minutes(angle: float, digits: int) -> str:
-    """``ddmm.mmmmm``, to two centimetres."""
-    minutes = round(abs(angle) * 60.0, 5)
-    return f"{int(minutes // 60):0{digits}d}{minutes % 60.0:08.5f}"
+    """``ddmm.mmmmmm``, to two millimetres."""
+    minutes = round(abs(angle) * 60.0, 6)
+    return f"{int(minutes // 60):0{digits}d}{minutes % 60.0:09.6f}"
 
 
 def _sentence(body: str) -> str:
