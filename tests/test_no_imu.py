@@ -114,6 +114,7 @@ def band(dives: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", range(3), ids=QUANTITIES)
 @pytest.mark.parametrize("kind", range(2), ids=KINDS)
 def test_errors_are_at_most_as_large_as_the_estimate_says(mean_nees, kind, quantity):
@@ -123,6 +124,7 @@ def test_errors_are_at_most_as_large_as_the_estimate_says(mean_nees, kind, quant
         assert mean_nees[kind, quantity] > low
 
 
+@pytest.mark.slow
 def test_too_little_process_noise_is_found_out(mean_nees):
     assert (mean_nees[2] > band(len(SEEDS))[1]).all()
 
@@ -130,6 +132,11 @@ def test_too_little_process_noise_is_found_out(mean_nees):
 @pytest.fixture(scope="module")
 def dive() -> tuple[Simulated, Config]:
     return drawn(1)
+
+
+def test_of_one_dive_too_little_process_noise_is_found_out(dive):
+    smoothed, filtered, stiff = one_dive(1)[:, 0]
+    assert max(smoothed, filtered) < chi2.ppf(0.999, 3) < stiff
 
 
 def test_a_log_without_imu_is_smoothed_and_no_bias_is_reported(dive):
@@ -201,16 +208,15 @@ def test_of_one_heading_alone_comes_a_track_that_is_wide_and_an_alarm(dive):
     case, config = dive
     first = np.arange(len(case.log["vehicle_heading"])) == 0
     done = smooth(kept(case.log, "vehicle_heading", first), config)
-    assert [alarm.kind for alarm in done.alarms][0] == "no heading" and done.verdict == "doubtful"
+    assert next(alarm.kind for alarm in done.alarms) == "no heading" and done.verdict == "doubtful"
     assert nees(done.estimates[0].trajectory, case, -1)[0] < chi2.ppf(0.99, 3)
     assert nees(batch(kept(case.log, "vehicle_heading", first), config).solve().trajectory, case, -1)[0] > 100.0
 
 
 def test_measurements_in_a_gap_of_the_attitude_leave_silences(dive):
     case, config = dive
-    log, gaps = without_attitude_gaps(
-        kept(case.log, "vehicle_heading", np.arange(len(case.log["vehicle_heading"])) == 0), config
-    )
+    first = np.arange(len(case.log["vehicle_heading"])) == 0
+    log, gaps = without_attitude_gaps(kept(case.log, "vehicle_heading", first), config)
     assert [gap.part for gap in gaps] == ["heading"] and len(log["depth"]) > 8
     steps = np.diff(np.unique(np.concatenate([log[s].time for s in ("dvl", "depth", "vehicle_tilt")])))
     assert steps[steps > 2.0].min() > 10.0
@@ -318,6 +324,7 @@ def test_online_without_an_imu_says_so_before_it_writes_anything(dive, tmp_path)
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_pd0_file_of_a_real_vehicle_becomes_a_smoothed_track(tmp_path, monkeypatch):
     if not REMUS.exists():
         pytest.skip(f"{REMUS} is not there")
