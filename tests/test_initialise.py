@@ -432,7 +432,7 @@ def test_what_was_written_of_the_start_gives_the_same_start_again(lively):
 
 def test_a_log_without_depth_says_that_it_begins_at_the_surface(lively):
     assert (
-        "start.down_m 0.0, as the log has no depth"
+        "start.down_m 0.0 within 100 m, as the log has no depth"
         in initialise(without(lively.log, "depth"), free(lively)).assumptions
     )
 

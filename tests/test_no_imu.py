@@ -1,9 +1,12 @@
 """A dive without an IMU: the vehicle's own attitude, a DVL, and a constant velocity in between."""
 
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from dives import (
     Simulated,
@@ -14,6 +17,7 @@ from dives import (
     changed,
     falcon,
     interrupted,
+    kept,
     renewed,
     same,
     true_at,
@@ -21,13 +25,17 @@ from dives import (
 )
 from scipy.stats import chi2
 
+from rovgraph.api.online import Online
+from rovgraph.cli.app import main
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.errors import InputError
+from rovgraph.estimators.attitude_gaps import without_attitude_gaps
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, wrap_angle
+from rovgraph.interchange.formats import read_recording
 from rovgraph.live.startup import Startup
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.log.frozen import frozen_stretches
@@ -35,6 +43,8 @@ from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import known
 from rovgraph.trajectory import Trajectory
 
+REMUS = Path(__file__).parents[2] / "shared" / "data" / "remus600_pd0" / "adcp.adc.gz"
+CONFIG = Path(__file__).parents[1] / "configs" / "remus600.yaml"
 SEEDS = range(1, 25)
 SECONDS, PING_RATE = 120.0, 1.0
 QUANTITIES = ("position", "velocity", "attitude")
@@ -104,6 +114,7 @@ def band(dives: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", range(3), ids=QUANTITIES)
 @pytest.mark.parametrize("kind", range(2), ids=KINDS)
 def test_errors_are_at_most_as_large_as_the_estimate_says(mean_nees, kind, quantity):
@@ -113,6 +124,7 @@ def test_errors_are_at_most_as_large_as_the_estimate_says(mean_nees, kind, quant
         assert mean_nees[kind, quantity] > low
 
 
+@pytest.mark.slow
 def test_too_little_process_noise_is_found_out(mean_nees):
     assert (mean_nees[2] > band(len(SEEDS))[1]).all()
 
@@ -120,6 +132,11 @@ def test_too_little_process_noise_is_found_out(mean_nees):
 @pytest.fixture(scope="module")
 def dive() -> tuple[Simulated, Config]:
     return drawn(1)
+
+
+def test_of_one_dive_too_little_process_noise_is_found_out(dive):
+    smoothed, filtered, stiff = one_dive(1)[:, 0]
+    assert max(smoothed, filtered) < chi2.ppf(0.999, 3) < stiff
 
 
 def test_a_log_without_imu_is_smoothed_and_no_bias_is_reported(dive):
@@ -165,6 +182,85 @@ def test_a_heading_that_is_held_leaves_a_track_as_certain_as_it_is(dive):
     done = smooth(altered(case.log, "vehicle_heading", data), config)
     assert done.verdict != "trusted"
     assert nees(done.estimates[0].trajectory, case, -1)[0] < chi2.ppf(0.99, 3)
+
+
+def silent(case: Simulated, *sensors: str) -> Log:
+    """The dive without some sensors for 30 s."""
+    return interrupted(case.log, 40.0, 30.0, *sensors)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "part"), [("vehicle_heading", "heading"), ("vehicle_tilt", "tilt")], ids=["heading", "tilt"]
+)
+def test_a_silent_attitude_makes_a_track_that_is_wide_and_an_alarm(dive, sensor, part):
+    case, config = dive
+    done = smooth(silent(case, sensor), config)
+    (alarm,) = [alarm for alarm in done.alarms if alarm.kind == f"no {part}"]
+    assert f"no {part} for 31 s, 39 to 70 s" in alarm.text and "30 pings" in alarm.text
+    assert done.left_out["dvl", f"no {part} for more than 10 s"] == 30
+    for estimate in done.estimates[:2]:
+        for time in (55.0, 69.0, 120.0):
+            k = int(estimate.trajectory.time.searchsorted(time)) - 1
+            assert nees(estimate.trajectory, case, k)[0] < chi2.ppf(0.999, 3)
+
+
+def test_of_one_heading_alone_comes_a_track_that_is_wide_and_an_alarm(dive):
+    case, config = dive
+    first = np.arange(len(case.log["vehicle_heading"])) == 0
+    done = smooth(kept(case.log, "vehicle_heading", first), config)
+    assert next(alarm.kind for alarm in done.alarms) == "no heading" and done.verdict == "doubtful"
+    assert nees(done.estimates[0].trajectory, case, -1)[0] < chi2.ppf(0.99, 3)
+    assert nees(batch(kept(case.log, "vehicle_heading", first), config).solve().trajectory, case, -1)[0] > 100.0
+
+
+def test_measurements_in_a_gap_of_the_attitude_leave_silences(dive):
+    case, config = dive
+    first = np.arange(len(case.log["vehicle_heading"])) == 0
+    log, gaps = without_attitude_gaps(kept(case.log, "vehicle_heading", first), config)
+    assert [gap.part for gap in gaps] == ["heading"] and len(log["depth"]) > 8
+    steps = np.diff(np.unique(np.concatenate([log[s].time for s in ("dvl", "depth", "vehicle_tilt")])))
+    assert steps[steps > 2.0].min() > 10.0
+    assert without_attitude_gaps(case.log, config) == (case.log, [])
+
+
+def one_silence(seed: int) -> Array:
+    """NEES of position in a silence of the heading, smoothed and filtered, and filtered with the pings in it, (3,)."""
+    case, config = drawn(seed)
+    log = silent(case, "vehicle_heading")
+    fair = without_attitude_gaps(log, config)[0]
+    tracks = batch(fair, config).solve(), renewed(fair, config).solve(), renewed(log, config).solve()
+    ends = [int(t.trajectory.time.searchsorted(69.0)) for t in tracks]
+    return np.array([nees(t.trajectory, case, k)[0] for t, k in zip(tracks, ends, strict=True)])
+
+
+@pytest.mark.slow
+def test_without_heading_position_is_as_wrong_as_it_says_at_most():
+    with ProcessPoolExecutor(2) as pool:
+        smoothed, filtered, overconfident = np.mean(list(pool.map(one_silence, range(1, 21))), axis=0)
+    limit = band(20)[1]
+    assert smoothed < limit and filtered < limit
+    assert overconfident > 5.0 * limit
+
+
+def test_without_depth_the_vertical_is_as_uncertain_as_the_start(dive):
+    case, config = dive
+    track = smooth(without(case.log, "depth"), config, "smoothed").estimates[0].trajectory
+    assert (track.p_n - true_at(case, track.time).p_n)[-1, 2] ** 2 < chi2.ppf(0.99, 1) * track.cov_p[-1, 2, 2]
+    assert np.sqrt(track.cov_p[-1, 2, 2]) > 50.0
+
+
+@pytest.mark.parametrize("wrong", ["mirrored", "reversed"])
+def test_a_wrong_heading_is_loud_where_a_few_fixes_show_the_way(dive, wrong):
+    case, config = dive
+    stream = case.log["vehicle_heading"]
+    log = altered(case.log, "vehicle_heading", wrap_angle(-stream.data if wrong == "mirrored" else stream.data + np.pi))
+    time, row = log["dvl"].time[::10], log["dvl"].row[::10]
+    fixes = np.zeros((len(time), len(STREAMS["fix"])))
+    fixes[:, :2] = true_at(case, time).p_n[:, :2] + np.random.default_rng(7).standard_normal((len(time), 2))
+    fixes[:, STREAMS["fix"].index("fix_sd")] = 1.0
+    fixed = replace(log, streams={**log.streams, "fix": Stream("fix", STREAMS["fix"], time, fixes, row)})
+    assert "rejected" in [alarm.kind for alarm in smooth(fixed, config, "smoothed").alarms if alarm.sensor == "fix"]
+    assert smooth(log, config, "smoothed").verdict == "trusted"  # nothing else can show it
 
 
 def test_an_imu_that_is_left_out_changes_nothing(dive):
@@ -213,6 +309,44 @@ def test_without_imu_roll_and_pitch_are_needed_and_online_refuses(dive):
         initialise(without(case.log, "vehicle_tilt"), config)
     with pytest.raises(InputError, match="online needs an IMU"):
         Startup(changed(config, motion={"model": "constant_velocity"}))
+    startup = Startup(config)
+    assert startup.begin(None) is None
+    assert startup.waits_for == "online needs an IMU, columns acc_x..acc_z and gyr_x..gyr_z"
+
+
+def test_online_without_an_imu_says_so_before_it_writes_anything(dive, tmp_path):
+    case, config = dive
+    case.dive.log_frame.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(InputError, match="online needs an IMU"):
+        Online(changed(config, motion={"model": "constant_velocity"})).run(
+            f"file:{tmp_path / 'log.csv'}", out=tmp_path / "out"
+        )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_pd0_file_of_a_real_vehicle_becomes_a_smoothed_track(tmp_path, monkeypatch):
+    if not REMUS.exists():
+        pytest.skip(f"{REMUS} is not there")
+    arguments = ["smooth", REMUS, "--config", CONFIG, "--out", tmp_path / "remus", "--estimate", "smoothed"]
+    monkeypatch.setattr(sys, "argv", ["rovgraph", *map(str, arguments), "--no-figures"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    track = pd.read_csv(tmp_path / "remus" / "trajectory_smoothed.csv")
+    recording = read_recording(REMUS)
+    columns = {c.sensor: c.columns for c in recording.channels}
+    for sensor, column, state in (
+        ("vehicle_heading", "heading", "yaw"),
+        ("vehicle_tilt", "pitch", "pitch"),
+        ("vehicle_tilt", "roll", "roll"),
+    ):
+        found = np.interp(columns[sensor]["time"], track["time"], np.unwrap(track[state]))
+        apart = np.rad2deg(wrap_angle(found - columns[sensor][column]))
+        assert np.abs(np.median(apart)) < 1.0 and np.median(np.abs(apart)) < 2.0, sensor
+    depth = np.interp(columns["depth"]["time"], track["time"], track["down"])
+    assert np.median(np.abs(depth - columns["depth"]["depth"])) < 0.2
+    assert len(track) > 4000 and np.isfinite(track[["north", "east", "north_sd", "east_sd"]]).all(axis=None)
 
 
 def test_gtsam_finds_the_same_optimum(dive):
@@ -227,8 +361,6 @@ def test_gtsam_finds_the_same_optimum(dive):
 
 
 if __name__ == "__main__":  # python tests/test_no_imu.py FIRST LAST: the same by hand, on other dives
-    import sys
-
     first, last = (int(a) for a in sys.argv[1:3])
     found = all_dives(range(first, last))
     print("band", np.round(band(len(found)), 2), *QUANTITIES)

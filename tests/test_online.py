@@ -296,7 +296,7 @@ def test_a_run_without_an_imu_says_what_is_missing(capsys, tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("time,depth\n0,1\n1,1\n")
     refusal = refused(capsys, "online", f"file:{log}", "--speed", "max", "--out", tmp_path / "out")
-    assert "no estimate was made: so far: no IMU" in refusal and f"file:{log}: depth" in refusal
+    assert "no estimate was made: online needs an IMU" in refusal and f"file:{log}: depth" in refusal
 
 
 class Full:

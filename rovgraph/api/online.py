@@ -182,6 +182,9 @@ class Online:
         if resume and any(source.pace == 1.0 for source in opened):
             raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
         feed = Feed(opened, warnings)
+        navigator = self._navigator(
+            config, patient=feed.recorded, trust=feed.replayed
+        )  # may refuse, before anything is written
         with ExitStack() as opened_outputs:  # they have threads, which a refused folder must not leave behind
             receivers: list[Output] = []
             for url in outputs:
@@ -197,7 +200,6 @@ class Online:
                     prepare(folder, force, sources)
                 files = Files(folder, config, warnings, resume, anew=self.engine == "isam2")
             opened_outputs.pop_all()
-        navigator = self._navigator(config, patient=feed.recorded, trust=feed.replayed)
         told: list[Callable[[Solution], None]] = [each.send for each in receivers]
         if watched is not None:
             told.append(watched.send)

@@ -9,11 +9,13 @@ import numpy as np
 
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.engine.variance_sources import variance_sources
 from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
+from rovgraph.estimators.attitude_gaps import AttitudeGap, without_attitude_gaps
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
@@ -91,15 +93,16 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     InputError : the log lacks what is needed, or does not determine some variable
     """
     log, frozen = without_frozen(log, config)
+    log, gaps = without_attitude_gaps(log, config)
     found: list[UnstatedNoise] = []
-    dive, best = _solve(log, config, frozen, estimate, progress)
+    dive, best = _solve(log, config, frozen, gaps, estimate, progress)
     for _ in range(MAX_NOISES if config.graph.find_noise else 0):
         more = find_noise(best, dive.beginning.config, dive.alarms) if isinstance(best, ChainOptimum) else []
         if not more:
             break
         found, config = found + more, with_noise(config, more)
         best = None  # a long dive is not kept twice
-        dive, best = _solve(log, config, frozen, estimate, progress)
+        dive, best = _solve(log, config, frozen, gaps, estimate, progress)
         if more[-1].lasts:
             break
     if isinstance(best, ChainOptimum):
@@ -122,7 +125,12 @@ def _with_main(dive: Dive, **more: object) -> Dive:
 
 
 def _solve(
-    log: Log, config: Config, frozen: list[FrozenStretch], estimate: str, progress: Progress
+    log: Log,
+    config: Config,
+    frozen: list[FrozenStretch],
+    gaps: list[AttitudeGap],
+    estimate: str,
+    progress: Progress,
 ) -> tuple[Dive, Optimum | None]:
     """The dive as configured, and the optimum of its smoothed estimate where a batch solver found it."""
     beginning = initialise(log, config)
@@ -146,8 +154,8 @@ def _solve(
             estimates.insert(0, smoothed(best, beginning))
             best.forget_covariances()  # of a long dive they are large
     intervals = batch.intervals if best is None else best.intervals
-    numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen))
-    left_out = _left_out(batch, frozen)
+    numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen, gaps))
+    left_out = _left_out(batch, frozen, gaps)
     return Dive([*estimates, batch.dead_reckoning()], beginning, left_out, frozen, numbers), best
 
 
@@ -164,12 +172,16 @@ def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
     return batch
 
 
-def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch]) -> dict[tuple[str, str], int]:
+def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch], gaps: list[AttitudeGap]) -> dict[tuple[str, str], int]:
     """What never reached the graph, and why."""
     counts = dict(batch.assembler.left_out)
     for stretch in frozen:
         why = (stretch.sensor, "frozen")
         counts[why] = counts.get(why, 0) + stretch.count
+    for gap in gaps:
+        if gap.pings:
+            why = ("dvl", f"no {gap.part} for more than {LONGEST_CRUISED_S:g} s")
+            counts[why] = counts.get(why, 0) + gap.pings
     return counts
 
 

@@ -22,6 +22,7 @@ QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that c
 STILL_SPEED = 0.1  # of a vehicle that stands still, by its DVL [m/s]
 STILL_TURN = np.deg2rad(3.0)  # its heading at the window's ends, at most [rad]
 HEADINGS = 50  # samples of a source that are looked at
+UNKNOWN_DOWN_SD = 100.0  # of a start whose depth nothing shows [m]
 FIRST_FIX_SD = 5.0  # the fix enters by itself, too [m]
 AGREE_SD = 3.0  # of a fix with the line through those around it
 MOST_MPS = 1.0  # that a vehicle moves before anything says where it is
@@ -169,7 +170,8 @@ def first_position(log: Log, config: Config, R_nb: Array, assumptions: list[str]
         p_n[2] = _robust_first(first.time, first.data[:, 0]) - rotate(R_nb, np.asarray(config.depth.lever_arm_m))[2]
         sd[2] = max(sd[2], MOST_MPS * (depth.time[0] - begin))
     elif start.down_m is None:
-        assumptions.append("start.down_m 0.0, as the log has no depth")
+        sd[2] = start.down_sd_m or UNKNOWN_DOWN_SD
+        assumptions.append(f"start.down_m 0.0 within {sd[2]:g} m, as the log has no depth")
     return p_n, sd
 
 

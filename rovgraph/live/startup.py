@@ -15,6 +15,7 @@ from rovgraph.sensors import SENSORS
 
 MARGIN_S = 0.5  # beyond the window, for data that come late
 AGAIN_S = 1.0  # between attempts
+NEEDS_IMU = "online needs an IMU, columns acc_x..acc_z and gyr_x..gyr_z"
 
 
 @dataclass
@@ -36,7 +37,7 @@ class Startup:
 
     def __post_init__(self) -> None:
         if has_constant_velocity(self.config):
-            raise InputError("motion.model: constant_velocity is for recorded logs, online needs an IMU")
+            raise InputError(f"motion.model: constant_velocity is for recorded logs, {NEEDS_IMU}")
 
     @property
     def expects(self) -> str:
@@ -69,9 +70,11 @@ class Startup:
         """The beginning from what is there, or None; then `waits_for` says why."""
         self.measurements.sort(key=place)
         imu = [m.time for m in self.measurements if m.sensor == "imu"]
-        if imu:
-            first = imu[-1] - WITHIN_S
-            self.measurements = [m for m in self.measurements if m.time >= first]
+        if not imu:
+            self.waits_for = NEEDS_IMU
+            return None
+        first = imu[-1] - WITHIN_S
+        self.measurements = [m for m in self.measurements if m.time >= first]
         named = self.config.heading.sources is not None
         later = [s for s in SENSORS.values() if s.may_begin_later]
         expected = {s.name for s in later if s.heading_source is None or named}

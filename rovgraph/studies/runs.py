@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from rovgraph.config import Config
+from rovgraph.estimators.attitude_gaps import without_attitude_gaps
 from rovgraph.log import Log
 from rovgraph.log.frozen import without_frozen
 from rovgraph.simulate import Choices, simulated
@@ -54,8 +55,9 @@ class Recorded:
     case: Case
 
     def load(self) -> Case:
-        """The case as it was given, without frozen measurements."""
-        return replace(self.case, log=without_frozen(self.case.log, self.case.config)[0])
+        """The case as it was given, without frozen measurements and those of unknown attitude."""
+        log, _ = without_frozen(self.case.log, self.case.config)
+        return replace(self.case, log=without_attitude_gaps(log, self.case.config)[0])
 
 
 @dataclass(frozen=True)

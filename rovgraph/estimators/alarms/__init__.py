@@ -21,6 +21,7 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     constants.moved,
     constants.earth_rate,
     sensors.frozen,
+    sensors.no_attitude,
     stretches.taken_out,
     stretches.close,
     residuals.rejected,

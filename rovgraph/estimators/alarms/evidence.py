@@ -10,6 +10,7 @@ import pandas as pd
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.estimators.attitude_gaps import AttitudeGap
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
 from rovgraph.log.frozen import FrozenStretch
@@ -47,6 +48,7 @@ class Evidence:
     intervals : of the estimates' keyframes
     optimum : of the smoothed estimate, where a batch solver found it
     frozen : what was left out since a sensor repeated itself
+    attitude_gaps : times without heading or tilt, of a dive without an IMU
     """
 
     beginning: InitialConditions
@@ -54,6 +56,7 @@ class Evidence:
     intervals: Sequence[KeyframeInterval]
     optimum: Optimum | None
     frozen: Sequence[FrozenStretch]
+    attitude_gaps: Sequence[AttitudeGap] = ()
 
     def estimate(self, kind: str) -> Estimate | None:
         """The estimate of a kind, if it was made."""

@@ -20,6 +20,7 @@ from rovgraph.geometry import Array
 CHANCE = 1e-6  # that a figure of a healthy sensor is beyond its limit
 ENOUGH = 20  # measurements
 REJECTED, MOSTLY_REJECTED = 0.05, 0.5  # share in a minute
+GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
 USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 TOO_LARGE, FAR_TOO_LARGE = 2.0, 6.0  # mean square of the dive
 IN_A_MINUTE = 1.5  # times as much
@@ -54,12 +55,21 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
     """The largest share of a sensor's measurements that was left out in a minute."""
     for r in evidence.residuals.values():
         window = windows(r.time, evidence.start, MINUTE)
-        share = share_rejected(np.bincount(window, r.weight <= 0.0), np.bincount(window))
+        out = r.weight <= 0.0
+        share = share_rejected(np.bincount(window, out), np.bincount(window))
+        if np.bincount(window).max(initial=0) < ENOUGH and _gives_up(out):
+            share[:] = out.mean()
         worst = int(np.argmax(share))
         bad = np.flatnonzero(share > REJECTED)
         begin, end = (bad[0], bad[-1]) if len(bad) else (worst, worst)
         begin_s, end_s = evidence.start + begin * MINUTE, min(evidence.start + (end + 1) * MINUTE, evidence.end)
         yield rejected_in(r.sensor, begin_s, end_s, float(share[worst]), evidence.start)
+
+
+def _gives_up(out: NDArray[np.bool_]) -> bool:
+    """Whether a sensor of few measurements, as fixes now and then, was rejected too often in the dive, shape (n,)."""
+    by_chance = float(bdtrc(max(int(out.sum()) - 1, 0), len(out), USUAL_SHARE)) > CHANCE
+    return bool(out.mean() > GIVEN_UP) and not by_chance
 
 
 def share_rejected(out: NDArray[Any], count: NDArray[Any]) -> Array:
@@ -83,8 +93,7 @@ def rejected_in(sensor: str, begin: float, end: float, share: float, start: floa
         share,
         REJECTED,
         MOSTLY_REJECTED,
-        f"up to {share:.0%} of a minute's measurements contradict the others and were rejected, "
-        f"{span(begin, end, start)}",
+        f"up to {share:.0%} of its measurements contradict the others and were rejected, {span(begin, end, start)}",
         f"if the instrument failed, remove that time from the log; if it lasts, check its mounting, signs "
         f"and clock (rovgraph check), and {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}",
     )

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
 from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic
 from rovgraph.estimators.alarms.evidence import Evidence, span
 
@@ -39,6 +40,29 @@ def frozen_for(sensor: str, first: float, last: float, seconds: float, times: in
         f"repeats its values for {seconds:.0f} s{often}, {span(first, last, start)}; they were ignored",
         "look at the instrument and its driver; the track is less certain there, as its sd says",
     )
+
+
+def no_attitude(evidence: Evidence) -> Iterator[Statistic]:
+    """Longest time without heading, and without tilt, in which nothing said what the DVL's pings mean."""
+    for part in ("heading", "tilt"):
+        gaps = [gap for gap in evidence.attitude_gaps if gap.part == part and gap.pings]
+        if not gaps:
+            continue
+        worst = max(gaps, key=lambda gap: gap.end - gap.begin)
+        seconds, often = worst.end - worst.begin, "" if len(gaps) == 1 else f", the longest of {len(gaps)} times"
+        yield Statistic(
+            f"no {part}",
+            part,
+            worst.begin,
+            worst.end,
+            seconds,
+            LONGEST_CRUISED_S,
+            float("inf"),
+            f"no {part} for {seconds:.0f} s, {evidence.span(worst.begin, worst.end)}{often}; nobody knows which way "
+            f"the vehicle turned, and {sum(gap.pings for gap in gaps)} pings of the DVL were left out",
+            f"look at the instrument and its driver, or map another source of {part}; position is as uncertain there "
+            "as its sd says",
+        )
 
 
 def contradictions(alarms: Sequence[Alarm], start: float) -> Iterator[Alarm]:
