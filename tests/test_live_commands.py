@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from dives import Simulated, falcon, simulated
 
+import rovgraph as rg
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.commands import DropMark, RemoveMark, SetPosition
 from rovgraph.live.feed import Feed
@@ -99,6 +100,21 @@ def test_marks_are_kept_with_where_the_vehicle_was_and_come_back(told):
     kinds = [e.kind for s in solutions for e in s.events if e.source == "pilot"]
     assert kinds == ["mark", "waypoint", "position", "removed"]
     assert all(json.dumps(e.as_dict()) for s in solutions for e in s.events)
+
+
+def test_results_of_the_recording_have_the_marks_where_the_smoothed_track_was(told, case, tmp_path):
+    config = rg.load_config(told[0] / "config.yaml")
+    result = rg.smooth(rg.read_log(told[0] / RECORDING, config), config, "smoothed")
+    result.save(tmp_path / "out", figures=False)
+    kept, placed = (pd.read_csv(folder / MARKS) for folder in (told[0], tmp_path / "out"))
+    assert list(placed["name"]) == list(kept["name"]) == [NASTY]
+    track = result.smoothed.trajectory.at(placed["time"].to_numpy())
+    np.testing.assert_allclose(placed[["north", "east", "down"]], track.p_n, atol=1e-9)
+    np.testing.assert_allclose(placed[["north_sd", "east_sd"]], track.p_sd[:, :2], atol=1e-9)
+    assert (placed["north"] != kept["north"]).all()
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "δύτης" in page or "\\u03b4\\u03cd" in page
+    assert NASTY not in page
 
 
 def test_a_torn_file_of_marks_loses_its_last_line_only(told, tmp_path):

@@ -4,6 +4,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,7 @@ def summarise(folder: Path, session: Session) -> None:
             "position_sd_m": solution.position_sd.tolist(),
             "distance_m": solution.distance,
             "calibration": {name: list(pair) for name, pair in solution.calibration.items()},
+            "marks": [asdict(mark) for mark in session.marks.all],
             "solutions": session.solutions,
             "left_out": [[*key, count] for key, count in sorted(navigator.left_out.items())],
             "warnings": [[*key, count] for key, count in sorted(session.warnings.counts.items())],

@@ -132,6 +132,7 @@ class Result:
         ------
         InputError : the folder exists, or cannot be written; as `rovgraph.export`
         """
+        from rovgraph.live.marks import MARKS, marks_beside, write_marks
         from rovgraph.report.folder import results_folder
         from rovgraph.report.results import write_results
 
@@ -154,6 +155,9 @@ class Result:
                 self.alarms,
                 self.warnings,
             )
+            marks = marks_beside(Path(self.log.source), self.main.trajectory, self.log.origin)
+            if marks:
+                write_marks(folder / MARKS, marks)
             if page:
                 from rovgraph.pages.reporting import write_page
 

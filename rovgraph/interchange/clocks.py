@@ -153,7 +153,7 @@ def join_clocks(
         before = len(waiting)
         for axis in list(waiting):
             channels = axis.channels(recordings[axis.file])
-            unix_sd = float(np.hypot(*(each.least_sd for each in (axis, base))))
+            unix_sd = float(np.hypot(axis.least_sd, base.least_sd))
             result = _joined(axis, base, channels, pool, stated.get(id(axis)), motion_of, unix_sd)
             if result is None:
                 continue

@@ -2,11 +2,15 @@
 
 import csv
 import math
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+
+import numpy as np
 
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
+from rovgraph.trajectory import Trajectory
 
 MARKS = "marks.csv"
 
@@ -87,13 +91,42 @@ class Marks:
             return
         partial = self._path.with_name(f".{MARKS}.partial")
         try:
-            with partial.open("w", encoding="utf-8", newline="") as file:
-                table = csv.DictWriter(file, [f.name for f in fields(Mark)])
-                table.writeheader()
-                table.writerows(asdict(mark) for mark in self.all)
+            write_marks(partial, self.all)
             partial.replace(self._path)
         except OSError as error:
             self._warnings.complain(str(self._path), "disk", f"cannot be written ({error.strerror}); free some space")
+
+
+def write_marks(path: Path, marks: Sequence[Mark]) -> None:
+    """A row for each, with names above."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, [f.name for f in fields(Mark)])
+        table.writeheader()
+        table.writerows(asdict(mark) for mark in marks)
+
+
+def marks_beside(recording: Path, track: Trajectory, origin: tuple[float, float] | None = None) -> tuple[Mark, ...]:
+    """The marks that were dropped while a recording was made, those of the vehicle where a better track has it then.
+
+    Parameters
+    ----------
+    recording : of the online mode
+    track : of the recording, such as the smoothed one
+    origin : latitude and longitude of north = east = 0 [deg]
+    """
+    marks = _read(recording.with_name(MARKS), Warnings())
+    inside = [m for m in marks if m.kind != "mark" or track.time[0] <= m.time <= track.time[-1]]
+    own = [k for k, mark in enumerate(inside) if mark.kind == "mark"]
+    if own:
+        there = track.at(np.array([inside[k].time for k in own]))
+        places = there.geodetic(origin) if origin is not None else ([None] * len(own),) * 2
+        for k, p, sd, latitude, longitude in zip(own, there.p_n, there.p_sd, *places, strict=True):
+            north, east, down = p.tolist()
+            place = {"latitude": latitude, "longitude": longitude}
+            inside[k] = replace(
+                inside[k], north=north, east=east, down=down, north_sd=float(sd[0]), east_sd=float(sd[1]), **place
+            )
+    return tuple(inside)
 
 
 def _read(path: Path, warnings: Warnings) -> tuple[Mark, ...]:

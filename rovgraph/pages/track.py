@@ -1,5 +1,6 @@
 """The track seen from above: estimates, fixes, ellipses, silences, and what the cursor needs to find the vehicle."""
 
+import html
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from rovgraph.report.colours import ESTIMATES, OTHER, REJECTED, USED
 
 ELLIPSES = 24
 SPACED = np.linspace(0.0, 2 * np.pi, 41)
-SILENT = "#B35900"
+SILENT, MARK = "#B35900", "#6A3D9A"
 
 
 def track_section(source: DiveSource) -> Section:
@@ -33,6 +34,7 @@ def track_section(source: DiveSource) -> Section:
         *_fixes(source.residuals, source),
         *_ellipses(source.main),
         *_ends(source),
+        *_marks(source.frame("marks.csv", "name", "north", "east")),
     ]
     note = "Ellipses hold 99 %. The thick line marks parts without bottom lock."
     chart: Item = Panel("Track", "east [m]", "north [m]", traces, kind="map", note=note)
@@ -148,3 +150,13 @@ def _ends(source: DiveSource) -> list[Trace]:
     ends = (("start", 0, "circle-open"), ("end", -1, "square"))
     look = [(name, track["east"][i], track["north"][i], symbol) for name, i, symbol in ends]
     return [points(name, [e], [n], "#000000", size=9, symbol=symbol, hoverinfo="name") for name, e, n, symbol in look]
+
+
+def _marks(rows: pd.DataFrame | None) -> list[Trace]:
+    """What a person marked during the dive, with the names."""
+    if rows is None or rows.empty:
+        return []
+    north, east = (pd.to_numeric(rows[c], errors="coerce").to_numpy(float) for c in ("north", "east"))
+    names = [html.escape(str(name)) for name in rows["name"].fillna("")]  # Plotly reads tags in a text
+    look: dict[str, Any] = {"mode": "markers+text", "text": names, "textposition": "top right", "hoverinfo": "text"}
+    return [points("mark", east, north, MARK, size=9, symbol="triangle-up", **look)]
