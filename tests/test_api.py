@@ -288,7 +288,7 @@ def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path):
 
 def test_plan_writes_what_the_command_writes(monkeypatch, tmp_path):
     monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything anew
-    options = ["--manoeuvres", "straight,turn", "--duration", 60, "--imu-rate", 20, "--dvl-rate", 2]
+    options = ["--manoeuvres", "straight", "--duration", 60, "--imu-rate", 20, "--dvl-rate", 2]
     assert command(monkeypatch, "plan", *options, "--estimate", "dvl_yaw", "-o", tmp_path / "command") == 0
     sensors = Sensors(20.0, 2.0, None)
     twin = rg.plan(rg.Config(), duration=60.0, manoeuvres=["straight"], estimate=["dvl_yaw"], sensors=sensors)
