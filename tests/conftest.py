@@ -6,8 +6,10 @@ import signal
 import pytest
 from hypothesis import HealthCheck, settings
 
-# how long an example takes says something about the machine only
-settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# how long an example takes says something about the machine only; the same examples each time, so that a failure stays
+SAME = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+settings.register_profile("any machine", SAME)
+settings.register_profile("other examples", SAME, derandomize=False, database=None)  # --hypothesis-profile
 settings.load_profile("any machine")
 
 # whoever starts the tests in the background has them ignore SIGINT, and so would every command that they interrupt

@@ -97,11 +97,13 @@ class Vehicle:
     lines : (time since the start [s], line), in order
     speed : seconds of the dive per second
     hang_up : when it closes the connection, once [s of the dive]
+    unheard_s : how much of the dive passes at most while nobody listens; then it waits, however slow the machine
     """
 
     lines: list[tuple[float, bytes]]
     speed: float = 1.0
     hang_up: float = np.inf
+    unheard_s: float = np.inf
     sent: float = -np.inf  # time of the newest line that a client took
     clients: int = 0  # that have come so far
     told: float = 0.0  # how much of the dive the newest of them was told [s]
@@ -119,17 +121,24 @@ class Vehicle:
         return f"tcp://127.0.0.1:{self.port}"
 
     def _serve(self) -> None:
-        client, begin, since, k = None, None, 0.0, 0
+        client, until, heard, since, k = None, 0.0, 0.0, 0.0, 0
+        last = time.monotonic()
         while not self._stop.is_set():
             if client is None:
                 with suppress(TimeoutError):
                     client = self._listener.accept()[0]
-                    begin = time.monotonic() if begin is None else begin
-                    since, self.told = self.speed * (time.monotonic() - begin), 0.0
+                    if self.clients == 0:
+                        last = time.monotonic()  # it waits for the first
+                    since, self.told = until, 0.0
                     self.clients += 1
-            if begin is None:
+            if self.clients == 0:
                 continue
-            until = self.speed * (time.monotonic() - begin)
+            now = time.monotonic()
+            if client is not None:
+                heard = until
+            if until - heard < self.unheard_s:
+                until += self.speed * (now - last)
+            last = now
             if client is not None and until > self.hang_up:
                 client.close()
                 client, self.hang_up = None, np.inf
@@ -156,8 +165,10 @@ class Vehicle:
 
 
 @contextmanager
-def vehicle(lines: list[tuple[float, bytes]], speed: float = 1.0, hang_up: float = np.inf) -> Iterator[Vehicle]:
-    server = Vehicle(lines, speed, hang_up)
+def vehicle(
+    lines: list[tuple[float, bytes]], speed: float = 1.0, hang_up: float = np.inf, unheard_s: float = np.inf
+) -> Iterator[Vehicle]:
+    server = Vehicle(lines, speed, hang_up, unheard_s)
     server._thread.start()
     try:
         yield server

@@ -37,7 +37,7 @@ from rovgraph.log import STREAMS
 
 TLOG = Path(__file__).parents[2] / "shared" / "data" / "ardusub" / "ardusub_small.tlog.gz"
 LONGEST_FRAME = 293  # bytes of MAVLink
-OPTIONAL = {"ahrs": 1, "dvl": 4, "fix": 2, GEODETIC: 2}  # sensor -> its first column that may be NaN
+OPTIONAL = {"ahrs": 1, "dvl": 4, "fix": 2, "place": 1, GEODETIC: 2}  # sensor -> its first column that may be NaN
 
 RAPID = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -146,6 +146,7 @@ json_values = st.recursive(
         st.sampled_from(["time", *(c for cs in STREAMS.values() for c in cs), "fix_lat", "fix_lon"]), json_values
     )
 )
+@example(row={"place_id": 0.0})
 @RAPID
 def test_no_json_value_raises(row):
     line = json.dumps(row).encode() + b"\n"

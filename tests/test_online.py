@@ -128,10 +128,10 @@ def events_of(out: Path, kind: str) -> int:
 def test_killed_twice_and_resumed_it_goes_on_where_it_was(tmp_path):
     case = simulated(falcon(), 35.0, seed=2, dvl_rate=4.0)
     lines = [(m.time, row(m)) for m in case.log.measurements()]
-    out, speed, solutions = tmp_path / "out", 1.0, b""  # what passes while a process starts, passes blindly
+    out, speed, solutions = tmp_path / "out", 4.0, b""
     config = tmp_path / "config.yaml"
     config.write_text(case.config.to_yaml())
-    with vehicle(lines, speed) as server:
+    with vehicle(lines, speed, unheard_s=4.0) as server:  # while a process starts
         for run, seconds in enumerate((3.0, 8.0, np.inf)):  # the first before there is a keyframe
             given = ["--config", config] if run == 0 else ["--resume"]
             with running(
