@@ -58,7 +58,7 @@ def starting() -> Iterator[None]:
 def in_workers(
     function: Callable[[Task], Result], tasks: Sequence[Task], jobs: int, progress: Callable[[float], None]
 ) -> list[Result]:
-    """``function`` of every task, in the order of the tasks, in processes of their own.
+    """``function`` of every task, in the order of the tasks: in processes of their own, or in this one if one does.
 
     Parameters
     ----------
@@ -70,6 +70,12 @@ def in_workers(
     ------
     InputError : a process was killed from outside
     """
+    if min(jobs, len(tasks)) == 1:  # a process more would only import everything once more
+        results = []
+        for done, task in enumerate(tasks, 1):
+            results.append(function(task))
+            progress(done / len(tasks))
+        return results
     with workers(min(jobs, len(tasks))) as pool:
         with starting():
             futures = [pool.submit(function, task) for task in tasks]
