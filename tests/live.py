@@ -5,7 +5,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -125,38 +125,45 @@ class Vehicle:
         last = time.monotonic()
         while not self._stop.is_set():
             if client is None:
-                with suppress(TimeoutError):
-                    client = self._listener.accept()[0]
-                    if self.clients == 0:
-                        last = time.monotonic()  # it waits for the first
-                    since, self.told = until, 0.0
-                    self.clients += 1
-            if self.clients == 0:
-                continue
-            now = time.monotonic()
-            if client is not None:
-                heard = until
-            if until - heard < self.unheard_s:
-                until += self.speed * (now - last)
-            last = now
+                client = self._accepted()
+                since = until if client is not None else since
+            elapsed, last = time.monotonic() - last, time.monotonic()
+            heard = heard if client is None else until
+            if self.clients > 0 and until - heard < self.unheard_s:
+                until += self.speed * elapsed
             if client is not None and until > self.hang_up:
                 client.close()
                 client, self.hang_up = None, np.inf
             first = k
             while k < len(self.lines) and self.lines[k][0] <= until:
                 k += 1
-            if client is not None and k > first:
-                try:
-                    client.sendall(b"".join(line for _, line in self.lines[first:k]))
-                    self.sent = self.lines[k - 1][0]
-                    self.told = self.sent - since
-                except OSError:
-                    client = None
+            if client is not None and k > first and not self._took(client, self.lines[first:k], since):
+                client = None
             if k == len(self.lines):
                 self.done.set()
             time.sleep(0.01)
         if client is not None:
             client.close()
+
+    def _accepted(self) -> socket.socket | None:
+        """Whoever has come."""
+        try:
+            client = self._listener.accept()[0]
+        except TimeoutError:
+            return None
+        self.told = 0.0
+        self.clients += 1
+        return client
+
+    def _took(self, client: socket.socket, lines: list[tuple[float, bytes]], since: float) -> bool:
+        """Whether a client that came at ``since`` took lines."""
+        try:
+            client.sendall(b"".join(line for _, line in lines))
+        except OSError:
+            return False
+        self.sent = lines[-1][0]
+        self.told = self.sent - since
+        return True
 
     def close(self) -> None:
         self._stop.set()

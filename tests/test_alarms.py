@@ -69,7 +69,7 @@ def broken(name: str, seed: int, path: str = "falcon", find_noise: bool = False)
     return case, smooth(BROKEN[name].breaks(case.log), case.config)
 
 
-@pytest.mark.parametrize("name", BROKEN)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * ("biased" in n)) for n in BROKEN])
 def test_what_is_broken_is_named_with_a_remedy(name):
     verdict, kind, words = SAID[name]
     _, dive = broken(name, 1)

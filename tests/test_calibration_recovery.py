@@ -154,7 +154,9 @@ def others_late(noise: bool) -> Simulated:
 
 
 @pytest.mark.parametrize("estimator", [batch, renewed], ids=["batch", "filter"])
-@pytest.mark.parametrize("noise", [False, True], ids=["without noise", "with noise"])
+@pytest.mark.parametrize(
+    "noise", [pytest.param(False, id="without noise", marks=pytest.mark.slow), pytest.param(True, id="with noise")]
+)
 def test_time_offsets_of_compasses_depth_and_fixes_are_found(estimator, noise):
     case = others_late(noise)
     estimate = estimator(case.log, started(case)).solve()

@@ -319,7 +319,7 @@ main()
 """
 
 
-@pytest.mark.parametrize("stage", ["estimating", "writing"])
+@pytest.mark.parametrize("stage", ["estimating", pytest.param("writing", marks=pytest.mark.slow)])
 def test_ctrl_c_in_the_middle_leaves_nothing_and_exits_130(tmp_path, config, short, stage):
     """At the first sign of progress, and before the first file is written."""
     arguments = [

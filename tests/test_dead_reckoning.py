@@ -52,9 +52,9 @@ def exact() -> Simulated:
     return simulated(falcon(), 200.0, path="accelerate-and-stop", style=CALM, noise=False)
 
 
-@pytest.mark.parametrize("grade", ["fog", "mti"])
+@pytest.mark.parametrize("grade", ["fog", pytest.param("mti", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rest", [True, False])
-@pytest.mark.parametrize("jitter", [1e-3, 0.1])
+@pytest.mark.parametrize("jitter", [pytest.param(1e-3, marks=pytest.mark.slow), 0.1])
 def test_a_dvl_that_pings_once_a_second_is_as_good_as_if_keyframes_might_be_further_apart(grade, rest, jitter):
     config = falcon(imu=GRADES[grade], heading={"sources": ["dvl"]})
     case = simulated(config, 400.0, 2, "lawnmower", dvl_rate=0.999, dvl_jitter=jitter, calibration=KNOWN)

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 import sys
 sys.modules["gtsam"] = None
@@ -36,6 +38,7 @@ assert len(intervals) > 3 and state.v_n[0, 0] > 0.2
 """
 
 
+@pytest.mark.slow
 def test_a_log_is_assembled_and_predicted_where_gtsam_cannot_be_imported():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

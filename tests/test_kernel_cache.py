@@ -98,6 +98,7 @@ def test_without_numba_one_line_says_what_to_install(command, tmp_path):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_missing_modules_are_compiled_by_processes_of_their_own_and_nothing_else(tmp_path):
     few = ["rovgraph.kernels.chain", "rovgraph.kernels.linear_chain"]
     code = (

@@ -203,7 +203,14 @@ def test_the_filters_smoother_agrees_with_the_batch_solution(lost):
     np.testing.assert_allclose(other.trajectory.p_sd[-1], one.trajectory.p_sd[-1], rtol=0.1)
 
 
-@pytest.mark.parametrize("solver", [batch, filtered, incremental], ids=["batch", "filter", "isam2"])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(batch, id="batch"),
+        pytest.param(filtered, id="filter"),
+        pytest.param(incremental, id="isam2", marks=pytest.mark.slow),
+    ],
+)
 def test_false_sightings_are_kept_out_and_change_nothing(misled, solver):
     false = is_false(misled)
     assert 0.3 < np.mean(list(false.values())) < 0.7

@@ -44,7 +44,9 @@ def wavy(world) -> tuple[Path, Sea]:
     return world.along(STRAIGHT, 0.5, sea, 100.0), sea
 
 
-@pytest.fixture(scope="module", params=sorted(RUNS))
+@pytest.fixture(
+    scope="module", params=["1", *(pytest.param(run, marks=pytest.mark.slow) for run in sorted(RUNS) if run != "1")]
+)
 def vattern(request) -> tuple[str, Dive]:
     return request.param, simulated("vattern", 4, choices=Choices(variant=request.param))[0]
 
@@ -120,7 +122,9 @@ def test_vattern_keeps_to_the_route_and_below_the_thesiss_speed(vattern):
     assert 0.2 < np.linalg.norm(dive.truth.v_n, axis=1).max() < 0.7
 
 
-@pytest.mark.parametrize("current", [(0.1, 0.0), (-0.07, 0.07), (0.0, -0.1)])
+@pytest.mark.parametrize(
+    "current", [(0.1, 0.0), *(pytest.param(c, marks=pytest.mark.slow) for c in ((-0.07, 0.07), (0.0, -0.1)))]
+)
 def test_vattern_is_reached_against_any_current_that_is_drawn(current):
     world = World.drawn(CONFIG, Choices(current=current), seed=1)
     run = RUNS["1"]

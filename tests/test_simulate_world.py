@@ -197,6 +197,7 @@ def test_iron_lies_below_the_whole_track(lakes):
     assert clearance.min() > 1.0 and clearance.max() < 3.5
 
 
+@pytest.mark.slow
 def test_iron_is_there_by_default_in_the_lake_only():
     assert "iron_p_n" in simulated("vattern", 0)[0].hidden["world"]
     assert "iron_p_n" not in simulated("tank", 0)[0].hidden["world"]
@@ -204,6 +205,7 @@ def test_iron_is_there_by_default_in_the_lake_only():
     assert "iron_p_n" in simulated("square", 0, choices=Choices(disturbances=True))[0].hidden["world"]
 
 
+@pytest.mark.slow
 def test_field_of_the_lake_is_another_than_the_tanks_whatever_is_estimated():
     fixed = CONFIG.model_dump(exclude_unset=True)
     fixed["calibration"] |= {"field_dip": {"estimate": False}, "field_scale": {"estimate": False}}

@@ -469,7 +469,7 @@ def test_wrong_noise_is_seen_in_the_innovations():
 
 
 @pytest.mark.parametrize("noise", [False, True])
-@pytest.mark.parametrize("variant", "abc")
+@pytest.mark.parametrize("variant", [*(pytest.param(v, marks=pytest.mark.slow) for v in "ab"), "c"])
 def test_body_and_earth_frame_agree_when_nothing_turns(variant, noise):
     """Linearised at the true motion; at their own estimates noise sets them apart, where heading is ill known."""
     means = {name: belief.mean for name, belief in beliefs(CONFIG).items()}
@@ -547,7 +547,7 @@ def test_frame_of_the_noise_matters_only_where_axes_differ():
 
 
 @pytest.mark.parametrize("switch", [{"iterations": 3}, {"linearized_at": "truth"}, {"coriolis": "exact"}])
-@pytest.mark.parametrize("name", ["4.3a", "4.4a"])
+@pytest.mark.parametrize("name", [pytest.param("4.3a", marks=pytest.mark.slow), "4.4a"])
 def test_switches_change_little_where_all_is_well_known(name, switch):
     case = lively_dive()
     variant = replace(FILTERS[name], **switch)
@@ -680,6 +680,7 @@ def test_filters_side_by_side_do_what_each_does_alone(names):
         assert_same(together, run_filter(each.variant, each.log, each.config))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", [{"iterations": 3}, {"linearized_at": "truth"}, {"coriolis": "exact"}])
 def test_filters_with_switches_do_so_too(switch):
     case = lively_dive()
@@ -840,7 +841,7 @@ ICTINEU = Path(__file__).parents[2] / "shared" / "data" / "ictineu"
 
 
 @pytest.mark.skipif(not ICTINEU.exists(), reason="no real log beside the checkout (shared/data/ictineu)")
-@pytest.mark.parametrize("name", ["4.1", "4.1-no-accelerometer"])
+@pytest.mark.parametrize("name", ["4.1", pytest.param("4.1-no-accelerometer", marks=pytest.mark.slow)])
 def test_real_log_of_a_slow_mti_is_within_what_its_compass_allows(name):
     """An IMU of 10 Hz; the mounting is wrong by 5.3 degrees and the compass deviates by as much; DGPS of a buoy."""
     config, log = real_log()
