@@ -18,6 +18,8 @@ from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
 
 FAR = 1000.0  # from the origin, in which seven digits are a tenth of a millimetre [m]
+TUM = ".ned.tum"  # end of the name of a TUM file, which says its frame
+TUM_FRAME = "time [s], position in north, east, down [m], quaternion x y z w from forward, starboard, down to those"
 POSITION = ["north", "east", "down"]
 ATTITUDE = ["roll", "pitch", "yaw"]
 VELOCITY = ["v_north", "v_east", "v_down"]
@@ -164,10 +166,11 @@ class Trajectory:
         write_csv(frame, path, append=more, decimals=decimals)
 
     def write_tum(self, path: Path) -> None:
-        """Write a TUM file: ``time x y z qx qy qz qw``, n axes."""
+        """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line says so (its name should: `TUM`)."""
         rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
         line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
-        path.write_text(line * len(rows) % tuple(rows.ravel().tolist()), encoding="utf-8", newline="")
+        poses = line * len(rows) % tuple(rows.ravel().tolist())
+        path.write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
 
 
 def _sd(covariance: Array) -> Array:

@@ -6,6 +6,7 @@ import sqlite3
 import warnings
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -365,9 +366,11 @@ def test_commands_write_what_the_library_does(results, monkeypatch, capsys):
             main()
         assert end.value.code == 0
     rg.export("out", ["tum", "geojson"], out="library")
-    for name in ("track_smoothed.tum", "track_smoothed.geojson"):
+    for name in ("track_smoothed.ned.tum", "track_smoothed.geojson"):
         assert (results / "maps" / name).read_bytes() == (results / "library" / name).read_bytes()
     assert (results / "out" / "track_smoothed.geojson").stat().st_size > 0
+    rg.tag("out/trajectory_filtered.csv", "out", "library.csv")
+    assert Path("placed.csv").read_bytes() == Path("library.csv").read_bytes()
     placed, smoothed = pd.read_csv("placed.csv"), pd.read_csv("out/trajectory_smoothed.csv")
     assert placed["rov_north"].to_numpy() == pytest.approx(smoothed["north"].to_numpy(), abs=1e-3)
 

@@ -92,8 +92,9 @@ def test_what_is_not_known_is_neither_written_nor_read_as_zero(trajectory, tmp_p
     np.testing.assert_allclose(short.at(np.array([0.5])).p_n[0, :2], [1.5, 2.5])
 
 
-def test_tum_file_has_position_and_quaternion_in_n(trajectory, tmp_path):
+def test_a_tum_file_says_its_frame_and_has_position_and_quaternion_in_n(trajectory, tmp_path):
     trajectory.write_tum(tmp_path / "t.tum")
+    assert "north, east, down" in (tmp_path / "t.tum").read_text().splitlines()[0]
     rows = np.loadtxt(tmp_path / "t.tum")
     assert rows.shape == (N, 8)
     np.testing.assert_allclose(rows[:, 1:4], trajectory.p_n, atol=1e-6)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from rovgraph.export.formats import ExportFormat, Options
 from rovgraph.export.track import Track
+from rovgraph.trajectory import TUM
 
 
 def write(track: Track, path: Path, options: Options) -> None:
@@ -11,4 +12,4 @@ def write(track: Track, path: Path, options: Options) -> None:
     track.at_rate(options.rate).trajectory.write_tum(path)
 
 
-FORMATS = (ExportFormat("tum", "TUM", ".tum", write),)
+FORMATS = (ExportFormat("tum", "TUM", TUM, write),)

@@ -22,7 +22,7 @@ from rovgraph.log import Log
 from rovgraph.report.dive_files import dvl_frame, input_file, left_out_frame, timings, versions
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
-from rovgraph.trajectory import Trajectory
+from rovgraph.trajectory import TUM, Trajectory
 from rovgraph.units import shown
 
 CHI2_99 = 9.21  # of two degrees of freedom, so sqrt(9.21) semi-axes hold 99 %
@@ -65,7 +65,7 @@ def write_results(
     estimates = main_first(estimates)
     for estimate in estimates:
         estimate.trajectory.write_csv(folder / f"trajectory_{estimate.kind}.csv", origin=log.origin)
-        estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}.tum")
+        estimate.trajectory.write_tum(folder / f"trajectory_{estimate.kind}{TUM}")
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
     write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
