@@ -101,7 +101,9 @@ def test_the_results_folder_holds_everything_that_is_promised(shipped):
     names = {p.name for p in shipped.iterdir()}
     tables = {"trajectory_smoothed.csv", "trajectory_filtered.csv", "trajectory_smoothed.ned.tum"}
     tables |= {"trajectory_filtered.ned.tum", "calibration.csv", "residuals.csv", "summary.json", "config.yaml"}
-    assert tables | {"track.png", "velocity.png", "attitude.png", "residuals.png", "calibration.png"} <= names
+    assert (
+        tables | {"track.png", "velocity.png", "attitude.png", "depth.png", "residuals.png", "calibration.png"} <= names
+    )
     json.loads((shipped / "summary.json").read_text())
 
 

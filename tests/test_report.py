@@ -500,7 +500,7 @@ def png_size(path):
     return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
 
-FIGURES = ["track.png", "velocity.png", "attitude.png", "residuals.png", "calibration.png"]
+FIGURES = ["track.png", "velocity.png", "attitude.png", "depth.png", "residuals.png", "calibration.png"]
 
 
 def test_figures_exist_with_sane_sizes(dive, tmp_path):
@@ -513,7 +513,7 @@ def test_figures_exist_with_sane_sizes(dive, tmp_path):
     assert [p.name for p in paths] == FIGURES
     for path in paths:
         width, height = png_size(path)
-        assert width == 1080 and 500 < height < 2500
+        assert width == 1080 and 400 < height < 2500
 
 
 def test_figures_of_bare_estimates(dive, tmp_path):
@@ -527,7 +527,37 @@ def test_figures_of_bare_estimates(dive, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         paths = draw_figures(tmp_path, [bare], only_imu, config)
-    assert [p.name for p in paths] == ["track.png", "velocity.png", "attitude.png"]
+    assert [p.name for p in paths] == ["track.png", "velocity.png", "attitude.png", "depth.png"]
+
+
+def test_a_poorly_known_start_does_not_flatten_the_axes_of_velocity(dive):
+    from rovgraph.report.figure_motion import draw_velocity
+
+    track = dive[0][1].trajectory
+    cov_v = track.cov_v.copy()
+    cov_v[:3] = 100.0 * np.eye(3)
+    figure = draw_velocity([replace(dive[0][1], trajectory=replace(track, cov_v=cov_v))])
+    sd = np.sqrt(np.diagonal(cov_v[3:], axis1=1, axis2=2)).max(axis=0)
+    for i in range(3):
+        low, high = figure.axes[i].get_ylim()
+        assert low <= track.v_n[:, i].min() and high >= track.v_n[:, i].max()
+        assert high - low < 1.2 * (np.ptp(track.v_n[:, i]) + 4.0 * sd[i])
+
+
+def test_depth_grows_downwards_and_the_bottom_lies_below_it_by_the_altitude(dive):
+    from rovgraph.report.figure_motion import draw_depth
+
+    estimates, log, _, _ = dive
+    time = log["imu"].time[::50]
+    columns, three = ("dvl_altitude",), np.full((len(time), 1), 3.0)
+    stream = Stream("dvl_altitude", columns, time, three, np.arange(len(time)))
+    sounded = replace(log, streams={**log.streams, "dvl_altitude": stream})
+    upper, lower = draw_depth(estimates, sounded).axes
+    below = next(line for line in upper.lines if line.get_label() == "bottom").get_ydata()
+    np.testing.assert_allclose(below, estimates[0].trajectory.at(time).p_n[:, 2] + 3.0)
+    assert upper.get_ylim()[0] > below.max() and upper.yaxis_inverted()
+    np.testing.assert_allclose(lower.lines[0].get_ydata(), 3.0)
+    assert len(draw_depth(estimates, log).axes) == 1
 
 
 def test_figures_leave_matplotlib_as_it_was(dive, tmp_path):

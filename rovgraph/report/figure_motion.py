@@ -1,4 +1,4 @@
-"""Velocity and attitude against time."""
+"""Velocity, attitude and depth against time."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -19,8 +19,10 @@ SOURCES: dict[str, tuple[str, dict[str, Any]]] = {
     "dvl_heading": ("DVL compass", {"marker": "x", "color": "#009E73", "mew": 0.5}),
     "mag": ("magnetometer", {"marker": "+", "color": "#E69F00", "mew": 0.5}),
 }
+BOTTOM: dict[str, Any] = {"color": "#8C6D46", "linewidth": 0.9, "zorder": 1}
 MOST_SAMPLES = 1500  # of a heading source
 DENSE = 2000  # epochs from which lines are drawn thinner
+USUAL = (1.0, 99.0)  # percentiles of value ± 2 sd that an axis shows; a poorly known start would flatten the dive
 
 
 def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
@@ -28,18 +30,52 @@ def draw_velocity(estimates: Sequence[Estimate]) -> Figure:
     figure = new_figure(7.2)
     panels: list[Axes] = list(figure.subplots(4, 1, sharex=True))
     clock = Clock.of(estimates[0])
+    spans: list[list[tuple[float, float]]] = [[] for _ in panels]
     for estimate in estimates:
         track = estimate.trajectory
         speed, speed_sd = _speed(track)
         values, sds = np.column_stack([track.v_n, speed]), np.column_stack([track.v_sd, speed_sd])
         some = thin(len(track))
-        for axes, value, sd in zip(panels, values[some].T, sds[some].T, strict=True):
+        for axes, span, value, sd in zip(panels, spans, values[some].T, sds[some].T, strict=True):
             _line_and_band(axes, clock(track.time[some]), value, sd, estimate.kind)
-    for axes, name in zip(panels, ("north", "east", "down", "speed"), strict=True):
+            span.append(_span(value, sd))
+    for axes, name, span in zip(panels, ("north", "east", "down", "speed"), spans, strict=True):
         axes.set_ylabel(f"{name} [m/s]")
+        _scale(axes, span)
     panels[3].set_ylim(bottom=0.0)
     panels[0].set_title("velocity over ground, bands ±2 sd", loc="left")
     clock.name_axis(panels[3])
+    figure.align_ylabels()
+    legend_below(figure, panels)
+    return figure
+
+
+def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
+    """Depth with ±2 sd, the bottom below it and the altitude over it where the DVL measured one."""
+    main, clock = estimates[0], Clock.of(estimates[0])
+    bottom = "dvl_altitude" in log
+    figure = new_figure(4.6 if bottom else 3.0)
+    panels: list[Axes] = list(figure.subplots(1 + bottom, 1, sharex=True, squeeze=False)[:, 0])
+    spans = []
+    for estimate in estimates:
+        track, some = estimate.trajectory, thin(len(estimate.trajectory))
+        depth, sd = track.p_n[some, 2], track.p_sd[some, 2]
+        _line_and_band(panels[0], clock(track.time[some]), depth, sd, estimate.kind)
+        spans.append(_span(depth, sd))
+    panels[0].set_ylabel("depth [m]")
+    panels[0].set_title("depth, bands ±2 sd" + ("; bottom and altitude by the DVL" if bottom else ""), loc="left")
+    if bottom:
+        stream = log["dvl_altitude"].take(thin(len(log["dvl_altitude"])))
+        altitude, time = stream["dvl_altitude"], clock(stream.time)
+        below = main.trajectory.at(stream.time).p_n[:, 2] + altitude
+        panels[0].plot(time, below, label="bottom", **BOTTOM)
+        spans.append(_span(below, np.zeros_like(below)))
+        panels[1].plot(time, altitude, **BOTTOM)
+        panels[1].set_ylabel("altitude [m]")
+        panels[1].set_ylim(bottom=0.0)
+    _scale(panels[0], spans)
+    panels[0].invert_yaxis()
+    clock.name_axis(panels[-1])
     figure.align_ylabels()
     legend_below(figure, panels)
     return figure
@@ -55,6 +91,9 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     low = _lower_end(main.trajectory)
     for estimate in estimates:
         _draw_attitude(panels, estimate, clock, low)
+    for i in (0, 1):
+        tracks = [estimate.trajectory for estimate in estimates]
+        _scale(panels[i], [_span(np.rad2deg(t.rpy[:, i]), np.rad2deg(t.rpy_sd[:, i])) for t in tracks])
     for sensor, (time, heading) in samples.items():
         label, look = SOURCES[sensor]
         panels[2].plot(clock(time), _within(heading, low), ls="none", ms=2.5, label=label, zorder=1, alpha=0.6, **look)
@@ -132,6 +171,24 @@ def _line_and_band(axes: Axes, time: Array, value: Array, sd: Array, kind: str) 
     if np.isfinite(sd).any():
         band = {"color": look["color"], "alpha": 0.18, "linewidth": 0, "zorder": look["zorder"] - 2}
         axes.fill_between(time, value - 2 * sd, value + 2 * sd, **band)
+
+
+def _span(value: Array, sd: Array) -> tuple[float, float]:
+    """What an axis has to show of a line and its ±2 sd."""
+    spread = np.where(np.isfinite(sd), 2.0 * sd, 0.0)
+    known = np.isfinite(value)
+    if not known.any():
+        return np.inf, -np.inf
+    ends = np.percentile((value - spread)[known], USUAL[0]), np.percentile((value + spread)[known], USUAL[1])
+    return float(min(*ends, value[known].min())), float(max(*ends, value[known].max()))
+
+
+def _scale(axes: Axes, spans: Sequence[tuple[float, float]]) -> None:
+    """Have an axis show all of some spans, and little more."""
+    low, high = min(span[0] for span in spans), max(span[1] for span in spans)
+    if high >= low:
+        margin = max(0.05 * (high - low), 1e-3)
+        axes.set_ylim(low - margin, high + margin)
 
 
 def _lower_end(track: Trajectory) -> float:

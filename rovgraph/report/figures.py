@@ -10,7 +10,7 @@ from rovgraph.config import Config
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.log import Log
 from rovgraph.report.figure_calibration import draw_calibration
-from rovgraph.report.figure_motion import draw_attitude, draw_velocity
+from rovgraph.report.figure_motion import draw_attitude, draw_depth, draw_velocity
 from rovgraph.report.figure_residuals import draw_residuals
 from rovgraph.report.figure_track import draw_track
 from rovgraph.report.results import main_first
@@ -42,6 +42,7 @@ def draw_figures(
             "track.png": draw_track(estimates, log, config, reference),
             "velocity.png": draw_velocity(over_time),
             "attitude.png": draw_attitude(over_time, log, config),
+            "depth.png": draw_depth(over_time, log),
             "residuals.png": draw_residuals(estimates[0]),
             "calibration.png": draw_calibration(over_time),
         }
