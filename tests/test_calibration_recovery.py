@@ -102,7 +102,14 @@ def isam2(log: Log, config: Config) -> IncrementalEstimator:
     return again
 
 
-@pytest.mark.parametrize("estimator", [batch, renewed, isam2], ids=["batch", "filter", "isam2"])
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        pytest.param(batch, id="batch"),
+        pytest.param(renewed, id="filter"),
+        pytest.param(isam2, id="isam2", marks=pytest.mark.slow),
+    ],
+)
 def test_with_noise_the_time_offset_is_found_as_required(estimator):
     case = late(0.3, sd=0.1, seconds=34.0, noise=True)
     error, sd = errors(estimator(case.log, started(case)).solve(), OFFSET, [0.3])

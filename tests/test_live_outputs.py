@@ -257,7 +257,7 @@ def test_a_patient_output_waits_for_its_reader_and_loses_nothing():
     assert dropped(err) == 0
 
 
-@pytest.mark.parametrize("how", ["live", "patient"])
+@pytest.mark.parametrize("how", [pytest.param("live", marks=pytest.mark.slow), "patient"])
 def test_a_closed_pipe_is_complained_of_once_and_is_no_error(how):
     child = prints(300, how)
     child.stdout.close()

@@ -193,7 +193,7 @@ def test_a_dvl_an_imu_and_an_autopilot_with_clocks_of_their_own(case, tmp_path):
             autopilot.append((m.time, packed(mavlink.MAVLink_attitude_message(boot, 0.0, 0.0, yaw, 0.0, 0.0, 0.0))))
     config = tmp_path / "config.yaml"
     config.write_text(case.config.model_copy(update={"heading": type(case.config.heading)()}).to_yaml())
-    with vehicle(samples, 4.0) as imu, vehicle(pings, 4.0) as dvl, vehicle(autopilot, 4.0) as mav:
+    with vehicle(samples, 2.0) as imu, vehicle(pings, 2.0) as dvl, vehicle(autopilot, 2.0) as mav:
         sources = [imu.url, dvl.url.replace("tcp", "waterlinked"), mav.url.replace("tcp:", "mavlink:tcp:")]
         sources[2] = sources[2].replace("//", "")
         with running(*sources, "-c", config, "--output", "-", "--rate", 2, stdout=subprocess.PIPE) as process:
@@ -221,7 +221,7 @@ def test_bad_input_is_counted_and_said_once_and_the_estimate_goes_on(lines, case
     closed = socket.create_server(("127.0.0.1", 0))
     nobody = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
     closed.close()
-    with vehicle(spoiled, 8.0, hang_up=20.0) as server:
+    with vehicle(spoiled, 4.0, hang_up=20.0) as server:
         options = ["-c", config, "--no-refine", "--rate", 20, "--output", "-", "--out", out]
         with running(server.url, nobody, "tcp://no.such.host.invalid:5", *options, stdout=subprocess.PIPE) as process:
             until(lambda: received(out, b"\n39.9"))  # and nobody reads what it says
