@@ -52,7 +52,7 @@ SAID = {
     "depth stuck": ("doubtful", "frozen", "depth: repeats its values for 140 s"),
     "DVL 0.3 s late": ("wrong", "clock", "s late relative to the IMU's"),
     "DVL noise three times as stated": ("doubtful", "too large", "raise dvl.velocity_sd_mps"),
-    "fixes 8 m off for a minute": ("doubtful", "lasting", "fix: residuals of north keep their sign"),
+    "fixes 8 m off for a minute": ("doubtful", "lasting", "fix: residuals of north do not average out"),
     "gyro scale 0.5 %": ("doubtful", "held", "estimate calibration.gyr_scale"),
     "gyro warms up": ("doubtful", "bias drift", "raise imu.noise.gyr_walk"),
 }

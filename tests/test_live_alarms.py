@@ -48,12 +48,12 @@ def test_a_healthy_dive_is_trusted_from_beginning_to_end(case):
     ("name", "words"),
     [
         ("DVL y sign flipped", "dvl: up to"),
-        ("IMU mounted 2, 1, 3 degrees off", "depth: residuals of down keep their sign"),
+        ("IMU mounted 2, 1, 3 degrees off", "depth: residuals of down do not average out"),
         ("DVL biased by 0.3 m/s for 20 s", "dvl: contradicts all other sensors"),
-        ("depth stuck", "depth: residuals of down keep their sign"),
+        ("depth stuck", "depth: residuals of down do not average out"),
         ("DVL 0.3 s late", "dvl: up to"),
         ("DVL noise three times as stated", "raise dvl.velocity_sd_mps"),
-        ("fixes 8 m off for a minute", "fix: residuals of north keep their sign"),
+        ("fixes 8 m off for a minute", "fix: residuals of north do not average out"),
     ],
 )
 def test_what_is_broken_is_named_while_the_dive_goes_on(name, words):

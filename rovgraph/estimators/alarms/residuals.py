@@ -189,8 +189,8 @@ def lasting_in(r: SensorResiduals, start: float, end: float, began: float | None
         ratio,
         max(LASTING, by_chance),
         max(BADLY_LASTING, by_chance),
-        f"residuals of {r.components[component]} keep their sign: means over {seconds:g} s vary {ratio:.0f} times "
-        f"as much as noise, most at {begin - (start if began is None else began):.0f} s",
+        f"residuals of {r.components[component]} do not average out: means over {seconds:g} s vary {ratio:.0f} "
+        f"times as much as noise, most at {begin - (start if began is None else began):.0f} s",
         _remedy_of_lasting(r.sensor),
     )
 
@@ -229,7 +229,7 @@ def _remedy_of_lasting(sensor: str) -> str:
             f"or raise {sd_key(sensor)}"
         )
     if sensor == "fix":
-        return "the fixes share an error there: remove them from the log, or raise fix.sd_m"
+        return "the fixes are all off there: remove them from the log, or raise fix.sd_m"
     if sensor == "depth":
         return "the depth contradicts the DVL's vertical velocity: check depth, dvl.mount_rpy_deg and imu.mount_rpy_deg"
     if sensor.startswith("dvl"):
