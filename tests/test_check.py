@@ -119,7 +119,7 @@ def test_timing_counts_rate_gap_and_repeats():
     ("absent", "level", "said"),
     [
         (["imu"], "error", "no IMU"),
-        (["dvl"], "warning", "no DVL: position is lost"),
+        (["dvl"], "warning", "no DVL: without fixes, position is lost"),
         (
             ["mag", "ahrs", "dvl_heading"],
             "warning",
