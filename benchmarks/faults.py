@@ -26,32 +26,33 @@ READING = """# Faults: when the configuration is wrong
 
 `python benchmarks/faults.py --seeds {seeds} --markdown docs/faults.md` makes this page{version}.
 
-An independent simulator makes the dives: WGS-84, Earth rate, IMU samples averaged over their period, its own frames \
-and equations (`benchmarks/fault_campaign`). Each case has one fault that the configuration does not state. Every log \
-goes through `rovgraph smooth`{online}, {seeds} seeds a case; cases named *online* go through `rovgraph online` \
-alone. NEES is the squared error over the stated variance per degree of freedom, its mean over dive and seeds: 1 is \
-consistent. The columns show that of the horizontal position, and the largest of depth, heading, `dvl_yaw` and \
-`dvl_scale`. The rms error and the stated sd are of the smoothed horizontal position. *Named* is the part of the \
-dives in which a warning names the cause. The warnings of the same dives without the fault do not count.
+An independent simulator (`benchmarks/fault_campaign`) makes the dives, with WGS-84, the Earth's rate, IMU samples \
+averaged over their period, and its own frames and equations. Each case has one fault that the configuration does \
+not state. Every log goes through `rovgraph smooth`{online}, {seeds} seeds a case; cases named *online* go through \
+`rovgraph online` alone. NEES is the squared error over the stated variance per degree of freedom, averaged over \
+dive and seeds: 1 is consistent. The columns show the NEES of the horizontal position, then the largest one of \
+depth, heading, `dvl_yaw` and `dvl_scale`. The rms error and the stated sd are of the smoothed horizontal position. \
+*Named* is the share of dives in which a warning names the cause. Warnings that the same dives raise without the \
+fault do not count.
 
 | outcome | |
 |---|---|
 | right | every NEES is at most 2, and the sd is at most 1.5 times that of the healthy dive |
-| wide | every NEES is at most 2, and the sd is larger |
-| loud | some NEES is above 2, and 19 of 20 dives name the cause, are refused, or are by themselves within 2 |
-| no trace | as a lie, but nothing in the log can show the fault: the reasons stand below the table |
+| wide | every NEES is at most 2, and the sd is larger than that |
+| loud | some NEES is above 2, and 19 of 20 dives name the cause, are refused, or have no NEES above 2 |
+| no trace | as a lie, but nothing in the log can show the fault; the reasons are below the table |
 | lie | some NEES is above 2, and the cause is not named |
 
-{limit}*Reported by* says who reported such a fault: `audit` is an audit of rovgraph with another simulator and \
-recorded dives, others are issue trackers of drivers, autopilots and navigation software.
+{limit}*Reported by* gives the source of such a fault: `audit` is an audit of rovgraph with another simulator and \
+recorded dives, the others are issue trackers of drivers, autopilots and navigation software.
 
-A fault leaves *no trace* if its log is that of another dive without a fault. Only wider priors cover it. `smooth` \
-prints what heading and depth rest on where nothing checks them, with the prior's sd; the outcome counts only if it \
-does, and only for the quantities that the reason concerns: every other must be right.
+A fault leaves *no trace* if another dive without a fault has the same log. Only wider priors cover it. Where \
+nothing checks heading and depth, `smooth` prints what they rest on, with the prior's sd. The outcome counts only if \
+it does so, and only for the quantities of that reason: every other quantity must be right.
 
 Run the campaign whenever the estimator changes. `--cases` selects some of them, `--jobs` sets the number of \
-processes, `--json` writes all figures, `--keep` continues an interrupted campaign, `--online` replays each log \
-through `rovgraph online` as well.
+processes, `--json` writes all figures, `--keep` continues an interrupted campaign, `--online` also replays each log \
+through `rovgraph online`.
 """
 
 
@@ -102,7 +103,9 @@ def _limit(seeds: int) -> str:
     limit = honest_nees(seeds)
     if limit <= HONEST_NEES:
         return ""
-    return f"With {seeds} seeds chance alone reaches {limit:.1f} in 1 of 100 campaigns, which takes the place of 2.\n\n"
+    return (
+        f"With {seeds} seeds the limit is {limit:.1f} instead of 2: chance alone reaches it in 1 of 100 campaigns.\n\n"
+    )
 
 
 def count(cases: list[Case], outcomes: dict[str, Outcome]) -> str:

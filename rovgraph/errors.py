@@ -1,4 +1,4 @@
-"""What goes wrong on the user's side, as one clear line."""
+"""Errors and warnings for the user, one clear line each."""
 
 import sys
 import warnings
@@ -17,7 +17,7 @@ class InputError(Exception):
 
 
 class DataWarning(UserWarning):
-    """Data that look wrong but can be worked with; issued with `warn`."""
+    """Data that look wrong but can be used; issued with `warn`."""
 
 
 def warn(text: str) -> None:

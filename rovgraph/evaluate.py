@@ -27,7 +27,7 @@ MIN_COVARIANCE = 1e-12  # [m^2]: a smaller determinant's root is a fixed positio
 
 @dataclass(frozen=True)
 class Metrics:
-    """Errors of a trajectory against a reference; None where something is not known.
+    """Errors of a trajectory relative to a reference; None = not known.
 
     Attributes
     ----------
@@ -41,10 +41,10 @@ class Metrics:
     drift_percent : ``end_m`` in percent of ``distance_m``
     rms_3d_m, rms_down_m : where the reference has ``down``
     heading_rms_deg, heading_mean_deg : where the reference has ``yaw``
-    nees : mean normalised error of north and east, 2 for honest covariances
+    nees : mean normalised error squared of north and east, 2 for consistent covariances
     inside_ellipse : part of the epochs inside the 99 % ellipse
-    aligned : the trajectory was fitted to the reference before
-    turned_deg, shift_north_m, shift_east_m : what the alignment took out
+    aligned : whether the trajectory was aligned with the reference first
+    turned_deg, shift_north_m, shift_east_m : rotation and shift of the alignment
     """
 
     epochs: int
@@ -81,14 +81,14 @@ def evaluate(
     Parameters
     ----------
     trajectory : Trajectory
-    reference : Trajectory; what it does not know is NaN
-    start : leave out what is earlier than this after the trajectory's first epoch [s]
-    align : fit the trajectory to the reference first
-    end : leave out what is later than this after the trajectory's first epoch [s]
+    reference : Trajectory; unknown quantities are NaN
+    start : skip this time after the trajectory's first epoch [s]
+    align : rotate and shift the trajectory onto the reference first
+    end : skip everything later than this after the trajectory's first epoch [s]
 
     Raises
     ------
-    InputError : no `Trajectory`; a start before or after the trajectory; an end before the start; fewer than two
+    InputError : not a `Trajectory`; a start before or after the trajectory; an end before the start; fewer than two
         reference epochs inside the rest of it
     """
     for name, track in (("trajectory", trajectory), ("reference", reference)):
@@ -211,9 +211,9 @@ def aligned(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, dict[s
 
 
 def read_reference(path: Path | str) -> Trajectory:
-    """Read a reference CSV, tolerating what other tools write.
+    """Read a reference CSV, also as other tools write it.
 
-    Rows without time, north or east and repeated times are left out with a `DataWarning`;
+    Rows without time, north or east and repeated times are ignored with a `DataWarning`;
     rows out of order are sorted.
 
     Raises

@@ -45,14 +45,14 @@ SHIPPED, SHIPPED_S = Path(__file__).parents[1] / "data" / "falcon", 160.0
 
 # what breaks -> the verdict, the kind of the alarm that names it, and words of its line
 SAID = {
-    "DVL y sign flipped": ("wrong", "axes", "dvl: its axes are left-handed, dvl_vx, -dvl_vy, dvl_vz are right"),
+    "DVL y sign flipped": ("wrong", "axes", "dvl: its axes are left-handed and should be dvl_vx, -dvl_vy, dvl_vz"),
     "IMU mounted 2, 1, 3 degrees off": ("wrong", "held", "check imu.mount_rpy_deg"),
     "DVL biased by 0.3 m/s for 20 s": ("wrong", "taken out", "dvl: contradicts all other sensors"),
     "DVL frozen for a minute": ("doubtful", "frozen", "dvl: repeats its values for 60 s"),
     "depth stuck": ("doubtful", "frozen", "depth: repeats its values for 140 s"),
-    "DVL 0.3 s late": ("wrong", "clock", "s late against the IMU's"),
+    "DVL 0.3 s late": ("wrong", "clock", "s late relative to the IMU's"),
     "DVL noise three times as stated": ("doubtful", "too large", "raise dvl.velocity_sd_mps"),
-    "fixes 8 m off for a minute": ("doubtful", "lasting", "fix: residuals of north last"),
+    "fixes 8 m off for a minute": ("doubtful", "lasting", "fix: residuals of north do not average out"),
     "gyro scale 0.5 %": ("doubtful", "held", "estimate calibration.gyr_scale"),
     "gyro warms up": ("doubtful", "bias drift", "raise imu.noise.gyr_walk"),
 }

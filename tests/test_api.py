@@ -138,7 +138,7 @@ def test_one_estimate_of_an_engine_is_that_of_the_command(monkeypatch, tmp_path,
         twin = rg.smooth(rg.read_log(log), estimate="smoothed", engine=engine)
     twin.save(tmp_path / "twin", figures=False)
     same_files(tmp_path / "command", tmp_path / "twin")
-    with pytest.raises(rg.InputError, match="filtered estimate was not asked for"):
+    with pytest.raises(rg.InputError, match="filtered estimate was not requested"):
         _ = twin.filtered
 
 

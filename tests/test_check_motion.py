@@ -95,7 +95,7 @@ def test_flipped_axes_are_said_to_be_no_mounting(k):
 def test_a_dvl_that_is_stamped_late_is_measured_against_the_imu(dive, seconds):
     log, config = dive
     text = said(later(log, "dvl", seconds), config, "dvl")
-    assert f"{'late' if seconds > 0 else 'early'} against the IMU's" in text
+    assert f"{'late' if seconds > 0 else 'early'} relative to the IMU's" in text
     found = float(text.split("dvl_time_offset: {estimate: true, mean: ")[1].split(",")[0])
     assert found == pytest.approx(seconds, abs=0.04)
 
@@ -104,7 +104,7 @@ def test_a_time_offset_that_is_stated_is_no_fault(dive):
     log, config = dive
     stated = config.model_dump(exclude_unset=True)
     stated["calibration"]["dvl_time_offset"] = {"estimate": False, "mean": 0.3}
-    assert "against the IMU's" not in said(later(log, "dvl", 0.3), Config.model_validate(stated), "dvl")
+    assert "relative to the IMU's" not in said(later(log, "dvl", 0.3), Config.model_validate(stated), "dvl")
 
 
 @pytest.mark.parametrize("sensor", ["dvl", "imu"])

@@ -62,7 +62,7 @@ def test_warnings_are_counted_and_exit_with_0(run, log, tmp_path):
     assert code == 0
     assert "no errors, 2 warnings" in out
     assert "180 deg away from upwards" in out
-    assert "ahrs_yaw turns against the gyro" in out
+    assert "ahrs_yaw turns opposite to the gyro" in out
 
 
 def test_errors_exit_with_2_after_the_report(run, log, tmp_path):

@@ -224,7 +224,7 @@ def test_the_tutorial_goes_from_a_wrong_track_to_one_that_is_right(drawing, caps
         told = runpy.run_path(str(DOCS / "tutorial.py"))
     said = capsys.readouterr().out
     assert [told[name].verdict for name in ("straight", "mounted")] == ["wrong", "trusted"]
-    assert "units: {gyr: deg/s}" in said and "mirrored?" in said and "mount_rpy_deg: [180.0, 0.0, 0.0]" in said
+    assert "units: {gyr: deg/s}" in said and "sign is reversed" in said and "mount_rpy_deg: [180.0, 0.0, 0.0]" in said
     assert "its noise is" in said  # of the ping that was stated too precise
     assert told["metrics"].rms_m < 1.0
     assert rg.evaluate(told["straight"].smoothed.trajectory, told["dive"].truth).rms_m > 5.0

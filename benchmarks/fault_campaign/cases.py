@@ -28,20 +28,20 @@ AHRS_DEPTH = ("ahrs", "depth")
 WAVES = "survey, waves"
 WITH_FIXES = ("ahrs", "depth", "fix")
 TURNED = NoTrace(
-    "Turned as a whole about the vertical, the dive obeys the same equations. Only position fixes, or a gyro that "
-    "measures the Earth's rate, know where north is.",
+    "If the whole dive is rotated about the vertical, it obeys the same equations. Only position fixes, or a gyro that "
+    "measures the Earth's rate, show where north is.",
     ("position", "heading"),
     "constant error of the heading",
 )
 LIFTED = NoTrace(
-    "Shifted as a whole along the vertical, the dive obeys the same equations: gravity changes by 0.003 mm/s² a metre. "
+    "If the whole dive is shifted vertically, it obeys the same equations: gravity changes by 0.003 mm/s² per metre. "
     "Only a start at a known depth shows the offset.",
     ("depth",),
     "constant error of the depth",
 )
 OTHER_AXES = NoTrace(
-    "A log has the angles between its sensors. Which axes are the vehicle's is stated by `imu.mount_rpy_deg` alone, "
-    "so heading and `dvl_yaw` have its error, and the track does not.",
+    "A log shows the angles between its sensors, but only `imu.mount_rpy_deg` states which axes are the vehicle's. "
+    "So heading and `dvl_yaw` have its error, and the track does not.",
     ("heading", "dvl_yaw"),
 )
 

@@ -18,7 +18,7 @@ class MagnetometerResult:
     Attributes
     ----------
     found : centre, matrix, disturbances, and how well the samples fit
-    config : the configuration that the calibration goes into
+    config : the configuration to which the calibration is added
     """
 
     found: MagnetometerCalibration
@@ -47,7 +47,7 @@ class NoiseResult:
     Attributes
     ----------
     found : channels with densities and bias instability, lines in the spectra, remarks
-    config : the configuration that the noise goes into
+    config : the configuration to which the noise is added
     """
 
     found: NoiseReport
@@ -72,11 +72,11 @@ class NoiseResult:
 def calibrate_magnetometer(
     log: Log, config: Config | None = None, method: library.Method = "ellipsoid"
 ) -> MagnetometerResult:
-    """Determine hard and soft iron from a log in which the vehicle was turned about all its axes.
+    """Determine hard and soft iron from a log in which the vehicle turns about all its axes.
 
     Parameters
     ----------
-    log : read with the configuration's ``with_raw_magnetometer()``, so that its samples are as measured
+    log : read with the configuration's ``with_raw_magnetometer()``, so that its samples are uncorrected
     config : of vehicle and sensors; None = all defaults
     method : "ellipsoid", or "turns" for a turn about z and one about x
 
@@ -99,7 +99,7 @@ def calibrate_noise(log: Log, config: Config | None = None) -> NoiseResult:
 
     Parameters
     ----------
-    log : as read with the configuration; the vehicle stands still in it, waves are tolerated
+    log : as read with the configuration; the vehicle is at rest in it, waves are tolerated
     config : of vehicle and sensors; None = all defaults
 
     Raises

@@ -30,9 +30,9 @@ class ComparisonResult:
     Attributes
     ----------
     comparison : all tables; docs/compare.md describes their columns
-    title : what was compared on
-    thesis : the thesis has numbers for it
-    about : what it was made of, for ``summary.json``
+    title : log or scenario
+    thesis : whether the thesis has numbers for it
+    about : its inputs, for ``summary.json``
     """
 
     comparison: Comparison
@@ -79,22 +79,22 @@ def compare(
     Parameters
     ----------
     log : as read with the configuration
-    config : what is believed of vehicle and sensors; None = all defaults, or the scenario's own
-    reference : what the log's estimates are compared with
+    config : of vehicle and sensors; None = all defaults, or the scenario's
+    reference : the track that the log's estimates are compared with
     scenario : simulate dives of this one instead of a log
     seeds : of the simulated dives
-    duration : of a simulated dive [s]; None = the scenario's own
-    estimators : names or patterns, as "graph-*"; None = all that need no thrusters
+    duration : of a simulated dive [s]; None = the scenario's
+    estimators : names or patterns, such as "graph-*"; None = all that need no thrusters
     jobs : processes; None = one per core
-    progress : called now and then with what is being done, and how far it is from 0 to 1
+    progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------
-    InputError : neither or both of log and scenario, no such estimator, a log that cannot be worked with
+    InputError : neither or both of log and scenario, an unknown estimator, a log that cannot be used
 
     Warns
     -----
-    DataWarning : whatever looks wrong
+    DataWarning : findings of the check
     """
     select(estimators)
     require_one(log, reference, scenario, seeds, duration)

@@ -30,10 +30,10 @@ class Conversion:
 
     Attributes
     ----------
-    merged : columns, sources, clocks and what was left
-    log : as an estimate takes it
-    config : what was given, completed by what the files know, for the log that `save` writes: without columns, units
-    used : dotted key -> value, of what the files know and the configuration did not state
+    merged : columns, sources, clocks and what was ignored
+    log : ready for an estimate
+    config : the given one, completed by settings of the files, for the log that `save` writes: without columns, units
+    used : dotted key -> value of the settings that come from the files
     """
 
     merged: Merged
@@ -43,13 +43,13 @@ class Conversion:
 
     @property
     def notes(self) -> list[str]:
-        """What was assumed, and which settings of the files hold, a sentence each."""
+        """Assumptions, and settings that come from the files, a sentence each."""
         told = [text for recording in self.merged.recordings for text in recording.notes]
         return [*told, *_settings_told(self.merged, self.used)]
 
     @property
     def report(self) -> dict[str, Any]:
-        """What was made of what, for JSON: files, columns, clocks, settings, warnings."""
+        """Where each part comes from, for JSON: files, columns, clocks, settings, warnings."""
         return account(self.merged)
 
     def save(self, path: Path | str, config_out: Path | str | None = None, force: bool = False) -> list[Path]:
@@ -63,7 +63,7 @@ class Conversion:
 
         Returns
         -------
-        list of Path : what was written
+        list of Path : the files written
 
         Raises
         ------
@@ -102,15 +102,15 @@ def convert(
     shift: Mapping[str, float] = NOTHING,
     progress: Progress = no_progress,
 ) -> Conversion:
-    """Make one log of native files of one dive (docs/formats.md).
+    """Convert native files of one dive into one log (docs/formats.md).
 
     Parameters
     ----------
     paths : files of any format, recognised by their content; rovgraph's own logs among them
-    config : for own logs' columns and units; what it states goes before what the files know
+    config : gives columns and units of rovgraph's own logs; takes precedence over settings of the files
     choose : sensor -> file, instance, message or topic that feeds it, where there are several
-    shift : sensor or file -> what is added to its stamps, where that is known [s]
-    progress : called now and then with what is being done, and how far it is from 0 to 1
+    shift : sensor or file -> seconds to add to its stamps, if known
+    progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------
@@ -118,7 +118,7 @@ def convert(
 
     Warns
     -----
-    DataWarning : what was left out, put in order, or looks wrong
+    DataWarning : what was ignored, sorted, or looks wrong
     """
     config = Config() if config is None else config
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]

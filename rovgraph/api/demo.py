@@ -18,7 +18,7 @@ SCENARIO, SEED, CHOICES = "falcon", 1, Choices(outliers=0.01)  # the dive of dat
 
 @dataclass(frozen=True)
 class Demo:
-    """The demonstration dive, its estimates, and how far they are from the truth.
+    """The demonstration dive, its estimates and their errors.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Demo:
     dive : the log and the truth
     result : what `rovgraph.smooth` returned
     summary : what ``summary.json`` of the results holds
-    metrics : the smoothed track against the truth
+    metrics : errors of the smoothed track
     """
 
     folder: Path
@@ -44,12 +44,11 @@ class Demo:
 def demo(path: Path | str = "demo", force: bool = False, progress: Progress = no_progress) -> Demo:
     """Write the demonstration dive into a folder, smooth it and evaluate the track.
 
-    The dive is simulated here, so that the package need not contain its log: eight minutes round a structure with
-    the sensors of a Falcon, the same for everyone.
+    The dive is simulated: eight minutes around a structure with the sensors of a Falcon, always the same.
 
     Parameters
     ----------
-    path : the folder to make: the files of ``rovgraph simulate``, and those of ``rovgraph smooth`` in ``results``
+    path : the folder to create: the files of ``rovgraph simulate``, and those of ``rovgraph smooth`` in ``results``
     force : replace an older folder
     progress : called at times with the current task and its progress from 0 to 1
 

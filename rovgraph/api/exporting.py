@@ -32,11 +32,11 @@ def export(
     results : of `smooth`, or a results folder
     to : name of a format, or several
     out : folder to write into; None = the results folder
-    estimate : "smoothed", "filtered" or "dead_reckoning"; None = the best there is
-    rate : of points [Hz]; None = each format's own
+    estimate : "smoothed", "filtered" or "dead_reckoning"; None = the best available
+    rate : of points [Hz]; None = each format's default
     crs : coordinates of GeoPackage and shapefile, such as "EPSG:25832" or "utm"
     unix_offset : Unix time of the log's time 0 [s]
-    force : replace files of that name
+    force : replace older files
 
     Returns
     -------
@@ -44,12 +44,12 @@ def export(
 
     Raises
     ------
-    InputError : an unknown format, a library that is not installed, an origin or a Unix time that a format needs and
-        the dive does not have, a file that is there
+    InputError : an unknown format, a missing library, a missing origin or Unix time that a format needs, a file that
+        exists
     """
     if out is None:
         if not isinstance(results, str | Path):
-            raise InputError("out: expected a folder to write into, since these results are in none")
+            raise InputError("out: expected a folder to write into, because these results have none")
         out = results
     track = track_of(results, estimate).shifted(unix_offset)
     return write_track(track, [to] if isinstance(to, str) else to, Path(out), Options(rate, crs), force)
@@ -73,15 +73,15 @@ def tag(
     results : of `smooth`, or a results folder
     out : CSV to write
     time : name of that column
-    offset : what is added to the table's times [s]
+    offset : to add to the table's times [s]
     estimate : as of `export`
-    exif : name of a column of JPEGs, relative to the table; copies with their place in EXIF go beside ``out``, into a
-        folder of its name with ``_photos``
-    force : replace files of that name
+    exif : name of a column of JPEG files, relative to the table; copies with the position in EXIF go into a folder
+        beside ``out``, named after it with ``_photos``
+    force : replace older files
 
     Raises
     ------
-    InputError : a table that cannot be worked with, no row within the dive, no origin for EXIF
+    InputError : a table that cannot be used, no row within the dive, no origin for EXIF
     """
     from rovgraph.report.folder import results_files
 

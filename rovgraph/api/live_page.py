@@ -25,22 +25,22 @@ def live_page(
     position_sd_limit_m: float = 5.0,
     warnings: Warnings | None = None,
 ) -> "LivePage":
-    """Serve the live page; give it each solution with `send`, and `close` it at the end (docs/live-page.md).
+    """Serve the live page (docs/live-page.md). Pass each solution to its `send`, and `close` it at the end.
 
     Parameters
     ----------
-    address : ``host:port``; another host than the loopback asks pages for a token, which is in the page's `url`
-    offer : takes the commands of pages; None = pages only look
-    marks : shown on the map
-    charts : GeoTIFF or GeoJSON files, or folders of tiles, below the track
+    address : ``host:port``; a host other than the loopback requires a token, which is in the page's `url`
+    offer : called with commands of pages; None = pages are read-only
+    marks : to show on the map
+    charts : GeoTIFF or GeoJSON files, or folders of tiles, to show under the track
     origins : of other pages, such as Cockpit's, that may frame the page and read values without a token
-    token : file that keeps the token; None = a new one each time
-    position_sd_limit_m : beyond which the page raises an alarm
-    warnings : told if the server fails
+    token : file that holds the token; None = a new token each time
+    position_sd_limit_m : position sd beyond which the page raises an alarm
+    warnings : receives failures of the server
 
     Raises
     ------
-    InputError : a library that is missing, an address that cannot be listened at, a chart that cannot be read
+    InputError : a missing library, an address that cannot be used, a chart that cannot be read
     """
     try:
         from rovgraph.web.page import LivePage

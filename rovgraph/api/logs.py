@@ -34,15 +34,15 @@ def read_log(
 
     Returns
     -------
-    Log : what native files know (mountings, ...) is in ``.settings`` and holds where a configuration states nothing
+    Log : ``.settings`` holds what native files state, such as mountings; the configuration takes precedence
 
     Raises
     ------
-    InputError : a file that cannot be worked with
+    InputError : a file that cannot be used
 
     Warns
     -----
-    DataWarning : what was ignored or sorted; a configuration beside the log that was not given
+    DataWarning : what was ignored or sorted; a configuration that lies beside the log but was not given
     """
     if isinstance(path, pd.DataFrame):
         raise InputError("log: is a DataFrame, expected a file's name; use Log.from_frame")
@@ -76,7 +76,7 @@ def check(log: Log, config: Config | None = None) -> Report:
 
     Raises
     ------
-    InputError : a log that was read with other columns
+    InputError : the log was read with other columns
     """
     config = given(log, config)
     report = examine(log, config)
@@ -94,7 +94,7 @@ def prepared(log: Log, config: Config) -> Log:
 
     Raises
     ------
-    InputError : a log that was read with other columns, or that an estimate cannot work with
+    InputError : the log was read with other columns, or that an estimate cannot work with
 
     Warns
     -----

@@ -27,10 +27,10 @@ class ObservabilityResult:
 
     Attributes
     ----------
-    observability : sd before and after, correlations, and when the dive showed it
-    config : of vehicle and sensors, with what was estimated
-    warnings : what was said of the log, a line each
-    about : what it was made of, for ``summary.json``
+    observability : sd before and after, correlations, and sd against time
+    config : of vehicle and sensors, including the variables estimated
+    warnings : findings on the log, a line each
+    about : its inputs, for ``summary.json``
     """
 
     observability: Observability
@@ -69,7 +69,7 @@ class PlanResult:
     ----------
     plan : the manoeuvres, the best first
     config : of vehicle and sensors
-    about : what it was made of, for ``summary.json``
+    about : its inputs, for ``summary.json``
     """
 
     plan: Plan
@@ -97,7 +97,7 @@ class PlanResult:
 def observe(
     log: Log, config: Config | None = None, estimate: Sequence[str] = (), progress: Progress = no_progress
 ) -> ObservabilityResult:
-    """How well a dive determines each calibration variable, when it did, and what is missing.
+    """Determine how well a dive shows each calibration variable, when it did, and what is missing.
 
     Parameters
     ----------
@@ -108,11 +108,11 @@ def observe(
 
     Raises
     ------
-    InputError : an unknown variable, one whose sensor is not in use, none at all; a log that cannot be worked with
+    InputError : an unknown variable, one whose sensor is not used, no variable at all, a log that cannot be used
 
     Warns
     -----
-    DataWarning : whatever looks wrong
+    DataWarning : findings of the check
     """
     config = estimating(given(log, config), estimate)
     with collected_warnings() as texts:
@@ -137,17 +137,17 @@ def plan(
     Parameters
     ----------
     config : of vehicle and sensors; None = all defaults
-    goals : label of a component -> sd that is wanted, radians and SI
-    known : of a dive before, or its ``observability.json``; None = nothing is known
+    goals : label of a component -> wanted sd, radians and SI
+    known : result of an earlier dive, or its ``observability.json``; None = none
     duration : of each manoeuvre [s]
-    manoeuvres : scenarios, as "circle" or "circle@0.3" (m/s); None = all
+    manoeuvres : scenarios, such as "circle" or "circle@0.3" (m/s); None = all
     estimate : calibration variables to estimate beside those of the configuration
-    sensors : how often they measure
+    sensors : their rates
     progress : called at times with the current task and its progress from 0 to 1
 
     Raises
     ------
-    InputError : no such manoeuvre or variable, nothing to estimate, a goal for what is not estimated
+    InputError : an unknown manoeuvre or variable, nothing to estimate, a goal for a variable that is not estimated
     """
     config = estimating(config_or_defaults(config), estimate)
     candidates = chosen(manoeuvres or None, duration)

@@ -33,19 +33,19 @@ ENGINES = ("fixed-lag", "isam2")
 
 @dataclass(frozen=True)
 class LiveRun:
-    """A run of the online estimator. Iterate over it once; each solution comes as soon as it is due.
+    """A run of the online estimator. Iterate over it once; it yields each solution as soon as it is due.
 
-    The run ends with its sources, when `close` is called, and when you leave the loop.
+    The run ends when its sources end, when you call `close`, or when you leave the loop.
 
     Attributes
     ----------
     sources : their addresses
     session : the estimate, the newest solution, and counts of warnings
     feed : messages of the sources
-    outputs : where solutions go
-    page : the live page, whose ``url`` a browser opens; None = none
-    folder : what is kept; None = nothing
-    resume : go on with what is in the folder
+    outputs : where solutions are sent
+    page : the live page; open its ``url`` in a browser; None = none
+    folder : of recording, track and checkpoint; None = none
+    resume : continue with the files in the folder
     """
 
     sources: tuple[str, ...]
@@ -57,7 +57,7 @@ class LiveRun:
     resume: bool = False
 
     def __iter__(self) -> Iterator[Solution]:
-        """Solutions as they are due.
+        """Yield solutions as they are due.
 
         Raises
         ------
@@ -73,7 +73,7 @@ class LiveRun:
             raise InputError(f"no estimate was made: {self.waiting()}")
 
     def close(self) -> None:
-        """End the run after what has come; from any thread or from the handler of a signal, more than once."""
+        """End the run once received data are processed. Call it from any thread or signal handler, also repeatedly."""
         self.feed.close()
 
     def waiting(self) -> str:
@@ -81,15 +81,15 @@ class LiveRun:
         return self.session.navigator.waiting(self.sources)
 
     def write_smoothed(self) -> None:
-        """Ask for the smoothed track so far in the folder, where iSAM2 has it; also from the handler of a signal."""
+        """Request the smoothed track so far in the folder (iSAM2 only). Call it from any thread or signal handler."""
         self.session.want_smoothed()
 
     def require_whole_recording(self) -> None:
-        """See that all that was received is in the folder.
+        """Check that the folder holds everything received.
 
         Raises
         ------
-        InputError : the disk was full for a while
+        InputError : the disk was full for a while, and rows were lost
         """
         files = self.session.files
         if files is not None and files.recorder.lost:
@@ -121,9 +121,9 @@ class Online:
 
     Attributes
     ----------
-    config : what is believed of vehicle and sensors; None = all defaults, or those of a run that is resumed
+    config : of vehicle and sensors; None = all defaults, or the configuration of the resumed run
     rate_hz : of solutions, by the log's time
-    engine : "fixed-lag", or "isam2", which smooths the whole dive as it goes
+    engine : "fixed-lag", or "isam2", which smooths the whole dive during the run
     """
 
     config: Config | None = None
@@ -148,24 +148,24 @@ class Online:
         http: str | None = None,
         page: Mapping[str, Any] | None = None,
     ) -> LiveRun:
-        """Open sources and outputs; iterate over what it returns for the solutions.
+        """Open sources and outputs; iterate over the returned run for its solutions.
 
         Parameters
         ----------
-        sources : addresses as ``rovgraph online`` takes them (docs/online-sources.md), as "tcp://192.168.2.2:5700"
-        outputs : where solutions go beside the iteration (docs/online-output.md), as "udp://127.0.0.1:5600"
-        speed : of files, a number or "max"
-        out : folder for recording, track and checkpoint; None = nothing is kept
-        resume : go on after a crash with what is in ``out``
+        sources : addresses as for ``rovgraph online`` (docs/online-sources.md), such as "tcp://192.168.2.2:5700"
+        outputs : where to send solutions as well (docs/online-output.md), such as "udp://127.0.0.1:5600"
+        speed : of replayed files, a number or "max"
+        out : folder for recording, track and checkpoint; None = none
+        resume : continue after a crash with the files in ``out``
         force : replace an older folder
-        complain : called with source, kind and text of what goes wrong with sources, outputs and disk, from other
-            threads too; None = it is only counted
+        complain : called with source, kind and text of a problem with sources, outputs or disk, also from other
+            threads; None = problems are only counted
         http : ``host:port`` of a live page for a browser (docs/live-page.md); None = none
-        page : ``charts``, ``origins``, ``token`` and ``position_sd_limit_m`` of it, as of `rovgraph.live_page`
+        page : its ``charts``, ``origins``, ``token`` and ``position_sd_limit_m``, as for `rovgraph.live_page`
 
         Raises
         ------
-        InputError : an address that cannot be used, a folder that exists or cannot be written, nothing to resume
+        InputError : an address that cannot be used, a folder that exists or cannot be written, no run to resume
 
         Warns
         -----
@@ -173,14 +173,14 @@ class Online:
         """
         folder = None if out is None else Path(out)
         if resume and folder is None:
-            raise InputError("--resume needs the folder to go on with, --out")
+            raise InputError("--resume needs the folder of the run, --out")
         if self.config is None and not resume:
             warn_of_unused(*(url.removeprefix("file:").partition("?")[0] for url in sources if url.startswith("file:")))
         config = self.config or (settings_of(folder) if resume and folder is not None else Config())
         warnings = Warnings(complain)
         opened = open_sources(sources, warnings, config, speed)
         if resume and any(source.pace == 1.0 for source in opened):
-            raise InputError("--resume goes on with a recording at another speed than 1; add --speed max")
+            raise InputError("--resume cannot continue a replay at speed 1; add --speed max")
         feed = Feed(opened, warnings)
         navigator = self._navigator(
             config, patient=feed.recorded, trust=feed.replayed
@@ -207,9 +207,9 @@ class Online:
         return LiveRun(sources, session, feed, tuple(receivers), watched, folder, resume)
 
     def replay(self, log: Log) -> Iterator[Solution]:
-        """The solutions of a log, as if its measurements arrived now; each call starts again.
+        """Yield the solutions of a log as if its measurements arrived now; each call starts again.
 
-        Nothing in it is checked beforehand: sensors that fail are noticed as they fail, and solutions have the events.
+        The log is not checked beforehand: failures of sensors are detected as they happen and come as events.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class Online:
 
         Raises
         ------
-        InputError : a log that was read with other columns, or that allows no estimate
+        InputError : the log was read with other columns, or allows no estimate
         """
         config = given(log, self.config)
         delays = {} if log.config is None else log.config.delay_s

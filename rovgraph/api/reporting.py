@@ -12,14 +12,14 @@ from rovgraph.pages.studies import check_page
 
 
 def report(*results: Path | str, out: Path | str | None = None, force: bool = False) -> Path:
-    """Write the page of a results folder, or one page that sets several dives side by side.
+    """Write the page of a results folder, or one page that compares several dives.
 
     Parameters
     ----------
-    results : results folders; of several, each of ``smooth``
-    out : the page; None = ``report.html`` in the folder, of several ``campaign.html`` where you are. A page of
-        this default name is replaced
-    force : replace an older file that ``out`` names
+    results : results folders; several must be results of ``smooth``
+    out : the page; None = ``report.html`` in the folder, or ``campaign.html`` in the current folder for several.
+        A page of this default name is replaced
+    force : replace an older file at ``out``
 
     Returns
     -------
@@ -27,7 +27,7 @@ def report(*results: Path | str, out: Path | str | None = None, force: bool = Fa
 
     Raises
     ------
-    InputError : no results folder, files that cannot be read, or a page that exists or cannot be written
+    InputError : no results folder, unreadable files, or a page that exists or cannot be written
     """
     folders = [Path(folder) for folder in results]
     if not folders:
@@ -42,11 +42,11 @@ def report(*results: Path | str, out: Path | str | None = None, force: bool = Fa
 
 
 def report_check(found: Report, out: Path | str, force: bool = False) -> Path:
-    """Write what `rovgraph.check` found as a page: what ``rovgraph check --page`` does.
+    """Write findings of `rovgraph.check` as a page, as ``rovgraph check --page`` does.
 
     Parameters
     ----------
-    found : of `rovgraph.check`
+    found : what `rovgraph.check` returned
     out : the page
     force : replace an older file
 

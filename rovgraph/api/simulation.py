@@ -20,8 +20,8 @@ class SimulatedDive:
 
     Attributes
     ----------
-    scenario, seed, choices : what it was made of
-    dive : everything, also the hidden truth
+    scenario, seed, choices : as given to `rovgraph.simulate`
+    dive : everything, including the hidden truth
     config : for an estimator
     """
 
@@ -66,13 +66,13 @@ def simulate(scenario: str, config: Config | None = None, seed: int = 1, choices
     Parameters
     ----------
     scenario : such as "lawnmower" or "vattern" (docs/simulation.md)
-    config : of vehicle and sensors; None = the thesis's Falcon where thrusters drive, all defaults elsewhere
-    seed : the same one gives the same dive, 0 or more
-    choices : duration, speed, current and so on, where they are not the scenario's own
+    config : of vehicle and sensors; None = the thesis's Falcon if driven by thrusters, else all defaults
+    seed : 0 or more; the same seed gives the same dive
+    choices : duration, speed, current and so on, to replace the scenario's
 
     Raises
     ------
-    InputError : no such scenario, or a choice that it does not have
+    InputError : an unknown scenario, or a choice that it does not have
     """
     dive, believed = simulated(scenario, seed, config, choices)
     return SimulatedDive(scenario, seed, choices, dive, believed)

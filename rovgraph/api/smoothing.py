@@ -28,8 +28,8 @@ class Result:
     Attributes
     ----------
     dive : estimates, assumptions, alarms and verdict
-    log : as estimated, with jumps of clocks bridged
-    warnings : of reading and checking the log, a line each; also issued as `DataWarning`
+    log : the log that was estimated, with jumps of clocks bridged
+    warnings : from reading and checking the log, a line each; also issued as `DataWarning`
     seconds : stage of the work -> wall time [s]; the command adds that of reading
     """
 
@@ -44,7 +44,7 @@ class Result:
 
         Raises
         ------
-        InputError : it was not asked for
+        InputError : it was not requested
         """
         return self._estimate("smoothed")
 
@@ -54,7 +54,7 @@ class Result:
 
         Raises
         ------
-        InputError : it was not asked for
+        InputError : it was not requested
         """
         return self._estimate("filtered")
 
@@ -65,7 +65,7 @@ class Result:
 
     @property
     def main(self) -> Estimate:
-        """The smoothed estimate, or the filtered one where that alone was asked for."""
+        """The smoothed estimate, or the filtered one if you requested only that."""
         return self.dive.estimates[0]
 
     @property
@@ -80,7 +80,7 @@ class Result:
 
     @property
     def alarms(self) -> Sequence[Alarm]:
-        """Alarms, the worst first; ``.text`` has cause and remedy."""
+        """Alarms, causes before their consequences; ``.text`` has cause and remedy."""
         return self.dive.alarms
 
     @property
@@ -94,11 +94,11 @@ class Result:
         return self.dive.beginning.config
 
     def track(self, estimate: str | None = None) -> Track:
-        """An estimate with its place on Earth and its fixes, as exports take it; None = the best there is.
+        """An estimate with its origin on Earth and its fixes, ready to be exported; None = the best available.
 
         Raises
         ------
-        InputError : not that estimate
+        InputError : the result has no such estimate
         """
         if estimate not in (None, *TRACKS):
             raise InputError(f"estimate {estimate!r}: expected {', '.join(TRACKS)}")
@@ -118,11 +118,11 @@ class Result:
 
         Parameters
         ----------
-        path : the folder to make
+        path : the folder to create
         force : replace an older results folder
         figures : draw them
         page : make report.html
-        export : formats that the track is written in too
+        export : further formats to write the track in
 
         Returns
         -------
@@ -130,7 +130,7 @@ class Result:
 
         Raises
         ------
-        InputError : the folder exists, or cannot be written; as `rovgraph.export`
+        InputError : the folder exists or cannot be written; those of `rovgraph.export`
         """
         from rovgraph.live.marks import MARKS, marks_beside, write_marks
         from rovgraph.report.folder import results_folder
@@ -165,7 +165,7 @@ class Result:
             return summary
 
     def report(self, out: Path | str = "report.html", force: bool = False) -> Path:
-        """Write the dive's page alone, where you keep no results folder: the page that `save` puts there.
+        """Write only the dive's page, the one that `save` puts into the results folder.
 
         Parameters
         ----------
@@ -194,7 +194,7 @@ class Result:
         found = next((estimate for estimate in self.dive.estimates if estimate.kind == kind), None)
         if found is None:
             made = ", ".join(estimate.kind for estimate in self.dive.estimates)
-            raise InputError(f"{self.log.source}: the {kind} estimate was not asked for; there are {made}")
+            raise InputError(f"{self.log.source}: the {kind} estimate was not requested; the result has {made}")
         return found
 
 
@@ -217,12 +217,11 @@ def smooth(
 
     Raises
     ------
-    InputError : a log that cannot be worked with, that was read with other columns, or that does not determine
-        some variable
+    InputError : the log cannot be used, was read with other columns, or does not determine some variable
 
     Warns
     -----
-    DataWarning : whatever looks wrong
+    DataWarning : findings of the check
     """
     if estimate not in ESTIMATES:
         raise InputError(f"estimate {estimate!r}: expected {', '.join(ESTIMATES)}")

@@ -20,7 +20,7 @@ def study_misalignment(
     scheduler: str | None = None,
     progress: Progress = no_progress,
 ) -> Tables:
-    """Study how well the DVL's misalignment can be estimated; every finished dive is kept as it comes.
+    """Study how well the DVL's misalignment can be estimated; every finished dive is saved at once.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def study_misalignment(
     resume : continue with the files in the folder
     only : one cell, by the first characters of its id; None = all
     jobs : processes on this machine; None = one per core
-    scheduler : of a Dask cluster, such as ``tcp://host:8786``; None = on this machine
+    scheduler : address of a Dask cluster, such as ``tcp://host:8786``; None = this machine
     progress : called at times with the current task and its progress from 0 to 1
 
     Returns
@@ -38,8 +38,8 @@ def study_misalignment(
 
     Raises
     ------
-    InputError : no valid study, a folder that exists or holds another study, a cluster that does not answer,
-        a disk that is full (what was written before is kept)
+    InputError : an invalid study, a folder that exists or holds another study, a cluster that does not answer,
+        a full disk (what was written before is kept)
     """
     from rovgraph.pages.reporting import write_page
     from rovgraph.report.figure_study import draw_study

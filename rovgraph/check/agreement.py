@@ -44,11 +44,9 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             # short windows: in long ones a compass's deviation looks like a lag
             found = lag(gyro, heading, max(1.0, 1.5 * period))
-            remedy = (
-                f" If it is late, state delay_s: {{{sensor}: {config.delay_s.get(sensor, 0.0) + found.seconds:.2g}}}"
-            )
-            what = f"the turning that {NAMES[sensor]} shows"
-            yield from _clock(sensor, what, "the gyro's", found, EVIDENCE, remedy)
+            delay = config.delay_s.get(sensor, 0.0) + found.seconds
+            remedy = f"if it is late, state delay_s: {{{sensor}: {delay:.2g}}}"
+            yield from _clock(sensor, f"the turning of {NAMES[sensor]}", "the gyro's", found, EVIDENCE, remedy)
 
 
 def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
@@ -111,25 +109,29 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b) < ENOUGH_TURNING:
         if beyond:
             largest = np.abs(log[sensor].data[:, 0]).max()
-            return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; in degrees? {_say_degrees(sensor)}")
+            return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; {_if_degrees(sensor)}")
         return Finding(sensor, "ok", f"too little turning to compare {name} with the gyro")
     numbers = f"slope {f.slope:.3g}, correlation {f.correlation:.2f} over {f.windows} windows"
     if abs(f.correlation) < FOLLOWS and f.sd_a < NOISE_MARGIN * noise:
-        return Finding(sensor, "ok", f"too little turning for its noise to compare {name} with the gyro ({numbers})")
+        return Finding(
+            sensor, "ok", f"too little turning, given its noise, to compare {name} with the gyro ({numbers})"
+        )
     if abs(f.correlation) < FOLLOWS:
-        hint = "hard iron, or a wrong mounting?" if sensor == "mag" else "wrong unit, mounting or clock?"
-        return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); {hint}")
+        causes = "hard iron and the mounting" if sensor == "mag" else "its unit, mounting and clock"
+        return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); check {causes}")
     if 40.0 < abs(f.slope) < 80.0 or 1 / 80.0 < abs(f.slope) < 1 / 40.0:
         return Finding(sensor, "error", f"{_factor_of_57(log, sensor, f.slope)} ({numbers})")
     if f.slope < 0.0:
         return Finding(
             sensor,
             "warning",
-            f"{name} turns against the gyro ({numbers}): the heading counts anticlockwise, or the IMU's z axis points "
-            "up (imu.mount_rpy_deg)",
+            f"{name} turns opposite to the gyro ({numbers}): the heading counts anticlockwise, or the IMU's z axis "
+            "points up (imu.mount_rpy_deg)",
         )
-    level: Level = "ok" if 0.7 < f.slope < 1.4 else "warning"
-    return Finding(sensor, level, f"{name} turns with the gyro ({numbers})")
+    if 0.7 < f.slope < 1.4:
+        return Finding(sensor, "ok", f"{name} turns with the gyro ({numbers})")
+    text = f"{name} turns with the gyro, but not by the same angle ({numbers}); check the units and scales of both"
+    return Finding(sensor, "warning", text)
 
 
 def _factor_of_57(log: Log, sensor: str, slope: float) -> str:
@@ -138,25 +140,27 @@ def _factor_of_57(log: Log, sensor: str, slope: float) -> str:
     name = NAMES[sensor]
     if abs(slope) < 1.0:
         if sensor != "mag" and np.ptp(log[sensor].data[:, 0]) < 2 * np.pi / 50 and fast < 3.0:
-            return f"{name} is 57 times too small; was it converted to radians twice, by units: too?"
-        return "the gyro is 57 times too fast; in deg/s? Say units: {gyr: deg/s}"
+            return f"{name} is 57 times too small: it was probably converted to radians twice; remove it from units:"
+        return "the gyro's rates are 57 times too large; if they are in deg/s, state units: {gyr: deg/s}"
     if sensor != "mag" and _beyond_circle(log[sensor].data[:, 0]):
-        return f"{name} is 57 times too large; in degrees? {_say_degrees(sensor)}"
-    return "the gyro is 57 times too slow; was it converted to rad/s twice, by units: too?"
+        return f"{name} is 57 times too large; {_if_degrees(sensor)}"
+    return (
+        "the gyro's rates are 57 times too small: they were probably converted to rad/s twice; remove gyr from units:"
+    )
 
 
-def _say_degrees(sensor: str) -> str:
-    return f"Say units: {{{sensor}: deg}}"
+def _if_degrees(sensor: str) -> str:
+    return f"if it is in degrees, state units: {{{sensor}: deg}}"
 
 
-def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float, remedy: str = "") -> Iterator[Finding]:
+def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float, remedy: str) -> Iterator[Finding]:
     """A lag, if there is one."""
     if np.isnan(found.seconds):
         return
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
     if found.significant(evidence):
-        text = f"{what} comes {later}{sd}: do the clocks disagree, or is it filtered slowly?{remedy}"
+        text = f"{what} comes {later}{sd}: the clocks disagree, or a filter delays it; {remedy}"
         yield Finding(sensor, "warning", text, "lag")
     else:
         yield Finding(sensor, "ok", f"{what} comes {later}{sd}")
@@ -173,21 +177,25 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
     depth, dvl, window = _descents(log, pings, mount_matrix(config.dvl.mount_rpy_deg), down)
     f = fit(depth, dvl, window)
     if f.windows < MIN_WINDOWS or f.sd_a < ENOUGH_DIVING:
-        yield Finding("dvl", "ok", "too little diving to compare its vertical velocity with depth")
+        yield Finding("dvl", "ok", "depth changes too little to compare the vertical velocity with it")
         return
     numbers = f"slope {f.slope:.2g}, correlation {f.correlation:.2f} over {f.windows} windows"
     if abs(f.correlation) < FOLLOWS:
         if f.sd_a < 2.0 * np.sqrt(2.0) * _depth_noise(depth, config, window):
-            yield Finding("dvl", "ok", "too little diving for the noise of depth to compare its vertical velocity with")
+            yield Finding(
+                "dvl", "ok", "depth changes too little, given its noise, to compare the vertical velocity with it"
+            )
         elif f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
-            yield Finding("dvl", "warning", f"vertical velocity does not follow depth ({numbers}); mounting or clock?")
+            yield Finding(
+                "dvl", "warning", f"vertical velocity does not follow depth ({numbers}); check mounting and clock"
+            )
         return
     if f.slope < 0.0:
         yield Finding(
             "dvl",
             "warning",
-            f"vertical velocity has the sign opposite to the change of depth ({numbers}): {_flip(config)}; "
-            "or does depth count upwards?",
+            f"vertical velocity and the change of depth have opposite signs ({numbers}): {_flip(config)}; "
+            "if depth counts upwards, state units: {depth: -m}",
         )
     else:
         low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
@@ -195,7 +203,9 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
-    yield from _clock("dvl", "vertical velocity", "the change of depth", behind, WAVE_EVIDENCE)
+    yield from _clock(
+        "dvl", "vertical velocity", "the change of depth", behind, WAVE_EVIDENCE, "check the clocks of both"
+    )
 
 
 def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:
@@ -226,7 +236,7 @@ def _flip(config: Config) -> str:
     """A hint at a DVL that is mounted the other way up."""
     roll, pitch, yaw = config.dvl.mount_rpy_deg
     turned, points = (180, "up") if abs(roll) < 90 else (0, "down")
-    return f"does the DVL's z axis point {points}? Then dvl.mount_rpy_deg is [{turned}, {pitch:g}, {yaw:g}]"
+    return f"if the DVL's z axis points {points}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}]"
 
 
 def _downwards(imu: Stream, config: Config, time: Array, span: float = 2.0) -> Array:

@@ -47,7 +47,7 @@ def dvl_and_imu(log: Log, config: Config) -> Iterator[Finding]:
     if fit is None:
         return
     better = found.error[0, found.now] / found.error[k, m]
-    yield _mounting(config, k, fit, f"so its acceleration agrees {better:.1f} times better with the IMU's")
+    yield _mounting(config, k, fit, f"corrected, its acceleration agrees {better:.1f} times better with the IMU's")
     yield _clock(config, compared, ORIENTATIONS[k], fit, float(found.lags[m]))
 
 
@@ -93,13 +93,15 @@ def _mounting(config: Config, k: int, fit: Fit, better: str) -> Finding:
     believed = np.array([0.0, 0.0, yaw.sd if yaw.estimate else 0.0])
     turned = bool((np.abs(turn) > np.maximum(TURNED, SURE * np.hypot(fit.turn_sd, believed))).any())
     if k == 0 and not turned:
-        return Finding("dvl", "ok", f"accelerates as the IMU does, axes as mounted (likeness {fit.likeness:.2f})")
+        return Finding(
+            "dvl", "ok", f"its acceleration agrees with the IMU's, axes as configured (likeness {fit.likeness:.2f})"
+        )
     if turned and np.linalg.det(fit.R_bs) > 0.0:
         cause, remedy = axes_remedy(np.eye(3), fit.R_bs)
-        better = "by its acceleration" if k == 0 else better
+        better = "its acceleration shows this" if k == 0 else better
     else:
         cause, remedy = axes_remedy(ORIENTATIONS[k], R_bs)
-    return Finding("dvl", "warning", f"{cause}, {better} (likeness {fit.likeness:.2f}); {remedy}")
+    return Finding("dvl", "warning", f"{cause}; {better} (likeness {fit.likeness:.2f}): {remedy}")
 
 
 def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: float) -> Finding:
@@ -108,14 +110,14 @@ def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: flo
     mean = float(offset.mean[0])
     late = fit.lag - mean
     sense = "late" if late >= 0.0 else "early"
-    text = f"its stamps are {abs(late):.3f} s {sense} against the IMU's (sd {fit.lag_sd:.3f} s)"
+    text = f"its stamps are {abs(late):.3f} s {sense} relative to the IMU's (sd {fit.lag_sd:.3f} s)"
     allowed = max(LAG_WARNING, SURE * fit.lag_sd, 3.0 * offset.sd if offset.estimate else 0.0)
     if abs(late) < allowed:
         return Finding("dvl", "ok", text)
     if abs(fit.lag - coarse) > max(APART, SURE * fit.lag_sd) or abs(coarse - mean) < 0.5 * abs(late):
-        return Finding("dvl", "ok", f"{text}, which the dive does not show well")
+        return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
     as_stamped = compared.refine(mean, H, held=True)
     if as_stamped is not None and 3.0 * fit.count * (as_stamped.error / fit.error - 1.0) < EVIDENCE:
-        return Finding("dvl", "ok", f"{text}, which the dive does not show well")
+        return Finding("dvl", "ok", f"{text}, but the dive shows this poorly")
     entry = f"{{estimate: true, mean: {fit.lag:.3f}, sd: {max(0.02, 3.0 * fit.lag_sd):.2f}}}"
     return Finding("dvl", "warning", f"{text}: correct its clock, or state calibration.dvl_time_offset: {entry}", "lag")

@@ -56,7 +56,7 @@ def repeated(log: Log, config: Config) -> Iterator[Finding]:
             "fix",
             "warning",
             f"{counts[longest]} fixes repeat {where}, for {last - first:.0f} s from {since(log, first)} on, "
-            f"while the DVL moves by {way:.0f} m: a receiver repeats its last fix; leave these rows out",
+            f"while the DVL moves by {way:.0f} m: the receiver probably repeats its last fix; remove these rows",
         )
 
 
@@ -105,20 +105,21 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
         yield Finding(
             "fix",
             "warning",
-            "north and east are swapped or mirrored: so the fixes fit the DVL's track, turned by "
-            f"{angle:+d} deg (likeness {swapped.likeness:.2f} against {as_is.likeness:.2f})",
+            "north and east are swapped or mirrored; corrected, the fixes fit the DVL's track turned by "
+            f"{angle:+d} deg (likeness {swapped.likeness:.2f} instead of {as_is.likeness:.2f}): "
+            "correct the columns of the fixes",
         )
     elif _better(unlike, as_is) and unlike.likeness > 0.6:
         yield Finding("dvl", "warning", _mirrored_text(config, as_is.likeness, unlike.likeness))
     elif as_is.likeness < 0.6:
         if as_is.error > EVIDENCE + 2.0 * plane.count:
-            text = f"velocities do not fit the fixes (likeness {as_is.likeness:.2f}); mounting or heading?"
+            text = f"velocities do not fit the fixes (likeness {as_is.likeness:.2f}); check mounting and heading"
             yield Finding("dvl", "warning", text)
     else:
         yield _turned(config, as_is, unlike)
         if late:
             sense = "late" if lag > 0.0 else "early"
-            text = f"fixes come {abs(lag):.1f} s {sense} against the DVL's track (sd {lag_sd:.1f} s)"
+            text = f"fixes come {abs(lag):.1f} s {sense} relative to the DVL's track (sd {lag_sd:.1f} s)"
             moved = float(np.median(np.linalg.norm(pings.data[:, :3], axis=1))) * abs(lag)
             known = config.delay_s.get("fix", 0.0) + lag
             remedy = f"state delay_s: {{fix: {known:.2g}}}, or correct fix.lever_arm_m, if it is {moved:.1f} m off"
@@ -137,8 +138,10 @@ def _turned(config: Config, as_is: _Line, unlike: _Line) -> Finding:
     )
     tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""
     if wrong and unlike.likeness > as_is.likeness - 0.05:
-        tail += f". As well it may be mirrored: {_other_way_up(config)}"
-    text = f"fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
+        tail += f". It may also be mirrored: {_other_way_up(config)}"
+    text = (
+        f"its track fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
+    )
     return Finding("dvl", "warning" if wrong else "ok", text)
 
 
@@ -237,7 +240,7 @@ def _inflation(left: Complexes) -> float:
 
 def _mirrored_text(config: Config, like: float, unlike: float) -> str:
     return (
-        f"velocities fit the fixes better with y mirrored (likeness {unlike:.2f} against {like:.2f}): "
+        f"velocities fit the fixes better with y mirrored (likeness {unlike:.2f} instead of {like:.2f}): "
         f"{_other_way_up(config)}"
     )
 
@@ -247,8 +250,8 @@ def _other_way_up(config: Config) -> str:
     roll, pitch, yaw = config.dvl.mount_rpy_deg
     turned, z, y = (180, "up", "port") if abs(roll) < 90 else (0, "down", "starboard")
     return (
-        f"does the DVL's z axis point {z} and y to {y}? Then dvl.mount_rpy_deg is [{turned}, {pitch:g}, {yaw:g}], "
-        "its yaw to be found"
+        f"if the DVL's z axis points {z} and y to {y}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}] "
+        "and determine its yaw again"
     )
 
 

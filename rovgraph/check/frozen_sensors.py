@@ -17,10 +17,14 @@ def standstill(log: Log, config: Config) -> Iterator[Finding]:
         by_sensor.setdefault(stretch.sensor, []).append(stretch)
     for sensor, found in by_sensor.items():
         for s in found[:SHOWN]:
-            what = "exactly zero" if s.zero else "the same value exactly"
+            what = "exactly zero" if s.zero else "exactly the same value"
             yield Finding(
-                sensor, "warning", f"{what} for {s.last - s.first:.1f} s from {since(log, s.first)} on although {s.why}"
+                sensor,
+                "warning",
+                f"{what} for {s.last - s.first:.1f} s from {since(log, s.first)} on, although {s.why}",
             )
         if len(found) > SHOWN:
             total = sum(s.last - s.first for s in found)
-            yield Finding(sensor, "warning", f"frozen {len(found)} times, {total:.0f} s in all, although it moves")
+            yield Finding(
+                sensor, "warning", f"frozen {len(found)} times, {total:.0f} s in all, although the vehicle moves"
+            )

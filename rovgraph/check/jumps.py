@@ -65,11 +65,13 @@ class Jump:
     def finding(self, log: Log) -> Finding:
         """What to say of it."""
         told = (
-            f"the DVL's stamps are {self.lags[0]:.1f} s late against the IMU's before {since(log, self.before)} "
+            f"the DVL's stamps are {self.lags[0]:.1f} s late relative to the IMU's before {since(log, self.before)} "
             f"and {self.lags[1]:.1f} s after {since(log, self.after)}"
         )
         if not self.sensor:
-            return Finding("log", "warning", f"{told}: a clock drifts or jumps; put both on one clock", "jump")
+            return Finding(
+                "log", "warning", f"{told}: a clock drifts or jumps; put both instruments on one clock", "jump"
+            )
         text = (
             f"{told}: the {NAMES[self.sensor]}'s clock jumps by {self.by:+.1f} s in the gap between; correct its stamps"
         )
@@ -138,8 +140,8 @@ def bridge_jumps(log: Log, config: Config) -> Log:
         shifted = [name for name, stream in streams.items() if stream is not log[name]]
         warn(
             f"{log.source}: the {NAMES[jump.sensor]}'s clock jumps by {jump.by:+.2f} s (sd {jump.sd:.2f} s) between "
-            f"{since(log, jump.before)} and {since(log, jump.after)}: bridged, stamps of {', '.join(shifted)} "
-            "from there on are put back by as much"
+            f"{since(log, jump.before)} and {since(log, jump.after)}: bridged; the later stamps of "
+            f"{', '.join(shifted)} are moved back by as much"
         )
         log = replace(log, streams=streams)
     return log

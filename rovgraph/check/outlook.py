@@ -52,7 +52,7 @@ def _assumptions(log: Log, config: Config, sources: list[str]) -> Iterator[str]:
         yield "start.down_m is not given: taken from the first depth"
     for section, sensor in ((config.imu, "imu"), (config.dvl, "dvl")):
         if sensor in log and "mount_rpy_deg" not in section.model_fields_set:
-            yield f"{sensor}.mount_rpy_deg is not given: its axes are taken as the body's, forward, right, down"
+            yield f"{sensor}.mount_rpy_deg is not given: its axes are taken as the vehicle's: forward, starboard, down"
         if sensor in log and "lever_arm_m" not in section.model_fields_set:
             yield f"{sensor}.lever_arm_m is not given: taken as zero"
     if sources and "declination_deg" not in env.model_fields_set:

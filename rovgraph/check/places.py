@@ -1,4 +1,4 @@
-"""Places seen before: how often each was, since one that is seen once tells nothing."""
+"""Places seen before: how often each was, since one that is seen once adds no information."""
 
 from collections.abc import Iterator
 
@@ -18,15 +18,16 @@ def places(log: Log, config: Config) -> Iterator[Finding]:
     spans = np.array([np.ptp(stream.time[which == k]) for k in range(len(names))])
     again = spans >= config.place.every_s
     if not again.any():
-        text = f"{len(names)} places and none of them seen again: they tell nothing; is place_id the same each time?"
+        text = f"{len(names)} places, none of them seen again: they add no information; "
+        text += "check that a place keeps its place_id"
         yield Finding("place", "warning", text)
         return
-    counted = f"{len(stream)} landmarks of {len(names)} places, {again.sum()} of them seen again"
+    counted = f"{len(stream)} observations of {len(names)} places, {again.sum()} of them seen again"
     text = f"{counted}, up to {spans.max():.0f} s later"
     if not again.all():
-        text += f"; {(~again).sum()} seen only once tell nothing"
+        text += f"; {(~again).sum()} seen only once add no information"
     yield Finding("place", "ok", text)
     last = float(stream.time[again[which]].max())
     yield Finding(
-        "place", "ok", f"last seen again at {since(log, last)}: from there on the error grows as without places"
+        "place", "ok", f"last seen again at {since(log, last)}; from there on the error grows as without places"
     )

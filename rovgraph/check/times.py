@@ -43,7 +43,7 @@ def presence(log: Log, config: Config) -> Iterator[Finding]:
     """Sensors that are missing, and what that means."""
     for sensor in SENSORS.values():
         if sensor.name == "imu" and motion_model(config, log.sensors) == "constant_velocity":
-            used = "no IMU is used: between measurements velocity and attitude are nearly constant (motion.model)"
+            used = "no IMU is used: velocity and attitude are nearly constant between measurements (motion.model)"
             yield Finding(sensor.name, "ok", used)
         elif sensor.if_missing is not None and sensor.name not in log:
             yield Finding(sensor.name, *sensor.if_missing)
@@ -64,16 +64,18 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
     for sensor, stream in log.streams.items():
         inside = np.mean((stream.time >= first) & (stream.time <= last))
         if inside == 0.0:
-            text = "no time in common with the IMU; do the clocks have different epochs? Put them on one clock"
+            text = "no time in common with the IMU: put both on one clock"
             shift = shift_of_epoch(log, config, sensor)
             if shift is not None:
                 delay = config.delay_s.get(sensor, 0.0) + shift[0]
-                text += f": it moves as the IMU does if put {shift[0]:.3f} s earlier (sd {shift[1]:.2g} s), "
-                text += f"delay_s: {{{sensor}: {delay:.3f}}}"
+                text += f"; its motion matches the IMU's if moved {shift[0]:.3f} s earlier (sd {shift[1]:.2g} s): "
+                text += f"state delay_s: {{{sensor}: {delay:.3f}}}"
             yield Finding(sensor, "error", text, "epoch")
         elif inside < 0.8:
             yield Finding(
-                sensor, "warning", f"{1.0 - inside:.0%} of its measurements lie before or after the IMU's and are lost"
+                sensor,
+                "warning",
+                f"{1.0 - inside:.0%} of its measurements lie before or after the IMU's and are ignored",
             )
 
 
@@ -82,28 +84,30 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
     for sensor, stream in log.streams.items():
         t = timing(stream)
         if np.isnan(t.rate):
-            yield Finding(sensor, "warning", "a single measurement")
+            yield Finding(sensor, "warning", "only one measurement")
             continue
         low, high = SENSORS[sensor].usual_rates
         if not low <= t.rate <= high:
             yield Finding(
                 sensor,
                 "warning",
-                f"{t.rate:.4g} Hz, expected {low:g} to {high:g}; is time in seconds? Otherwise say units: {{time: ms}}",
+                f"{t.rate:.4g} Hz, expected {low:g} to {high:g}; "
+                "if time is not in seconds, state its unit, such as units: {time: ms}",
             )
         yield from _gaps(log, config, t)
         if sensor == "imu" and t.jitter * t.rate > 0.5:
             yield Finding(
                 sensor,
                 "warning",
-                f"times jitter by {t.jitter:.3g} s about {1 / t.rate:.3g} s; are they times of arrival?",
+                f"times jitter by {t.jitter:.3g} s around a period of {1 / t.rate:.3g} s: "
+                "they may be times of arrival; log times of measurement",
             )
         if sensor in ("imu", "mag", "dvl") and t.repeats > REPEATED * t.count and _moves(stream):
             yield Finding(
                 sensor,
                 "warning",
-                f"{t.repeats / t.count:.0%} of the measurements repeat the one before exactly; "
-                "written faster than measured? Log each once",
+                f"{t.repeats / t.count:.0%} of the measurements repeat the previous one exactly: "
+                "the log is written faster than the sensor measures; log each measurement once",
             )
 
 
@@ -121,7 +125,8 @@ def _gaps(log: Log, config: Config, t: Timing) -> Iterator[Finding]:
     longer = int((periods > limit).sum())
     if not longer:
         return
-    text = f"{longer} gaps longer than {limit:.3g} s, the longest {t.gap:.1f} s from {since(log, t.gap_at)} on"
+    gaps = "1 gap" if longer == 1 else f"{longer} gaps"
+    text = f"{gaps} longer than {limit:.3g} s, the longest {t.gap:.1f} s from {since(log, t.gap_at)} on"
     if t.sensor == "imu" and t.gap > config.imu.max_gap_s:
         text += f"; longer than imu.max_gap_s = {config.imu.max_gap_s:g}: split the log there or raise that key"
         yield Finding(t.sensor, "error", text)

@@ -45,7 +45,7 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
             "imu",
             "warning",
             f"mean specific force points {np.rad2deg(angle):.0f} deg away from upwards (-z of the body): it is on the "
-            f"IMU's {axis} axis; is imu.mount_rpy_deg {list(UPRIGHT[axis])} with a yaw of your own?",
+            f"IMU's {axis} axis; check imu.mount_rpy_deg, probably {list(UPRIGHT[axis])} with the yaw of your IMU",
         )
     elif low <= size <= high:
         yield Finding("imu", "ok", f"mean specific force {size:.2f} m/s2, {np.rad2deg(angle):.1f} deg from upwards")
@@ -69,8 +69,8 @@ def tilt(log: Log, config: Config) -> float:
 def _acc_unit(size: float) -> str:
     for unit, g in (("g", 1.0), ("mg", 1000.0)):
         if 0.9 < size / g < 1.1:
-            return f"acc in {unit}? Say units: {{acc: {unit}}}"
-    return "is gravity taken out of it? Give specific force" if size < 1.0 else "check the unit of acc"
+            return f"if acc is in {unit}, state units: {{acc: {unit}}}"
+    return "gravity seems to be removed: give specific force" if size < 1.0 else "check the unit of acc"
 
 
 def turn_rates(log: Log, config: Config) -> Iterator[Finding]:
@@ -84,13 +84,15 @@ def turn_rates(log: Log, config: Config) -> Iterator[Finding]:
             "imu",
             "error",
             f"a tenth of the rates is above {usual:.3g} rad/s ({np.rad2deg(usual):.0f} deg/s); "
-            "in deg/s? Say units: {gyr: deg/s}",
+            "if they are in deg/s, state units: {gyr: deg/s}",
         )
     elif fast:
         when = since(log, log["imu"].time[np.argmax(rate > FAST_SPIKE)])
-        yield Finding("imu", "warning", f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or deg/s")
+        yield Finding(
+            "imu", "warning", f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or a wrong unit"
+        )
     if not np.ptp(log["imu"].data[:, 3:], axis=0).any():
-        yield Finding("imu", "error", "the gyro never changes; is it connected?")
+        yield Finding("imu", "error", "the gyro's values never change; check its connection")
 
 
 def angles(log: Log, config: Config) -> Iterator[Finding]:
@@ -100,7 +102,11 @@ def angles(log: Log, config: Config) -> Iterator[Finding]:
     tilt = np.abs(log["ahrs"].data[:, 1:])
     largest = float(np.max(tilt, initial=0.0, where=np.isfinite(tilt)))
     if largest > np.pi + 0.01:
-        yield Finding("ahrs", "error", f"roll or pitch reaches {largest:.4g} rad; in degrees? Say units: {{ahrs: deg}}")
+        yield Finding(
+            "ahrs",
+            "error",
+            f"roll or pitch reaches {largest:.4g} rad; if they are in degrees, state units: {{ahrs: deg}}",
+        )
 
 
 def own(log: Log, config: Config) -> Iterator[Finding]:
@@ -128,5 +134,5 @@ def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]],
             sensor,
             "warning",
             f"{name} repeats one value exactly for {duration:.1f} s from {since(log, start)} on "
-            f"({len(long)} such times); a sensor that noise never moves is not measuring",
+            f"({len(long)} such intervals); a working sensor always shows noise: check its connection and driver",
         )

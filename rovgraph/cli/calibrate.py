@@ -17,7 +17,7 @@ calibrate = typer.Typer(
 
 LogPath = Annotated[Path, typer.Argument(help="CSV, CSV.gz or Parquet, see docs/log-format.md", metavar="LOG")]
 ConfigPath = Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")]
-OutPath = Annotated[Path, typer.Option("--out", "-o", help="results folder to make", show_default=False)]
+OutPath = Annotated[Path, typer.Option("--out", "-o", help="results folder to create", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="replace an older results folder")]
 
 
@@ -33,10 +33,12 @@ def magnetometer(
     log: LogPath,
     out: OutPath,
     config: ConfigPath = None,
-    method: Annotated[Method, typer.Option(help="turns: a turn about z and one about x")] = Method.ellipsoid,
+    method: Annotated[
+        Method, typer.Option(help="ellipsoid, or turns for one turn about z and one about x")
+    ] = Method.ellipsoid,
     force: Force = False,
 ) -> None:
-    """Hard and soft iron from a log in which the vehicle was turned about all its axes.
+    """Determine hard and soft iron from a log in which the vehicle turns about all its axes.
 
     Example: rovgraph calibrate magnetometer turned.csv --out magnetometer
     """
@@ -57,7 +59,7 @@ def magnetometer(
 
 @calibrate.command()
 def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = False) -> None:
-    """Noise of IMU, DVL and compasses from a log in which the vehicle stands still; waves are tolerated.
+    """Determine the noise of IMU, DVL and compasses from a log at rest; waves are tolerated.
 
     Example: rovgraph calibrate noise standing.csv --out noise
     """

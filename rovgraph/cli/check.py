@@ -20,7 +20,7 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
     choose: Choose = None,
     shift: Shift = None,
-    page: Annotated[Path | None, typer.Option("--page", help="write the report as an HTML page, too")] = None,
+    page: Annotated[Path | None, typer.Option("--page", help="also write the report as an HTML page")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older page")] = False,
 ) -> None:
     """Check a log: sensors, rates, gaps, units, signs, clocks, and the assumptions of an estimate."""

@@ -21,9 +21,9 @@ def compare(
     ] = None,
     scenario: Annotated[str | None, typer.Option(help="simulate dives of this scenario instead of a LOG")] = None,
     seeds: Annotated[int, typer.Option(help="number of simulated dives")] = 30,
-    first_seed: Annotated[int, typer.Option(min=0, help="seed of the first of them")] = 1,
+    first_seed: Annotated[int, typer.Option(min=0, help="seed of the first simulated dive")] = 1,
     duration: Annotated[
-        float | None, typer.Option(help="seconds of a simulated dive; default: the scenario's own")
+        float | None, typer.Option(help="duration of a simulated dive in seconds; default: the scenario's")
     ] = None,
     estimators: Annotated[
         str | None,

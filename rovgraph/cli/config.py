@@ -38,15 +38,15 @@ _GROUP_TEXT = {
 
 def config(
     path: Annotated[
-        Path | None, typer.Argument(help="configuration (YAML); without it all defaults", metavar="[CONFIG]")
+        Path | None, typer.Argument(help="configuration (YAML); default: all defaults", metavar="[CONFIG]")
     ] = None,
     keys: Annotated[bool, typer.Option("--keys", help="list all keys with default, unit and meaning")] = False,
-    presets: Annotated[
-        bool, typer.Option("--presets", help="list the instruments known by name, with sources")
+    presets: Annotated[bool, typer.Option("--presets", help="list the presets of instruments, with sources")] = False,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="with --keys or --presets: print Markdown, as in the manual")
     ] = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="with --keys or --presets: as in the manual")] = False,
 ) -> None:
-    """Print the effective configuration with every key; a wrong key is an error."""
+    """Print the effective configuration with every key; an unknown key is an error."""
     from rovgraph.config import load_config
 
     settings = load_config(path)

@@ -14,12 +14,12 @@ def convert(
     files: Files,
     out: Annotated[Path, typer.Option("--out", "-o", help="log to write: .csv, .csv.gz or .parquet")],
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
-    config_out: Annotated[Path | None, typer.Option(help="configuration to begin with, to write (YAML)")] = None,
+    config_out: Annotated[Path | None, typer.Option(help="also write a configuration to begin with (YAML)")] = None,
     choose: Choose = None,
     shift: Shift = None,
     force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
 ) -> None:
-    """Make one log of native files: of instruments, autopilots, robots.
+    """Convert native files of instruments, autopilots and robots into one log.
 
     Example: rovgraph convert dive.BIN dvl.jsonl --out log.csv --config-out vehicle.yaml
     """

@@ -16,9 +16,11 @@ def evaluate(
     ],
     start: Annotated[float, typer.Option("--from", help="Skip the first seconds of the trajectory.")] = 0.0,
     end: Annotated[
-        float | None, typer.Option("--to", help="Skip what is later than this many seconds.", show_default=False)
+        float | None, typer.Option("--to", help="Skip everything after this many seconds.", show_default=False)
     ] = None,
-    align: Annotated[bool, typer.Option("--align", help="Rotate and shift the trajectory to fit first.")] = False,
+    align: Annotated[
+        bool, typer.Option("--align", help="First rotate and shift the trajectory onto the reference.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare a trajectory with a reference.

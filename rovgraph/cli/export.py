@@ -9,20 +9,20 @@ import typer
 def export(
     results: Annotated[Path, typer.Argument(help="results folder of smooth or online", metavar="RESULTS")],
     to: Annotated[
-        list[str] | None, typer.Option(help="format, as kml; may be repeated. Without it, formats are listed")
+        list[str] | None, typer.Option(help="format, such as kml; may be repeated; default: list the formats")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="folder; default: the results folder")] = None,
     estimate: Annotated[
-        str | None, typer.Option(help="smoothed, filtered or dead_reckoning; default: the best there is")
+        str | None, typer.Option(help="smoothed, filtered or dead_reckoning; default: the best available")
     ] = None,
-    rate: Annotated[float | None, typer.Option(help="points a second; default: the format's own")] = None,
+    rate: Annotated[float | None, typer.Option(help="points a second; default: the format's")] = None,
     crs: Annotated[
-        str | None, typer.Option(help="coordinates of gpkg and shp, as EPSG:25832, or utm; default: lat, lon")
+        str | None, typer.Option(help="coordinates of gpkg and shp, such as EPSG:25832, or utm; default: lat, lon")
     ] = None,
     unix_offset: Annotated[
-        float, typer.Option(help="Unix time of the log's time 0, in seconds, where a format needs it")
+        float, typer.Option(help="Unix time of the log's time 0 in seconds, for formats that need it")
     ] = 0.0,
-    force: Annotated[bool, typer.Option("--force", help="replace files of that name")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
 ) -> None:
     """Write a track as KML, GeoJSON, GPX, GeoPackage, NMEA, ROS 2 bag, NetCDF, SBET, subtitles and more.
 

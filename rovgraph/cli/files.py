@@ -15,11 +15,11 @@ Files = Annotated[
 ]
 Choose = Annotated[
     list[str] | None,
-    typer.Option(help="file, instance, message or topic that feeds a sensor; repeat", metavar="SENSOR=SOURCE"),
+    typer.Option(help="file, instance, message or topic that feeds a sensor; may be repeated", metavar="SENSOR=SOURCE"),
 ]
 Shift = Annotated[
     list[str] | None,
-    typer.Option(help="seconds that are added to the stamps of a sensor or a file; repeat", metavar="NAME=SECONDS"),
+    typer.Option(help="seconds to add to the stamps of a sensor or file; may be repeated", metavar="NAME=SECONDS"),
 ]
 
 

@@ -22,27 +22,29 @@ def online(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="folder for recording, track and checkpoint")] = None,
     output: Annotated[
-        list[str] | None, typer.Option("--output", help="where solutions go; default: - unless on a terminal")
+        list[str] | None, typer.Option("--output", help="where to send solutions; default: - unless on a terminal")
     ] = None,
     rate: Annotated[
         float | None, typer.Option(min=0.01, max=200.0, help="solutions per second; default: 5, or 10 with --http")
     ] = None,
-    speed: Annotated[str, typer.Option(help="of files: 1, 10, max")] = "1",
+    speed: Annotated[str, typer.Option(help="speed of replayed files: 1, 10, max")] = "1",
     engine: Annotated[
-        Engine, typer.Option(help="fixed-lag for missions of any length, isam2 for the smoothed track too")
+        Engine, typer.Option(help="fixed-lag for missions of any length; isam2 also gives the smoothed track")
     ] = (Engine.fixed_lag),
     resume: Annotated[bool, typer.Option("--resume", help="continue after a crash, with the files in --out")] = False,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="smooth the recording at the end")] = True,
     force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
     http: Annotated[str | None, typer.Option("--http", help="show a live page at host:port", metavar="ADDRESS")] = None,
     chart: Annotated[
-        list[Path] | None, typer.Option("--chart", help="below the live page's track: GeoTIFF, GeoJSON, tiles")
+        list[Path] | None, typer.Option("--chart", help="chart under the live page's track: GeoTIFF, GeoJSON, tiles")
     ] = None,
     http_origin: Annotated[
         list[str] | None, typer.Option("--http-origin", help="origin of a page that may frame the live page")
     ] = None,
-    http_token: Annotated[Path | None, typer.Option("--http-token", help="file that keeps the page's token")] = None,
-    position_sd_limit: Annotated[float, typer.Option(help="metres; beyond it the live page raises an alarm")] = 5.0,
+    http_token: Annotated[Path | None, typer.Option("--http-token", help="file that holds the page's token")] = None,
+    position_sd_limit: Annotated[
+        float, typer.Option(help="position sd in metres beyond which the live page raises an alarm")
+    ] = 5.0,
 ) -> None:
     """Estimate while data arrive, on board or at the topside.
 
@@ -98,7 +100,7 @@ def _smooth(out: Path) -> None:
     from rovgraph.errors import InputError
     from rovgraph.live.files import CONFIG, RECORDING
 
-    _note("smoothing what was recorded; Ctrl-C leaves it out")
+    _note("smoothing the recording; Ctrl-C skips it")
     try:
         with contextlib.redirect_stdout(sys.stderr):
             smooth([out / RECORDING], out / CONFIG, out / "smoothed", force=True)

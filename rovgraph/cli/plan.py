@@ -11,18 +11,19 @@ def plan(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     known: Annotated[Path | None, typer.Option(help="observability.json of an earlier dive; default: none")] = None,
     goal: Annotated[
-        list[str] | None, typer.Option(help="wanted sd, as dvl_yaw=1deg; may be repeated", metavar="NAME=SD")
+        list[str] | None, typer.Option(help="wanted sd, such as dvl_yaw=1deg; may be repeated", metavar="NAME=SD")
     ] = None,
-    duration: Annotated[float, typer.Option(help="seconds of each manoeuvre")] = 120.0,
+    duration: Annotated[float, typer.Option(help="duration of each manoeuvre in seconds")] = 120.0,
     manoeuvres: Annotated[
-        str | None, typer.Option(help="scenarios, as circle or circle@0.3 (m/s), separated by commas; default: all")
+        str | None,
+        typer.Option(help="scenarios, such as circle or circle@0.3 (m/s), separated by commas; default: all"),
     ] = None,
     estimate: Annotated[
         str | None, typer.Option(help="further calibration variables to estimate, separated by commas")
     ] = None,
     fix_interval: Annotated[float | None, typer.Option(help="seconds between position fixes; default: none")] = None,
-    imu_rate: Annotated[float, typer.Option(help="of the IMU, 5 to 1000 Hz")] = 100.0,
-    dvl_rate: Annotated[float, typer.Option(help="of the DVL's pings, 0.1 to 50 Hz")] = 5.6,
+    imu_rate: Annotated[float, typer.Option(help="rate of the IMU, 5 to 1000 Hz")] = 100.0,
+    dvl_rate: Annotated[float, typer.Option(help="rate of the DVL's pings, 0.1 to 50 Hz")] = 5.6,
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
 ) -> None:
     """Rank manoeuvres by how well they would determine the calibration, before the dive.

@@ -10,11 +10,11 @@ def report(
     results: Annotated[list[Path], typer.Argument(help="results folders", metavar="RESULTS...")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="page to write; default: report.html in RESULTS, of several campaign.html"),
+        typer.Option("--out", "-o", help="page to write; default: report.html in RESULTS, campaign.html for several"),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an older file that --out names")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace an older file at --out")] = False,
 ) -> None:
-    """Make the page of a results folder again, or one page that compares several dives.
+    """Make the page of a results folder again, or a page that compares several dives.
 
     Example: rovgraph report results/monday results/tuesday --out campaign.html
     """

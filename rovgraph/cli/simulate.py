@@ -13,24 +13,24 @@ def simulate(
     scenario: Annotated[
         str,
         typer.Argument(
-            help="Driven through thrusters: vattern, docking, excited, tank, stationary. "
-            "Motions as such: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral.",
+            help="Driven by thrusters: vattern, docking, excited, tank, stationary. "
+            "Prescribed motions: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral.",
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder to make.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder to create.", show_default=False)],
     seed: Annotated[int, typer.Option(min=0, help="Seed: the same one gives the same dive.")] = 1,
-    duration: Annotated[float | None, typer.Option(help="Duration in seconds; default: the scenario's own.")] = None,
-    speed: Annotated[float | None, typer.Option(help="Speed in m/s; default: the scenario's own.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Duration in seconds; default: the scenario's.")] = None,
+    speed: Annotated[float | None, typer.Option(help="Speed in m/s; default: the scenario's.")] = None,
     variant: Annotated[
         str | None,
         typer.Option(
-            help="Of vattern: run 1, 2 or 3, default by the seed; of tank: raw, calibrated; of stationary: land, water."
+            help="vattern: run 1, 2 or 3, default by the seed; tank: raw or calibrated; stationary: land or water."
         ),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help="Configuration (YAML); default: the thesis's Falcon where thrusters drive, else defaults."),
+        typer.Option(help="Configuration (YAML); default: the thesis's Falcon if driven by thrusters, else defaults."),
     ] = None,
     current: Annotated[
         tuple[float, float] | None,
@@ -45,20 +45,22 @@ def simulate(
     outliers: Annotated[float, typer.Option(help="Share of DVL pings that are wrong, 0 to 1.")] = 0.0,
     dropout: Annotated[
         list[str] | None,
-        typer.Option(help="No bottom lock from a second to another, as 100:130; may be repeated.", metavar="FROM:TO"),
+        typer.Option(help="Seconds without bottom lock, such as 100:130; may be repeated.", metavar="FROM:TO"),
     ] = None,
     place: Annotated[
         list[str] | None,
-        typer.Option(help="A place that a camera recognises, in m, as 10:-5; may be repeated.", metavar="NORTH:EAST"),
+        typer.Option(
+            help="A place that a camera recognises, in m, such as 10:-5; may be repeated.", metavar="NORTH:EAST"
+        ),
     ] = None,
-    false_places: Annotated[float, typer.Option(help="Share of its landmarks that are false, below 1.")] = 0.0,
+    false_places: Annotated[float, typer.Option(help="Share of the camera's matches that are false, below 1.")] = 0.0,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Noise, biases and drawn calibration.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an older folder.")] = False,
 ) -> None:
     """Simulate a dive: log.csv, the truth, and the configuration for an estimator.
 
-    Of motions as such, what the configuration says to estimate is drawn from its priors; the world
-    of a driven scenario is its own (docs/simulation.md).
+    For a prescribed motion, the truth of what the configuration estimates is drawn from its priors.
+    A driven scenario has a world of its own (docs/simulation.md).
 
     Example: rovgraph simulate vattern --seed 7 --out dive
     """

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-study = typer.Typer(help="Monte Carlo over many simulated dives: what is observable.", no_args_is_help=True)
+study = typer.Typer(help="Study by many simulated dives what is observable.", no_args_is_help=True)
 
 WIDE = 170  # columns of a file or a pipe, which has no width of its own
 
@@ -22,8 +22,8 @@ def misalignment(
     resume: Annotated[bool, typer.Option("--resume", help="continue with the files in the results folder")] = False,
     only: Annotated[str | None, typer.Option(help="one cell, by the first characters of its id")] = None,
     jobs: Annotated[int | None, typer.Option(help="processes; default: one per core")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="of a Dask cluster, such as tcp://host:8786")] = None,
-    show: Annotated[bool, typer.Option("--list", help="show the cells and their ids, and run nothing")] = False,
+    scheduler: Annotated[str | None, typer.Option(help="address of a Dask cluster, such as tcp://host:8786")] = None,
+    show: Annotated[bool, typer.Option("--list", help="list the cells and their ids without running them")] = False,
 ) -> None:
     """Study how well the DVL's misalignment can be estimated, and whether the stated sd is right.
 

@@ -13,12 +13,12 @@ def tag(
     time: Annotated[str, typer.Option(help="column of times: seconds of the log's clock, or dates")] = "time",
     offset: Annotated[float, typer.Option(help="seconds to add to the table's times")] = 0.0,
     estimate: Annotated[
-        str | None, typer.Option(help="smoothed, filtered or dead_reckoning; default: the best there is")
+        str | None, typer.Option(help="smoothed, filtered or dead_reckoning; default: the best available")
     ] = None,
     exif: Annotated[
-        str | None, typer.Option(help="column of JPEG files; copies get their place in EXIF", metavar="COLUMN")
+        str | None, typer.Option(help="column of JPEG files; write copies with the position in EXIF", metavar="COLUMN")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace files of that name")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
 ) -> None:
     """Add position, attitude and their sd to photos, sonar pings or samples.
 

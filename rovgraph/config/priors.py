@@ -91,7 +91,7 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
             Positive | None,
             Field(
                 variable.time_constant if np.isfinite(variable.time_constant) else None,
-                description="an error of that sd that lasts so long, in the place of the walk; null = none",
+                description="time constant of an error with that sd, in place of the walk; null = none",
             ),
         ),
     }

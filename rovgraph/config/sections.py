@@ -130,7 +130,7 @@ class Imu(Section):
     mag: Mag = Mag()
     acc_bias_sd_mps2: Positive = Field(0.05, description="sd of the accelerometer's bias at the start")
     gyr_bias_sd_dps: Positive = Field(0.6, description="sd of the gyro's bias at the start, deg/s")
-    max_gap_s: Positive = Field(30.0, description="a longer IMU outage is refused")
+    max_gap_s: Positive = Field(30.0, description="a log with a longer IMU outage is refused")
 
 
 class Motion(Section):
@@ -141,7 +141,9 @@ class Motion(Section):
     )
     acc: Positive = Field(0.1, description="constant velocity: noise density of the acceleration [m/s2/rtHz]")
     gyr: Positive = Field(0.3, description="constant velocity: noise density of the rate of turn [rad/s/rtHz]")
-    rate_sd_dps: Positive = Field(5.0, description="constant velocity: rate of turn, as a DVL on a lever arm sees it")
+    rate_sd_dps: Positive = Field(
+        5.0, description="constant velocity: sd of the rate of turn, which a DVL on a lever arm sees"
+    )
 
 
 class Dvl(Section):
@@ -166,7 +168,7 @@ class Heading(Section):
 
     sources: tuple[HeadingSource, ...] | None = Field(
         None,
-        description="of mag, dvl, ahrs, vehicle; null = dvl, and the first of mag, ahrs and vehicle that the log has",
+        description="any of mag, dvl, ahrs, vehicle; null = dvl, and the first of mag, ahrs and vehicle in the log",
     )
     mag_sd_deg: Positive = Field(2.0, description="noise of a magnetometer heading")
     dvl_sd_deg: Positive = Field(3.0, description="noise of the DVL's compass")
@@ -182,14 +184,14 @@ class Tilt(Section):
 
     sd_deg: Positive = Field(1.0, description="noise of roll and of pitch")
     loss: Loss = Field("huber", description="robust loss")
-    gate_sd: Positive | None = Field(6.0, description="roll and pitch further off than this many sd are left out")
+    gate_sd: Positive | None = Field(6.0, description="roll and pitch further off than this many sd are rejected")
     readmit_s: Readmission = 10.0
 
 
 class Depth(Section):
     """Pressure sensor."""
 
-    sd_m: Positive = Field(0.05, description="noise of a depth")
+    sd_m: Positive = Field(0.05, description="noise of a depth sample")
     lever_arm_m: Triple = Field((0.0, 0.0, 0.0), description="position of the pressure sensor in body axes")
     loss: Loss = Field("huber", description="robust loss")
     gate_sd: Positive | None = Field(6.0, description="a depth further off than this many sd is rejected")
@@ -264,7 +266,7 @@ class Vehicle(Section):
     drag_quadratic: NotNegativeTriple = Field((140.0, 55.0, 400.0), description="quadratic drag [N s2/m2]")
     turning_drag_linear: NotNegativeTriple = Field((42.0, 55.0, 90.0), description="linear drag of turning [N m s]")
     turning_drag_quadratic: NotNegativeTriple = Field((42.0, 55.0, 90.0), description="quadratic drag of turning")
-    centre_of_buoyancy_m: Triple = Field((0.0, 0.0, -0.2), description="of buoyancy, from the centre of mass")
+    centre_of_buoyancy_m: Triple = Field((0.0, 0.0, -0.2), description="centre of buoyancy, from the centre of mass")
     thrust: Triple = Field(
         (0.32, -0.016, 2.98e-4), description="thrust [N] of a signal u: a u + b |u| u + c u^3 (2.21)"
     )
@@ -288,7 +290,9 @@ class Graph(Section):
     min_gap_s: NotNegative = Field(
         0.05, description="shortest time between keyframes; closer pings belong to the keyframe before"
     )
-    solver: Literal["batch", "isam2"] = Field("batch", description="of the smoothed estimate; isam2 is incremental")
+    solver: Literal["batch", "isam2"] = Field(
+        "batch", description="solver of the smoothed estimate; isam2 is incremental"
+    )
     segment_s: Positive = Field(10.0, description="isam2: calibration has a new value this often")
     lag_s: Positive = Field(5.0, description="online: how late a measurement may come; no effect on a recorded log")
     hydrodynamics: bool = Field(False, description="use thruster signals and drag (vehicle) as a source of velocity")

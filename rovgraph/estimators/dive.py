@@ -34,7 +34,7 @@ MAX_NOISES = 3  # times that a dive is solved again with noise that was found in
 
 
 def no_progress(what: str, done: float) -> None:
-    """Shows nothing. ``what`` is being done, ``done`` goes from 0 to 1."""
+    """Show no progress; ``what`` is the current task, ``done`` goes from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Dive:
 
     Attributes
     ----------
-    estimates : "smoothed" and "filtered" as asked for, and "dead_reckoning"
+    estimates : "smoothed" and "filtered" as requested, and "dead_reckoning"
     beginning : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
-    frozen : times in which a sensor repeated itself; left out, too
+    frozen : intervals in which a sensor repeated its values; ignored too
     statistics : numbers that healthy dives keep small
     """
 
@@ -58,7 +58,7 @@ class Dive:
 
     @cached_property
     def alarms(self) -> list[Alarm]:
-        """What the estimates say against themselves, the worst first."""
+        """Alarms of the dive, causes before their consequences."""
         return find_alarms(self.statistics, float(self.estimates[0].trajectory.time[0]))
 
     @property
@@ -73,7 +73,7 @@ class Dive:
 
     @property
     def assumptions(self) -> list[str]:
-        """What was assumed and what was left out, a line each."""
+        """Assumptions and counts of ignored measurements, a line each."""
         counts = sorted(self.left_out.items())
         left_out = [f"left out {n} of {sensor}: {why}" for (sensor, why), n in counts]
         return self.beginning.assumptions + _taken_as_exact(self.beginning) + left_out

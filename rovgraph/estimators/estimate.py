@@ -57,13 +57,13 @@ class CalibrationEstimate:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A trajectory, the calibration, and how the measurements fitted.
+    """A trajectory, the calibration and the residuals of the measurements.
 
     Attributes
     ----------
     kind : "smoothed", "filtered" or "dead_reckoning"
     trajectory : Trajectory of the body's origin, one epoch per keyframe
-    calibration : one entry per scalar component whose sensor is used
+    calibration : one entry per scalar component of the sensors in use
     history : variable -> History; acc_bias and gyr_bias, and the estimated calibration
         variables (the filter's against time; a smoother's constants at both ends)
     residuals : columns `RESIDUAL_COLUMNS`; component is x, y, z or a name, normalised is

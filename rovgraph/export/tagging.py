@@ -22,7 +22,7 @@ PLACED = "rov_"  # begins the names of columns that are added
 
 @dataclass(frozen=True)
 class Tagged:
-    """A table with the vehicle's place at each row.
+    """A table with the vehicle's position and attitude at each row.
 
     Attributes
     ----------

@@ -65,12 +65,12 @@ class Solution:
     calibration : label -> (value, sd), radians and SI
     sensors : name of the stream -> SensorHealth
     events : since the last solution
-    verdict, alarms : of the estimate now, and what it comes of
+    verdict, alarms : of the estimate now, and the alarms behind the verdict
     distance : travelled [m]
-    altitude : newest height over the bottom that the DVL reported [m], None where that is older than 3 s
-    predicted_s : how far the IMU alone carried it beyond the newest keyframe [s]
-    latency_s : from the arrival of the newest measurement to this, or None in a replay
-    update_s : time that the newest update took
+    altitude : newest height over the bottom that the DVL reported [m], None if older than 3 s
+    predicted_s : time since the newest keyframe, bridged by the IMU alone [s]
+    latency_s : from the arrival of the newest measurement to this solution [s], None in a replay
+    update_s : duration of the newest update [s]
     """
 
     time: float

@@ -23,13 +23,13 @@ class Log:
     Attributes
     ----------
     source : file name, for messages
-    streams : sensor -> Stream, only those that the log has
+    streams : sensor -> Stream, for the sensors in the log
     origin : latitude and longitude [deg] of north = east = 0, or None
-    config : whose columns, units, delays and magnetometer's calibration it was read with; None where the
-        streams were made otherwise
-    warnings : what was left out or put in order when it was read
-    settings : what its files know of the vehicle, nested as in YAML; holds where a configuration states nothing
-    notes : how it was made of native files, a sentence each
+    config : its columns, units, delays and magnetometer calibration were used to read the log; None if the streams
+        were made otherwise
+    warnings : what was ignored or sorted on reading
+    settings : what its files state of the vehicle, nested as in YAML; a configuration takes precedence
+    notes : how it was converted from native files, a sentence each
     """
 
     source: str
@@ -42,7 +42,7 @@ class Log:
 
     @staticmethod
     def from_frame(frame: pd.DataFrame, config: Config | None = None, source: str = "log") -> "Log":
-        """A log that is in memory already, as `read_log` would read it from a file.
+        """Make a log from a data frame, as `read_log` would from a file.
 
         Parameters
         ----------
@@ -52,21 +52,21 @@ class Log:
 
         Raises
         ------
-        InputError : a frame that cannot be worked with; lines are counted as in a file, the first row is line 2
+        InputError : a frame that cannot be used; lines are counted as in a file, the first row is line 2
 
         Warns
         -----
-        DataWarning : what was left out or put in order
+        DataWarning : what was ignored or sorted
         """
         return _log(table_of_frame(frame, source), config)
 
     @staticmethod
     def from_arrays(*tables: Mapping[str, ArrayLike], config: Config | None = None, source: str = "log") -> "Log":
-        """A log of arrays.
+        """Make a log from arrays.
 
         Parameters
         ----------
-        tables : column -> array_like, shape (n,), ``time`` among them; as many as there are clocks or rates
+        tables : column -> array_like, shape (n,), including ``time``; one table for each clock or rate
         config, source : of `from_frame`
 
         Raises
@@ -93,11 +93,11 @@ class Log:
         return min(float(stream.time[0]) for stream in self.streams.values())
 
     def require_read_with(self, config: Config) -> None:
-        """See that it was read with a configuration's columns, units, delays and magnetometer's calibration.
+        """Check that the log was read with this configuration's columns, units, delays and magnetometer calibration.
 
         Raises
         ------
-        InputError : it was read with others
+        InputError : it was read with another configuration
         """
         if self.config is None:
             return
@@ -109,9 +109,9 @@ class Log:
                 )
 
     def measurements(self) -> Iterator[Measurement]:
-        """All measurements in the order of time; at equal times the IMU comes first, then the DVL.
+        """Yield all measurements in the order of time; at equal times the IMU comes first, then the DVL.
 
-        So a ping makes its keyframe before what was measured together with it is attached.
+        So a ping makes its keyframe before simultaneous measurements are attached to it.
         """
         streams = in_precedence(self.streams.values())
         if not streams:
@@ -133,11 +133,11 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
 
     Raises
     ------
-    InputError : a file that cannot be worked with
+    InputError : a file that cannot be used
 
     Warns
     -----
-    DataWarning : what was left out or put in order
+    DataWarning : what was ignored or sorted
     """
     with collected_warnings() as texts:
         table = read_table(path)

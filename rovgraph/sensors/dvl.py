@@ -30,7 +30,7 @@ def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
     R_bs : ndarray, shape (3, 3), mounting as configured, or as it fits
     """
     if np.linalg.det(H) > 0.0:
-        return "it is mounted in another way", f"state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ H)}"
+        return "its mounting is not as configured", f"state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ H)}"
     named = ["-" * int(row.min() < 0.0) + VELOCITIES[int(np.abs(row).argmax())] for row in H]
     wrong = int(np.diagonal(H).argmin())
     turn = H.copy()
@@ -38,7 +38,7 @@ def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
     remedy = f"put a minus before the unit of {VELOCITIES[wrong]}, units: {{{VELOCITIES[wrong]}: -m/s}}"
     if not np.array_equal(turn, np.eye(3)):
         remedy += f", and state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ turn)}"
-    return f"its axes are left-handed, {', '.join(named)} are right", remedy
+    return f"its axes are left-handed and should be {', '.join(named)}", remedy
 
 
 def _rpy_deg(R_bs: Array) -> list[float]:
@@ -137,11 +137,11 @@ def _bottom_lock(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
     usual, limit = float(np.median(np.linalg.norm(velocity, axis=1))), config.dvl.max_speed_mps
     lost = int((np.abs(velocity).max(axis=1) > limit).sum())
     if usual > max(limit, 10.0):
-        yield "error", f"median speed {usual:.3g} m/s; in mm/s or cm/s? Say units: {{dvl: mm/s}}"
+        yield "error", f"median speed {usual:.3g} m/s; if it is in mm/s or cm/s, state units: {{dvl: mm/s}}"
     elif lost > 0.05 * len(velocity):
-        yield "warning", f"{lost} pings are faster than dvl.max_speed_mps = {limit:g} and are left out"
+        yield "warning", f"{lost} pings are faster than dvl.max_speed_mps = {limit:g} and are ignored"
     else:
-        tail = f"; {lost} faster than {limit:g} m/s are left out" if lost else ""
+        tail = f"; {lost} faster than {limit:g} m/s are ignored" if lost else ""
         yield "ok", f"median speed {usual:.2f} m/s{tail}"
 
 
@@ -159,7 +159,7 @@ DVL = Sensor(
     linear_in=VELOCITY,
     may_begin_later=True,
     usual_rates=(0.1, 100.0),
-    if_missing=("warning", "no DVL: position is lost within a minute between fixes; give dvl_vx, dvl_vy, dvl_vz"),
+    if_missing=("warning", "no DVL: without fixes, position is lost within a minute; give dvl_vx, dvl_vy, dvl_vz"),
     look=_bottom_lock,
 )
 DVL_WATER = Sensor(

@@ -11,7 +11,7 @@ IMU = Sensor(
     usual_rates=(5.0, 4000.0),
     if_missing=(
         "error",
-        "no IMU: nothing carries attitude from ping to ping; give acc_x, acc_y, acc_z, gyr_x, gyr_y, gyr_z, "
-        "or else roll and pitch, which do without one",
+        "no IMU: the attitude between measurements is unknown; give acc_x, acc_y, acc_z, gyr_x, gyr_y, gyr_z, "
+        "or roll and pitch instead",
     ),
 )

@@ -77,15 +77,15 @@ def _magnitude(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
     low, middle, high = np.percentile(np.linalg.norm(values, axis=1), [5, 50, 95])
     spread = (high - low) / middle if middle > 0 else np.inf
     level: Level = "warning" if spread > 0.4 else "ok"
-    hint = "; large hard iron, calibrate it (rovgraph calibrate)" if level == "warning" else ""
+    hint = "; the hard iron is large: calibrate it (rovgraph calibrate magnetometer)" if level == "warning" else ""
     given = [unit for name, unit in config.units.items() if name.startswith("mag")]
     possible = ("uT",) if given else tuple(EARTH_FIELD)
     if not any(low < middle / EARTH_FIELD[unit] < high for unit in possible for low, high in (EARTH_RANGE,)):
         said = "uT" if given else "any unit"
         yield (
             "warning",
-            f"field {middle:.4g} is not the Earth's in {said} (22 to 67 uT); is the unit wrong? "
-            "Say units: {mag: nT}, or calibrate it (rovgraph calibrate magnetometer)",
+            f"field {middle:.4g} is not the Earth's in {said} (22 to 67 uT); if the unit is wrong, "
+            "state it, such as units: {mag: nT}, or calibrate it (rovgraph calibrate magnetometer)",
         )
     yield level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}"
 

@@ -79,15 +79,20 @@ def _range(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
     """Depth positive down, and in metres."""
     depth = values[:, 0]
     if np.median(depth) < -0.5:
-        yield "warning", f"median depth {np.median(depth):.2f} m; depth counts downwards: mirrored?"
+        yield (
+            "warning",
+            f"median depth {np.median(depth):.2f} m, but depth counts downwards; "
+            "if its sign is reversed, state units: {depth: -m}",
+        )
     elif np.percentile(depth, 1) < -1.0:
         lowest = -float(np.percentile(depth, 1))
         yield (
             "warning",
-            f"it reaches {lowest:.1f} m above the surface; was the first pressure, under water, taken for it?",
+            f"it reaches {lowest:.1f} m above the surface; "
+            "the first pressure was probably measured under water and taken for that at the surface",
         )
     if np.ptp(depth) > 1000.0:
-        yield "warning", f"depth spans {np.ptp(depth):.4g} m; in cm or mm? Say units: {{depth: mm}}"
+        yield "warning", f"depth spans {np.ptp(depth):.4g} m; if it is in cm or mm, state units: {{depth: mm}}"
 
 
 DEPTH = Sensor(
@@ -99,7 +104,7 @@ DEPTH = Sensor(
     observes=Observed("position", (2,)),
     may_begin_later=True,
     usual_rates=(0.05, 1000.0),
-    if_missing=("warning", "no depth: the vertical drifts; give depth if there is a pressure sensor"),
+    if_missing=("warning", "no depth: the vertical position drifts; give depth if you have a pressure sensor"),
     look=_range,
 )
 FIX = Sensor(

@@ -13,7 +13,7 @@ EVERYWHERE = frozenset({"noise", "outliers", "dropouts", "disturbances", "places
 
 @dataclass(frozen=True)
 class Choices:
-    """None = the scenario's own.
+    """Choices for a simulated dive; None = the scenario's.
 
     Attributes
     ----------
@@ -25,8 +25,8 @@ class Choices:
     outliers : share of DVL pings that are wrong, 0 to 1
     dropouts : intervals (from, to) [s] without bottom lock
     places : north, east [m] of places that a camera recognises
-    false_places : share of the landmarks that are of another spot, 0 to less than 1
-    noise : noise, biases, and everything about vehicle and sensors that is drawn
+    false_places : share of the matches that are false, from 0 to below 1
+    noise : with noise, biases and drawn errors of vehicle and sensors
     """
 
     duration: float | None = None

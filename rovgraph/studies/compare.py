@@ -40,9 +40,9 @@ class Comparison:
     runs : a row per run and estimator
     misalignment : a row per run, estimator and epoch: run, estimator, time [s], value_deg,
         sd_deg, true_deg
-    velocity : of the first run, a row per estimator and epoch: estimator, time [s], v_north,
+    velocity : velocities of the first run, a row per estimator and epoch: estimator, time [s], v_north,
         v_east [m/s]; the reference is among the estimators
-    config : that the estimators were given on the first run
+    config : the configuration of the estimators on the first run
     """
 
     table: pd.DataFrame

@@ -45,7 +45,7 @@ class Observability:
     prior_sd : ndarray, shape (c,), before the dive [unit of each]
     claimed_sd : ndarray, shape (c,), after it as the graph has it, linearised at its noisy estimate
     information : ndarray, shape (c, c), that the data add to the prior, in units of the prior's sd,
-        without what noise pretends
+        without spurious information
     correlation : ndarray, shape (c, c + 9), of the components with each other, then with the last
         bias (accelerometer, gyro; body axes) and the start's roll, pitch and heading
     time : ndarray, shape (m,), since the start of the dive [s]
@@ -223,7 +223,7 @@ def _correlation(joint: Array, calibration: Array) -> Array:
     Parameters
     ----------
     joint : ndarray, covariance of others and calibration, as the graph has it
-    calibration : ndarray, shape (c, c), covariance without what noise pretends: what the others
+    calibration : ndarray, shape (c, c), covariance without spurious information: what the others
         depend on the calibration stays, given that
     """
     own, other = slice(OTHERS, None), slice(0, OTHERS)

@@ -78,7 +78,8 @@ def moved_constant(c: CalibrationEstimate, begin: float, end: float) -> Iterator
         off,
         f"{c.label} was estimated at {factor * c.value:.3g}{behind(unit)}, {off:.0f} sd from its prior "
         f"{factor * c.prior_mean:.3g} ± {factor * c.prior_sd:.2g}{behind(unit)}",
-        f"check {_key_of(name)}; if the estimate is right, state it as the mean, or a larger sd, in calibration.{name}",
+        f"check {_key_of(name)}; if the estimate is right, state it as the mean, or state a larger "
+        f"sd, in calibration.{name}",
     )
 
 
@@ -117,8 +118,8 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
             HELD,
             FAR_MOVED if belief.considered else HELD_FAR_OFF,  # the prior's sd is all that the track's sd has of it
-            f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements put it "
-            f"{factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)} from that",
+            f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements shift it "
+            f"by {factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)}",
             _remedy_of_held(r, evidence.beginning.config),
         )
 
@@ -144,8 +145,8 @@ def earth_rate_of(sd: float, begin: float, end: float) -> Statistic:
         EARTH_RATE / sd,
         FEELS_THE_EARTH,
         np.inf,
-        f"the Earth's rotation is not modelled, but the gyro's bias has an sd of {np.rad2deg(sd) * 3600:.2g} "
-        "deg/h, where the Earth turns 15 deg/h",
+        f"the gyro's bias has an sd of {np.rad2deg(sd) * 3600:.2g} deg/h, but the Earth's rotation of 15 deg/h is "
+        "not modelled",
         "state environment.latitude_deg and environment.earth_rotation: true",
     )
 
@@ -179,7 +180,7 @@ def halves(evidence: Evidence) -> Iterator[Statistic]:
                 off,
                 DISAGREE,
                 DISAGREE_BADLY,
-                f"{label} of the first half of the dive and of the second differ by {off:.0f} sd",
+                f"{label} differs by {off:.0f} sd between the first half of the dive and the second",
                 f"it changes during the dive, or another error looks like it: check {_key_of(name)}, "
                 f"or let it walk (calibration.{name})",
             )
@@ -223,5 +224,7 @@ def _remedy_of_held(r: Released, config: Config) -> str:
     if r.name == "dvl_yaw":
         return f"check {_key_of(r.name)}, or estimate calibration.dvl_yaw"
     if r.name in ("dvl_roll", "dvl_pitch"):
-        return f"DVL and IMU are tilted to each other: check imu.mount_rpy_deg, or estimate calibration.{r.name}"
+        return (
+            f"DVL and IMU are tilted relative to each other: check imu.mount_rpy_deg, or estimate calibration.{r.name}"
+        )
     return f"estimate calibration.{r.name}"

@@ -48,11 +48,11 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
         figure, kind = as_configured / min(turned), "axes"
     else:
         late = "late" if shift > 0 else "early"
-        cause = f"its stamps are about {abs(shift):.2g} s {late} against the IMU's"
+        cause = f"its stamps are about {abs(shift):.2g} s {late} relative to the IMU's"
         entry = f"{{estimate: true, mean: {shift:.2g}, sd: 0.1}}"
         remedy = f"correct the clock, or state calibration.dvl_time_offset: {entry}"
         figure, kind = as_configured / shifted[shift], "clock"
-    text = f"{cause}: so it agrees {figure:.1f} times better with the IMU"
+    text = f"{cause}; corrected, it agrees {figure:.1f} times better with the IMU"
     yield Statistic(kind, "dvl", evidence.start, evidence.end, figure, BETTER, BETTER, text, remedy)
 
 

@@ -135,5 +135,5 @@ def apart(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statistic]:
             LARGE_JUMP,
             f"smoothed and filtered {what} differ by {size[k]:.2g} {unit}, {np.sqrt(square[k]):.0f} joint sds, "
             f"at {float(s.time[at[k]]) - start:.0f} s",
-            "something that was believed then was given up later: look at the residuals before that time",
+            "later measurements contradict the filter: look at the residuals before that time",
         )

@@ -189,8 +189,8 @@ def lasting_in(r: SensorResiduals, start: float, end: float, began: float | None
         ratio,
         max(LASTING, by_chance),
         max(BADLY_LASTING, by_chance),
-        f"residuals of {r.components[component]} last: means over {seconds:g} s vary by {ratio:.0f} times what "
-        f"noise would, most at {begin - (start if began is None else began):.0f} s",
+        f"residuals of {r.components[component]} do not average out: means over {seconds:g} s vary {ratio:.0f} "
+        f"times as much as noise, most at {begin - (start if began is None else began):.0f} s",
         _remedy_of_lasting(r.sensor),
     )
 
@@ -220,13 +220,16 @@ def _remedy_of_lasting(sensor: str) -> str:
     """What lets a sensor's errors last, and what to do."""
     if sensor == "mag":
         return (
-            "iron near the vehicle or a bad calibration (rovgraph calibrate magnetometer); "
+            "look for iron near the vehicle or calibrate again (rovgraph calibrate magnetometer), or "
             f"raise {sd_key(sensor)}{_CHANGING_FIELD}"
         )
     if sensor in ("dvl_heading", "ahrs"):
-        return f"iron near the vehicle or a bad calibration (rovgraph calibrate magnetometer); raise {sd_key(sensor)}"
+        return (
+            "look for iron near the vehicle or calibrate again (rovgraph calibrate magnetometer), "
+            f"or raise {sd_key(sensor)}"
+        )
     if sensor == "fix":
-        return "the fixes are off together for that time: take them out, or raise fix.sd_m"
+        return "the fixes are all off there: remove them from the log, or raise fix.sd_m"
     if sensor == "depth":
         return "the depth contradicts the DVL's vertical velocity: check depth, dvl.mount_rpy_deg and imu.mount_rpy_deg"
     if sensor.startswith("dvl"):

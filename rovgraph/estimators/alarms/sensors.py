@@ -38,7 +38,7 @@ def frozen_for(sensor: str, first: float, last: float, seconds: float, times: in
         FROZEN_S,
         float("inf"),
         f"repeats its values for {seconds:.0f} s{often}, {span(first, last, start)}; they were ignored",
-        "look at the instrument and its driver; the track is less certain there, as its sd says",
+        "check the instrument and its driver; the track is less certain there, and its sd includes that",
     )
 
 
@@ -58,10 +58,10 @@ def no_attitude(evidence: Evidence) -> Iterator[Statistic]:
             seconds,
             LONGEST_CRUISED_S,
             float("inf"),
-            f"no {part} for {seconds:.0f} s, {evidence.span(worst.begin, worst.end)}{often}; nobody knows which way "
-            f"the vehicle turned, and {sum(gap.pings for gap in gaps)} pings of the DVL were left out",
-            f"look at the instrument and its driver, or map another source of {part}; position is as uncertain there "
-            "as its sd says",
+            f"no {part} for {seconds:.0f} s, {evidence.span(worst.begin, worst.end)}{often}: the vehicle's "
+            f"turns are unknown there, and {sum(gap.pings for gap in gaps)} DVL pings were ignored",
+            f"check the instrument and its driver, or map another source of {part}; position is less certain there, "
+            "and its sd includes that",
         )
 
 
