@@ -19,6 +19,7 @@ from rovgraph.log import Log
 from rovgraph.report.status import status
 
 SECONDS = 120.0
+LASTS = "depth: residuals of down do not average out"
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +49,9 @@ def test_a_healthy_dive_is_trusted_from_beginning_to_end(case):
     ("name", "words"),
     [
         ("DVL y sign flipped", "dvl: up to"),
-        pytest.param("IMU mounted 2, 1, 3 degrees off", "depth: residuals of down do not average out", marks=pytest.mark.slow),
+        pytest.param("IMU mounted 2, 1, 3 degrees off", LASTS, marks=pytest.mark.slow),
         ("DVL biased by 0.3 m/s for 20 s", "dvl: contradicts all other sensors"),
-        pytest.param("depth stuck", "depth: residuals of down do not average out", marks=pytest.mark.slow),
+        pytest.param("depth stuck", LASTS, marks=pytest.mark.slow),
         pytest.param("DVL 0.3 s late", "dvl: up to", marks=pytest.mark.slow),
         ("DVL noise three times as stated", "raise dvl.velocity_sd_mps"),
         ("fixes 8 m off for a minute", "fix: residuals of north do not average out"),
