@@ -69,8 +69,8 @@ names = "columns: {time: stamp_ms, depth: z}\n"
 look(names + "units: {time: ms}")
 
 # %% [markdown]
-# The gyro turns 57 times as much as the compass, and the depth is mirrored. Both are one word in the configuration;
-# the file stays as it is.
+# The gyro's rates are 57 times too large, and the depth has the wrong sign. One word in the configuration corrects
+# each; the file stays as it is.
 
 # %%
 units = names + "units: {time: ms, gyr: deg/s, depth: -m}\n"
@@ -79,8 +79,8 @@ look(units)
 # %% [markdown]
 # ## The mounting
 #
-# What is left is the DVL: nobody has stated how it sits, so rovgraph takes its axes for the vehicle's. The dive is too
-# calm for the check to notice. The estimate does. Read the verdict and its first line before you look at the track:
+# The DVL remains: no mounting is stated, so rovgraph takes its axes for the vehicle's. The dive is too calm for the
+# check to notice, but the estimate shows it. Read the verdict and its first line before you look at the track:
 
 # %%
 units += "calibration: {dvl_yaw: {estimate: true, sd_deg: 5}}\n"  # the yaw of a mounting is known to 5° or so

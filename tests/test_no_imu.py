@@ -196,7 +196,7 @@ def test_a_silent_attitude_makes_a_track_that_is_wide_and_an_alarm(dive, sensor,
     case, config = dive
     done = smooth(silent(case, sensor), config)
     (alarm,) = [alarm for alarm in done.alarms if alarm.kind == f"no {part}"]
-    assert f"no {part} for 31 s, 39 to 70 s" in alarm.text and "30 pings" in alarm.text
+    assert f"no {part} for 31 s, 39 to 70 s" in alarm.text and "30 DVL pings" in alarm.text
     assert done.left_out["dvl", f"no {part} for more than 10 s"] == 30
     for estimate in done.estimates[:2]:
         for time in (55.0, 69.0, 120.0):

@@ -35,7 +35,7 @@ def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
     wrong = int(np.diagonal(H).argmin())
     turn = H.copy()
     turn[:, wrong] *= -1.0
-    remedy = f"put a minus before the unit of {VELOCITIES[wrong]}, units: {{{VELOCITIES[wrong]}: -m/s}}"
+    remedy = f"reverse the sign of {VELOCITIES[wrong]}, units: {{{VELOCITIES[wrong]}: -m/s}}"
     if not np.array_equal(turn, np.eye(3)):
         remedy += f", and state dvl.mount_rpy_deg: {_rpy_deg(R_bs @ turn)}"
     return f"its axes are left-handed and should be {', '.join(named)}", remedy

@@ -55,8 +55,8 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
                 ratio,
                 max(IMU, by_chance),
                 max(IMU_BADLY, by_chance),
-                f"{part} {axis} contradicts the other sensors: means over {IMU_S:g} s vary by {ratio:.0f} times what "
-                f"its noise allows, most at {evidence.since(begin):.0f} s",
+                f"{part} {axis} contradicts the other sensors: means over {IMU_S:g} s vary {ratio:.0f} times as much "
+                f"as its noise allows, most at {evidence.since(begin):.0f} s",
                 f"check imu.mount_rpy_deg and the compasses, estimate calibration.{key}_scale or raise imu.noise.{key}",
             )
 
