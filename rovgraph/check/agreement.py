@@ -13,7 +13,6 @@ from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Fit, Lag, Signal, coars
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, rotate
 from rovgraph.log import Log, Stream
-from rovgraph.sensors import Level
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
@@ -120,7 +119,8 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
         causes = "hard iron and the mounting" if sensor == "mag" else "its unit, mounting and clock"
         return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); check {causes}")
     if 40.0 < abs(f.slope) < 80.0 or 1 / 80.0 < abs(f.slope) < 1 / 40.0:
-        return Finding(sensor, "error", f"{_factor_of_57(log, sensor, f.slope)} ({numbers})")
+        cause, remedy = _factor_of_57(log, sensor, f.slope)
+        return Finding(sensor, "error", f"{cause} ({numbers}); {remedy}")
     if f.slope < 0.0:
         return Finding(
             sensor,
@@ -134,18 +134,19 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
     return Finding(sensor, "warning", text)
 
 
-def _factor_of_57(log: Log, sensor: str, slope: float) -> str:
-    """Which of gyro and heading is in the wrong unit."""
+def _factor_of_57(log: Log, sensor: str, slope: float) -> tuple[str, str]:
+    """Which of gyro and heading is in the wrong unit, and what to do."""
     fast = float(np.percentile(np.abs(log["imu"].data[:, 3:]), 99))
     name = NAMES[sensor]
     if abs(slope) < 1.0:
         if sensor != "mag" and np.ptp(log[sensor].data[:, 0]) < 2 * np.pi / 50 and fast < 3.0:
-            return f"{name} is 57 times too small: it was probably converted to radians twice; remove it from units:"
-        return "the gyro's rates are 57 times too large; if they are in deg/s, state units: {gyr: deg/s}"
+            return f"{name} is 57 times too small", "it was probably converted to radians twice: remove it from units:"
+        return "the gyro's rates are 57 times too large", "if they are in deg/s, state units: {gyr: deg/s}"
     if sensor != "mag" and _beyond_circle(log[sensor].data[:, 0]):
-        return f"{name} is 57 times too large; {_if_degrees(sensor)}"
+        return f"{name} is 57 times too large", _if_degrees(sensor)
     return (
-        "the gyro's rates are 57 times too small: they were probably converted to rad/s twice; remove gyr from units:"
+        "the gyro's rates are 57 times too small",
+        "they were probably converted to rad/s twice: remove gyr from units:",
     )
 
 
@@ -199,8 +200,11 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
         )
     else:
         low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
-        level: Level = "ok" if low < f.slope < high else "warning"
-        yield Finding("dvl", level, f"vertical velocity agrees with the change of depth ({numbers})")
+        if low < f.slope < high:
+            yield Finding("dvl", "ok", f"vertical velocity agrees with the change of depth ({numbers})")
+        else:
+            text = f"vertical velocity follows depth, but not by the same amount ({numbers}); check the units of both"
+            yield Finding("dvl", "warning", text)
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
     yield from _clock(

@@ -64,9 +64,10 @@ class Jump:
 
     def finding(self, log: Log) -> Finding:
         """What to say of it."""
+        first, second = (round(lag, 1) + 0.0 for lag in self.lags)  # no minus before a zero
         told = (
-            f"the DVL's stamps are {self.lags[0]:.1f} s late relative to the IMU's before {since(log, self.before)} "
-            f"and {self.lags[1]:.1f} s after {since(log, self.after)}"
+            f"the DVL's stamps are {first:.1f} s late relative to the IMU's before {since(log, self.before)} "
+            f"and {second:.1f} s after {since(log, self.after)}"
         )
         if not self.sensor:
             return Finding(

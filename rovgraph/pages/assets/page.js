@@ -36,6 +36,7 @@
     return Math.abs(times[j] - t) < Math.abs(times[i] - t) ? j : i;
   };
   const number = (v) => (Number.isFinite(v) ? String(Math.abs(v) < 1000 ? +v.toPrecision(4) : +v.toFixed(1)) : "unknown");
+  const metres = (v) => (Number.isFinite(v) ? v.toFixed(2) : "unknown");
 
   // ---- drawing -------------------------------------------------------------------------------
   const axis = (title, log, ticks) => ({
@@ -247,8 +248,8 @@
     let text = `${now.toFixed(unit === "s" ? 1 : 2)} ${unit}`;
     if (cursor) {
       const v = vehicle(now), heading = (((v.yaw * 180) / Math.PI) % 360 + 360) % 360;
-      text += ` · north ${number(v.north)} m, east ${number(v.east)} m, down ${number(v.down)} m · heading ${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
-      text += Number.isFinite(v.major) ? ` · 99 % within ${number(v.major)} × ${number(v.minor)} m` : "";
+      text += ` · north ${metres(v.north)} m, east ${metres(v.east)} m, down ${metres(v.down)} m · heading ${Number.isFinite(heading) ? heading.toFixed(1) + "°" : "unknown"}`;
+      text += Number.isFinite(v.major) ? ` · 99 % within ${metres(v.major)} × ${metres(v.minor)} m` : "";
       if (data.origin) text += ` · ${degrees(data.origin.lat + v.north / data.origin.lat_m, "NS", 0.05)} ${degrees(data.origin.lon + v.east / data.origin.lon_m, "EW", 0.05)}`;
     }
     output.textContent = text;
