@@ -1,4 +1,4 @@
-"""The pictures of both pages in the docs: ``ROVGRAPH_PICTURES=docs/images pytest -m slow tests/test_page_pictures.py``."""
+"""Pictures of both pages; with ROVGRAPH_PICTURES=docs/images, ``pytest -m slow`` of this file makes those of the docs."""
 
 import os
 from pathlib import Path
