@@ -1,4 +1,4 @@
-"""Pictures of both pages; with ROVGRAPH_PICTURES=docs/images, ``pytest -m slow`` of this file makes those of the docs."""
+"""Pictures of both pages. ROVGRAPH_PICTURES=docs/images and ``pytest -m slow`` of this file make those of the docs."""
 
 import os
 from pathlib import Path
