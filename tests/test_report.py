@@ -319,7 +319,7 @@ def test_read_only_parent_is_one_line(tmp_path, monkeypatch):
 def test_every_file_is_written(written):
     folder, _ = written
     names = {p.name for p in folder.iterdir()}
-    tracks = {f"trajectory_{kind}.{ending}" for kind in ("smoothed", "filtered") for ending in ("csv", "tum")}
+    tracks = {f"trajectory_{kind}.{ending}" for kind in ("smoothed", "filtered") for ending in ("csv", "ned.tum")}
     tables = {"calibration.csv", "residuals.csv", "history.csv", "left_out.csv"}
     assert names == tracks | tables | {"config.yaml", "summary.json"}
 
