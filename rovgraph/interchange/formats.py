@@ -36,6 +36,7 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "nmea",
     "gpx",
     "xsens",
+    "xsens_mtb",
 )
 GROUP = "rovgraph.formats"
 

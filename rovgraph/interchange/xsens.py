@@ -59,7 +59,7 @@ class Xsens:
         if not rows:
             raise InputError(f"{path}: holds no row of measurements; export it again with Acc, Gyr and SampleTimeFine")
         table = dict(zip(names, np.array(rows).T, strict=True))
-        return _recording(path, self.name, table, "".join(header), left)
+        return recording_of(path, self.name, table, "".join(header), left)
 
 
 FORMAT = Xsens()
@@ -84,7 +84,20 @@ def _row(line: bytes, count: int, left: Counter[str]) -> list[float] | None:
         return None
 
 
-def _recording(path: Path, format_: str, table: dict[str, Array], header: str, left: Counter[str]) -> Recording:
+def recording_of(path: Path, format_: str, table: dict[str, Array], header: str, left: Counter[str]) -> Recording:
+    """What the columns of a file become.
+
+    Parameters
+    ----------
+    path, format_ : the file, and the name of its format
+    table : name of MT Manager -> column, all of one length; m/s^2, rad/s, degrees
+    header : names the coordinate system, and the rate where there is no ``SampleTimeFine``
+    left : why rows were left out -> how many
+
+    Raises
+    ------
+    InputError : no acceleration, rate or time
+    """
     if not {*IMU.values()} <= table.keys():
         raise InputError(f"{path}: lacks acceleration or rate (Acc_X, Gyr_X, ...); it has: {', '.join(table)[:200]}")
     time, notes = _times(path, table, header)

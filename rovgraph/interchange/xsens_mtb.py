@@ -1,0 +1,261 @@
+"""Xsens' binary recordings (MTB): XBus messages, of which MTData2 holds the measurements.
+
+A message is ``FA``, bus, kind, length, data and a sum; bus to sum add up to 0 modulo 256. MTData2 is a sequence of
+items: an identifier of two bytes, a size and big-endian numbers, whose last nibble names their precision (float, fixed
+point 12.20 or 16.32, double) and the world of an attitude (ENU, NED, NWU). What it says goes where the text export's
+columns go (`rovgraph.interchange.xsens`).
+"""
+
+import mmap
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rovgraph.errors import InputError
+from rovgraph.geometry import Array, rpy_from_matrix
+from rovgraph.interchange.formats import Options
+from rovgraph.interchange.recording import Clock, Recording
+from rovgraph.interchange.xsens import SENSOR, recording_of
+
+PREAMBLE, EXTENDED, MTDATA2, LEGACY = 0xFA, 0xFF, 0x36, 0x32
+SURE = 3  # messages in a row that nothing else has
+PROGRESS = 1 << 20  # bytes
+KIND, WORLD, PRECISION = 0xFFF0, 0xC, 0x3  # masks of an identifier
+UTC_TIME, COUNTER, FINE, QUATERNION, EULER = 0x1010, 0x1020, 0x1060, 0x2010, 0x2030
+DELTA_V, ACCELERATION, RATE, DELTA_Q, FIELD = 0x4010, 0x4020, 0x8020, 0x8030, 0xC020
+COUNT = {QUATERNION: 4, EULER: 3, DELTA_V: 3, ACCELERATION: 3, RATE: 3, DELTA_Q: 4, FIELD: 3}  # numbers of each
+WORLDS = {0x0: "ENU", 0x4: "NED", 0x8: "NWU"}
+LEFT = {
+    0x0810: "temperature of the IMU",
+    0x3010: "pressure of the housing",
+    0x4030: "acceleration without gravity, by the instrument's own filter",
+    0x4040: "acceleration before calibration",
+    0x5020: "height, by the instrument's own filter",
+    0x5040: "position, by the instrument's own filter",
+    0x7010: "GNSS",
+    0x8040: "rate before calibration",
+    0xD010: "velocity, by the instrument's own filter",
+    0xE010: "status",
+    0xE020: "status",
+}
+CALENDAR = ("year", "month", "day", "h", "min", "s")
+UTC_FIELDS = np.dtype([("ns", ">u4"), ("year", ">u2"), *((name, "u1") for name in (*CALENDAR[1:], "flags"))])
+UTC_VALID = 0x7  # date, time of day, and leap seconds known
+UTC_SD_S = 0.01
+
+Layout = tuple[tuple[int, int, int], ...]  # identifier, first byte, size of each item
+
+
+class Mtb:
+    """The format; see `rovgraph.interchange.formats.Format`."""
+
+    name = "mtb"
+    title = "Xsens binary recording (MTB)"
+    extra = ""
+
+    def recognise(self, path: Path, head: bytes) -> float:
+        found, lost = 0, 0
+        for at, length, _, _ in _messages(head, Counter()):
+            lost += at if not found else 0
+            found += length > 0
+            if found == SURE:
+                return 0.9 if lost < SURE else 0.6
+        return 0.9 if found and not lost else 0.0
+
+    def read(self, path: Path, options: Options) -> Recording:
+        size, left = path.stat().st_size, Counter[str]()
+        if not size:
+            raise InputError(f"{path}: is empty")
+        with path.open("rb") as file:
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        at: list[int] = []
+        length: list[int] = []
+        told = 0
+        for begin, count, kind, _ in _messages(content, left):
+            if begin - told > PROGRESS:
+                options.progress(told := begin, size)
+            if kind == MTDATA2:
+                at.append(begin)
+                length.append(count)
+            else:
+                left[_other(kind)] += 1
+        options.progress(size, size)
+        values, worlds = _values(np.frombuffer(content, np.uint8), np.array(at), np.array(length), left)
+        table = _table(values)
+        if not table:
+            raise InputError(f"{path}: holds no acceleration with a rate of turn; record it with both")
+        if len(worlds) > 1:
+            raise InputError(f"{path}: gives attitude relative to {', '.join(sorted(worlds))}; split it there")
+        recording = recording_of(
+            path, self.name, table, f"Coordinate system: {worlds.pop() if worlds else 'ENU'}", left
+        )
+        return replace(recording, clocks={SENSOR: _clock(values, table)})
+
+
+FORMAT = Mtb()
+
+
+def _messages(content: bytes | mmap.mmap, left: Counter[str]) -> Iterator[tuple[int, int, int, int]]:
+    """First byte of the data, its length, kind and the next message of every message whose sum is right."""
+    at, size = content.find(bytes([PREAMBLE])), len(content)
+    while 0 <= at < size - 4:
+        length, data = content[at + 3], at + 4
+        if length == EXTENDED and at + 6 < size:
+            length, data = 256 * content[at + 4] + content[at + 5], at + 6
+        end = data + length
+        if end < size and sum(content[at + 1 : end + 1]) % 256 == 0:
+            yield data, length, content[at + 2], end + 1
+            after = end + 1
+        else:
+            left["a message that is cut off or whose sum is wrong"] += 1
+            after = at + 1
+        at = content.find(bytes([PREAMBLE]), after)
+
+
+def _other(kind: int) -> str:
+    return "legacy MTData, which MT Manager exports as text" if kind == LEGACY else f"message 0x{kind:02X}"
+
+
+def _values(
+    raw: NDArray[np.uint8], at: NDArray[np.int64], length: NDArray[np.int64], left: Counter[str]
+) -> tuple[dict[int, Array], set[str]]:
+    """Kind of item -> its numbers in every packet, NaN where there are none; and the worlds of attitudes.
+
+    Packets are alike, so those of one layout are read at once.
+    """
+    values: dict[int, Array] = {}
+    worlds: set[str] = set()
+    for size in np.unique(length):
+        rows = np.flatnonzero(length == size)
+        while len(rows):
+            packets = raw[at[rows, None] + np.arange(size)]
+            layout = _layout(packets[0])
+            headers = np.array([first - 3 + k for _, first, _ in layout for k in range(3)], np.int64)
+            alike = (packets[:, headers] == packets[0, headers]).all(axis=1)
+            for identifier, first, count in layout:
+                kind = identifier & KIND
+                numbers = _numbers(identifier, packets[alike, first : first + count])
+                if numbers is None:
+                    left[LEFT.get(kind, f"item 0x{kind:04X}")] += int(alike.sum())
+                    continue
+                column = values.setdefault(kind, np.full((len(at), numbers.shape[1]), np.nan))
+                column[rows[alike]] = numbers
+                if kind in (QUATERNION, EULER):
+                    worlds.add(WORLDS.get(identifier & WORLD, "ENU"))
+            rows = rows[~alike]
+    return values, worlds
+
+
+def _layout(packet: NDArray[np.uint8]) -> Layout:
+    """Items of a packet; one that reaches beyond its end is none."""
+    items, at = [], 0
+    while at + 3 <= len(packet):
+        identifier, size = 256 * int(packet[at]) + int(packet[at + 1]), int(packet[at + 2])
+        if at + 3 + size > len(packet):
+            break
+        items.append((identifier, at + 3, size))
+        at += 3 + size
+    return tuple(items)
+
+
+def _numbers(identifier: int, data: NDArray[np.uint8]) -> Array | None:
+    """What an item holds in each of m packets (m, k); None for one that a log has no place for."""
+    kind, rows = identifier & KIND, np.ascontiguousarray(data)
+    if kind in (COUNTER, FINE):
+        type_ = {2: ">u2", 4: ">u4"}.get(rows.shape[1])
+        return None if type_ is None else rows.view(type_).astype(float)
+    if kind == UTC_TIME and rows.shape[1] == UTC_FIELDS.itemsize:
+        return np.array([[_unix(time)] for time in rows.view(UTC_FIELDS)[:, 0]])
+    if kind not in COUNT:
+        return None
+    width = (4, 4, 6, 8)[identifier & PRECISION]
+    if rows.shape[1] != width * COUNT[kind]:
+        return None
+    if width == 6:  # the fraction comes first
+        parts = rows.reshape(len(rows), -1, 6)
+        fraction = np.ascontiguousarray(parts[:, :, :4]).view(">u4")[:, :, 0] / 2.0**32
+        return np.asarray(np.ascontiguousarray(parts[:, :, 4:]).view(">i2")[:, :, 0] + fraction)
+    fixed = identifier & PRECISION == 1
+    numbers = rows.view(">i4" if fixed else f">f{width}").astype(float)
+    return np.asarray(numbers / 2.0**20 if fixed else numbers)
+
+
+def _unix(time: np.void) -> float:
+    """Unix time of a UTC item [s], NaN while the instrument does not know it."""
+    if int(time["flags"]) & UTC_VALID != UTC_VALID:
+        return np.nan
+    try:
+        whole = datetime(*(int(time[name]) for name in CALENDAR), tzinfo=UTC)
+    except ValueError:
+        return np.nan
+    return whole.timestamp() + 1e-9 * float(time["ns"])
+
+
+def _table(values: dict[int, Array]) -> dict[str, Array]:
+    """The columns that the text export has; {} without acceleration and rate, which increments may stand for."""
+    acceleration, rate = values.get(ACCELERATION), values.get(RATE)
+    step = _step(values)
+    if acceleration is None and DELTA_V in values:
+        acceleration = values[DELTA_V] / step
+    if rate is None and DELTA_Q in values:
+        rate = _turned(values[DELTA_Q]) / step
+    if acceleration is None or rate is None:
+        return {}
+    table = {"PacketCounter": values[COUNTER][:, 0]} if COUNTER in values else {}
+    if FINE in values:
+        table["SampleTimeFine"] = values[FINE][:, 0]
+    for name, vectors in (("Acc", acceleration), ("Gyr", rate), ("Mag", values.get(FIELD))):
+        if vectors is not None:
+            table |= {f"{name}_{axis}": vectors[:, k] for k, axis in enumerate("XYZ")}
+    angles = values.get(EULER)
+    if angles is None and QUATERNION in values:
+        angles = np.rad2deg(rpy_from_matrix(_rotation(values[QUATERNION])))
+    if angles is not None:
+        table |= {name: angles[:, k] for k, name in enumerate(("Roll", "Pitch", "Yaw"))}
+    return table
+
+
+def _step(values: dict[int, Array]) -> float:
+    """Over which increments are summed [s]; NaN where no time says."""
+    for increment in (DELTA_V, DELTA_Q):
+        if increment in values and FINE in values:
+            ticks = values[FINE][np.isfinite(values[increment][:, 0]), 0]
+            if len(ticks) > 1:
+                return float(np.nanmedian(np.diff(ticks))) * 1e-4
+    return np.nan
+
+
+def _turned(q: Array) -> Array:
+    """Rotation vectors [rad] of quaternions w, x, y, z (n, 4)."""
+    q = np.where(q[:, :1] < 0.0, -q, q)
+    sine = np.linalg.norm(q[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(sine, q[:, 0])
+    return np.asarray(q[:, 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)[:, None])
+
+
+def _rotation(q: Array) -> Array:
+    """Rotation matrices (n, 3, 3) of quaternions w, x, y, z, from the instrument's axes to the world's."""
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _clock(values: dict[int, Array], table: dict[str, Array]) -> Clock:
+    """The instrument's clock, and what it lacks of Unix time where it knew UTC."""
+    fine = table.get("SampleTimeFine")
+    if UTC_TIME not in values or fine is None:
+        return Clock(SENSOR)
+    known = np.isfinite(values[UTC_TIME][:, 0]) & np.isfinite(fine)
+    if not known.any() or (np.diff(fine[np.isfinite(fine)]) < 0.0).any():
+        return Clock(SENSOR)
+    offset = float(np.median(values[UTC_TIME][known, 0] - 1e-4 * fine[known]))
+    return Clock(SENSOR, offset, UTC_SD_S, "UTC of the instrument's GNSS")
