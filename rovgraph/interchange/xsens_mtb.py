@@ -189,8 +189,9 @@ def _unix(time: np.void) -> float:
     """Unix time of a UTC item [s], NaN while the instrument does not know it."""
     if int(time["flags"]) & UTC_VALID != UTC_VALID:
         return np.nan
+    year, month, day, hour, minute, second = (int(time[name]) for name in CALENDAR)
     try:
-        whole = datetime(*(int(time[name]) for name in CALENDAR), tzinfo=UTC)
+        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return np.nan
     return whole.timestamp() + 1e-9 * float(time["ns"])
