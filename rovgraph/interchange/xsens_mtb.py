@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, rpy_from_matrix
+from rovgraph.interchange.binary_records import ROWS
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Clock, Recording
 from rovgraph.interchange.xsens import SENSOR, recording_of
@@ -133,7 +134,8 @@ def _values(
     for size in np.unique(length):
         rows = np.flatnonzero(length == size)
         while len(rows):
-            packets = raw[at[rows, None] + np.arange(size)]
+            parts = np.array_split(rows, 1 + len(rows) // ROWS)
+            packets = np.concatenate([raw[at[part, None] + np.arange(size)] for part in parts])
             layout = _layout(packets[0])
             headers = np.array([first - 3 + k for _, first, _ in layout for k in range(3)], np.int64)
             alike = (packets[:, headers] == packets[0, headers]).all(axis=1)
