@@ -358,7 +358,7 @@ BAD = {
     "a duration for a log": ["log.csv", "--reference", "truth.csv", "--duration", 60],
     "no seeds": ["--scenario", "circle", "--seeds", 0],
     "fewer than no seeds": ["--scenario", "circle", "--seeds", -3],
-    "an unknown scenario": ["--scenario", "cirle", "--jobs", 1],
+    "an unknown scenario": ["--scenario", "cirle"],
     "an unknown estimator": ["--scenario", "circle", "--estimators", "graph-smothed-a"],
     "no estimator": ["--scenario", "circle", "--estimators", ","],
     "no jobs": ["--scenario", "circle", "--jobs", 0],

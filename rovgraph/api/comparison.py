@@ -13,6 +13,7 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.log import Log
+from rovgraph.simulate.named import require_known
 from rovgraph.studies import compare as library
 from rovgraph.studies.compare import Comparison
 from rovgraph.studies.estimators import select
@@ -101,6 +102,7 @@ def compare(
     runs: list[Run]
     about: dict[str, Any]
     if scenario is not None:
+        require_known(scenario)
         runs = [Simulated(scenario, seed, config, duration) for seed in seeds]
         about = {"scenario": scenario, "seeds": [*seeds], "duration_s": duration}
         title = f"{scenario}, {len(seeds)} seeds"

@@ -23,6 +23,19 @@ _KINEMATIC = frozenset({"duration", "speed"})
 _OWN = Choices()
 
 
+def require_known(name: str) -> None:
+    """Refuse what is no scenario.
+
+    Raises
+    ------
+    InputError : the name is not one of `NAMES`; with the nearest
+    """
+    if name not in NAMES:
+        near = difflib.get_close_matches(name, NAMES, 1)
+        hint = f", did you mean {near[0]}?" if near else ""
+        raise InputError(f"unknown scenario {name!r}{hint} (known: {', '.join(sorted(NAMES))})")
+
+
 def simulated(name: str, seed: int, config: Config | None = None, choices: Choices = _OWN) -> tuple[Dive, Config]:
     """A dive of a scenario.
 
@@ -45,10 +58,7 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
     ------
     InputError : no such scenario, or a choice that it does not have
     """
-    if name not in NAMES:
-        near = difflib.get_close_matches(name, NAMES, 1)
-        hint = f", did you mean {near[0]}?" if near else ""
-        raise InputError(f"unknown scenario {name!r}{hint} (known: {', '.join(sorted(NAMES))})")
+    require_known(name)
     if seed < 0:
         raise InputError(f"seed {seed}: 0 or more is expected")
     if name in DRIVEN:
