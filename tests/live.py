@@ -122,14 +122,16 @@ class Vehicle:
 
     def _serve(self) -> None:
         client, until, heard, since, k = None, 0.0, 0.0, 0.0, 0
-        last = time.monotonic()
+        while client is None and not self._stop.is_set():
+            client = self._accepted()  # again at once: of several vehicles the one that is called first speaks first
+        last = time.monotonic()  # the dive begins with the first client
         while not self._stop.is_set():
             if client is None:
                 client = self._accepted()
                 since = until if client is not None else since
             elapsed, last = time.monotonic() - last, time.monotonic()
             heard = heard if client is None else until
-            if self.clients > 0 and until - heard < self.unheard_s:
+            if until - heard < self.unheard_s:
                 until += self.speed * elapsed
             if client is not None and until > self.hang_up:
                 client.close()
