@@ -10,7 +10,7 @@ from autopilot_files import FORMATS, DataFlashWriter, dataflash_of, short_dive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink import DFReader
-from recordings import close
+from recordings import close, first
 
 from rovgraph.errors import InputError
 from rovgraph.interchange.dataflash_messages import read_messages
@@ -42,10 +42,6 @@ def read(data: bytes, folder: Path, **choose: str) -> Recording:
     path = folder / "dive.BIN"
     path.write_bytes(data)
     return read_recording(path, Options(choose=choose))
-
-
-def first(recording: Recording, sensor: str):
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 def imus(count: int, start: float = 0.0, instances: int = 1, rate: float = 25.0) -> DataFlashWriter:

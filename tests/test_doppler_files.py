@@ -25,23 +25,18 @@ from doppler_files import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recordings import first, read
 from ruamel.yaml import YAML
 from scipy.io import loadmat
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy
 from rovgraph.interchange.formats import read_recording
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.interchange.recording import Recording
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 RNG = np.random.default_rng(5)
 WAYS = [(BEAM, False), (BEAM, True), (INSTRUMENT, False), (INSTRUMENT, True), (SHIP, False), (EARTH, False)]
-
-
-def read(data: bytes, folder: Path) -> Recording:
-    path = folder / "dive.bin"  # content tells what it is, not its name
-    path.write_bytes(data)
-    return read_recording(path)
 
 
 def real(name: str) -> Recording:
@@ -49,10 +44,6 @@ def real(name: str) -> Recording:
     if not path.exists():
         pytest.skip(f"{path} is not there")
     return read_recording(path)
-
-
-def first(recording: Recording, sensor: str) -> Channel:
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 def velocity(recording: Recording, prefix: str = "dvl_v") -> np.ndarray:

@@ -14,11 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from recordings import close
+from recordings import close, first, read
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import Options, read_recording, recognise
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.interchange.formats import read_recording, recognise
 from rovgraph.log import Log
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "ardusub"
@@ -44,16 +43,6 @@ def written(sent: Iterable[Sent], form: str = "tlog", clock: Any = lambda boot: 
         for name in {"each": [topic], "together": ["mavlink/out"], "both": ["mavlink/out", topic]}[form]:
             out.append((clock(time), name, data))
     return mcap(out)
-
-
-def read(data: bytes, folder: Path, **choose: str) -> Recording:
-    path = folder / "dive.bin"  # content tells what it is, not its name
-    path.write_bytes(data)
-    return read_recording(path, Options(choose=choose))
-
-
-def first(recording: Recording, sensor: str) -> Channel:
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 @cache

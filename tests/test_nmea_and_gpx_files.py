@@ -1,7 +1,6 @@
 """Files of NMEA sentences and GPX tracks: fixes and headings at their times."""
 
 from datetime import UTC, datetime
-from pathlib import Path
 
 import gpxpy.gpx
 import numpy as np
@@ -9,24 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymap3d import geodetic2ned
-from recordings import check_refused_or_whole, close
+from recordings import check_refused_or_whole, close, first, read
 from wire import sentence
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import Options, read_recording
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.interchange.recording import Recording
 
 MIDNIGHT = datetime(2024, 3, 2, tzinfo=UTC).timestamp()
-
-
-def read(data: bytes, folder: Path, **choose: str) -> Recording:
-    path = folder / "ship.txt"
-    path.write_bytes(data)
-    return read_recording(path, Options(choose=choose))
-
-
-def first(recording: Recording, sensor: str) -> Channel:
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 def gga(clock: str, minutes: float, talker: str = "GP", quality: int = 1) -> bytes:

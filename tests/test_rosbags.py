@@ -11,12 +11,12 @@ from autopilot_files import short_dive
 from bags import FORMS, START, Maker, Sent, imu, marine_dvl, of_dive, transform, write, xyz
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import close
+from recordings import close, first
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix
 from rovgraph.interchange.formats import Options, read_recording, recognise
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.interchange.recording import Recording
 from rovgraph.log import Log
 
 FLU = np.diag([1.0, -1.0, -1.0])
@@ -30,10 +30,6 @@ def bag(folder: Path, *sent: Any, form: str = "ros1", **more: Any) -> Path:
 
 def read(folder: Path, *sent: Any, form: str = "ros1", choose: Any = None, **more: Any) -> Recording:
     return read_recording(bag(folder, *sent, form=form, **more), Options(choose=choose or {}))
-
-
-def first(recording: Recording, sensor: str) -> Channel:
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 def left(recording: Recording) -> dict[str, int]:

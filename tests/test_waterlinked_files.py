@@ -1,32 +1,21 @@
 """Files of Water Linked's DVLs: reports come back as they were sent, and what is damaged is counted."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from autopilot_files import short_dive
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import check_refused_or_whole, close
+from recordings import check_refused_or_whole, close, first, read
 from wire import report
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import read_recording, recognise
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.interchange.formats import recognise
+from rovgraph.interchange.recording import Recording
 from rovgraph.log import Log
 
 START = 1_638_191_471.0
-
-
-def read(data: bytes, folder: Path) -> Recording:
-    path = folder / "dvl.dat"  # content tells what it is, not its name
-    path.write_bytes(data)
-    return read_recording(path)
-
-
-def first(recording: Recording, sensor: str) -> Channel:
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 def pings(count: int, start: float = START, **changes: object) -> list[bytes]:
@@ -140,7 +129,7 @@ def test_damaged_lines_are_counted_and_the_rest_is_read(tmp_path):
 
 def test_a_file_without_a_velocity_is_refused_by_what_it_holds(tmp_path):
     answer = b'{"type": "response", "format": "json_v3.1"}\n'
-    with pytest.raises(InputError, match=r"dvl.dat: holds no velocity report.*response: 1"):
+    with pytest.raises(InputError, match=r"dive.bin: holds no velocity report.*response: 1"):
         read(answer + report(format="json_v9"), tmp_path)
 
 

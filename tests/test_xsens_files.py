@@ -1,17 +1,13 @@
 """Text exports of Xsens' MT Manager: counters that wrap, worlds, and damage."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import check_refused_or_whole, close
+from recordings import check_refused_or_whole, close, first, read
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
-from rovgraph.interchange.formats import read_recording
-from rovgraph.interchange.recording import Channel, Recording
 
 VECTORS = [f"{sensor}_{axis}" for sensor in ("Acc", "Gyr", "Mag") for axis in "XYZ"]
 NAMES = ["PacketCounter", "SampleTimeFine", *VECTORS, "Roll", "Pitch", "Yaw"]
@@ -27,16 +23,6 @@ def export(
         counts = [k % 65536, (100 * k) % 2**32] if fine else [k % 65536]
         lines.append("\t".join(map(str, [*counts, 0.1, 0.2, 9.8, 0.01, 0.02, 0.03, 0.5, 0.1, -0.8, *rpy])))
     return "\r\n".join([*lines, ""]).encode()
-
-
-def read(data: bytes, folder: Path) -> Recording:
-    path = folder / "mti.dat"
-    path.write_bytes(data)
-    return read_recording(path)
-
-
-def first(recording: Recording, sensor: str) -> Channel:
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 @pytest.mark.parametrize(("fine", "start"), [(True, 42_949_660), (False, 65_530)])

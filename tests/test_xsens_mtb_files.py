@@ -1,19 +1,17 @@
 """Xsens' binary recordings, written here by `struct`: precisions, worlds, increments, a time that wraps, and damage."""
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import check_refused_or_whole, close
+from recordings import check_refused_or_whole, close, first, read
 
 import rovgraph as rg
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix
-from rovgraph.interchange.formats import read_recording, recognise
-from rovgraph.interchange.recording import Channel, Recording
+from rovgraph.interchange.formats import recognise
 from rovgraph.simulate import Choices
 
 ACC, GYR, MAG = (0.1, 0.2, 9.8), (0.01, 0.02, 0.03), (0.5, 0.1, -0.8)
@@ -51,16 +49,6 @@ def packet(k: int, precision: int = 0, world: int = 0, q=None, *, more: bytes = 
 
 def recorded(count: int = 20, start: int = 0, **given: object) -> bytes:
     return message(b"\x01\x02\x03", 0x01) + b"".join(packet(start + k, **given) for k in range(count))
-
-
-def read(data: bytes, folder: Path) -> Recording:
-    path = folder / "recording"
-    path.write_bytes(data)
-    return read_recording(path)
-
-
-def first(recording: Recording, sensor: str) -> Channel:
-    return next(channel for channel in recording.channels if channel.sensor == sensor)
 
 
 @pytest.mark.parametrize(("precision", "within"), [(0, 1e-6), (1, 1e-6), (2, 1e-9), (3, 1e-15)])
