@@ -125,10 +125,30 @@ def test_a_file_without_use_is_refused_in_one_line(data, said, tmp_path):
 
 
 def test_text_and_noise_are_no_recording(tmp_path):
-    for name, data in (("text", b"time,depth\n0,1\n"), ("noise", np.random.default_rng(1).bytes(60_000))):
-        (tmp_path / name).write_bytes(data)
-        found = recognise(tmp_path / name)
+    path = tmp_path / "file"
+    for data in (b"time,depth\n0,1\n", *(np.random.default_rng(seed).bytes(60_000) for seed in range(20))):
+        path.write_bytes(data)
+        found = recognise(path)
         assert found is None or found.name != "mtb"
+
+
+def test_a_recording_that_begins_within_a_message_is_recognised(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(recorded()[90:])
+    assert recognise(path).name == "mtb"
+
+
+def test_increments_without_a_time_are_refused(tmp_path):
+    with pytest.raises(InputError, match="SampleTimeFine"):
+        read(
+            message(item(0x8033, struct.pack(">4d", 1, 0, 0, 0)) + item(0x4013, struct.pack(">3d", *ACC))) * 9, tmp_path
+        )
+
+
+def test_an_attitude_that_is_no_unit_quaternion_is_left_out(tmp_path):
+    data = packet(0, q=(0, 0, 0, 0)) + packet(1, q=(np.nan, 0, 0, 1)) + recorded(9, start=2, q=(1, 0, 0, 0))
+    roll = first(read(data, tmp_path), "ahrs").columns["ahrs_roll"]
+    assert np.isnan(roll[:2]).all() and np.isfinite(roll[2:]).all()
 
 
 def test_a_recorded_dive_is_smoothed_as_its_log_is(tmp_path):

@@ -22,6 +22,7 @@ from rovgraph.interchange.nortek_tracks import (
 )
 from rovgraph.interchange.pressure import FRESH, GRAVITY
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.stamps import unix_of_calendar
 
 SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
 CLOCK = "instrument's clock"
@@ -161,10 +162,7 @@ def decoded_dvl(content: bytes | mmap.mmap, found: Records, kind: int) -> Track:
 def _time(date: NDArray[np.uint8], fraction: NDArray[np.uint16]) -> Array:
     """Seconds since 1970 of calendar dates, shape (n,), NaN for what is none; ``fraction`` is in 0.1 ms."""
     year, month, day, hour, minute, second = date.astype(np.int64).T
-    sound = (month < 12) & (day >= 1) & (day <= 31) & (hour < 24) & (minute < 60) & (second < 60)
-    months = np.where(sound, 12 * (year - 70) + month, 0).astype("datetime64[M]")
-    days = months.astype("datetime64[D]").astype(np.int64) + day - 1
-    return np.where(sound, 86400.0 * days + 3600.0 * hour + 60.0 * minute + second + 1e-4 * fraction, np.nan)
+    return unix_of_calendar(year + 1900, month + 1, day, hour, minute, second) + 1e-4 * fraction
 
 
 def _attitude(content: bytes | mmap.mmap, found: Records) -> Iterator[Channel]:

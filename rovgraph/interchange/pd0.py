@@ -26,6 +26,7 @@ from rovgraph.interchange.pd0_ensembles import (
     find_ensembles,
 )
 from rovgraph.interchange.recording import Clock, Left, Recording
+from rovgraph.interchange.stamps import unix_of_calendar
 from rovgraph.interchange.trdi_axes import BEAM, EARTH, Attitude, forward_starboard_down
 from rovgraph.interchange.trdi_recording import CLOCK, Pings, recording
 
@@ -132,11 +133,8 @@ def _time(date: NDArray[np.uint8], century: NDArray[np.uint8]) -> Array:
     """Seconds since 1970 of calendar dates, of which years may have two digits; NaN for what is none."""
     year, month, day, hour, minute, second, hundredths = date.astype(np.int64).T
     full = np.where((century == 19) | (century == 20), 100 * century.astype(np.int64), 2000) + year
-    sound = (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31) & (year < 100)
-    sound &= (hour < 24) & (minute < 60) & (second < 60) & (hundredths < 100)
-    months = np.where(sound, 12 * (full - 1970) + month - 1, 0).astype("datetime64[M]")
-    days = months.astype("datetime64[D]").astype(np.int64) + day - 1
-    return np.where(sound, 86400.0 * days + 3600.0 * hour + 60.0 * minute + second + 0.01 * hundredths, np.nan)
+    whole = unix_of_calendar(full, month, day, hour, minute, second)
+    return np.where((year < 100) & (hundredths < 100), whole + 0.01 * hundredths, np.nan)
 
 
 def _left(found: Ensembles) -> Iterator[Left]:

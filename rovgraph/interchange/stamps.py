@@ -6,11 +6,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
+from rovgraph.geometry import Array
 from rovgraph.interchange.recording import Channel
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 JUMP = 86400.0  # ahead, after which a stamp is of another epoch [s]
 LOST = 0.1  # of the rows, that stamps of another epoch may have
+
+
+def unix_of_calendar(
+    year: NDArray[np.int64],
+    month: NDArray[np.int64],
+    day: NDArray[np.int64],
+    hour: NDArray[np.int64],
+    minute: NDArray[np.int64],
+    second: NDArray[np.int64],
+) -> Array:
+    """Seconds since 1970 of calendar dates taken for UTC, each argument and the result of shape (n,).
+
+    NaN where a field is outside of its range; days of short months that there are not count on into the next month.
+    """
+    sound = (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31) & (hour < 24) & (minute < 60) & (second < 60)
+    months = np.where(sound, 12 * (year - 1970) + month - 1, 0).astype("datetime64[M]")
+    days = months.astype("datetime64[D]").astype(np.int64) + day - 1
+    return np.where(sound, 86400.0 * days + 3600.0 * hour + 60.0 * minute + second, np.nan)
 
 
 def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:

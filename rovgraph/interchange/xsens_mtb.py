@@ -8,23 +8,24 @@ columns go (`rovgraph.interchange.xsens`).
 
 import mmap
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, rpy_from_matrix
 from rovgraph.interchange.binary_records import ROWS
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Clock, Recording
-from rovgraph.interchange.xsens import SENSOR, recording_of
+from rovgraph.interchange.stamps import unix_of_calendar
+from rovgraph.interchange.xsens import FINE_S, SENSOR, recording_of
 
 PREAMBLE, EXTENDED, MTDATA2, LEGACY = 0xFA, 0xFF, 0x36, 0x32
-SURE = 3  # messages in a row that nothing else has
+SURE = 3  # messages, each after the other, that nothing else has
 PROGRESS = 1 << 20  # bytes
 KIND, WORLD, PRECISION = 0xFFF0, 0xC, 0x3  # masks of an identifier
 UTC_TIME, COUNTER, FINE, QUATERNION, EULER = 0x1010, 0x1020, 0x1060, 0x2010, 0x2030
@@ -48,6 +49,7 @@ CALENDAR = ("year", "month", "day", "h", "min", "s")
 UTC_FIELDS = np.dtype([("ns", ">u4"), ("year", ">u2"), *((name, "u1") for name in (*CALENDAR[1:], "flags"))])
 UTC_VALID = 0x7  # date, time of day, and leap seconds known
 UTC_SD_S = 0.01
+UNIT = 0.01  # from which a quaternion's length may differ from 1
 
 Layout = tuple[tuple[int, int, int], ...]  # identifier, first byte, size of each item
 
@@ -60,13 +62,13 @@ class Mtb:
     extra = ""
 
     def recognise(self, path: Path, head: bytes) -> float:
-        found, lost = 0, 0
-        for at, length, _, _ in _messages(head, Counter()):
-            lost += at if not found else 0
-            found += length > 0
-            if found == SURE:
-                return 0.9 if lost < SURE else 0.6
-        return 0.9 if found and not lost else 0.0
+        run, end = 0, -1
+        for begin, at, length, _ in _messages(head, Counter()):
+            run = run + 1 if begin == end else 1
+            if run == SURE:
+                return 0.9
+            end = at + length + 1
+        return 0.0
 
     def read(self, path: Path, options: Options) -> Recording:
         size, left = path.stat().st_size, Counter[str]()
@@ -77,11 +79,11 @@ class Mtb:
         at: list[int] = []
         length: list[int] = []
         told = 0
-        for begin, count, kind, _ in _messages(content, left):
+        for begin, data, count, kind in _messages(content, left):
             if begin - told > PROGRESS:
                 options.progress(told := begin, size)
             if kind == MTDATA2:
-                at.append(begin)
+                at.append(data)
                 length.append(count)
             else:
                 left[_other(kind)] += 1
@@ -102,7 +104,7 @@ FORMAT = Mtb()
 
 
 def _messages(content: bytes | mmap.mmap, left: Counter[str]) -> Iterator[tuple[int, int, int, int]]:
-    """First byte of the data, its length, kind and the next message of every message whose sum is right."""
+    """Every message whose sum is right: its first byte, the first byte and length of its data, and its kind."""
     at, size = content.find(bytes([PREAMBLE])), len(content)
     while 0 <= at < size - 4:
         length, data = content[at + 3], at + 4
@@ -110,7 +112,7 @@ def _messages(content: bytes | mmap.mmap, left: Counter[str]) -> Iterator[tuple[
             length, data = 256 * content[at + 4] + content[at + 5], at + 6
         end = data + length
         if end < size and sum(content[at + 1 : end + 1]) % 256 == 0:
-            yield data, length, content[at + 2], end + 1
+            yield at, data, length, content[at + 2]
             after = end + 1
         else:
             left["a message that is cut off or whose sum is wrong"] += 1
@@ -172,7 +174,7 @@ def _numbers(identifier: int, data: NDArray[np.uint8]) -> Array | None:
         type_ = {2: ">u2", 4: ">u4"}.get(rows.shape[1])
         return None if type_ is None else rows.view(type_).astype(float)
     if kind == UTC_TIME and rows.shape[1] == UTC_FIELDS.itemsize:
-        return np.array([[_unix(time)] for time in rows.view(UTC_FIELDS)[:, 0]])
+        return _unix(rows.view(UTC_FIELDS)[:, 0])[:, None]
     if kind not in COUNT:
         return None
     width = (4, 4, 6, 8)[identifier & PRECISION]
@@ -187,26 +189,21 @@ def _numbers(identifier: int, data: NDArray[np.uint8]) -> Array | None:
     return np.asarray(numbers / 2.0**20 if fixed else numbers)
 
 
-def _unix(time: np.void) -> float:
-    """Unix time of a UTC item [s], NaN while the instrument does not know it."""
-    if int(time["flags"]) & UTC_VALID != UTC_VALID:
-        return np.nan
-    year, month, day, hour, minute, second = (int(time[name]) for name in CALENDAR)
-    try:
-        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-    except ValueError:
-        return np.nan
-    return whole.timestamp() + 1e-9 * float(time["ns"])
+def _unix(time: NDArray[np.void]) -> Array:
+    """Unix time of UTC items, shape (n,) [s]; NaN while the instrument does not know it."""
+    known = (time["flags"] & UTC_VALID) == UTC_VALID
+    whole = unix_of_calendar(*(time[name].astype(np.int64) for name in CALENDAR))
+    return np.where(known, whole + 1e-9 * time["ns"], np.nan)
 
 
 def _table(values: dict[int, Array]) -> dict[str, Array]:
     """The columns that the text export has; {} without acceleration and rate, which increments may stand for."""
     acceleration, rate = values.get(ACCELERATION), values.get(RATE)
-    step = _step(values)
     if acceleration is None and DELTA_V in values:
-        acceleration = values[DELTA_V] / step
+        acceleration = values[DELTA_V] / _period(values, DELTA_V)
     if rate is None and DELTA_Q in values:
-        rate = _turned(values[DELTA_Q]) / step
+        turn = _of_unit_quaternions(values[DELTA_Q], Rotation.as_rotvec, (3,))
+        rate = turn / _period(values, DELTA_Q)
     if acceleration is None or rate is None:
         return {}
     table = {"PacketCounter": values[COUNTER][:, 0]} if COUNTER in values else {}
@@ -217,39 +214,26 @@ def _table(values: dict[int, Array]) -> dict[str, Array]:
             table |= {f"{name}_{axis}": vectors[:, k] for k, axis in enumerate("XYZ")}
     angles = values.get(EULER)
     if angles is None and QUATERNION in values:
-        angles = np.rad2deg(rpy_from_matrix(_rotation(values[QUATERNION])))
+        angles = np.rad2deg(rpy_from_matrix(_of_unit_quaternions(values[QUATERNION], Rotation.as_matrix, (3, 3))))
     if angles is not None:
         table |= {name: angles[:, k] for k, name in enumerate(("Roll", "Pitch", "Yaw"))}
     return table
 
 
-def _step(values: dict[int, Array]) -> float:
-    """Over which increments are summed [s]; NaN where no time says."""
-    for increment in (DELTA_V, DELTA_Q):
-        if increment in values and FINE in values:
-            ticks = values[FINE][np.isfinite(values[increment][:, 0]), 0]
-            if len(ticks) > 1:
-                return float(np.nanmedian(np.diff(ticks))) * 1e-4
-    return np.nan
+def _period(values: dict[int, Array], increment: int) -> float:
+    """Over which an increment is summed [s]; NaN where no time says."""
+    if FINE not in values:
+        return np.nan
+    ticks = values[FINE][np.isfinite(values[increment][:, 0]), 0]
+    return FINE_S * float(np.nanmedian(np.diff(ticks))) if len(ticks) > 1 else np.nan
 
 
-def _turned(q: Array) -> Array:
-    """Rotation vectors [rad] of quaternions w, x, y, z (n, 4)."""
-    q = np.where(q[:, :1] < 0.0, -q, q)
-    sine = np.linalg.norm(q[:, 1:], axis=1)
-    angle = 2.0 * np.arctan2(sine, q[:, 0])
-    return np.asarray(q[:, 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)[:, None])
-
-
-def _rotation(q: Array) -> Array:
-    """Rotation matrices (n, 3, 3) of quaternions w, x, y, z, from the instrument's axes to the world's."""
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+def _of_unit_quaternions(q: Array, form: Callable[[Rotation], Array], shape: tuple[int, ...]) -> Array:
+    """A form of rotation, (n, shape), of quaternions w, x, y, z (n, 4); NaN where one has not the length 1."""
+    unit = np.abs(np.linalg.norm(q, axis=1) - 1.0) < UNIT
+    out = np.full((len(q), *shape), np.nan)
+    out[unit] = form(Rotation.from_quat(q[unit], scalar_first=True))
+    return out
 
 
 def _clock(values: dict[int, Array], table: dict[str, Array]) -> Clock:
@@ -260,5 +244,5 @@ def _clock(values: dict[int, Array], table: dict[str, Array]) -> Clock:
     known = np.isfinite(values[UTC_TIME][:, 0]) & np.isfinite(fine)
     if not known.any() or (np.diff(fine[np.isfinite(fine)]) < 0.0).any():
         return Clock(SENSOR)
-    offset = float(np.median(values[UTC_TIME][known, 0] - 1e-4 * fine[known]))
+    offset = float(np.median(values[UTC_TIME][known, 0] - FINE_S * fine[known]))
     return Clock(SENSOR, offset, UTC_SD_S, "UTC of the instrument's GNSS")
