@@ -20,7 +20,7 @@ from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import known
 from rovgraph.trajectory import Trajectory
 
-SEEDS = range(1, 21)
+SEEDS = range(1, 25)
 SECONDS, PING_RATE = 100.0, 2.5  # fewer pings than a real DVL
 QUANTITIES = ("position", "velocity", "attitude")
 KINDS = ("smoothed", "filtered", "smoothed with a boastful DVL")

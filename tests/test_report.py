@@ -513,7 +513,7 @@ def test_figures_exist_with_sane_sizes(dive, tmp_path):
     assert [p.name for p in paths] == FIGURES
     for path in paths:
         width, height = png_size(path)
-        assert width == 1080 and 400 < height < 2500
+        assert width == 1080 and 500 < height < 2500
 
 
 def test_figures_of_bare_estimates(dive, tmp_path):

@@ -54,7 +54,7 @@ def draw_depth(estimates: Sequence[Estimate], log: Log) -> Figure:
     """Depth with ±2 sd, the bottom below it and the altitude over it where the DVL measured one."""
     main, clock = estimates[0], Clock.of(estimates[0])
     bottom = "dvl_altitude" in log
-    figure = new_figure(4.6 if bottom else 3.0)
+    figure = new_figure(4.8 if bottom else 3.6)
     panels: list[Axes] = list(figure.subplots(1 + bottom, 1, sharex=True, squeeze=False)[:, 0])
     spans = []
     for estimate in estimates:
@@ -91,8 +91,8 @@ def draw_attitude(estimates: Sequence[Estimate], log: Log, config: Config) -> Fi
     low = _lower_end(main.trajectory)
     for estimate in estimates:
         _draw_attitude(panels, estimate, clock, low)
+    tracks = [estimate.trajectory for estimate in estimates]
     for i in (0, 1):
-        tracks = [estimate.trajectory for estimate in estimates]
         _scale(panels[i], [_span(np.rad2deg(t.rpy[:, i]), np.rad2deg(t.rpy_sd[:, i])) for t in tracks])
     for sensor, (time, heading) in samples.items():
         label, look = SOURCES[sensor]

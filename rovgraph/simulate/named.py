@@ -24,7 +24,11 @@ _OWN = Choices()
 
 
 def require_known(name: str) -> None:
-    """Refuse what is no scenario.
+    """Refuse the name of a scenario that does not exist.
+
+    Parameters
+    ----------
+    name : of a scenario
 
     Raises
     ------
