@@ -79,6 +79,12 @@ class Log:
     def __contains__(self, sensor: str) -> bool:
         return sensor in self.streams
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.streams)
+
+    def __len__(self) -> int:
+        return len(self.streams)
+
     def __getitem__(self, sensor: str) -> Stream:
         return self.streams[sensor]
 
