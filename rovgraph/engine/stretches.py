@@ -154,13 +154,13 @@ def _with_fitted_edge(
     problem: Linearizable[Point, Step], best: Solution[Point], time: Array, end: bool
 ) -> Solution[Point]:
     """The same for one edge: in by bisection until it is clear, then out by doubled steps until nothing shows."""
-    newest, least = best.stretches[-1], best.cost
+    newest, least, nearest = best.stretches[-1], best.cost, best
 
     @cache
     def at(index: int) -> Solution[Point] | None:
         edge = float(time[min(max(index, 0), len(time) - 1)])
         moved = replace(newest, end=edge) if end else replace(newest, begin=edge)
-        return _solved_without(problem, best, (*best.stretches[:-1], moved))
+        return _solved_without(problem, nearest, (*best.stretches[:-1], moved))
 
     inside = np.flatnonzero((time >= newest.begin) & (time <= newest.end)).tolist()
     outer, inner = (inside[-1], inside[0]) if end else (inside[0], inside[-1])
@@ -168,7 +168,10 @@ def _with_fitted_edge(
     while abs(inner - clear) > 1:
         middle = (inner + clear) // 2
         shorter = at(middle)
-        clear, inner = (middle, inner) if shorter is not None and shorter.cost <= least + CLEAR else (clear, middle)
+        if shorter is not None and shorter.cost <= least + CLEAR:
+            clear, nearest = middle, shorter
+        else:
+            inner = middle
     away = 1 if end else -1
     costs = {k: one.cost for k in OUTWARDS if (one := at(clear + away * k)) is not None}
     steps = next((k for k, cost in costs.items() if cost <= min(costs.values()) + NOTICEABLE), 0)
