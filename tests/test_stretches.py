@@ -5,6 +5,7 @@ import pytest
 from broken import BROKEN, FROM, changed_data
 from dives import Simulated, altered, batch, falcon, interrupted, position_errors, rms, simulated, smoothed
 
+import rovgraph as rg
 from rovgraph.config import beliefs
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
@@ -15,6 +16,7 @@ from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array
 from rovgraph.graph.places import smooth_graph
 from rovgraph.log import Log
+from rovgraph.simulate import Choices
 from rovgraph.state import State
 
 BIASED_S = 20.0
@@ -49,6 +51,19 @@ def test_a_biased_stretch_of_the_dvl_is_found_and_taken_out(case):
     assert stretch.sensor == "dvl"
     assert abs(stretch.begin - begin) < 3.0
     assert abs(stretch.end - begin - BIASED_S) < 3.0
+
+
+def test_a_tilt_of_the_dvl_does_not_widen_the_stretch_of_its_bias():
+    """Seed 5 draws a DVL that is tilted by 3.8 and 3.2 degrees, which the priors allow: all its pings cost more."""
+    config = rg.Config().changed(heading={"sources": ["dvl"]})
+    frame = rg.simulate("lawnmower", config, 5, Choices(duration=160.0)).dive.log_frame
+    frame.loc[frame["time"].between(80.0, 100.0), "dvl_vx"] += 0.3
+    log = rg.Log.from_frame(frame, config)
+    best = batch(log, config).optimum()
+    (stretch,) = best.solution.stretches
+    assert stretch.sensor == "dvl"
+    assert stretch.begin == pytest.approx(80.0, abs=3.0)
+    assert stretch.end == pytest.approx(100.0, abs=3.0)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -185,4 +185,6 @@ def smooth_chain(
     beliefs, rows = beliefs_of(initial.config), rows or DiveRows.of(intervals, [*initial.instruments])
     wanted = unknowns(beliefs, rows.used)
     chain = Chain(intervals, initial, beliefs, wanted, rows)
-    return ChainOptimum(chain, solve(chain, chain.start(states, calibration)))
+    held = [name for name in wanted.considered if not beliefs[name].variable.time_offset]
+    freed = partial(widened, chain, names=tuple(held)) if held else None
+    return ChainOptimum(chain, solve(chain, chain.start(states, calibration), freed))

@@ -17,7 +17,7 @@ the time, or a dive that is no better without it, is not as configured: alarms s
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -54,16 +54,38 @@ MAX_STRETCHES = 4
 TOLERANCE = 0.1  # decrease of the cost that is left when optima are compared
 
 
-def solve(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
+def solve(
+    problem: Linearizable[Point, Step],
+    point: Point,
+    freed: Callable[[Point], Linearizable[Point, Step]] | None = None,
+) -> Solution[Point]:
     """The cheapest optimum of a dive: from ``point``, and without stretches in which a sensor contradicts the others.
+
+    Parameters
+    ----------
+    problem, point : the dive, and where to begin
+    freed : the dive, from where it is linearised, with what ``problem`` holds and does not know exactly estimated: an
+        error that a mounting explains is no stretch's
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
+    best = minimise(problem, point)
+    if not _bursts(problem.measured(), best):
+        return best
+    if freed is None:
+        found = _without_stretches(problem, best)
+        return resume(problem, found.point, found) if found.stretches else found
+    free = freed(best.point)
+    found = _without_stretches(free, minimise(free, best.point, best.gates))
+    return resume(problem, best.point, found) if found.stretches else replace(best, runner_up=found.runner_up)
+
+
+def _without_stretches(problem: Linearizable[Point, Step], best: Solution[Point]) -> Solution[Point]:
+    """The cheapest of an optimum and those without stretches in which a sensor contradicts the others."""
     tried: list[Stretch] = []
-    best, runner_up = minimise(problem, point), math.inf
-    measured = problem.measured()
+    measured, runner_up = problem.measured(), math.inf
     for _ in range(MAX_STRETCHES):
         burst = next((b for b in _bursts(measured, best) if not any(_overlap(b, t) for t in tried)), None)
         if burst is None:
@@ -77,8 +99,6 @@ def solve(problem: Linearizable[Point, Step], point: Point) -> Solution[Point]:
         if _right_elsewhere(problem, fitted):
             best = fitted
             runner_up = min([runner_up, *(other.cost - ranked[0].cost for other in ranked[1:])])
-    if best.stretches:
-        best = resume(problem, best.point, best)
     return replace(best, runner_up=runner_up)
 
 
