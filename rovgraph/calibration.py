@@ -87,6 +87,7 @@ _DEG = float(np.deg2rad(1.0))
 _ONE = ("",)
 _XYZ = ("_x", "_y", "_z")
 _CURVE = ("_sin", "_cos")
+_OF_THE_FIELD = "rolling and pitching: on a level vehicle it cannot be told from hard_iron_z"
 _SYMMETRIC = ("_xx", "_yy", "_zz", "_xy", "_xz", "_yz")
 _DVL = ("dvl", "dvl_water")
 
@@ -246,7 +247,7 @@ TABLE: dict[str, Variable] = {
             3 * _DEG,
             ("mag",),
             "difference of the field's dip from environment.dip_deg",
-            "always",
+            _OF_THE_FIELD,
             estimate=True,
         ),
         Variable(
@@ -257,7 +258,7 @@ TABLE: dict[str, Variable] = {
             0.05,
             ("mag",),
             "difference of the field's magnitude from environment.field_norm, as a fraction of it",
-            "always",
+            _OF_THE_FIELD,
             estimate=True,
         ),
         Variable(

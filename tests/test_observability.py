@@ -369,3 +369,16 @@ def test_a_file_that_is_no_report_is_refused(tmp_path):
 def test_a_goal_for_what_is_held_is_refused():
     with pytest.raises(InputError, match="goal dvl_scale: it is not estimated"):
         plan(ONE_COMPASS, [Manoeuvre("straight", 0.4)], 40.0, goals={"dvl_scale": 0.001}, sensors=Sensors(50.0, 4.0))
+
+
+def test_open_directions_are_told_apart_and_each_once():
+    """The dive sees only the difference of two components, and only the sum of two others."""
+    half = np.sqrt(0.5)
+    open_ones = np.array([[half, half, 0, 0], [0, 0, 0.72, -np.sqrt(1.0 - 0.72**2)]])
+    mixed = np.array([[0.8, 0.6], [-0.6, 0.8]]) @ open_ones  # of nearly one eigenvalue, axes are any mixture
+    seen = np.array([[half, -half, 0, 0], [0, 0, np.sqrt(1.0 - 0.72**2), 0.72]])
+    information = mixed.T @ np.diag([0.05, 0.06]) @ mixed + 1e4 * seen.T @ seen
+    words = in_words(information, ["a", "b", "c", "d"], ["rad"] * 4, np.ones(4))
+    told = {frozenset(sentence.split()) for sentence in words}
+    sentences = ("only the difference of a and b is known", "only the sum of c and d is known")
+    assert told == {frozenset(sentence.split()) for sentence in sentences}

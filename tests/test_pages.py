@@ -350,6 +350,37 @@ def test_what_check_finds_is_a_page_and_an_older_one_stays(dive, tmp_path):
         rg.report_check(rg.check(dive.log, dive.config), out)
 
 
+def test_a_comparison_says_which_estimator_errs_least_and_whose_sd_is_wrong(tmp_path):
+    summary = {"program": "rovgraph", "estimators": ["dead-reckoning", "ekf-a", NASTY], "failures": []}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    table = {
+        "estimator": ["dead-reckoning", "ekf-a", NASTY],
+        "rms_m": [9.0, 2.5, np.nan],
+        "end_mean_m": [11.0, 3.0, np.nan],
+    }
+    band = {"nees_end_band": ["", "above", ""]}
+    pd.DataFrame({**table, **band}).to_csv(tmp_path / "table.csv", index=False)
+    runs = {"run": ["a", "b"] * 2, "estimator": ["dead-reckoning"] * 2 + ["ekf-a"] * 2, "rms_m": [8.0, 10.0, 2.0, 3.0]}
+    pd.DataFrame(runs).to_csv(tmp_path / "runs.csv", index=False)
+    html = page_of(tmp_path)
+    assert "ekf-a errs least: 2.5 m rms along the track; dead reckoning errs by 9 m." in html
+    assert "The stated sd is too small at the end of the track of ekf-a." in html
+    assert "alert(1)</script>" not in html
+    (tmp_path / "table.csv").unlink()
+    assert "table.csv is missing" in page_of(tmp_path)
+
+
+def test_a_plan_says_how_far_the_best_manoeuvre_is_from_the_goal_in_degrees(tmp_path):
+    sd = {"mag_offset": 0.05, "dvl_yaw": np.deg2rad(2.0)}
+    ranking = [{"manoeuvre": "circle", "speed_mps": 0.5, "score": 2.0, "bits": 7.0, "sd": sd}]
+    ranking.append({"manoeuvre": "straight", "speed_mps": 0.5, "score": None, "bits": 0.0, "sd": None})
+    summary = {"program": "rovgraph", "goals": {"dvl_yaw": np.deg2rad(1.0)}, "sd_before": sd, "ranking": ranking}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    html = page_of(tmp_path)
+    assert "dvl_yaw: sd 2 deg, wanted 1 deg; 2 times the goal." in html
+    assert html.index("dvl_yaw °, sd") < html.index("mag_offset °, sd")
+
+
 def test_noise_of_a_log_at_rest_is_a_page_and_one_that_is_incomplete_says_so(tmp_path):
     channel = {"unit": "m/s2", "rate_hz": 50.0, "sd": 0.02, "sd_without_lines": 0.02, "density": 0.003}
     summary = {"program": "rovgraph", "calibration": "noise", "channels": {"acc_x": channel}, "remarks": [NASTY]}

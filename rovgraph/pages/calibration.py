@@ -72,7 +72,7 @@ def _words(joint: dict[str, list[float]]) -> list[str]:
     if not (np.isfinite(P).all() and np.isfinite(prior).all() and (prior > 0).all()):
         return []
     try:
-        sentences = in_words(data_information(P, prior), labels, [_unit(label) for label in labels], prior)
+        sentences = in_words(data_information(P, prior), labels, [unit_of(label) for label in labels], prior)
     except np.linalg.LinAlgError:
         return ["the covariance of the calibration is singular, so nothing is said of its combinations"]
     return [sentence(s) for s in sentences]
@@ -84,7 +84,8 @@ def sentence(words: str) -> str:
     return (words if named else words[:1].upper() + words[1:]) + "."
 
 
-def _unit(label: str) -> str:
+def unit_of(label: str) -> str:
+    """Unit of a component inside the program; "1" where it is not known."""
     return next((v.unit for v in TABLE.values() if label in v.labels), "1")
 
 

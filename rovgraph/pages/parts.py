@@ -39,10 +39,10 @@ def points(name: str, x: ArrayLike, y: ArrayLike, colour: str, **look: Any) -> T
     return {"name": name, "mode": "markers", "marker": style, "x": packed(x), "y": packed(y), **look}
 
 
-def bars(name: str, x: ArrayLike, y: ArrayLike, colour: str, width: float) -> Trace:
-    """Bars of one width."""
+def bars(name: str, x: ArrayLike, y: ArrayLike, colour: str, width: float, **look: Any) -> Trace:
+    """Bars of one width; ``look`` has keys of Plotly's trace."""
     colours = {"color": colour}
-    return {"name": name, "type": "bar", "x": packed(x), "y": packed(y), "width": width, "marker": colours}
+    return {"name": name, "type": "bar", "x": packed(x), "y": packed(y), "width": width, "marker": colours, **look}
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,7 @@ class Panel:
     spans : from, to, colour: times that are shaded
     log : which axes are logarithmic, of "x" and "y"
     wide : over the whole width
+    names : of the places 1, 2, ... on the y axis, the first on top
     """
 
     title: str
@@ -72,11 +73,13 @@ class Panel:
     spans: Sequence[tuple[float, float, str]] = ()
     log: str = ""
     wide: bool = True
+    names: Sequence[str] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """What ``page.js`` draws."""
         chosen = {"kind": self.kind, "x": self.x, "y": self.y, "title": self.title, "traces": [*self.traces]}
-        return {**chosen, "levels": [*self.levels], "spans": [list(s) for s in self.spans], "log": self.log}
+        spans = [list(s) for s in self.spans]
+        return {**chosen, "levels": [*self.levels], "spans": spans, "log": self.log, "names": [*self.names]}
 
 
 @dataclass(frozen=True)

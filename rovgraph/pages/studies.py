@@ -7,16 +7,55 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.pages.about import about_section
-from rovgraph.pages.calibration import sentence
+from rovgraph.pages.calibration import sentence, unit_of
 from rovgraph.pages.page import render
 from rovgraph.pages.parts import Image, Item, Missing, Panel, Section, Table, Text, Trace, bars, line, points
 from rovgraph.pages.source import Clock, Source
 from rovgraph.pages.thinning import extremes
 from rovgraph.report.units import label_with_unit
-from rovgraph.units import shown
+from rovgraph.units import behind, shown
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#7B3294", "#A3206B", "#333333", "#8C6D00", "#56808F")
 MOST_ROWS = 60
+DEAD_RECKONING = "dead-reckoning"
+OF_ESTIMATOR = {  # column of table.csv -> what a reader calls it
+    "estimator": "estimator",
+    "rms_m": "rms error [m]",
+    "end_mean_m": "error at the end [m]",
+    "end_sd_m": "its sd over runs [m]",
+    "max_m": "largest error [m]",
+    "heading_rms_deg": "heading, rms [°]",
+    "velocity_rms_mps": "velocity, rms [m/s]",
+    "nees_mean": "NEES",
+    "nees_end_mean": "NEES at the end",
+    "nees_end_band": "its band",
+    "misalignment_error_rms_deg": "misalignment, rms error [°]",
+    "runs": "runs",
+    "failed": "failed",
+    "about": "what it is",
+}
+OF_TIMING = {  # key of a timing -> what a reader calls it
+    "sensor": "sensor",
+    "count": "measurements",
+    "rate": "rate [Hz]",
+    "first": "first [s]",
+    "last": "last [s]",
+    "gap": "longest gap [s]",
+    "gap_at": "gap begins at [s]",
+    "jitter": "jitter [s]",
+    "repeats": "repeated values",
+}
+OF_RUN = {  # column of runs.csv -> what a reader calls it
+    "run": "run",
+    "estimator": "estimator",
+    "rms_m": "rms error [m]",
+    "end_m": "error at the end [m]",
+    "max_m": "largest error [m]",
+    "heading_rms_deg": "heading, rms [°]",
+    "velocity_rms_mps": "velocity, rms [m/s]",
+    "nees": "NEES",
+    "error": "why it failed",
+}
 
 
 def study_page_of(source: Source) -> Callable[[Source], str] | None:
@@ -53,7 +92,12 @@ def observe_page(source: Source) -> str:
         for row, values in zip(correlation["rows"], correlation["values"], strict=True)
     ]
     items = [
-        Table("Calibration variables", head, rows, note=f"{seen['joint_bits']:.1f} bits in all."),
+        Table(
+            "Calibration variables",
+            head,
+            rows,
+            note=f"{seen['joint_bits']:.1f} bits in all, combinations counted once.",
+        ),
         Table("Correlations", ("", *correlation["columns"]), matrix, shaded=True),
     ]
     time = np.array(seen["history"]["time_s"], float)
@@ -72,57 +116,93 @@ def observe_page(source: Source) -> str:
 
 def plan_page(source: Source) -> str:
     """Manoeuvres, ranked."""
-    ranking = source.summary["ranking"]
-    labels = [*(source.summary.get("sd_before") or {})]
-    head = ("manoeuvre", "speed [m/s]", "score", "bits", *(f"{label}, sd" for label in labels))
-    rows = [
-        (
-            str(p["manoeuvre"]),
-            _cell(p["speed_mps"]),
-            _cell(p["score"]),
-            f"{p['bits']:.1f}",
-            *(_cell((p["sd"] or {}).get(label)) for label in labels),
-        )
-        for p in ranking
-    ]
-    best = f"{ranking[0]['manoeuvre']} at {ranking[0]['speed_mps']:g} m/s" if ranking else "none"
+    summary = source.summary
+    ranking = summary["ranking"]
+    goals, labels = summary.get("goals") or {}, [*(summary.get("sd_before") or {})]
+    labels.sort(key=lambda label: label not in goals)
+    factors = {label: shown(unit_of(label))[0] for label in labels}
+    names = [f"{p['manoeuvre']} at {p['speed_mps']:g} m/s" for p in ranking]
+    head = ("manoeuvre", "bits", *(f"{label_with_unit(label, unit_of(label))}, sd" for label in labels))
+    told = [("as known before", "", summary.get("sd_before") or {})]
+    told += [(name, f"{p['bits']:.1f}", p["sd"] or {}) for name, p in zip(names, ranking, strict=True)]
+    rows = [(name, bits, *(_times(factors[label], sd.get(label)) for label in labels)) for name, bits, sd in told]
     place = np.arange(1, len(ranking) + 1)
-    drawn = [bars("bits", place, [p["bits"] for p in ranking], "#8FBBD9", 0.7)]
+    drawn = [bars("bits", [p["bits"] for p in ranking], place, "#8FBBD9", 0.7, orientation="h", showlegend=False)]
     items: list[Item] = [
-        Table("Manoeuvres", head, rows, note="sd in radians and SI."),
-        Panel("What each shows", "rank", "information [bit]", drawn, kind="xy"),
+        Table("Manoeuvres", head, rows, note="sd: after one manoeuvre. bits: what it tells of all variables."),
+        Panel("What each manoeuvre tells", "information [bit]", "", drawn, kind="xy", names=names),
         *_images(source),
     ]
-    return _render(source, "Manoeuvres, ranked", [Section("plan", f"Best: {best}", (), items)])
+    title = f"Best: {names[0]}" if names else "Best: none"
+    lead = [_reached(goal, sd, (ranking[0]["sd"] or {}).get(goal)) for goal, sd in goals.items()] if ranking else []
+    return _render(source, "Manoeuvres, ranked", [Section("plan", title, lead, items)])
+
+
+def _reached(label: str, wanted: float, sd: float | None) -> str:
+    """How the best manoeuvre does by a goal."""
+    factor, unit = shown(unit_of(label))
+    if sd is None:
+        return f"{label}: not shown, wanted {factor * wanted:.2g}{behind(unit)}."
+    verdict = "the goal is reached" if sd <= wanted else f"{sd / wanted:.2g} times the goal"
+    return f"{label}: sd {factor * sd:.2g}{behind(unit)}, wanted {factor * wanted:.2g}{behind(unit)}; {verdict}."
+
+
+def _times(factor: float, value: float | None) -> str:
+    return "–" if value is None else f"{factor * value:.3g}"
 
 
 def compare_page(source: Source) -> str:
     """Estimators against each other."""
+    table, runs = source.frame("table.csv", "estimator"), source.frame("runs.csv", "run", "estimator")
     items: list[Item] = []
-    runs = source.frame("runs.csv", "run", "estimator")
-    if runs is not None:
-        items += _of_runs(runs)
-    items += [_frame_table(source, name, title) for name, title in (("table.csv", "Estimators"), ("runs.csv", "Runs"))]
+    if table is None:
+        items.append(Missing("Estimators", "table.csv is missing, or has no column estimator"))
+    else:
+        items += _errors(table, runs)
+        items.append(_table_of(table, "Estimators", OF_ESTIMATOR, "table.csv"))
+    if runs is None:
+        items.append(Missing("Runs", "runs.csv is missing, or has no column run or estimator"))
+    else:
+        items.append(_table_of(runs, "Runs", OF_RUN, "runs.csv"))
     failures = [f"{f['estimator']}, {f['run']}: {f['error']}" for f in source.summary.get("failures") or []]
     lists = {"Failures": failures} if failures else {}
-    sections = [Section("estimators", "Estimators", (), [*items, *_images(source)], lists)]
+    lead = [] if table is None else _ranked_in_words(table)
+    sections = [Section("estimators", "Estimators", lead, [*items, *_images(source)], lists)]
     return _render(source, "Estimators against each other", sections)
 
 
-def _of_runs(runs: pd.DataFrame) -> list[Item]:
-    """Every run's errors by estimator."""
+def _ranked_in_words(table: pd.DataFrame) -> list[str]:
+    """Which estimator errs least, and whose sd is not right."""
+    sentences = []
+    if "rms_m" in table:
+        known = table.assign(rms=pd.to_numeric(table["rms_m"], errors="coerce")).dropna(subset="rms")
+        rms = dict(zip(known["estimator"].astype(str), known["rms"], strict=True))
+        if rms:
+            best = min(rms, key=lambda name: rms[name])
+            beside = f"; dead reckoning errs by {rms[DEAD_RECKONING]:.3g} m" if DEAD_RECKONING in rms else ""
+            sentences.append(f"{best} errs least: {rms[best]:.3g} m rms along the track{beside}.")
+    for band, words in (("above", "too small"), ("below", "too large")) if "nees_end_band" in table else ():
+        names = table.loc[table["nees_end_band"] == band, "estimator"].astype(str)
+        if len(names):
+            sentences.append(f"The stated sd is {words} at the end of the track of {', '.join(names)}.")
+    return sentences
+
+
+def _errors(table: pd.DataFrame, runs: pd.DataFrame | None) -> list[Item]:
+    """Errors of every estimator, that of each run as a point."""
+    names = [*table["estimator"].astype(str)]
     panels: list[Item] = []
-    estimators = [*dict.fromkeys(runs["estimator"].astype(str))]
-    for column, axis in (("end_m", "end error [m]"), ("rms_m", "rms error [m]")):
-        if column not in runs:
-            continue
+    for column, mean, axis in (("rms_m", "rms_m", "rms error [m]"), ("end_m", "end_mean_m", "error at the end [m]")):
         drawn = []
-        for k, name in enumerate(estimators):
-            values = pd.to_numeric(runs.loc[runs["estimator"].astype(str) == name, column], errors="coerce").to_numpy()
-            colour = COLOURS[k % len(COLOURS)]
-            drawn.append(points(name, np.full(len(values), k + 1.0), values, colour, size=6))
-        note = "One point per run; the number of an estimator is its place in the legend."
-        panels.append(Panel(axis, "estimator [number]", axis, drawn, kind="xy", note=note, log="y"))
+        if runs is not None and column in runs:
+            own = runs[runs["estimator"].astype(str).isin(names)]
+            place = own["estimator"].astype(str).map(names.index) + 1.0
+            drawn.append(points("a run", pd.to_numeric(own[column], errors="coerce"), place, "#56808F", size=6))
+        if mean in table:
+            values = pd.to_numeric(table[mean], errors="coerce")
+            drawn.append(points("mean", values, np.arange(len(names)) + 1.0, "#D55E00", size=9, symbol="diamond-open"))
+        if drawn:
+            panels.append(Panel(axis, axis, "", drawn, kind="xy", log="x", wide=False, names=names))
     return panels
 
 
@@ -200,11 +280,12 @@ def check_page(report: dict[str, Any], title: str) -> str:
     found = {level: [f for f in report["findings"] if f["level"] == level] for level in levels}
     rows = [(level, str(f["sensor"]), str(f["text"])) for level in levels for f in found[level]]
     timings = report["timings"]
-    keys = [*timings[0]] if timings else []
-    timing = Table("When measurements came", keys, [tuple(_cell(t[k]) for k in keys) for t in timings])
+    keys = [key for key in OF_TIMING if any(key in t for t in timings)]
+    cells = [tuple(_cell(t.get(key)) for key in keys) for t in timings]
+    timing = Table("When measurements came", [OF_TIMING[key] for key in keys], cells)
     lead = [f"{len(found['error'])} errors, {len(found['warning'])} warnings."]
     findings = Table("Findings", ("level", "sensor", "finding"), rows)
-    return render(f"{title}: is this log sane?", [Section("findings", "Findings", lead, [findings, timing])])
+    return render(f"Check of {title}", [Section("findings", "Findings", lead, [findings, timing])])
 
 
 def _render(source: Source, title: str, sections: Sequence[Section], clock: Clock | None = None) -> str:
@@ -213,6 +294,14 @@ def _render(source: Source, title: str, sections: Sequence[Section], clock: Cloc
     if clock is not None:
         time = {"unit": clock.unit, "end": (clock.end - clock.start) / clock.scale, "label": clock.label}
     return render(title, [*note, *sections, about_section(source)], time)
+
+
+def _table_of(table: pd.DataFrame, title: str, names: dict[str, str], file: str) -> Table:
+    """Columns that have anything, under names a reader knows."""
+    known = {column: name for column, name in names.items() if column in table and table[column].notna().any()}
+    rows = [tuple(_cell(v) for v in row) for row in table[[*known]].head(MOST_ROWS).itertuples(index=False)]
+    some = f"The first {MOST_ROWS} of {len(table)} rows. " if len(table) > MOST_ROWS else ""
+    return Table(title, [*known.values()], rows, note=f"{some}{file} has more columns.")
 
 
 def _frame_table(source: Source, name: str, title: str) -> Item:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import qr
 
 from rovgraph.estimators.observability import UNOBSERVABLE_ABOVE, relative_covariance
 from rovgraph.geometry import Array
@@ -54,14 +55,25 @@ def in_words(information: Array, labels: Sequence[str], units: Sequence[str], pr
     own = np.linalg.inv(relative_covariance(information)[np.ix_(heard, heard)]) - np.eye(len(heard))
     found = directions(own)
     names, kinds, sd = [labels[i] for i in heard], [units[i] for i in heard], prior_sd[heard]
-    open_ones = [axis for ratio, axis in zip(found.ratio, found.axes, strict=True) if ratio > UNOBSERVABLE_ABOVE]
-    sentences += [_combination(axis, names, kinds, sd) for axis in open_ones]
+    open_ones = found.axes[found.ratio > UNOBSERVABLE_ABOVE]
+    sentences += [_combination(axis, names, kinds, sd) for axis in _apart(open_ones)]
     if not sentences:
         parts = [names[i] for i in _parts(found.axes[0])]
         sentences.append(
             f"the weakest direction is {_listed(parts)}, known to {100 * found.ratio[0]:.0f} % of the prior"
         )
     return sentences
+
+
+def _apart(axes: Array) -> Array:
+    """Directions, shape (k, c), that span the same as k given ones, of as few components each as elimination leaves.
+
+    Axes of nearly one eigenvalue are any mixture of each other, and would tell the same twice.
+    """
+    if len(axes) < 2:
+        return axes
+    pivots = qr(axes, mode="r", pivoting=True)[1][: len(axes)]
+    return np.asarray(np.linalg.solve(axes[:, pivots], axes))
 
 
 def _parts(axis: Array) -> list[int]:

@@ -56,6 +56,9 @@
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
     };
     if (panel.kind === "time") layout.xaxis.range = range || [0, data.clock.end];
+    if (panel.names.length) Object.assign(layout.yaxis, { tickvals: panel.names.map((_, i) => i + 1), ticktext: panel.names,
+      range: [panel.names.length + 0.7, 0.3] });
+    if (panel.names.length && panel.log.includes("x")) layout.xaxis.dtick = "D2"; // 2 and 5 too: errors span a decade or two
     if (panel.kind === "map") {
       Object.assign(layout.yaxis, { scaleanchor: "x", scaleratio: 1 });
       if (data.origin) graticule(layout, null);
@@ -76,6 +79,7 @@
     const series = panel.traces.map((trace) => traceOf(panel, trace));
     const entry = { panel, plot, series, readout: figure.querySelector(".readout") };
     drawn.set(key, entry);
+    if (panel.names.length) plot.style.height = `${110 + 22 * panel.names.length}px`;
     const options = { responsive: true, displaylogo: false, scrollZoom: false,
       toImageButtonOptions: { format: "png", scale: 2, filename: key },
       modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], modeBarButtonsToAdd: [exportButton(entry)] };
