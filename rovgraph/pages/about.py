@@ -18,7 +18,8 @@ def about_section(source: Source, command: str = "") -> Section:
     versions = {"rovgraph": source.summary.get("version"), **(source.summary.get("versions") or {})}
     items.append(Table("Versions", ("", ""), [(name, str(v)) for name, v in versions.items()]))
     items.append(_files(source))
-    config = source.text("config.yaml")
+    found = (source.text(name) for name in ("config.yaml", "study.yaml"))
+    config = next(filter(None, found), None)
     items.append(
         Text("Configuration in effect", config) if config else Missing("Configuration", "config.yaml is missing")
     )

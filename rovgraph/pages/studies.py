@@ -34,6 +34,20 @@ OF_ESTIMATOR = {  # column of table.csv -> what a reader calls it
     "failed": "failed",
     "about": "what it is",
 }
+OF_CELL = {  # column of cells.csv -> what a reader calls it
+    "rms_deg": "rms error [°]",
+    "bias_deg": "bias [°]",
+    "sd_deg": "sd of the error [°]",
+    "predicted_sd_deg": "predicted sd [°]",
+    "coverage": "share within 95 %",
+    "nees": "NEES",
+    "verdict": "verdict",
+    "time_to_1deg_s": "1° after [s]",
+    "track_rms_m": "track, rms error [m]",
+    "track_rms_held_m": "the same, misalignment held [m]",
+    "runs": "runs",
+    "failed": "failed",
+}
 OF_TIMING = {  # key of a timing -> what a reader calls it
     "sensor": "sensor",
     "count": "measurements",
@@ -208,11 +222,22 @@ def _errors(table: pd.DataFrame, runs: pd.DataFrame | None) -> list[Item]:
 
 def study_page(source: Source) -> str:
     """Cells of a Monte Carlo study."""
-    items = [_frame_table(source, "cells.csv", "Cells"), *_images(source)]
+    table = source.frame("cells.csv", "cell")
+    items: list[Item] = [Missing("Cells", "cells.csv is missing, or has no column cell")]
+    if table is not None:
+        names = {**_that_differ(table), **OF_CELL} if len(table) > 1 else {"manoeuvre": "manoeuvre", **OF_CELL}
+        items = [_table_of(table, "Cells", names, "cells.csv")]
+    items += _images(source)
     failures = [f"{f['cell']}, run {f['run']}: {f['failure']}" for f in source.summary.get("failures") or []]
     lead = [f"{source.summary.get('runs', 'unknown')} of {source.summary.get('planned', 'unknown')} runs were made."]
     section = Section("cells", "Cells", lead, items, {"Failures": failures} if failures else {})
     return _render(source, f"Study {source.summary['study']}", [section])
+
+
+def _that_differ(table: pd.DataFrame) -> dict[str, str]:
+    """Settings that tell the cells of a study apart: those before the count of its runs."""
+    settings = [*table.columns[1 : table.columns.get_loc("runs")]] if "runs" in table else []
+    return {str(name): str(name).replace("_", " ") for name in settings if len(table[name].drop_duplicates()) > 1}
 
 
 def noise_page(source: Source) -> str:
@@ -302,15 +327,6 @@ def _table_of(table: pd.DataFrame, title: str, names: dict[str, str], file: str)
     rows = [tuple(_cell(v) for v in row) for row in table[[*known]].head(MOST_ROWS).itertuples(index=False)]
     some = f"The first {MOST_ROWS} of {len(table)} rows. " if len(table) > MOST_ROWS else ""
     return Table(title, [*known.values()], rows, note=f"{some}{file} has more columns.")
-
-
-def _frame_table(source: Source, name: str, title: str) -> Item:
-    table = source.frame(name)
-    if table is None:
-        return Missing(title, f"{name} is missing")
-    rows = [tuple(_cell(v) for v in row) for row in table.head(MOST_ROWS).itertuples(index=False)]
-    note = f"The first {MOST_ROWS} of {len(table)} rows; {name} has all." if len(table) > MOST_ROWS else ""
-    return Table(title, [str(c) for c in table.columns], rows, note=note)
 
 
 def _images(source: Source) -> list[Item]:

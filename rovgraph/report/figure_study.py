@@ -130,7 +130,8 @@ def draw_sd(cells: pd.DataFrame) -> Figure:
             if np.isfinite(value):
                 color = "white" if value > middle else "black"
                 axes.text(j, i, f"{value:.2g}", ha="center", va="center", fontsize=8, color=color)
-    figure.colorbar(image, ax=panels, label="predicted sd [deg]")
+    ticks = np.geomspace(scale["vmin"], scale["vmax"], 4)
+    figure.colorbar(image, ax=panels, label="predicted sd [deg]", ticks=ticks, format="%.3g").minorticks_off()
     return figure
 
 
