@@ -16,7 +16,7 @@ import rovgraph as rg
 from rovgraph.cli.app import main
 from rovgraph.export import ExportFormat, Fixes, Options, Track, export_formats, tag, write_track
 from rovgraph.export import formats as registry
-from rovgraph.export.sbet import GPS_EPOCH, LEAP_SECONDS, NAMES, WEEK
+from rovgraph.export.sbet import NAMES
 from rovgraph.geometry import Array, matrix_from_rpy
 from rovgraph.trajectory import Trajectory
 
@@ -199,8 +199,9 @@ def test_netcdf_has_units_and_sds_as_cf_wants_them(tmp_path):
 def test_sbet_has_17_doubles_a_record_and_gps_seconds_of_the_week(tmp_path):
     path = written("sbet", tmp_path)
     record = np.fromfile(path / "sbet.out", dtype=[(name, "<f8") for name in NAMES])
-    time = record["time"] + np.floor((BEGAN - GPS_EPOCH + LEAP_SECONDS) / WEEK) * WEEK + GPS_EPOCH - LEAP_SECONDS
-    assert len(record) == 6001 and 0.0 <= record["time"][0] < WEEK
+    week, ahead = 604_800.0, 18.0 - 315_964_800.0  # GPS time is 18 s ahead of UTC since 2017, and counts from 1980
+    time = record["time"] + np.floor((BEGAN + ahead) / week) * week - ahead
+    assert len(record) == 6001 and 0.0 <= record["time"][0] < week
     assert off(np.rad2deg(record["latitude"]), np.rad2deg(record["longitude"]), time) < WITHIN_M
     assert record["heading"][3000] == pytest.approx(np.pi, abs=1e-3)
     errors = np.fromfile(path / "smrmsg.out", dtype="<f8").reshape(-1, 10)

@@ -6,10 +6,8 @@ import numpy as np
 
 from rovgraph.export.formats import ExportFormat, Options
 from rovgraph.export.track import Track
+from rovgraph.gps_time import EPOCH, LEAP_S, WEEK_S
 
-GPS_EPOCH = 315_964_800.0  # Unix time of 1980-01-06 [s]
-LEAP_SECONDS = 18.0  # GPS time is ahead of UTC by, since 2017 [s]
-WEEK = 604_800.0  # [s]
 RATE = 100.0  # of records, unless told otherwise [Hz]
 NAMES = (
     "time", "latitude", "longitude", "altitude", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch",
@@ -23,8 +21,8 @@ ERRORS = (
 
 def week_seconds(unix: np.ndarray) -> np.ndarray:
     """GPS seconds of the week in which the first time lies, going on beyond its end; shape as given."""
-    gps = unix - GPS_EPOCH + LEAP_SECONDS
-    return np.asarray(gps - np.floor(gps[0] / WEEK) * WEEK)
+    gps = unix - EPOCH + LEAP_S
+    return np.asarray(gps - np.floor(gps[0] / WEEK_S) * WEEK_S)
 
 
 def write(track: Track, path: Path, options: Options) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.errors import InputError
+from rovgraph.gps_time import WEEK_S, unix_of_gps
 from rovgraph.interchange import dataflash_channels as channels
 from rovgraph.interchange.alternatives import SourceMissing, preferred_first
 from rovgraph.interchange.ardupilot import CLOCK, SPEED_ESTIMATE_AXES, settings
@@ -17,8 +18,6 @@ from rovgraph.interchange.rates import too_slow
 from rovgraph.interchange.receiver import longest_boot
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 
-GPS_EPOCH, WEEK_S = 315_964_800, 604_800  # in Unix time [s]
-LEAP_S = 18  # by which UTC is behind GPS, since 2017
 RTC_SD_S = {0: 0.2, 1: 1.0, 2: 2.0}  # by where the clock was set from: GPS, a ground station, a battery
 GPS_SD_S = 0.2  # a fix reaches the autopilot so late
 
@@ -265,7 +264,7 @@ def _clock(messages: Mapping[str, Messages]) -> Clock:
     if gps is not None and all(name in gps for name in ("TimeUS", "Status", "GMS", "GWk")):
         gps = gps.take(np.logical_and(gps.fields["Status"] >= channels.FIX_3D, gps.fields["GWk"] > 0))
         if len(gps):
-            unix = GPS_EPOCH + WEEK_S * gps.fields["GWk"].astype(float) + 1e-3 * gps.fields["GMS"] - LEAP_S
+            unix = unix_of_gps(WEEK_S * gps.fields["GWk"].astype(float) + 1e-3 * gps.fields["GMS"])
             offset = float(np.median(unix - gps.fields["TimeUS"] * 1e-6))
             return Clock(CLOCK, offset, GPS_SD_S, "GPS week and milliseconds")
     return Clock(CLOCK)

@@ -37,6 +37,9 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "gpx",
     "xsens",
     "xsens_mtb",
+    "microstrain",
+    "vectornav",
+    "vectornav_sentences",
 )
 GROUP = "rovgraph.formats"
 

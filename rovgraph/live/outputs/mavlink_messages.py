@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.gps_time import EPOCH, LEAP_S, WEEK_S
 from rovgraph.live.outputs.receiver import SATELLITES, dilution
 from rovgraph.live.solution import Solution
 
 UNIX = 1e9  # a time beyond this counts from 1970 [s]
-GPS_EPOCH = 315_964_800 - 18  # of GPS time, in seconds since 1970; it is 18 leap seconds ahead since 2017
-WEEK = 604_800
 
 
 def gps_input(solution: Solution) -> Any:
@@ -38,7 +37,7 @@ def gps_input(solution: Solution) -> Any:
         m.GPS_INPUT_IGNORE_FLAG_VEL_VERT: float(s.velocity[2]),
         m.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY: speed_sd,
     }
-    week, of_week = divmod(s.time - GPS_EPOCH, WEEK) if s.time > UNIX else (0, 0.0)
+    week, of_week = divmod(s.time - EPOCH + LEAP_S, WEEK_S) if s.time > UNIX else (0, 0.0)
     north, east, downwards = (_finite(v) for v in s.velocity.tolist())
     return m.MAVLink_gps_input_message(
         time_usec=_microseconds(s.time),
