@@ -144,7 +144,7 @@ def plan_page(source: Source) -> str:
     drawn = [bars("bits", [p["bits"] for p in ranking], place, "#8FBBD9", 0.7, orientation="h", showlegend=False)]
     items: list[Item] = [
         Table("Manoeuvres", head, rows, note="sd: after one manoeuvre. bits: what it tells of all variables."),
-        Panel("What each manoeuvre tells", "information [bit]", "", drawn, kind="xy", names=names),
+        Panel("What each manoeuvre tells", "information [bit]", "manoeuvre", drawn, kind="xy", names=names),
         *_images(source),
     ]
     title = f"Best: {names[0]}" if names else "Best: none"
@@ -216,7 +216,7 @@ def _errors(table: pd.DataFrame, runs: pd.DataFrame | None) -> list[Item]:
             values = pd.to_numeric(table[mean], errors="coerce")
             drawn.append(points("mean", values, np.arange(len(names)) + 1.0, "#D55E00", size=9, symbol="diamond-open"))
         if drawn:
-            panels.append(Panel(axis, axis, "", drawn, kind="xy", log="x", wide=False, names=names))
+            panels.append(Panel(axis, axis, "estimator", drawn, kind="xy", log="x", wide=False, names=names))
     return panels
 
 
