@@ -6,7 +6,7 @@ frame, which is what a navigator needs to know. With ``align`` a turn about down
 in the horizontal (least squares, Umeyama 1991 without scale) are taken out first.
 
 Consistency uses the normalised error e' P^-1 e of north and east, which is chi-square with
-two degrees of freedom (mean 2) for an honest P.
+two degrees of freedom (mean 2) for a P that is right.
 """
 
 from dataclasses import asdict, dataclass, replace

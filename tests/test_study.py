@@ -229,7 +229,7 @@ def test_an_honest_estimator_has_coverage_and_nees_in_their_bands():
     assert row["coverage_low"] < 0.95 < row["coverage_high"]
     assert row["nees_low"] < row["nees"] < row["nees_high"]
     assert row["nees_high"] == pytest.approx(chi2.ppf(0.975, 400) / 400)
-    assert row["honesty"] == pytest.approx(1.0, abs=2.0 / np.sqrt(2 * 400) * 2)
+    assert row["sd_ratio"] == pytest.approx(1.0, abs=2.0 / np.sqrt(2 * 400) * 2)
     assert abs(row["bias_deg"]) < 3.0 / np.sqrt(400)
 
 
@@ -237,7 +237,7 @@ def test_an_estimator_that_claims_half_its_error_is_found_out():
     row = synthetic(400, 0.5)
     assert row["coverage_high"] < 0.95
     assert row["nees"] > row["nees_high"]
-    assert row["honesty"] < 0.6
+    assert row["sd_ratio"] < 0.6
 
 
 def test_a_process_that_dies_costs_nothing_but_its_own_task(tmp_path):

@@ -20,7 +20,7 @@ from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, signed_permutations
 from rovgraph.log import Stream
 
-FOLLOWS = 0.65  # likeness of accelerations that are of one motion
+FOLLOWS = 0.65  # agreement of accelerations that are of one motion
 BETTER = 2.0  # times smaller an error than as configured, which chance does not make
 WINDOW = 1.0  # over which velocities change, at least two pings [s]
 LARGEST_LAG = 300.0  # that is searched for [s]
@@ -52,12 +52,12 @@ class Search:
     ----------
     lags : ndarray, shape (m,), how late the stamps are [s]
     error : ndarray, shape (48, m), mean squared difference for each of `ORIENTATIONS` [m^2/s^4]
-    likeness : ndarray, shape (48, m), 1 - error / mean square of both, at most 1
+    agreement : ndarray, shape (48, m), 1 - error / mean square of both, at most 1
     """
 
     lags: Array
     error: Array
-    likeness: Array
+    agreement: Array
 
     @property
     def now(self) -> int:
@@ -74,7 +74,7 @@ class Fit:
     lag, lag_sd : how late its stamps are [s]
     R_bs : ndarray, shape (3, 3), mounting, left-handed if the axes are
     turn_sd : ndarray, shape (3,), of the mounting about the body's axes [rad]
-    likeness : as in `Search`
+    agreement : as in `Search`
     error : mean squared difference [m^2/s^4]
     count : of independent differences
     """
@@ -83,7 +83,7 @@ class Fit:
     lag_sd: float
     R_bs: Array
     turn_sd: Array
-    likeness: float
+    agreement: float
     error: float
     count: float
 

@@ -38,7 +38,7 @@ def dvl_and_imu(log: Log, config: Config) -> Iterator[Finding]:
         yield jump.finding(log)
         return
     k, m = _explanation(found)
-    if found.likeness[k, m] < FOLLOWS:
+    if found.agreement[k, m] < FOLLOWS:
         yield Finding("dvl", "ok", "too little acceleration to compare its axes and clock with the IMU")
         return
     if k:
@@ -59,7 +59,7 @@ def _explanation(found: Search) -> tuple[int, int]:
     both = np.unravel_index(int(np.argmin(found.error)), found.error.shape)
     axes, lag = int(np.argmin(found.error[:, found.now])), int(np.argmin(found.error[0]))
     least = found.error[both]
-    if found.error[0, found.now] < BETTER * least or found.likeness[both] < FOLLOWS:
+    if found.error[0, found.now] < BETTER * least or found.agreement[both] < FOLLOWS:
         near = np.abs(found.lags) <= 1.0  # small lags do not make errors twice as large
         return 0, int(np.flatnonzero(near)[np.argmin(found.error[0, near])])
     if found.error[0, lag] < SIMPLER * least:
@@ -94,14 +94,14 @@ def _mounting(config: Config, k: int, fit: Fit, better: str) -> Finding:
     turned = bool((np.abs(turn) > np.maximum(TURNED, SURE * np.hypot(fit.turn_sd, believed))).any())
     if k == 0 and not turned:
         return Finding(
-            "dvl", "ok", f"its acceleration agrees with the IMU's, axes as configured (likeness {fit.likeness:.2f})"
+            "dvl", "ok", f"its acceleration agrees with the IMU's, axes as configured (agreement {fit.agreement:.2f})"
         )
     if turned and np.linalg.det(fit.R_bs) > 0.0:
         cause, remedy = axes_remedy(np.eye(3), fit.R_bs)
         better = "its acceleration shows this" if k == 0 else better
     else:
         cause, remedy = axes_remedy(ORIENTATIONS[k], R_bs)
-    return Finding("dvl", "warning", f"{cause}; {better} (likeness {fit.likeness:.2f}): {remedy}")
+    return Finding("dvl", "warning", f"{cause}; {better} (agreement {fit.agreement:.2f}): {remedy}")
 
 
 def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: float) -> Finding:

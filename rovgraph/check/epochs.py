@@ -40,7 +40,7 @@ def _dvl_lag(log: Log, config: Config) -> tuple[float, float] | None:
         return None
     found = compared.search()
     k = int(np.argmin(found.error[0]))
-    if found.likeness[0, k] < FOLLOWS:
+    if found.agreement[0, k] < FOLLOWS:
         return None
     fit = compared.refine(float(found.lags[k]), ORIENTATIONS[0])
     return None if fit is None else (fit.lag, fit.lag_sd)

@@ -68,13 +68,13 @@ class _Line:
     ----------
     c : turn and scale
     sd : of c, relative
-    likeness : part of the fixes' movement that it explains, 0 to 1, as a correlation
+    agreement : part of the fixes' movement that it explains, 0 to 1, as a correlation
     error : sum of squared residuals, in units of their variance where all is right
     """
 
     c: complex
     sd: float
-    likeness: float
+    agreement: float
     error: float
 
 
@@ -106,14 +106,14 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             "fix",
             "warning",
             "north and east are swapped or mirrored; corrected, the fixes fit the DVL's track turned by "
-            f"{angle:+d} deg (likeness {swapped.likeness:.2f} instead of {as_is.likeness:.2f}): "
+            f"{angle:+d} deg (agreement {swapped.agreement:.2f} instead of {as_is.agreement:.2f}): "
             "correct the columns of the fixes",
         )
-    elif _better(unlike, as_is) and unlike.likeness > 0.6:
-        yield Finding("dvl", "warning", _mirrored_text(config, as_is.likeness, unlike.likeness))
-    elif as_is.likeness < 0.6:
+    elif _better(unlike, as_is) and unlike.agreement > 0.6:
+        yield Finding("dvl", "warning", _mirrored_text(config, as_is.agreement, unlike.agreement))
+    elif as_is.agreement < 0.6:
         if as_is.error > EVIDENCE + 2.0 * plane.count:
-            text = f"velocities do not fit the fixes (likeness {as_is.likeness:.2f}); check mounting and heading"
+            text = f"velocities do not fit the fixes (agreement {as_is.agreement:.2f}); check mounting and heading"
             yield Finding("dvl", "warning", text)
     else:
         yield _turned(config, as_is, unlike)
@@ -137,7 +137,7 @@ def _turned(config: Config, as_is: _Line, unlike: _Line) -> Finding:
         not 0.8 < scale < 1.25 and abs(np.log(scale)) > SURE * as_is.sd + 0.2
     )
     tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""
-    if wrong and unlike.likeness > as_is.likeness - 0.05:
+    if wrong and unlike.agreement > as_is.agreement - 0.05:
         tail += f". It may also be mirrored: {_other_way_up(config)}"
     text = (
         f"its track fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
@@ -193,9 +193,9 @@ class _Plane:
         size = np.abs(left) ** 2
         left = np.where(size > CLIPPED**2 * np.median(size), 0.0, left)
         total = max(float(np.vdot(d, d).real), 1e-12)
-        likeness = float(abs(np.vdot(D, d))) / np.sqrt(square * total)
+        agreement = float(abs(np.vdot(D, d))) / np.sqrt(square * total)
         error = float(np.vdot(left, left).real)
-        return _Line(c, np.sqrt(error / len(d) * _inflation(left) / square), likeness, error / self.noise**2)
+        return _Line(c, np.sqrt(error / len(d) * _inflation(left) / square), agreement, error / self.noise**2)
 
     @property
     def noise(self) -> float:
@@ -240,7 +240,7 @@ def _inflation(left: Complexes) -> float:
 
 def _mirrored_text(config: Config, like: float, unlike: float) -> str:
     return (
-        f"velocities fit the fixes better with y mirrored (likeness {unlike:.2f} instead of {like:.2f}): "
+        f"velocities fit the fixes better with y mirrored (agreement {unlike:.2f} instead of {like:.2f}): "
         f"{_other_way_up(config)}"
     )
 

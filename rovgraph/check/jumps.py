@@ -100,7 +100,7 @@ def find_jump(log: Log, compared: Comparison) -> Jump | None:
         sides = [compared.search(reach, span) for span in spans]
         best = [int(np.argmin(side.error[0])) for side in sides]
         lags = [float(side.lags[k]) for side, k in zip(sides, best, strict=True)]
-        if not all(side.likeness[0, k] > FOLLOWS for side, k in zip(sides, best, strict=True)):
+        if not all(side.agreement[0, k] > FOLLOWS for side, k in zip(sides, best, strict=True)):
             continue
         worse = [
             side.error[0, _index(side, lag)] / side.error[0, k]

@@ -67,7 +67,7 @@ def rows(metrics: "Metrics") -> list[tuple[str, str]]:
         ("depth error, rms", _format("{:.3f} m", m.rms_down_m)),
         ("heading error, rms", _format("{:.2f}°", m.heading_rms_deg)),
         ("heading error, mean", _format("{:+.2f}°", m.heading_mean_deg)),
-        ("normalised error squared (honest: 2)", _format("{:.2f}", m.nees)),
+        ("normalised error squared (consistent: 2)", _format("{:.2f}", m.nees)),
         ("inside the 99 % ellipse", _format("{:.1f} %", None if m.inside_ellipse is None else 100 * m.inside_ellipse)),
     ]
     return [(label, value) for label, value in every if value]

@@ -73,7 +73,7 @@ def comparison_table(comparison: Comparison, title: str, thesis: bool) -> Table:
         family = str(row["family"])
         table.add_row(*_cells(row, thesis))
     table.caption = (
-        "end error: mean ± sd over runs. rms, heading, velocity: along the track. NEES: at the end, 2 where honest, "
+        "end error: mean ± sd over runs. rms, heading, velocity: along the track. NEES: at the end, 2 if consistent, "
         "↑↓ outside the 95 % band of its mean. in 99 %: ends inside their ellipse. DVL fit: mean NIS / dimension, "
         "in () mean square of residuals. misalignment: mean error of the DVL's yaw, where the truth is unknown its "
         "mean beyond the mounting, ± stated sd. cost: processor time per second of log"

@@ -104,7 +104,7 @@ def study_table(tables: Tables) -> Table:
     beyond = len(tables.cells) - MOST_ROWS
     table.caption = (
         "coverage: share of runs whose 95 % interval holds the truth, with the 95 % interval of that share. bias, sd: "
-        "of the error. predicted: sd that the estimator says, median. NEES: 1 where honest, ↑↓ outside its 95 % band"
+        "of the error. predicted: sd that the estimator says, median. NEES: 1 if consistent, ↑↓ outside its 95 % band"
         + (f"; {beyond} more cells are in cells.csv" if beyond > 0 else "")
         + (f"; {escape(told)}" if (told := unless_said(tables)) else "")
     )
@@ -119,7 +119,7 @@ def _cells(row: "pd.Series[Any]") -> list[str]:
     if row["coverage"] == row["coverage"]:
         parts = (100 * row[name] for name in ("coverage", "coverage_low", "coverage_high"))
         coverage = "{:.0f} % ({:.0f}–{:.0f})".format(*parts)
-    numbers = [_number(row[name]) for name in ("bias_deg", "sd_deg", "predicted_sd_deg", "honesty")]
+    numbers = [_number(row[name]) for name in ("bias_deg", "sd_deg", "predicted_sd_deg", "sd_ratio")]
     converged = "–" if pd.isna(row["converged"]) else f"{100 * row['converged']:.0f} %"
     verdict = "" if pd.isna(row["verdict"]) else str(row["verdict"])
     failed = str(row["failed"]) if row["failed"] else ""

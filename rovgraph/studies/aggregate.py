@@ -1,7 +1,7 @@
 """From a row per run and estimator to a row per estimator.
 
 The mean NEES of N independent runs at their ends, 2 components each, is chi-square with
-2 N degrees of freedom over N for honest covariances (Bar-Shalom et al. 2001, 5.4.2). Along a
+2 N degrees of freedom over N for covariances that are right (Bar-Shalom et al. 2001, 5.4.2). Along a
 track errors are correlated, so the mean there has no such band.
 """
 

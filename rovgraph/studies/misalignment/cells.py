@@ -1,6 +1,6 @@
 """From a row per run to a row per cell: is what an estimator says of its error true?
 
-The error of N independent runs with an honest sd has a mean NEES (error / sd squared, one component)
+The error of N independent runs with the right sd has a mean NEES (error / sd squared, one component)
 that is chi-square with N degrees of freedom over N (Bar-Shalom et al. 2001, 5.4.2), and the
 number of runs within their 95 % interval is binomial.
 """
@@ -16,7 +16,7 @@ from rovgraph.studies.misalignment.plan import Cell
 
 BAND = 0.95
 CELL_COLUMNS = [
-    "cell", *Cell.model_fields, "runs", "failed", "bias_deg", "sd_deg", "rms_deg", "predicted_sd_deg", "honesty",
+    "cell", *Cell.model_fields, "runs", "failed", "bias_deg", "sd_deg", "rms_deg", "predicted_sd_deg", "sd_ratio",
     "coverage", "coverage_low", "coverage_high", "nees", "nees_low", "nees_high", "converged", "verdict",
     "reached_1deg", "time_to_1deg_s", "track_rms_m", "track_rms_held_m", "cpu_s",
 ]  # fmt: skip
@@ -50,7 +50,7 @@ def _row(cell: Cell, runs: pd.DataFrame) -> dict[str, Any]:
         "sd_deg": error.std(ddof=1) if len(good) > 1 else np.nan,
         "rms_deg": rms,
         "predicted_sd_deg": float(np.median(sd)),
-        "honesty": float(np.sqrt(np.mean(sd**2))) / rms,
+        "sd_ratio": float(np.sqrt(np.mean(sd**2))) / rms,
         "coverage": inside / len(good),
         "coverage_low": covered.low,
         "coverage_high": covered.high,
