@@ -17,7 +17,7 @@ for seed in range(1, 11):
     sds.append(track.p_sd[-1, :2])
     nees.append(rg.evaluate(track, dive.truth).nees)
 error, sd = np.array(errors), np.array(sds)
-print(f"NEES {np.mean(nees):.1f} over {len(nees)} dives; covariances that are right give 1.0 to 3.4 in 95 of 100 such runs")
+print(f"NEES {np.mean(nees):.1f} over {len(nees)} dives; 95 of 100 such runs give 1.0 to 3.4 if the sd is right")
 print(f"end: {np.sqrt((error**2).sum(axis=1).mean()):.2f} m rms, promised {np.sqrt((sd**2).sum(axis=1).mean()):.2f} m")
 
 figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
