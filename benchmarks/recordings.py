@@ -4,7 +4,7 @@
     python benchmarks/recordings.py --megabytes 1000 --formats dataflash ros2-mcap
 
 Files hold what a vehicle records: an IMU at 200 Hz or more, a magnetometer, attitude, depth and a DVL, and in bags
-images, too. They are made in a temporary folder, which needs the space. Nothing is asserted.
+images, too, or nothing else. They are made in a temporary folder, which needs the space. Nothing is asserted.
 """
 
 import argparse
@@ -80,7 +80,9 @@ def telemetry(path: Path, size: int) -> None:
                 return
 
 
-def bag(form: str) -> Callable[[Path, int], None]:
+def bag(form: str, images: bool = True) -> Callable[[Path, int], None]:
+    """A bag that is mostly images, or one without any."""
+
     def made(path: Path, size: int) -> None:
         import bags
         import numpy as np
@@ -98,8 +100,9 @@ def bag(form: str) -> Callable[[Path, int], None]:
                     yield bags.marine_dvl(at, (0.5, 0.0, 0.0))
                     yield bags.pressure(at, 120_000.0)
                     written += 700
-                    yield bags.Sent(at, "/camera", "sensor_msgs/msg/Image", image)
-                    written += 77_000
+                    if images:
+                        yield bags.Sent(at, "/camera", "sensor_msgs/msg/Image", image)
+                        written += 77_000
                 if written > size:
                     return
 
@@ -114,6 +117,8 @@ FORMATS: dict[str, tuple[str, Callable[[Path, int], None]]] = {
     "ros2-sqlite": ("dive", bag("sqlite")),
     "ros2-mcap": ("dive", bag("mcap")),
     "ros1": ("dive.bag", bag("ros1")),
+    "mcap-imu": ("dive", bag("mcap", images=False)),
+    "ros1-imu": ("dive.bag", bag("ros1", images=False)),
 }
 
 

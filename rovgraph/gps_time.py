@@ -1,30 +1,25 @@
-"""GPS weeks and times of week as Unix time."""
+"""GPS time, weeks and seconds since 1980 without leap seconds, as Unix time."""
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from rovgraph.geometry import Array
 
-EPOCH = 315_964_800.0  # of GPS time, in Unix time [s]
-LEAP_S = 18.0  # GPS time less UTC since 2017
-WEEK_S = 604_800.0
-FIRST_LEAP = 13  # GPS time less UTC from 1999 on [s]
-LATER_LEAPS = np.array([  # Unix times from which it is a second more each
-    1_136_073_600.0, 1_230_768_000.0, 1_341_100_800.0, 1_435_708_800.0, 1_483_228_800.0,
-])  # fmt: skip
-WEEKS = 990, 4000  # 1998 to 2056: what a receiver that knows the date may state
+EPOCH, WEEK_S = 315_964_800.0, 604_800.0  # in Unix time; [s]
+LEAP_S = 18.0  # by which it is ahead of UTC since 2017
+WEEKS = 1356, 4000  # a receiver that states another has not learnt the week: 2006 to 2056
+_LEAPS = np.array([1136073600.0, 1230768000.0, 1341100800.0, 1435708800.0, 1483228800.0])  # Unix times of leap seconds
+_FIRST_LEAP = 13  # seconds that GPS was ahead of UTC before the first of them
 
 
-def unix_of_gps(seconds: Array) -> Array:
-    """Unix time of seconds since the GPS epoch, shape (n,); right from 1999 on."""
-    late = EPOCH + np.asarray(seconds, dtype=float)
-    leaps = FIRST_LEAP + np.searchsorted(LATER_LEAPS + FIRST_LEAP + np.arange(1, len(LATER_LEAPS) + 1), late, "right")
-    return np.asarray(late - leaps)
+def unix_of_gps(week: ArrayLike, seconds: ArrayLike) -> Array:
+    """Unix time [s] of weeks and seconds of the week, shape (n,)."""
+    ahead = EPOCH + WEEK_S * np.asarray(week, dtype=float) + np.asarray(seconds, dtype=float)
+    leaps = np.searchsorted(_LEAPS + _FIRST_LEAP + 1 + np.arange(len(_LEAPS)), ahead, side="right")
+    return np.asarray(ahead - _FIRST_LEAP - leaps)
 
 
-def unwrapped_week(tow: Array) -> Array:
-    """Times of week that go on over the end of a week, shape (n,) [s]; NaN stay where they are."""
-    out = np.full(len(tow), np.nan)
-    known = np.isfinite(tow)
-    weeks = np.concatenate([[0], np.cumsum(np.diff(tow[known]) < -0.5 * WEEK_S)])[: int(known.sum())]
-    out[known] = tow[known] + WEEK_S * weeks
-    return out
+def is_week(week: ArrayLike) -> NDArray[np.bool_]:
+    """Whether a receiver knew the week, shape (n,)."""
+    known = np.asarray(week, dtype=float)
+    return np.asarray((known >= WEEKS[0]) & (known <= WEEKS[1]))

@@ -1,8 +1,12 @@
 """Every exported file is opened by another library than the one that wrote it, and shows the same positions."""
 
 import json
+import os
 import re
+import shutil
 import sqlite3
+import subprocess
+import sys
 import warnings
 import zipfile
 from dataclasses import replace
@@ -159,6 +163,20 @@ def test_tum_and_kitti_have_the_same_poses(tmp_path):
     assert np.abs(kitti[:, :, :3] - t.R_nb).max() < 1e-6
 
 
+@pytest.mark.parametrize("name", ["tum", "kitti"])
+def test_evo_reads_the_same_poses(tmp_path, name):
+    """As a program of its own: it is under the GPL."""
+    program = shutil.which("evo_traj", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    if program is None:
+        pytest.skip("evo is not installed")
+    path = written(name, tmp_path)
+    command = [program, name, path, "--save_as_kitti", "--no_warnings"]
+    subprocess.run(command, cwd=tmp_path, env=os.environ | {"HOME": str(tmp_path)}, check=True, capture_output=True)
+    poses = np.loadtxt(next(tmp_path.glob("*.kitti"))).reshape(-1, 3, 4)
+    assert np.abs(poses[:, :, 3] - circle().p_n).max() < WITHIN_M
+    assert np.abs(poses[:, :, :3] - circle().R_nb).max() < 1e-6
+
+
 @pytest.mark.parametrize("name", ["rosbag2", "mcap"])
 def test_a_ros_bag_has_odometry_by_rep_103(tmp_path, name):
     highlevel = pytest.importorskip("rosbags.highlevel")
@@ -214,6 +232,21 @@ def test_subtitles_follow_the_video_of_the_dive(tmp_path):
     assert (number, stamp) == ("31", "00:00:30,000 --> 00:00:31,000")
     assert place.startswith("N 0.0 m  E 40.0 m ±") and attitude == "heading 180°  depth 4.0 m"
     assert re.fullmatch(r"2026-02-13 \d\d:\d\d:\d\d UTC", utc)
+
+
+@pytest.mark.parametrize("place", [True, False])
+def test_subtitles_are_read_back_by_another_library(tmp_path, place):
+    srt = pytest.importorskip("srt")
+    of = track() if place else track(None)
+    shown = list(srt.parse(written("srt", tmp_path, of=of).read_text(encoding="utf-8")))
+    starts = np.array([each.start.total_seconds() for each in shown])
+    assert [each.index for each in shown] == list(range(1, 62)) and starts == pytest.approx(np.arange(61.0))
+    numbers = np.array([re.findall(r"-?\d+\.\d+", each.content.splitlines()[0])[:2] for each in shown], dtype=float)
+    if place:  # shown to six decimals of a degree, and to 0.1 m
+        assert off(*numbers.T, BEGAN + starts) < 0.11
+    else:
+        expected = np.column_stack([np.interp(BEGAN + starts, circle().time, p) for p in circle().p_n[:, :2].T])
+        assert np.abs(numbers - expected).max() < 0.051
 
 
 def test_a_line_across_the_date_line_stays_whole(tmp_path):

@@ -1,257 +1,226 @@
-"""Text exports of MicroStrain: both programs' names, units, clocks, rows of several kinds, and damage."""
+"""CSV exports of MicroStrain: units, worlds, clocks, damage, and a dive that comes back."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import check_refused_or_whole, close, first, read
+from recordings import check_dive_comes_back, check_refused_or_whole, close, first, read
+from rovgraph.gps_time import unix_of_gps
 
 import rovgraph as rg
 from rovgraph.errors import InputError
+from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
 from rovgraph.interchange.formats import recognise
-from rovgraph.interchange.recording import Recording
-from rovgraph.simulate import Choices
 
 G = 9.80665
-WEEK, TOW = 2315, 490_025.0  # 2024-05-24 16:07:05 GPS time, 18 s ahead of UTC
-UNIX = 1_716_566_825.0 - 18.0
-ACC, GYR, MAG, RPY = (0.05, 0.04, -0.995), (0.01, -0.02, 0.03), (-0.15, -0.18, -0.07), (0.1, -0.2, 1.0)
-INFO = (
-    "FILE_INFO\r\nListSeparator={}\r\nDecimalSeparator={}\r\n\r\n"
-    "DEVICE_INFO\r\nModelName,3DM-GX5-45\r\n\r\nDATA_START\r\n"
-)
-MONITOR = (
-    "GPS TFlags,GPS Week,GPS TOW,X Accel [x8004],Y Accel [x8004],Z Accel [x8004],X Gyro [x8005],Y Gyro [x8005],"
-    "Z Gyro [x8005],X Mag [x8006],Y Mag [x8006],Z Mag [x8006],Roll [x800C],Pitch [x800C],Yaw [x800C],Lat [x8103],"
-    "Long [x8103],Horz Acc [x8103],Flags [x8103],Pressure [x8017],Flags [x8105]"
-)
-PARTS = ("scaledAccel", "scaledGyro", "scaledMag")
+WEEK, TOW = 2300, 490_025.0
+MONITOR = [
+    "GPS TFlags", "GPS Week", "GPS TOW", "X Accel [x8004]", "Y Accel [x8004]", "Z Accel [x8004]", "X Gyro [x8005]",
+    "Y Gyro [x8005]", "Z Gyro [x8005]", "X Mag [x8006]", "Y Mag [x8006]", "Z Mag [x8006]", "Roll [x800C]",
+    "Pitch [x800C]", "Yaw [x800C]", "Lat [x8103]", "Long [x8103]", "Height [x8103]", "Horz Acc [x8103]",
+    "Flags [x8103]",
+]  # fmt: skip
+ABOVE = ["FILE_INFO", "ListSeparator=comma", "DecimalSeparator=period", "", "DEVICE_INFO", "ModelName,3DM-GX5-45", ""]
+VALUES = ["0.1", "-0.2", "-0.97", "0.01", "0.02", "0.03", "0.2", "0.05", "0.4"]
+DEVICE = "inertial-6253.76535:"
+CONNECT = [f"{part}{axis}" for part in ("scaledAccel", "scaledGyro", "scaledMag") for axis in "XYZ"]
 
 
-def row(k: int, flags: int = 5, week: int = WEEK, values=(*ACC, *GYR, *MAG, *RPY)) -> str:
-    return ",".join(map(str, [flags, week, f"{TOW + 0.01 * k:.6f}", *values, "", "", "", "", 1013.2, ""]))
+def monitor(count: int = 20, flags: int = 7, week: int = WEEK, start: float = TOW, rpy=(0.0, 0.0, 1.0)) -> bytes:
+    """An export of MIP Monitor; its GNSS has a row of its own."""
+    lines = [*ABOVE, "DATA_START", ",".join(MONITOR)]
+    for k in range(count):
+        tow = (start + 0.01 * k) % 604_800
+        lines.append(",".join([str(flags), str(week), f"{tow:.6f}", *VALUES, *map(repr, rpy), *[""] * 5]))
+    lines.append(",".join(["3", str(week), f"{start + 0.005:.6f}", *[""] * 12, "54.3", "10.1", "40", "2.5", "31"]))
+    return "\r\n".join([*lines, ""]).encode()
 
 
-def fix_row(k: int, flags: int = 31) -> str:
-    place = [50.0 + 1e-6 * k, 8.1, 1.5]
-    return ",".join(map(str, [3, WEEK, f"{TOW + 0.01 * k:.6f}", *[""] * 12, *place, flags, "", 7]))
+def connect(rows: list[list[str]], names: list[str] = CONNECT, clock: str = "timeInfo_referenceTime") -> bytes:
+    """An export of SensorConnect."""
+    lines = [",".join(["Time", *(DEVICE + name for name in [clock, *names])])]
+    lines += [",".join(["5/31/2024 12:00:00.500", *row]) for row in rows]
+    return "\n".join([*lines, ""]).encode()
 
 
-def monitor(count: int = 20, head: str = INFO.format("comma", "period"), **given: object) -> bytes:
-    return (head + "\r\n".join([MONITOR, *(row(k, **given) for k in range(count)), ""])).encode()
+def by_reference(count: int = 20, values: list[str] = VALUES) -> list[list[str]]:
+    return [[str(10**9 + 10**7 * k), *values] for k in range(count)]
 
 
-def connect(time: list[str], extra: str = "", cells: str = "", values=(*ACC, *GYR, *MAG)) -> bytes:
-    names = ",".join(f"inertial-6253.76535:{part}{axis}" for part in PARTS for axis in "XYZ")
-    rows = [f"{t}{cells.format(k)},{','.join(map(str, values))}" for k, t in enumerate(time)]
-    return "\n".join([f"Time{extra},{names}", *rows, ""]).encode()
-
-
-def check_values(recording: Recording) -> None:
-    for sensor, prefix, expected in (
-        ("imu", "acc", G * np.array(ACC)),
-        ("imu", "gyr", GYR),
-        ("mag", "mag", 100.0 * np.array(MAG)),
-    ):
-        columns = first(recording, sensor).columns
-        for axis, value in zip("xyz", expected, strict=True):
-            close(columns[f"{prefix}_{axis}"], value, atol=1e-9)
-
-
-def test_descriptors_give_units_and_gps_time_becomes_unix_time(tmp_path):
+def test_an_export_of_mip_monitor_is_read_in_si(tmp_path):
     recording = read(monitor(), tmp_path)
     assert recording.format == "microstrain"
-    check_values(recording)
-    imu, ahrs = first(recording, "imu").columns, first(recording, "ahrs").columns
-    close(imu["time"], UNIX + 0.01 * np.arange(20), atol=1e-6)
-    close([ahrs[f"ahrs_{name}"][0] for name in ("roll", "pitch", "yaw")], RPY)
-    assert [clock.unix_offset for clock in recording.clocks.values()] == [0.0]
-    assert recording.settings == {"imu": {"mount_rpy_deg": [0.0, 0.0, 0.0]}}
-    assert any("z down, as gravity has it" in text for text in recording.warnings)
+    imu, mag, fix = (first(recording, sensor).columns for sensor in ("imu", "mag", "fix"))
+    close([imu[f"acc_{a}"][3] for a in "xyz"], np.array([0.1, -0.2, -0.97]) * G)
+    close([imu[f"gyr_{a}"][3] for a in "xyz"], [0.01, 0.02, 0.03])
+    close([mag[f"mag_{a}"][3] for a in "xyz"], [20.0, 5.0, 40.0])
+    close([fix["fix_lat"][0], fix["fix_lon"][0], fix["fix_sd"][0]], [54.3, 10.1, 2.5])
+    close(imu["time"][:2], [unix_of_gps(WEEK, TOW), unix_of_gps(WEEK, TOW) + 0.01])
+    assert recording.settings["imu"]["mount_rpy_deg"] == [0.0, 0.0, 0.0]
+    assert [each.reason for each in recording.left] == ["no measurement that a log has: Height [x8103]"]
 
 
-def test_every_column_is_read_or_named_with_a_reason(tmp_path):
-    recording = read(monitor(), tmp_path)
-    left = {each.name: (each.count, each.reason) for each in recording.left}
-    assert left == {"pressure x8017": (20, "pressure of the housing")}
-
-
-def test_rows_of_the_gnss_lie_between_those_of_the_imu(tmp_path):
-    lines = monitor(12).decode().splitlines()
-    lines[-6:-6] = [fix_row(5), fix_row(6), fix_row(6, flags=30)]
-    recording = read("\n".join(lines).encode(), tmp_path)
-    assert len(first(recording, "imu").columns["time"]) == 12
-    fix = first(recording, "fix").columns
-    close(fix["fix_lat"], [50.000005, 50.000006], atol=1e-12)
-    close(fix["fix_sd"], 1.5)
-    close(fix["time"], UNIX + np.array([0.05, 0.06]), atol=1e-6)
-
-
-def test_a_clock_that_was_never_set_is_the_instruments_own(tmp_path):
-    recording = read(monitor(flags=1), tmp_path)
-    assert [clock.unix_offset for clock in recording.clocks.values()] == [None]
-    assert "counts from its start" in recording.notes[0]
-    close(np.diff(first(recording, "imu").columns["time"]), 0.01, atol=1e-6)
-
-
-def test_rows_from_before_the_clock_was_set_are_left_and_counted(tmp_path):
-    data = monitor(20).decode().replace(row(0), row(0, flags=1)).replace(row(1), row(1, flags=1)).encode()
-    recording = read(data, tmp_path)
-    assert len(first(recording, "imu").columns["time"]) == 18
-    assert {left.reason: left.count for left in recording.left}["from before the instrument's clock was set"] == 2
-
-
-def test_time_of_week_goes_on_over_the_end_of_the_week(tmp_path):
-    end = [row(0).replace(f"{TOW:.6f}", f"{604_799.99 + 0.01 * k:.6f}") for k in range(1)]
-    begin = [row(0, week=WEEK + 1).replace(f"{TOW:.6f}", f"{0.01 * k:.6f}") for k in range(5)]
-    data = "\n".join(["DATA_START", MONITOR, *end, *begin, ""]).encode()
-    close(np.diff(first(read(data, tmp_path), "imu").columns["time"]), 0.01, atol=1e-6)
-
-
-def test_separators_are_those_that_the_file_states(tmp_path):
-    table = monitor(head="").decode().replace(",", ";").replace(".", ",")
-    check_values(read((INFO.format("semicolon", "comma") + table).encode(), tmp_path))
+def test_an_export_of_sensorconnect_is_read_by_the_instruments_own_time(tmp_path):
+    imu = first(read(connect(by_reference()), tmp_path), "imu").columns
+    close(imu["time"], 1.0 + 0.01 * np.arange(20), atol=1e-9)
+    close(imu["acc_z"], -0.97 * G)
 
 
 @pytest.mark.parametrize(
-    ("time", "begin", "step"),
+    ("cell", "unix"),
     [
-        ([f"2024-05-24 16:07:{5 + 0.01 * k:09.6f}" for k in range(20)], UNIX + 18.0, 0.01),
-        ([f"5/24/2024 16:07:{5 + 0.01 * k:09.6f}" for k in range(20)], UNIX + 18.0, 0.01),
-        ([str(1_716_566_825_000_000_000 + 10_000_000 * k) for k in range(20)], UNIX + 18.0, 0.01),
-        ([f"{0.01 * k:.3f}" for k in range(20)], 0.0, 0.01),
+        ("5/31/2024 12:00:00.500", 1717156800.5),
+        ("5/31/2024 12:00:00.500 PM", 1717156800.5),
+        ("2024-05-31 12:00:00.500000000", 1717156800.5),
+        ("1717156800500000000", 1717156800.5),
+        ("12.5", None),
     ],
 )
-def test_the_computers_time_is_taken_with_a_warning_where_there_is_no_other(time, begin, step, tmp_path):
-    recording = read(connect(time), tmp_path)
-    check_values(recording)
-    close(first(recording, "imu").columns["time"], begin + step * np.arange(20), atol=1e-5)
-    assert any("those of the computer" in text for text in recording.warnings)
+def test_without_it_the_computers_time_counts_with_a_warning(cell, unix, tmp_path):
+    data = connect([[*VALUES] for _ in range(9)], CONNECT[1:], CONNECT[0])
+    recording = read(data.replace(b"5/31/2024 12:00:00.500", cell.encode()), tmp_path)
+    close(first(recording, "imu").columns["time"], 12.5 if unix is None else unix, atol=1e-3)
+    assert [clock.unix_offset for clock in recording.clocks.values()] == [None if unix is None else 0.0]
+    assert any("stamps are those of the computer" in text for text in recording.warnings)
 
 
-def test_the_instruments_time_goes_before_the_computers(tmp_path):
-    data = connect(["2024-05-24 16:07:05"] * 20, ",inertial-6253.76535:referenceTimestamp_referenceTime", ",{}0000000")
-    recording = read(data, tmp_path)
-    close(first(recording, "imu").columns["time"], 0.01 * np.arange(20), atol=1e-9)
-    assert "nanoseconds since the instrument's start" in recording.notes[0]
+def test_a_time_of_week_that_wraps_goes_on(tmp_path):
+    recording = read(monitor(flags=1, week=0, start=604_799.9), tmp_path)
+    close(np.diff(first(recording, "imu").columns["time"]), 0.01, atol=1e-6)
+    assert [clock.unix_offset for clock in recording.clocks.values()] == [None]
 
 
-def test_increments_are_divided_by_the_interval_and_stamped_in_its_middle(tmp_path):
-    data = connect([f"{0.01 * k:.3f}" for k in range(20)], values=(*[0.01 * v for v in (*ACC, *GYR)], *MAG))
-    recording = read(data.replace(b"scaledAccel", b"deltaVel").replace(b"scaledGyro", b"deltaTheta"), tmp_path)
-    check_values(recording)
-    close(first(recording, "imu").columns["time"][0], -0.005, atol=1e-6)
+def test_rows_from_before_the_clock_was_set_are_counted(tmp_path):
+    lines = monitor().split(b"\r\n")
+    at = lines.index(b"DATA_START") + 2
+    lines[at : at + 2] = [line.replace(b"7,2300,490025", b"3,0,17") for line in lines[at : at + 2]]
+    recording = read(b"\r\n".join(lines), tmp_path)
+    assert len(first(recording, "imu").columns["time"]) == 18
+    assert any("before the instrument's clock was set" in each.reason and each.count == 2 for each in recording.left)
 
 
-def test_units_that_a_header_states_are_those_of_the_values(tmp_path):
-    data = connect([f"{0.01 * k:.3f}" for k in range(20)], values=(*[G * v for v in ACC], *np.rad2deg(GYR), *MAG))
-    for axis in b"XYZ":
-        for part, unit in ((b"scaledAccel", b"[m/s^2]"), (b"scaledGyro", b"[deg/s]")):
-            data = data.replace(part + bytes([axis]), part + bytes([axis]) + b" " + unit)
-    check_values(read(data, tmp_path))
+@pytest.mark.parametrize(("unix", "seconds"), [(1483228799, 16.0), (1483228800, 18.0), (1483228801, 19.0)])
+def test_gps_time_counts_leap_seconds(unix, seconds):
+    assert unix_of_gps(1930, seconds) == unix
 
 
-def test_columns_that_state_different_units_are_converted_each_with_a_warning(tmp_path):
-    values = (*ACC, np.rad2deg(GYR[0]), *GYR[1:], *MAG)
-    data = connect([f"{0.01 * k:.3f}" for k in range(20)], values=values).replace(b"GyroX", b"GyroX [deg/s]")
-    recording = read(data, tmp_path)
-    check_values(recording)
-    assert any("different units (deg/s, rad/s, rad/s)" in text for text in recording.warnings)
+@pytest.mark.parametrize("world", ["NED", "ENU"])
+def test_gravity_tells_relative_to_what_the_attitude_is(world, tmp_path):
+    rpy = [0.1, -0.2, 1.0]
+    to_world = {"NED": np.eye(3), "ENU": np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])}[world]
+    recording = read(monitor(rpy=tuple(rpy_from_matrix(to_world @ matrix_from_rpy(rpy)).tolist())), tmp_path)
+    ahrs = first(recording, "ahrs").columns
+    close([ahrs[f"ahrs_{name}"][0] for name in ("roll", "pitch", "yaw")], rpy, atol=1e-9)
+    assert any("z of its world points up" in text for text in recording.warnings) == (world == "ENU")
 
 
-def test_damaged_lines_are_counted_and_the_rest_is_read(tmp_path):
-    data = (
-        monitor(20) + b"1,2,3\r\n" + row(30).replace("-0.995", "-0.9x5").encode() + b"\r\n\r\n" + row(31)[:-40].encode()
-    )
-    recording = read(data, tmp_path)
-    assert len(first(recording, "imu").columns["time"]) == 20
-    counts = {left.reason: left.count for left in recording.left if left.name == "rows"}
-    assert counts == {"more or fewer cells than the names": 2, "a cell that is no number": 1}
+@pytest.mark.parametrize(
+    ("values", "gyr", "said"),
+    [
+        (["0.98", "-2.0", "-9.5", *VALUES[3:]], [0.01, 0.02, 0.03], "taken in m/s2"),
+        ([*VALUES[:3], "1", "50", "3", *VALUES[6:]], np.deg2rad([1.0, 50.0, 3.0]), "taken in deg/s"),
+    ],
+)
+def test_values_that_the_documented_unit_makes_impossible_are_in_another_one(values, gyr, said, tmp_path):
+    recording = read(connect(by_reference(values=values)), tmp_path)
+    imu = first(recording, "imu").columns
+    close([imu[f"gyr_{a}"][0] for a in "xyz"], gyr)
+    assert 9.0 < np.linalg.norm([imu[f"acc_{a}"][0] for a in "xyz"]) < 10.5
+    assert any(said in text for text in recording.warnings)
 
 
-def test_names_that_come_again_are_left_and_others_refused(tmp_path):
-    again = monitor(5) + monitor(5, head="")
-    recording = read(again, tmp_path)
-    assert len(first(recording, "imu").columns["time"]) == 10
-    for other in (b"X Gyro [deg/s]", b"X Gyro [x8005],more"):
-        with pytest.raises(InputError, match="names its columns twice, and not alike") as refused:
-            read(monitor(5) + monitor(5, head="").replace(b"X Gyro [x8005]", other), tmp_path)
-        assert "\n" not in str(refused.value)
+def test_units_that_names_state_count(tmp_path):
+    units = dict.fromkeys(CONNECT[:3], "m/s^2") | dict.fromkeys(CONNECT[3:6], "deg/s")
+    names = [f"{name} [{units[name]}]" if name in units else name for name in CONNECT]
+    imu = first(read(connect(by_reference(values=["0", "0", "-9.8", *VALUES[3:]]), names), tmp_path), "imu").columns
+    close([imu["acc_z"][0], imu["gyr_z"][0]], [-9.8, np.deg2rad(0.03)])
+
+
+def test_a_second_device_in_the_file_is_left(tmp_path):
+    data = connect(by_reference()).replace(b"scaledMag", b"x").split(b"\n")
+    data[0] += b"," + b",".join(b"inertial-6284.1:scaledGyro" + axis for axis in (b"X", b"Y", b"Z"))
+    rows = [line + b",9,9,9" for line in data[1:-1]]
+    recording = read(b"\n".join([data[0], *rows, b""]), tmp_path)
+    close(first(recording, "imu").columns["gyr_x"], 0.01)
+    assert any("inertial-6284.1" in each.reason for each in recording.left)
+
+
+def test_damaged_rows_and_names_that_come_again_are_counted(tmp_path):
+    data = monitor()
+    names = ",".join(MONITOR).encode()
+    row = data.splitlines()[-2]
+    recording = read(data + names + b"\r\n" + row.replace(b"-0.97", b"x") + b"\r\n1,2\r\n" + row + b"\r\n", tmp_path)
+    assert len(first(recording, "imu").columns["time"]) == 21
+    reasons = {each.reason: each.count for each in recording.left if each.name == "rows"}
+    assert reasons == {
+        "the names again": 1, "a cell that is no number": 1, "more or fewer cells than the names": 1,
+    }  # fmt: skip
+
+
+ANEW = connect(by_reference(5)) + connect(by_reference(5), [f"{name} [deg/s]" if "Gyro" in name else name for name in CONNECT])  # fmt: skip  # noqa: E501
 
 
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (monitor(0), "no value of acceleration, rate or attitude"),
-        (connect(["yesterday"] * 5), "Time is 'yesterday', expected 2024-05-31"),
-        (connect(["1.0"] * 5).replace(b"Time,", b"When,"), "no column of time"),
-        (connect(["1.0"] * 5).replace(b"GyroX", b"GyroX [rpm]"), "states the unit 'rpm', expected one of: rad/s"),
+        (monitor(0).rsplit(b"\r\n3,", 1)[0], "no column of time"),
+        (connect(by_reference()).replace(b"scaledGyroY", b"scaledGyroY [deg/s]"), "in different units"),
+        (connect(by_reference()).replace(b"scaledMagX", b"scaledMagX [furlong]"), "in different units"),
+        (
+            connect(by_reference(), [f"{name} [furlong]" if "Mag" in name else name for name in CONNECT]),
+            "unknown unit 'furlong'; expected one of: uT",
+        ),
+        (ANEW, "row 6 names the columns anew, and otherwise than before"),
+        (connect(by_reference()).replace(b"Gyro", b"Temp"), "no row with a time and acceleration"),
     ],
 )
-def test_a_file_without_use_is_refused_in_one_line(data, said, tmp_path):
+def test_a_file_that_would_mislead_is_refused_in_one_line(data, said, tmp_path):
     with pytest.raises(InputError, match=said) as refused:
         read(data, tmp_path)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    "text",
+    "data",
     [
-        "time,roll,pitch,yaw\n0,1,2,3\n",
-        "Time,AccelX,AccelY,AccelZ,GyroX,GyroY,GyroZ\n0,1,2,3,4,5,6\n",
-        "DATA_START\n",
-        "DATA_START\nChannel 1,Channel 2\n",
+        b"time,acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z\n0,0,0,-9.8,0,0,0\n",
+        b"Time,Roll,Pitch,Yaw,Latitude,Longitude\n0,0,0,0,54,10\n",
+        b"timestamp,AccelX,AccelY,AccelZ,GyroX,GyroY,GyroZ\n0,0,0,-9.8,0,0,0\n",
+        b"PacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z\n",
+        np.random.default_rng(1).bytes(60_000),
     ],
 )
-def test_tables_of_others_are_not_taken_for_it(text, tmp_path):
-    path = tmp_path / "table.csv"
-    path.write_text(text)
-    found = recognise(path)
+def test_other_files_are_none_of_microstrain(data, tmp_path):
+    (tmp_path / "other.csv").write_bytes(data)
+    found = recognise(tmp_path / "other.csv")
     assert found is None or found.name != "microstrain"
 
 
-def test_a_file_larger_than_a_block_is_read_whole(tmp_path, monkeypatch):
-    whole = read(monitor(50), tmp_path)
-    monkeypatch.setattr("rovgraph.interchange.text_table.BLOCK", 700)
-    parts = read(monitor(50), tmp_path)
-    close(first(parts, "imu").columns["acc_z"], first(whole, "imu").columns["acc_z"])
-    assert parts.left == whole.left
+def as_export(log: rg.Log) -> bytes:
+    imu, mag = log["imu"], log["mag"]
+    field = {round(t, 3): row for t, row in zip(mag.time, mag.data, strict=True)}
+    rows = []
+    for t, row in zip(imu.time, imu.data, strict=True):
+        there = field.get(round(t, 3))
+        magnetic = [""] * 3 if there is None else [repr(float(v) / 100.0) for v in there[:3]]
+        inertial = [repr(float(v)) for v in (*(row[:3] / G), *row[3:6])]
+        rows.append([str(round(1e9 * t)), *inertial, *magnetic])
+    return connect(rows)
 
 
-def test_an_export_of_a_dive_is_smoothed_as_its_log_is(tmp_path):
-    config = rg.Config().changed(heading={"sources": ["mag"]}, start={"heading_deg": 0.0})
-    frame = rg.simulate("circle", config, 1, Choices(duration=40.0)).dive.log_frame
-    simulated = rg.Log.from_frame(frame, config)
-    imu, mag = simulated["imu"], simulated["mag"]
-    field = dict(zip(np.round(mag.time, 3), mag.data, strict=True))
-    lines = ["DATA_START", MONITOR]
-    for t, values in zip(imu.time, imu.data, strict=True):
-        cells = [f"{v:.8f}" for v in (*values[:3] / G, *values[3:6])]
-        cells += [f"{v:.8f}" for v in field[round(t, 3)] / 100.0] if round(t, 3) in field else ["", "", ""]
-        lines.append(",".join(["5", str(WEEK), f"{TOW + t:.9f}", *cells, *[""] * 9]))
-    path = tmp_path / "dive.csv"
-    path.write_text("\n".join(lines))
-    rest = [name for name in frame if not name.startswith(("acc_", "gyr_", "mag_"))]
-    frame.loc[frame[rest[1:]].notna().any(axis=1), rest].to_csv(tmp_path / "rest.csv", index=False)
-    with pytest.warns(rg.DataWarning, match="check the mounting"):
-        log = rg.read_log([path, tmp_path / "rest.csv"], config, shift={"rest.csv": UNIX})
-    close(log["imu"].data, imu.data, atol=1e-7)
-    close(log["mag"].data, mag.data, atol=1e-6)
-    close(log["imu"].time - UNIX, imu.time, atol=1e-6)
-    tracks = [rg.smooth(each, config, "smoothed").smoothed.trajectory for each in (simulated, log)]
-    close(tracks[1].at(tracks[0].time[1:-1] + UNIX).p_n, tracks[0].p_n[1:-1], atol=0.02)
+def test_an_exported_dive_is_smoothed_as_its_log_is(tmp_path):
+    check_dive_comes_back(as_export, tmp_path)
 
 
-@settings(max_examples=50, deadline=None)
-@given(changes=st.lists(st.tuples(st.integers(0, 10**6), st.binary(max_size=4)), max_size=10))
-def test_changed_bytes_raise_nothing_but_a_refusal(changes, tmp_path_factory):
-    data = bytearray(monitor(9))
+@settings(max_examples=60, deadline=None)
+@given(
+    changes=st.lists(st.tuples(st.integers(0, 10**6), st.binary(max_size=4)), max_size=10),
+    until=st.integers(1, 4000),
+    whole=st.booleans(),
+    of=st.sampled_from([monitor(6), connect(by_reference(9))]),
+)
+def test_changed_and_truncated_bytes_raise_nothing_but_a_refusal(changes, until, whole, of, tmp_path_factory):
+    data = bytearray(of)
     for place, new in changes:
         data[place % len(data) : place % len(data) + 2] = new
-    check_refused_or_whole(read, bytes(data), tmp_path_factory.getbasetemp())
-
-
-@settings(max_examples=50, deadline=None)
-@given(body=st.binary(max_size=300))
-def test_rows_of_any_content_raise_nothing_but_a_refusal(body, tmp_path_factory):
-    check_refused_or_whole(read, monitor(4) + body, tmp_path_factory.getbasetemp())
+    check_refused_or_whole(read, bytes(data if whole else data[:until]), tmp_path_factory.getbasetemp())

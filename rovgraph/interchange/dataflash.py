@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.gps_time import WEEK_S, unix_of_gps
+from rovgraph.gps_time import unix_of_gps
 from rovgraph.interchange import dataflash_channels as channels
 from rovgraph.interchange.alternatives import SourceMissing, preferred_first
 from rovgraph.interchange.ardupilot import CLOCK, SPEED_ESTIMATE_AXES, settings
@@ -264,7 +264,7 @@ def _clock(messages: Mapping[str, Messages]) -> Clock:
     if gps is not None and all(name in gps for name in ("TimeUS", "Status", "GMS", "GWk")):
         gps = gps.take(np.logical_and(gps.fields["Status"] >= channels.FIX_3D, gps.fields["GWk"] > 0))
         if len(gps):
-            unix = unix_of_gps(WEEK_S * gps.fields["GWk"].astype(float) + 1e-3 * gps.fields["GMS"])
+            unix = unix_of_gps(gps.fields["GWk"], 1e-3 * gps.fields["GMS"])
             offset = float(np.median(unix - gps.fields["TimeUS"] * 1e-6))
             return Clock(CLOCK, offset, GPS_SD_S, "GPS week and milliseconds")
     return Clock(CLOCK)

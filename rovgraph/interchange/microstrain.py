@@ -1,100 +1,105 @@
-"""Text exports of MicroStrain's inertial units (GX3 to CV7): of MIP Monitor, and of SensorConnect.
+"""CSV exports of MicroStrain's inertial units (3DM-GX3 to CV7): of MIP Monitor, and of SensorConnect.
 
-MIP Monitor writes a field's descriptor behind each name, ``X Accel [x8004]``; SensorConnect writes names of MSCL behind
-the device's, ``inertial-6253.76535:scaledAccelX``. Both follow ``DATA_START``, if blocks on file and device come first.
-Descriptors and names state units: g, rad/s, gauss, rad in NED (MIP SDK, `data_sensor.h`, `data_filter.h`).
+MIP Monitor writes a field's descriptor behind each name, ``X Accel [x8004]``, below blocks on file and device that end
+with ``DATA_START``. SensorConnect writes the names of MSCL behind the device's, ``inertial-6253.76535:scaledAccelX``.
+Names state no units: those of the MIP protocol are g, rad/s, gauss, and radians relative to NED.
 """
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.gps_time import WEEK_S, WEEKS, unix_of_gps, unwrapped_week
+from rovgraph.gps_time import WEEK_S, is_week, unix_of_gps
 from rovgraph.interchange.formats import HEAD, Options
-from rovgraph.interchange.inertial_columns import (
-    UNUSED,
+from rovgraph.interchange.inertial import (
     Account,
-    Choice,
-    Found,
-    Names,
-    index_of,
-    inertial_recording,
-    stem_and_unit,
-    take,
+    Measured,
+    Source,
+    Vector,
+    measured_of,
+    name_and_unit,
+    recording_of_inertial,
 )
 from rovgraph.interchange.recording import Clock, Recording
-from rovgraph.interchange.text_table import Columns, Layout, cells_of, read_columns
+from rovgraph.interchange.text_table import Layout, Table, cells_of, read_table
 
-START = "DATA_START"
+START = b"DATA_START"
 DESCRIPTOR = re.compile(r"^(.*?)\s*\[x([0-9A-F]{4})\]$", re.IGNORECASE)
-FILTERED = "are corrected by the instrument's own filter; record the scaled ones for a filter of ours"
-
-
-def _of_field(field: str, *names: str) -> tuple[str, ...]:
-    return tuple(f"{name} {field}" for name in names)
+CORRECTED = "values are corrected by the instrument's own filter; record the scaled ones for a filter of ours"
+NORTH = "the yaw is taken relative to magnetic north; state declination_deg: 0 if the instrument adds a declination"
 
 
 def _xyz(name: str) -> tuple[str, ...]:
     return tuple(f"{name}{axis}" for axis in "xyz")
 
 
-CHOICES = {
-    "acc": (
-        Choice(_of_field("x8004", "x accel", "y accel", "z accel"), "acceleration", "g"),
-        Choice(_xyz("scaledaccel"), "acceleration", "g"),
-        Choice(_of_field("x8008", "delta vel x", "delta vel y", "delta vel z"), "acceleration", "g", summed=True),
-        Choice(_xyz("deltavel"), "acceleration", "g", summed=True),
-        Choice(_xyz("estcompensatedaccel"), "acceleration", "m/s2", f"estCompensatedAccel: values {FILTERED}"),
+def _field(descriptor: str, *names: str) -> tuple[str, ...]:
+    return tuple(f"{name} x{descriptor}" for name in names)
+
+
+def _imu(label: str, acc: tuple[str, ...], gyr: tuple[str, ...], summed: bool = False) -> Source:
+    vectors = Vector(acc, "acceleration", "g", summed), Vector(gyr, "rate", "rad/s", summed)
+    return Source("imu", label, vectors)
+
+
+SOURCES = (
+    _imu("Accel, Gyro", _field("8004", "xaccel", "yaccel", "zaccel"), _field("8005", "xgyro", "ygyro", "zgyro")),
+    _imu("scaledAccel, scaledGyro", _xyz("scaledaccel"), _xyz("scaledgyro")),
+    _imu(
+        "Delta Vel, Delta Theta",
+        _field("8008", "deltavelx", "deltavely", "deltavelz"),
+        _field("8007", "deltathetax", "deltathetay", "deltathetaz"),
+        summed=True,
     ),
-    "gyr": (
-        Choice(_of_field("x8005", "x gyro", "y gyro", "z gyro"), "rate", "rad/s"),
-        Choice(_xyz("scaledgyro"), "rate", "rad/s"),
-        Choice(_of_field("x8007", "delta theta x", "delta theta y", "delta theta z"), "rate", "rad/s", summed=True),
-        Choice(_xyz("deltatheta"), "rate", "rad/s", summed=True),
-        Choice(_xyz("estangularrate"), "rate", "rad/s", f"estAngularRate: values {FILTERED}"),
+    _imu("deltaVel, deltaTheta", _xyz("deltavel"), _xyz("deltatheta"), summed=True),
+    Source(
+        "imu",
+        "estCompensatedAccel, estAngularRate",
+        (
+            Vector(_xyz("estcompensatedaccel"), "acceleration", "m/s2"),
+            Vector(_xyz("estangularrate"), "rate", "rad/s"),
+        ),
+        f"estCompensatedAccel, estAngularRate: {CORRECTED}",
     ),
-    "mag": (
-        Choice(_of_field("x8006", "x mag", "y mag", "z mag"), "field", "gauss"),
-        Choice(_xyz("scaledmag"), "field", "gauss"),
+    Source("mag", "Mag", (Vector(_field("8006", "xmag", "ymag", "zmag"), "field", "gauss"),)),
+    Source("mag", "scaledMag", (Vector(_xyz("scaledmag"), "field", "gauss"),)),
+    *(
+        Source("ahrs", label, (Vector(names, "angle", "rad"),), f"{label}: {NORTH}")
+        for label, names in (
+            ("Roll, Pitch, Yaw [x800C]", _field("800c", "roll", "pitch", "yaw")),
+            ("roll, pitch, yaw", ("roll", "pitch", "yaw")),
+            ("Roll, Pitch, Yaw [x8205]", _field("8205", "roll", "pitch", "yaw")),
+            ("estRoll, estPitch, estYaw", ("estroll", "estpitch", "estyaw")),
+        )
     ),
-    "rpy": (
-        Choice(_of_field("x800C", "roll", "pitch", "yaw"), "angle", "rad"),
-        Choice(("roll", "pitch", "yaw"), "angle", "rad"),
-        Choice(_of_field("x8205", "roll", "pitch", "yaw"), "angle", "rad"),
-        Choice(("estroll", "estpitch", "estyaw"), "angle", "rad"),
-    ),
-}
-KNOWN = {name for choices in CHOICES.values() for choice in choices for name in choice.names}
-GPS = (  # flags, week, time of week
-    ("gps tflags", "gps week", "gps tow"),
-    ("gpscorreltimestampflags", "gpscorreltimestampweeknum", "gpscorreltimestamptow"),
 )
-SET = 0x4  # flag of a clock that was set, since the instrument started
-GPS_SD_S = 0.01
-FIX = _of_field("x8103", "lat", "long", "horz acc", "flags"), ("latitude", "longitude", "horizontalaccuracy")
-FIX_VALID = 0x1
-REFERENCE, COMPUTER = "referencetime", "time"  # ns since the start; of the computer that recorded
-DATES = ("ISO8601", "%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %I:%M:%S.%f %p")
-ZONE_SD_S = 6 * 3600.0  # of a computer's clock whose time zone nobody states
-COMPUTER_SD_S = 1.0
-NANOSECONDS = 1e17  # Unix times in nanoseconds are larger, those in seconds smaller
-UNIX_S = (9.5e8, 4.2e9)
+FIXES = (  # latitude, longitude, sd, and flags of which one says that they are valid
+    (*_field("8103", "lat", "long", "horzacc"), "flags x8103"),
+    ("latitude", "longitude", "horizontalaccuracy", ""),
+)
+GPS = (  # week, time of week, flags
+    ("gpsweek", "gpstow", "gpstflags"),
+    ("gpscorreltimestampweeknum", "gpscorreltimestamptow", "gpscorreltimestampflags"),
+    ("timeinfoweeknumber", "timeinfotow", ""),
+)
+SET, VALID = 0x4, 0x1  # flags of a clock that was set since the start, and of a valid position
+REFERENCE, COMPUTER = "timeinforeferencetime", "time"  # [ns]; of the computer that recorded
+VECTORS = {name for source in SOURCES for vector in source.vectors for name in vector.names}
+KNOWN = VECTORS | {name for group in (*FIXES, *GPS) for name in group if name} | {REFERENCE}
+OWN = KNOWN - {"roll", "pitch", "yaw", "latitude", "longitude", "horizontalaccuracy", *_xyz("deltavel")}
 FEW = 3  # names that nothing else has
-SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
-DECIMALS = {"period": ".", "point": ".", "comma": ","}
-LEFT = {
-    "x800D": "temperature of the IMU",
-    "x8010": "stabilised by the instrument's own filter",
-    "x8011": "stabilised by the instrument's own filter",
-    "x8017": "pressure of the housing",
-    "est": "computed by the instrument's own filter",
-    "scaledambientpressure": "pressure of the housing",
-}
+SEPARATORS = {b"comma": ",", b"semicolon": ";", b"tab": "\t"}
+DECIMALS = {b"period": ".", b"point": ".", b"comma": ","}
+DATES = ("%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S", "%m/%d/%Y %I:%M:%S.%f %p", "%m/%d/%Y %I:%M:%S %p")
+GPS_SD_S, COMPUTER_SD_S = 0.01, 1.0
+ZONE_SD_S = 6 * 3600.0  # of a computer's calendar, whose time zone nobody states
+UNIX_S = 9.5e8, 4.2e9
+SINCE_START = "the instrument's time since its start"
 
 
 class MicroStrain:
@@ -106,27 +111,24 @@ class MicroStrain:
 
     def recognise(self, path: Path, head: bytes) -> float:
         layout = _layout(head)
-        own = 0 if layout is None else sum(map(_is_own, set(layout.names)))
-        return 0.9 if own >= FEW else 0.0
+        own = set() if layout is None else {_plain(name)[0] for name in layout.names} & OWN
+        return 0.9 if len(own) >= FEW and layout is not None and _is_theirs(layout.names) else 0.0
 
     def read(self, path: Path, options: Options) -> Recording:
         with path.open("rb") as file:
             layout = _layout(file.read(HEAD))
         if layout is None:
             raise InputError(f"{path}: no line names columns of MicroStrain; export it again as CSV")
-        names = [_plain(name) for name in layout.names]
-        wanted = {
-            k for k, (name, _) in enumerate(names) if name in KNOWN or _is_time(name) or name in (*FIX[0], *FIX[1])
-        }
-        texts = {k for k, (name, _) in enumerate(names) if name == COMPUTER}
-        columns = read_columns(path, layout, wanted - texts, texts, options.progress)
-        values = columns.numbers
-        say = Account()
-        found = {part: take(path, names, values, choices, say) for part, choices in CHOICES.items()}
-        found["fix"] = _fix(names, values, say)
-        stamps = _stamps(path, names, columns, found, say)
-        say.unused(names, columns, _why_left)
-        return inertial_recording(path, self.name, stamps.clock, stamps.time, found, stamps.step, say)
+        account, naming = Account(), _of_one_device(layout.names)
+        by_instrument = {naming(name)[0] for name in layout.names} & {REFERENCE, *(tow for _, tow, _ in GPS)}
+        wanted = KNOWN if by_instrument else KNOWN | {COMPUTER}
+        table = read_table(path, layout, naming, wanted, options.progress, {COMPUTER: _computer_time})
+        account.left.update({("rows", why): count for why, count in table.left.items()})
+        unread = [name for name in layout.names if naming(name)[0] not in {*wanted, COMPUTER}]
+        account.left["columns", f"no measurement that a log has: {', '.join(unread)[:120]}"] = len(unread)
+        time, clock = _stamps(path, table, account)
+        found = measured_of(path, table, SOURCES, time, None, account)
+        return recording_of_inertial(path, self.name, [*found, *_fixes(table, time)], clock, account, options)
 
 
 FORMAT = MicroStrain()
@@ -134,142 +136,126 @@ FORMAT = MicroStrain()
 
 def _layout(head: bytes) -> Layout | None:
     """The line that names the columns: the one behind ``DATA_START``, else the first that is not blank."""
-    separator, decimal, at, behind = ",", ".", 0, START.encode() not in head
+    separator, decimal, at, behind = ",", ".", 0, START not in head
     for line in head.splitlines(keepends=True):
         at += len(line)
-        text = line.decode("utf-8-sig", "replace").strip()
-        key, _, value = text.partition("=")
+        key, _, value = line.strip().partition(b"=")
         if not behind:
-            separator = SEPARATORS.get(value.lower(), separator) if key == "ListSeparator" else separator
-            decimal = DECIMALS.get(value.lower(), decimal) if key == "DecimalSeparator" else decimal
-            behind = text.strip('",;') == START
-        elif text:
-            names = tuple(cells_of(text, separator))
+            separator = SEPARATORS.get(value.lower(), separator) if key.endswith(b"ListSeparator") else separator
+            decimal = DECIMALS.get(value.lower(), decimal) if key.endswith(b"DecimalSeparator") else decimal
+            behind = line.strip(b'",;\t \r\n') == START
+        elif line.strip():
+            names = tuple(cells_of(line, separator))
             return Layout(names, at, separator, decimal) if len(names) > 1 and decimal != separator else None
     return None
 
 
 def _plain(name: str) -> tuple[str, str]:
-    """A name in small letters with its descriptor but without its device; and a unit that it states."""
-    name = name.rpartition(":")[2] if ":" in name and not name.lower().endswith(":valid") else name
-    if found := DESCRIPTOR.match(name.strip()):
-        return f"{found[1].lower()} x{found[2].upper()}", ""
-    return stem_and_unit(name)
+    """A name with its descriptor and without its device; and the unit that it states."""
+    if found := DESCRIPTOR.match(name):
+        return f"{name_and_unit(found[1])[0]} x{found[2].lower()}", ""
+    return name_and_unit(name.rpartition(":")[2])
 
 
-def _is_own(name: str) -> bool:
-    """Whether no other program names a column so: with a descriptor, or as MSCL does, which begins in small letters."""
-    plain = _plain(name)[0]
-    if DESCRIPTOR.match(name) or plain in GPS[0]:
-        return plain in KNOWN or plain in GPS[0]
-    return plain in KNOWN - {"roll", "pitch", "yaw"} and name.rpartition(":")[2][:1].islower()
-
-
-def _is_time(name: str) -> bool:
-    return any(name in group for group in GPS) or REFERENCE in name
-
-
-def _why_left(name: str) -> str:
-    known = (why for key, why in LEFT.items() if name.startswith(key) or name.endswith(f" {key}"))
-    return next(known, UNUSED)
-
-
-def _fix(names: Names, values: dict[int, Array], say: Account) -> Found | None:
-    """Latitude and longitude of the instrument's GNSS, where it says that they are valid."""
-    for wanted in FIX:
-        at = [index_of(names, name) for name in wanted]
-        if -1 in at:
-            continue
-        lat, lon, sd = (values[k] for k in at[:3])
-        if wanted == FIX[0]:
-            flags = np.nan_to_num(values[at[3]]).clip(0.0, 2.0**31).astype(np.int64)
-            lat = np.where(flags & FIX_VALID, lat, np.nan)
-        say.used.update(at)
-        return Found(np.column_stack([lat, lon, sd]), ", ".join(wanted[:3]), Choice(wanted, "latitude", "deg"))
-    return None
-
-
-@dataclass(frozen=True)
-class Stamps:
-    """Times of rows, shape (n,), NaN = none [s]; the clock that they are of; and the usual step of the IMU's [s]."""
-
-    time: Array
-    clock: Clock
-    step: float
-
-
-def _stamps(path: Path, names: Names, columns: Columns, found: dict[str, Found | None], say: Account) -> Stamps:
-    inertial = [each.data for part in ("acc", "gyr", "rpy") if (each := found[part]) is not None]
-    if not inertial:
-        told = ", ".join(name for name, _ in names)[:200]
-        raise InputError(f"{path}: has no value of acceleration, rate or attitude; its columns are: {told}")
-    rows = np.asarray(np.isfinite(inertial[0]).all(axis=1))
-    made = _by_gps(names, columns.numbers, rows, say) or _by_reference(names, columns.numbers, say)
-    made = made or _by_computer(path, names, columns, say)
-    if made is None:
-        raise InputError(f"{path}: no column of time; export it with GPS time, reference time or Time")
-    time, clock = made
-    steps = np.diff(time[rows & np.isfinite(time)])
-    steps = steps[steps > 0.0]
-    return Stamps(time, clock, float(np.median(steps)) if len(steps) else np.nan)
-
-
-def _by_gps(names: Names, values: dict[int, Array], rows: np.ndarray, say: Account) -> tuple[Array, Clock] | None:
-    """Week and time of week; Unix time where the instrument says that its clock was set."""
-    for group in GPS:
-        at = [index_of(names, name) for name in group]
-        if -1 in at[1:] or not np.isfinite(values[at[2]]).any():
-            continue
-        say.used.update(k for k in at if k >= 0)
-        week, tow = values[at[1]], values[at[2]]
-        set_ = (week >= WEEKS[0]) & (week <= WEEKS[1])
-        if at[0] >= 0:
-            flags = np.nan_to_num(values[at[0]]).clip(0.0, 2.0**31).astype(np.int64)
-            set_ &= (flags & SET > 0) | ~rows  # rows of its GNSS have other flags
-        stamped = rows & np.isfinite(tow)
-        if set_[stamped].mean(dtype=float) > 0.5 if stamped.any() else bool(set_.any()):
-            say.left["rows", "from before the instrument's clock was set"] = int((stamped & ~set_).sum())
-            time = np.where(set_, unix_of_gps(np.where(set_, week, 0.0) * WEEK_S + np.nan_to_num(tow)), np.nan)
-            time = np.where(np.isfinite(tow), time, np.nan)
-            return time, Clock("the instrument's GPS time", 0.0, GPS_SD_S, "GPS week and time of week")
-        say.left["rows", "from after the instrument's clock was set"] = int((stamped & set_).sum())
-        say.notes.append("the instrument's clock was not set: its GPS time counts from its start")
-        return unwrapped_week(np.where(set_, np.nan, tow)), Clock("the instrument's time since its start")
-    return None
-
-
-def _by_reference(names: Names, values: dict[int, Array], say: Account) -> tuple[Array, Clock] | None:
-    for k, (name, _) in enumerate(names):
-        if REFERENCE in name and k in values and np.isfinite(values[k]).any():
-            say.used.add(k)
-            say.notes.append(f"{name} is taken in nanoseconds since the instrument's start")
-            return 1e-9 * values[k], Clock("the instrument's time since its start")
-    return None
-
-
-def _by_computer(path: Path, names: Names, columns: Columns, say: Account) -> tuple[Array, Clock] | None:
-    k = index_of(names, COMPUTER)
-    if k < 0 or not any(columns.texts[k]):
-        return None
-    say.used.add(k)
-    texts = pd.Series(columns.texts[k])
-    say.warnings.append("stamps are those of the computer, after the transport; record the instrument's own time")
-    numbers = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
-    if np.isfinite(numbers).any():
-        usual = float(np.nanmedian(numbers))
-        scale = 1e-9 if usual > NANOSECONDS else 1.0
-        if UNIX_S[0] < scale * usual < UNIX_S[1]:
-            return np.asarray(scale * numbers, dtype=float), Clock(
-                "the computer's time", 0.0, COMPUTER_SD_S, "its stamps look like Unix time"
-            )
-        return np.asarray(numbers, dtype=float), Clock("the computer's time")
-    for form in DATES:
-        dates = pd.to_datetime(texts, format=form, errors="coerce", utc=True)
-        if dates.notna().any():
-            unix = (dates - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
-            clock = Clock("the computer's time", 0.0, ZONE_SD_S, "its calendar, taken for UTC")
-            return np.asarray(unix, dtype=float), clock
-    example = next(text for text in columns.texts[k] if text)
-    raise InputError(
-        f"{path}: Time is {example[:40]!r}, expected 2024-05-31 12:00:00.5, 5/31/2024 12:00:00.5 or seconds"
+def _is_theirs(names: Sequence[str]) -> bool:
+    """Whether names are written as nobody else does: with a descriptor, or as MSCL does, ``scaledAccelX``."""
+    return any(
+        DESCRIPTOR.match(name) or (_plain(name)[0] in OWN and name.rpartition(":")[2][:1].islower()) for name in names
     )
+
+
+def _of_one_device(names: Sequence[str]) -> Callable[[str], tuple[str, str]]:
+    """Plain names of the first device that measures; those of others keep their prefix."""
+    devices = [name.rpartition(":")[0] for name in names if _plain(name)[0] in VECTORS]
+    first = devices[0] if devices else ""
+
+    def naming(name: str) -> tuple[str, str]:
+        device = name.rpartition(":")[0]
+        return _plain(name) if device in ("", first) else (name, "")
+
+    return naming
+
+
+def _fixes(table: Table, time: Array) -> list[Measured]:
+    """Positions of the instrument's GNSS, where it says that they are valid."""
+    for *names, flags in FIXES:
+        if table.holds(*names[:2]):
+            sd = table[names[2]] if names[2] in table else np.full(len(time), np.nan)
+            lat, lon = (table[name] for name in names[:2])
+            if flags in table:
+                lat = np.where(_flags(table[flags]) & VALID, lat, np.nan)
+            return [Measured("fix", "latitude, longitude", time, np.column_stack([lat, lon, sd]))]
+    return []
+
+
+def _flags(values: Array) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+    return np.nan_to_num(values).clip(0.0, 2.0**31).astype(np.int64)
+
+
+def _stamps(path: Path, table: Table, account: Account) -> tuple[Array, Clock]:
+    """Times of rows [s], NaN where there is none, and their clock."""
+    for week, tow, flags in GPS:
+        if table.holds(tow):
+            return _by_gps(table, week, tow, flags, account)
+    if table.holds(REFERENCE):
+        return 1e-9 * table[REFERENCE], Clock(SINCE_START)
+    if table.holds(COMPUTER):
+        account.warnings.append("stamps are those of the computer, after the transport; export the instrument's time")
+        time = table[COMPUTER]
+        if not UNIX_S[0] < float(np.nanmedian(time)) < UNIX_S[1]:
+            return time, Clock("the computer's time")
+        account.notes.append("the computer's calendar is taken for UTC")
+        return time, Clock("the computer's time", 0.0, ZONE_SD_S, "its calendar, taken for UTC")
+    raise InputError(f"{path}: no column of time; export it with GPS time, reference time or Time")
+
+
+def _by_gps(table: Table, week: str, tow: str, flags: str, account: Account) -> tuple[Array, Clock]:
+    """Unix time where the instrument's clock was set, else the time since its start, which wraps after a week."""
+    seconds = table[tow]
+    weeks = table[week] if week in table else np.zeros(len(seconds))
+    known = is_week(weeks) & np.isfinite(seconds)
+    inertial = np.isfinite(np.column_stack([table[name] for name in table.columns if name in VECTORS])).any(axis=1)
+    if flags in table:
+        known &= ~inertial | (_flags(table[flags]) & SET > 0)  # rows of its GNSS have other flags
+    stamped = inertial & np.isfinite(seconds)
+    if 2 * (known & stamped).sum() > stamped.sum():
+        account.left["rows", "from before the instrument's clock was set"] += int((stamped & ~known).sum())
+        time = np.where(known, unix_of_gps(np.where(known, weeks, 0.0), np.where(known, seconds, 0.0)), np.nan)
+        return time, Clock("the instrument's GPS time", 0.0, GPS_SD_S, "GPS week and time of week")
+    account.left["rows", "from after the instrument's clock was set"] += int((stamped & known).sum())
+    account.notes.append("the instrument's clock was not set: its GPS time counts from its start")
+    time = np.where(known, np.nan, seconds)
+    there = np.isfinite(time)
+    wraps = np.cumsum(np.diff(time[there], prepend=time[there][:1]) < -0.5 * WEEK_S)
+    time[there] += WEEK_S * wraps
+    return time, Clock(SINCE_START)
+
+
+def _computer_time(cell: str) -> float:
+    """Seconds, of Unix time where the cell is a date or a number of that size.
+
+    Raises
+    ------
+    ValueError : it is neither
+    """
+    try:
+        number = float(cell)
+    except ValueError:
+        return _date(cell)
+    return number * 1e-9 if number > 1e17 else number
+
+
+def _date(cell: str) -> float:
+    cell = re.sub(r"(\.\d{6})\d+", r"\1", cell)  # dates have six decimals
+    try:
+        found = datetime.fromisoformat(cell)
+    except ValueError:
+        for form in DATES:
+            try:
+                found = datetime.strptime(cell, form)
+                break
+            except ValueError:
+                continue
+        else:
+            raise
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()

@@ -1,35 +1,34 @@
-"""Columns of a large table of text: blocks of whole lines, read by pandas; lines that are no rows are counted."""
+"""Tables of text: a line that names the columns, and a row of numbers a line."""
 
-import csv
+from array import array
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 
-BLOCK = 1 << 24  # bytes that are read at once
-LOOKED_AT = 1000  # lines of a block without numbers, in which names of columns are looked for
-NO_NUMBER = ("nan(ind)", "-nan(ind)", "-nan")  # beside those that pandas knows
-CELLS, WORDS, NAMES = "more or fewer cells than the names", "a cell that is no number", "the names of columns again"
+LONGEST = 1 << 16  # bytes of a line
+FEW = 3  # names of columns that make a line one that names them
+EVERY = 4096  # rows between two calls of progress
+BAD_COUNT, NO_NUMBER, AGAIN = "more or fewer cells than the names", "a cell that is no number", "the names again"
+
+Naming = Callable[[str], tuple[str, str]]  # a name as written -> the column, and its unit or ""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How a table is written.
+    """Where the columns of a file are.
 
     Attributes
     ----------
-    names : of its columns; some programs name several alike
-    start : first byte behind the line of the names
-    separator, decimal : between cells, and in numbers
+    names : as written
+    start : first byte of the rows
+    separator : between cells
+    decimal : point or comma
     """
 
     names: tuple[str, ...]
@@ -38,129 +37,118 @@ class Layout:
     decimal: str = "."
 
 
-@dataclass
-class Columns:
-    """What a table holds.
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers.
 
     Attributes
     ----------
-    numbers : index of a column -> ndarray, shape (n,), NaN where a cell is empty
-    texts : index of a column -> its n cells
-    filled : cells of each column that hold something, shape (columns,)
-    left : why lines were left out -> how many
+    name : as written
+    unit : that the name states, "" = none
+    values : ndarray, shape (n,), NaN where a cell is empty
     """
 
-    numbers: dict[int, Array]
-    texts: dict[int, list[str]]
-    filled: NDArray[np.int64]
+    name: str
+    unit: str
+    values: Array
+
+
+@dataclass
+class Table:
+    """The columns that were asked for, by their plain names, and why rows were left out.
+
+    Attributes
+    ----------
+    columns : plain name -> column; the first of several that are called alike
+    left : why -> rows
+    """
+
+    columns: dict[str, Column]
     left: Counter[str] = field(default_factory=Counter)
 
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
 
-def cells_of(line: str, separator: str = ",") -> list[str]:
-    """Cells of a line, without quotation marks and blanks around them."""
-    return [cell.strip().strip('"').strip() for cell in line.strip("\r\n").split(separator)]
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name].values
+
+    def holds(self, *names: str) -> bool:
+        """Whether all these columns are there, each with a number."""
+        return all(name in self and bool(np.isfinite(self[name]).any()) for name in names)
 
 
-def read_columns(
-    path: Path, layout: Layout, numbers: Collection[int], texts: Collection[int], progress: Callable[[int, int], None]
-) -> Columns:
-    """Some columns of a table as numbers or texts.
+def cells_of(line: bytes, separator: str = ",") -> list[str]:
+    """Cells of a line, without blanks and quotes."""
+    text = line.decode("utf-8-sig", "replace").strip("\r\n")
+    return [cell.strip().strip('"').strip() for cell in text.split(separator)]
+
+
+def read_table(
+    path: Path,
+    layout: Layout,
+    naming: Naming,
+    wanted: Collection[str],
+    progress: Callable[[int, int], None],
+    parsers: Mapping[str, Callable[[str], float]] | None = None,
+) -> Table:
+    """The columns of a file that are wanted, by plain names.
+
+    Parameters
+    ----------
+    naming : of a name as written
+    progress : called with bytes read and those of the file
+    parsers : plain name -> what makes a number of a cell; ``float`` without
 
     Raises
     ------
-    InputError : the names of the columns change within the file
+    InputError : the columns are named anew within the file, and otherwise than before
     """
-    count = len(layout.names)
-    blocks: list[pd.DataFrame] = []
-    out = Columns({}, {}, np.zeros(count, dtype=np.int64))
-    size = path.stat().st_size
+    places: dict[str, tuple[int, str, str]] = {}  # plain name -> place in a row, name as written, unit
+    for k, written in enumerate(layout.names):
+        plain, unit = naming(written)
+        if plain in wanted:
+            places.setdefault(plain, (k, written, unit))
+    takes = [(k, (parsers or {}).get(plain, float), array("d")) for plain, (k, _, _) in places.items()]
+    left: Counter[str] = Counter()
+    size, count = path.stat().st_size, len(layout.names)
+    known = {naming(name)[0] for name in layout.names}
     with path.open("rb") as file:
         file.seek(layout.start)
-        for data in _blocks(file, out.left):
-            progress(min(file.tell(), size), size)
-            rows, others = _rows(data, count, layout.separator)
-            for line in others[:LOOKED_AT]:
-                _check_names(path, layout, cells_of(line.decode("latin-1"), layout.separator), out.left, CELLS)
-            out.left[CELLS] += max(len(others) - LOOKED_AT, 0)
-            if rows:
-                blocks.append(_numbers(path, layout, rows, numbers, texts, out))
-    frame = pd.concat(blocks, ignore_index=True) if blocks else pd.DataFrame(columns=[*numbers, *texts])
-    out.numbers = {k: frame[k].to_numpy(dtype=float) for k in numbers}
-    out.texts = {k: [cell.strip().strip('"') for cell in frame[k].fillna("").astype(str)] for k in texts}
-    out.left = +out.left
-    return out
+        number = 0
+        while line := file.readline(LONGEST):
+            number += 1
+            if number % EVERY == 0:
+                progress(min(file.tell(), size), size)
+            cells = cells_of(line, layout.separator)
+            if len(cells) == count + 1 and not cells[-1]:  # some programs end a row with a separator
+                del cells[-1]
+            why = BAD_COUNT if len(cells) != count else "" if _take(cells, takes, layout.decimal) else NO_NUMBER
+            if why and sum(naming(cell)[0] in known for cell in cells) >= min(FEW, len(known)):
+                if tuple(cells) != layout.names:
+                    raise InputError(
+                        f"{path}: row {number} names the columns anew, and otherwise than before "
+                        f"({', '.join(cells)[:80]}...); split the file there"
+                    )
+                why = AGAIN
+            if why and any(cells):
+                left[why] += 1
+    progress(size, size)
+    columns = {
+        plain: Column(written, unit, np.frombuffer(values).copy() if len(values) else np.empty(0))
+        for (plain, (_, written, unit)), (_, _, values) in zip(places.items(), takes, strict=True)
+    }
+    return Table(columns, left)
 
 
-def _blocks(file: BinaryIO, left: Counter[str]) -> Iterator[bytes]:
-    """Whole lines, each with its end, and without carriage returns and zeros, which a table has none of."""
-    rest = b""
-    while block := file.read(BLOCK):
-        rest += block
-        end = rest.rfind(b"\n") + 1
-        if end:
-            yield _plain(rest[:end])
-            rest = rest[end:]
-        elif len(rest) > BLOCK:
-            left["a line without end"] += 1
-            rest = b""
-    if rest.strip():
-        yield _plain(rest + b"\n")
-
-
-def _plain(data: bytes) -> bytes:
-    return data.replace(b"\r\n", b"\n").replace(b"\r", b"?").replace(b"\0", b"?")
-
-
-def _rows(data: bytes, count: int, separator: str) -> tuple[bytes, list[bytes]]:
-    """Lines with as many cells as there are names, or an empty one more; and the others that are not blank."""
-    raw = np.frombuffer(data, np.uint8)
-    ends = np.flatnonzero(raw == ord("\n"))
-    begins = np.concatenate([[0], ends[:-1] + 1])
-    cells = 1 + np.diff(np.searchsorted(np.flatnonzero(raw == ord(separator)), ends), prepend=0)
-    closed = (cells == count + 1) & (raw[ends - 1] == ord(separator))  # some programs end a line with a separator
-    good = (cells == count) | closed
-    if good.all():
-        return data, []
-    others = [data[begins[k] : ends[k]] for k in np.flatnonzero(~good)]
-    return raw[np.repeat(good, ends + 1 - begins)].tobytes(), [line for line in others if line.strip()]
-
-
-def _numbers(
-    path: Path, layout: Layout, rows: bytes, numbers: Collection[int], texts: Collection[int], out: Columns
-) -> pd.DataFrame:
-    count = len(layout.names)
-    frame = pd.read_csv(
-        BytesIO(rows), sep=layout.separator, decimal=layout.decimal, header=None, names=range(count + 1),
-        index_col=False, dtype=dict.fromkeys(texts, str), na_values=[*NO_NUMBER], skipinitialspace=True,
-        quoting=csv.QUOTE_NONE, lineterminator="\n", encoding="latin-1", low_memory=False, skip_blank_lines=False,
-    )  # fmt: skip
-    wrong = np.zeros(len(frame), dtype=bool)
-    made: dict[int, pd.Series] = {k: frame[k] for k in texts}
-    for k in numbers:
-        values = pd.to_numeric(frame[k], errors="coerce").astype(float)
-        wrong |= (values.isna() & frame[k].notna()).to_numpy()
-        made[k] = values.where(np.isfinite(values))
-    for k, row in enumerate(np.flatnonzero(wrong)):
-        if k < LOOKED_AT:
-            _check_names(
-                path, layout, [str(cell).strip() for cell in frame.iloc[int(row)].tolist()[:count]], out.left, WORDS
-            )
-        else:
-            out.left[WORDS] += 1
-    out.filled += frame.loc[~wrong, range(count)].notna().sum().to_numpy()
-    return pd.DataFrame(made)[~wrong]
-
-
-def _check_names(path: Path, layout: Layout, cells: Sequence[str], left: Counter[str], why: str) -> None:
-    """Count a line that is no row, unless it names other columns: then the file is two in one."""
-    plain = [cell.strip('"') for cell in cells]
-    while plain and plain[-1] in ("", "nan"):
-        del plain[-1]
-    shared = {name for name in layout.names if name} & set(plain)
-    if plain == list(layout.names)[: len(plain)] and shared:
-        left[NAMES] += 1
-    elif len(shared) >= 2:
-        odd = next((cell for cell in plain if cell not in layout.names), "fewer of them")
-        raise InputError(f"{path}: names its columns twice, and not alike (then with {odd[:40]!r}); split it there")
-    else:
-        left[why] += 1
+def _take(cells: list[str], takes: "list[tuple[int, Callable[[str], float], array[float]]]", decimal: str) -> bool:
+    """Append a row to its columns; False, and nothing appended, where a cell is no number."""
+    try:
+        row = [
+            parse(cells[k] if decimal == "." else cells[k].replace(decimal, ".")) if cells[k] else np.nan
+            for k, parse, _ in takes
+        ]
+    except (ValueError, OverflowError):
+        return False
+    for (_, _, values), value in zip(takes, row, strict=True):
+        values.append(value)
+    return True

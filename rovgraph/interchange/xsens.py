@@ -11,21 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix
+from rovgraph.geometry import Array
 from rovgraph.interchange.formats import Options
-from rovgraph.interchange.rates import too_slow
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.inertial import Account, Measured, recording_of_inertial
+from rovgraph.interchange.recording import Clock, Recording
 
 FINE_S, FINE_WRAP = 1e-4, 2**32
 COUNTER_WRAP = 2**16
-IMU = {f"{ours}_{a}": f"{theirs}_{a.upper()}" for ours, theirs in (("acc", "Acc"), ("gyr", "Gyr")) for a in "xyz"}
-MAG = {f"mag_{a}": f"Mag_{a.upper()}" for a in "xyz"}
+IMU = tuple(f"{name}_{axis}" for name in ("Acc", "Gyr") for axis in "XYZ")
+MAG = ("Mag_X", "Mag_Y", "Mag_Z")
 ANGLES = ("Roll", "Pitch", "Yaw")
-WORLDS = {  # to NED, of the coordinate systems that a header names
-    "ENU": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
-    "NWU": np.diag([1.0, -1.0, -1.0]),
-    "NED": np.eye(3),
-}
 SENSOR = "the IMU's time"
 LONGEST = 1 << 14
 
@@ -59,7 +54,7 @@ class Xsens:
         if not rows:
             raise InputError(f"{path}: holds no row of measurements; export it again with Acc, Gyr and SampleTimeFine")
         table = dict(zip(names, np.array(rows).T, strict=True))
-        return recording_of(path, self.name, table, "".join(header), left)
+        return recording_of(path, self.name, table, "".join(header), left, options)
 
 
 FORMAT = Xsens()
@@ -84,7 +79,9 @@ def _row(line: bytes, count: int, left: Counter[str]) -> list[float] | None:
         return None
 
 
-def recording_of(path: Path, format_: str, table: dict[str, Array], header: str, left: Counter[str]) -> Recording:
+def recording_of(
+    path: Path, format_: str, table: dict[str, Array], header: str, left: Counter[str], options: Options
+) -> Recording:
     """What the columns of a file become.
 
     Parameters
@@ -98,42 +95,23 @@ def recording_of(path: Path, format_: str, table: dict[str, Array], header: str,
     ------
     InputError : no acceleration, rate or time
     """
-    if not {*IMU.values()} <= table.keys():
+    if not {*IMU} <= table.keys():
         raise InputError(f"{path}: lacks acceleration or rate (Acc_X, Gyr_X, ...); it has: {', '.join(table)[:200]}")
     time, notes = _times(path, table, header)
-    keep = np.isfinite(time)
-    if not keep.all():
-        left["a row without a time"] += int((~keep).sum())
-    table, time = {name: values[keep] for name, values in table.items()}, time[keep]
-    frame, warnings = "the IMU's", []
-    imu = {ours: table[theirs] for ours, theirs in IMU.items()}
-    channels = [Channel("imu", {"time": time, **imu}, "Acc, Gyr", frame, SENSOR)]
-    if {*MAG.values()} <= table.keys():
-        field = {ours: table[theirs] for ours, theirs in MAG.items()}
-        channels.append(Channel("mag", {"time": time, **field}, "Mag", frame, SENSOR))
+    account = Account(notes, left=Counter({("rows", why): count for why, count in left.items()}))
+    found = [Measured("imu", "Acc, Gyr", time, np.column_stack([table[name] for name in IMU]))]
+    if {*MAG} <= table.keys():
+        found.append(Measured("mag", "Mag", time, np.column_stack([table[name] for name in MAG])))
     if {*ANGLES} <= table.keys():
         stated = re.search(r"coordinate system:.*?\b(ENU|NWU|NED)\b", header, re.IGNORECASE)
         world = stated[1].upper() if stated else "ENU"
         if not stated:
-            warnings.append("the header names no coordinate system: Roll, Pitch and Yaw are taken relative to ENU")
+            account.warnings.append(
+                "the header names no coordinate system: Roll, Pitch and Yaw are taken relative to ENU"
+            )
         angles = np.deg2rad(np.column_stack([table[name] for name in ANGLES]))
-        found = rpy_from_matrix(WORLDS[world] @ matrix_from_rpy(angles))
-        columns = {f"ahrs_{name.lower()}": found[:, k] for k, name in enumerate(ANGLES)}
-        channels.append(Channel("ahrs", {"time": time, **columns}, f"Roll, Pitch, Yaw, {world}", frame, SENSOR))
-    up = bool(np.nanmean(imu["acc_z"]) > 0.0)
-    axes = "x forward, y left, z up" if up else "x forward, y right, z down"
-    warnings.append(f"the IMU's axes are taken as {axes}, as gravity has it: check the mounting")
-    warnings += too_slow(time, "Acc, Gyr", "export at 50 Hz or more")
-    return Recording(
-        str(path),
-        format_,
-        tuple(channels),
-        {SENSOR: Clock(SENSOR)},
-        tuple(Left("rows", count, why) for why, count in sorted(left.items()) if count),
-        {"imu": {"mount_rpy_deg": [180.0 if up else 0.0, 0.0, 0.0]}},
-        tuple(notes),
-        tuple(warnings),
-    )
+        found.append(Measured("ahrs", f"Roll, Pitch, Yaw, {world}", time, angles, world=world))
+    return recording_of_inertial(path, format_, found, Clock(SENSOR), account, options)
 
 
 def _times(path: Path, table: dict[str, Array], header: str) -> tuple[Array, list[str]]:

@@ -94,9 +94,8 @@ class Mtb:
             raise InputError(f"{path}: holds no acceleration with a rate of turn; record it with both")
         if len(worlds) > 1:
             raise InputError(f"{path}: gives attitude relative to {', '.join(sorted(worlds))}; split it there")
-        recording = recording_of(
-            path, self.name, table, f"Coordinate system: {worlds.pop() if worlds else 'ENU'}", left
-        )
+        header = f"Coordinate system: {worlds.pop() if worlds else 'ENU'}"
+        recording = recording_of(path, self.name, table, header, left, options)
         return replace(recording, clocks={SENSOR: _clock(values, table)})
 
 
