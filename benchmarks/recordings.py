@@ -14,7 +14,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -81,7 +81,7 @@ def telemetry(path: Path, size: int) -> None:
 
 
 def bag(form: str, images: bool = True) -> Callable[[Path, int], None]:
-    """A bag that is mostly images, or one without any."""
+    """A bag that is mostly images, or one without any: the same messages again and again with their own stamps."""
 
     def made(path: Path, size: int) -> None:
         import bags
@@ -89,24 +89,22 @@ def bag(form: str, images: bool = True) -> Callable[[Path, int], None]:
 
         image = {"height": 240, "width": 320, "encoding": "mono8", "is_bigendian": 0, "step": 320}
         image |= {"data": np.zeros(240 * 320, np.uint8)}
-
-        def messages() -> Iterator[bags.Sent]:
+        often = [bags.imu(0.0, (0.1, 0.2, -9.8), (0.01, 0.02, 0.03))]
+        seldom = [bags.marine_dvl(0.0, (0.5, 0.0, 0.0)), bags.pressure(0.0, 120_000.0)]
+        seldom += [bags.Sent(0.0, "/camera", "sensor_msgs/msg/Image", image)] * images
+        maker = bags.Maker(form)
+        contents = {each.topic: bytearray(maker.message(each)) for each in often + seldom}
+        with bags.opened(path, form) as writer:
+            lines = {e.topic: writer.add_connection(e.topic, e.type, typestore=maker.store) for e in often + seldom}
             written = 0
             for k in itertools.count():
-                at = k / RATE
-                yield bags.imu(at, (0.1, 0.2, -9.8), (0.01, 0.02, 0.03))
-                written += 370
-                if k % 40 == 0:
-                    yield bags.marine_dvl(at, (0.5, 0.0, 0.0))
-                    yield bags.pressure(at, 120_000.0)
-                    written += 700
-                    if images:
-                        yield bags.Sent(at, "/camera", "sensor_msgs/msg/Image", image)
-                        written += 77_000
+                stamp = round(1e9 * (bags.START + k / RATE))
+                for each in often if k % 40 else often + seldom:
+                    struct.pack_into("<II", contents[each.topic], 4, *divmod(stamp, 10**9))  # of the header
+                    writer.write(lines[each.topic], stamp + 4_000_000, bytes(contents[each.topic]))
+                    written += len(contents[each.topic]) + 40
                 if written > size:
                     return
-
-        bags.write(path, form, messages())
 
     return made
 

@@ -142,6 +142,14 @@ class Maker:
         return self.store.types[kind](**made)
 
 
+def opened(path: Path, form: str) -> Any:
+    """A writer of a bag, for a ``with``."""
+    if form == "ros1":
+        return Writer1(path)
+    plugin = StoragePlugin.MCAP if form == "mcap" else StoragePlugin.SQLITE3
+    return Writer2(path, version=9, storage_plugin=plugin)
+
+
 def write(path: Path, form: str, sent: Iterable[Sent], definitions: bool = True) -> Path:
     """A bag, a file for ROS 1 and a folder otherwise.
 
@@ -150,10 +158,7 @@ def write(path: Path, form: str, sent: Iterable[Sent], definitions: bool = True)
     definitions : whether the bag holds those of its types, as it does since ROS 2 Iron
     """
     maker = Maker(form)
-    bag = Writer1(path) if form == "ros1" else Writer2(
-        path, version=9, storage_plugin=StoragePlugin.MCAP if form == "mcap" else StoragePlugin.SQLITE3
-    )  # fmt: skip
-    with bag:
+    with opened(path, form) as bag:
         lines: dict[str, Any] = {}
         for each in sent:
             if each.topic not in lines:

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import check_dive_comes_back, check_refused_or_whole, close, first, read
-from rovgraph.gps_time import unix_of_gps
 
 import rovgraph as rg
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
+from rovgraph.gps_time import unix_of_gps
 from rovgraph.interchange.formats import recognise
 
 G = 9.80665
