@@ -30,12 +30,12 @@ def write_csv(
         frame.to_csv(path, mode="a" if append else "w", header=not append, index=False, float_format=f"%.{digits}g")
         return
     row = ",".join(str(own) for own in formats) + "\n"
-    columns = [_cells(frame[name], digits) for name in frame]
+    columns = [(frame[name], bool(frame[name].isna().any())) for name in frame]
     with path.open("a" if append else "w", encoding="utf-8", newline="") as file:
         if not append:
             file.write(",".join(str(name) for name in frame) + "\n")
         for begin in range(0, len(frame), ROWS):
-            parts = [column[begin : begin + ROWS] for column in columns]
+            parts = [_cells(column.iloc[begin : begin + ROWS], holey, digits) for column, holey in columns]
             cells: list[object] = [None] * (len(parts) * len(parts[0]))
             for k, part in enumerate(parts):
                 cells[k :: len(parts)] = part
@@ -52,8 +52,9 @@ def _format(column: "pd.Series[Any]", digits: int) -> str | None:
     return "%s" if all(isinstance(text, str) and _QUOTED.isdisjoint(text) for text in texts) else None
 
 
-def _cells(column: "pd.Series[Any]", digits: int) -> list[object]:
+def _cells(column: "pd.Series[Any]", holey: bool, digits: int) -> list[object]:
+    """Some rows of a column; ``holey`` = somewhere in it a value is not known."""
     values: list[object] = column.tolist()
-    if column.dtype.kind == "f" and column.isna().any():
+    if column.dtype.kind == "f" and holey:
         return ["" if value != value else f"%.{digits}g" % value for value in values]
     return values

@@ -10,6 +10,7 @@ import pandas as pd
 
 from rovgraph.config.completion import leaves
 from rovgraph.errors import InputError
+from rovgraph.geometry import Array
 from rovgraph.interchange.clocks import JoinedClock, join_clocks
 from rovgraph.interchange.motion import Motion
 from rovgraph.interchange.motion import motion_of as motion_of_log
@@ -84,20 +85,36 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
     selected, unused = select(recordings, choose)
     clocks, beside, unix, told = join_clocks(recordings, selected, shift, _motion)
     by_name = {(clock.file, clock.name): clock for clock in clocks}
-    frames = []
-    for each in selected:
-        clock = by_name[each.file, each.channel.clock]
-        columns = {name: np.asarray(values) for name, values in each.channel.columns.items()}
-        time = clock(columns["time"]) + beside.get(each.channel.sensor, 0.0)
-        columns["time"] = np.round(time, STAMP_DIGITS)  # equal stamps stay equal, and a written log is read the same
-        frames.append(pd.DataFrame(columns))
-    frame = pd.concat(frames, ignore_index=True).sort_values("time", kind="stable", ignore_index=True)
-    others = {str(name) for name in frame} - set(all_columns())
-    order = [name for name in all_columns() if name in frame] + sorted(others, key=_natural)
+    times = [
+        clock(np.asarray(each.channel.columns["time"])) + beside.get(each.channel.sensor, 0.0)
+        for each in selected
+        for clock in [by_name[each.file, each.channel.clock]]
+    ]
+    frame = _frame([each.channel for each in selected], times)
+    settings = _settings(recordings, selected, clocks)
+    return Merged(frame, recordings, selected, unused, clocks, unix, settings, (*said, *told))
+
+
+def _frame(channels: Sequence[Channel], times: Sequence[Array]) -> pd.DataFrame:
+    """Rows of all channels in the order of their times [s], each column made once, as large logs need."""
+    time = np.round(np.concatenate(times), STAMP_DIGITS)  # equal stamps stay equal; a written log is read the same
+    order = np.argsort(time, kind="stable")
+    place = np.empty(len(time), dtype=np.int64)  # of a channel's rows among all
+    place[order] = np.arange(len(time))
+    columns: dict[str, Array] = {"time": np.asarray(time[order], dtype=float)}
+    first = 0
+    for channel, own in zip(channels, times, strict=True):
+        rows = place[first : first + len(own)]
+        first += len(own)
+        for name, values in channel.columns.items():
+            if name != "time":
+                columns.setdefault(name, np.full(len(time), np.nan))[rows] = values
+    known = [name for name in all_columns() if name in columns]
+    names = known + sorted(columns.keys() - set(known), key=_natural)
+    frame = pd.DataFrame({name: columns.pop(name) for name in names}, copy=False)
     if LABEL in frame:
         frame[LABEL] = frame[LABEL].astype("Int64")
-    settings = _settings(recordings, selected, clocks)
-    return Merged(frame[order], recordings, selected, unused, clocks, unix, settings, (*said, *told))
+    return frame
 
 
 def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
