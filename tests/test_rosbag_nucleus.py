@@ -51,7 +51,7 @@ def channel(recording: Recording, sensor: str) -> Channel:
     return next(each for each in recording.channels if each.sensor == sensor)
 
 
-@pytest.mark.parametrize(("form", "definitions"), [("sqlite", True), ("sqlite", False), ("mcap", True)])
+@pytest.mark.parametrize(("form", "definitions"), [("sqlite", True), ("sqlite", False), ("mcap", True), ("ros1", True)])
 def test_its_packets_become_all_its_sensors(form, definitions, tmp_path):
     recording = read(tmp_path, packets(), form, definitions)
     imu, dvl, ahrs = (columns(recording, sensor) for sensor in ("imu", "dvl", "ahrs"))
