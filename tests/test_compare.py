@@ -424,13 +424,16 @@ def test_an_interrupt_ends_all_workers_and_leaves_nothing(tmp_path):
         [*command, "--jobs", "2", "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True
     )
     children: set[int] = set()
-    deadline = time.monotonic() + 30.0
-    while len(children) < 3 and time.monotonic() < deadline:  # two workers and what keeps count of them
-        time.sleep(0.05)
-        children = {int(p) for p in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()}
-    assert len(children) >= 3
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    deadline = time.monotonic() + 120.0
+    try:
+        while len(children) < 3 and time.monotonic() < deadline:  # two workers and what keeps count of them
+            time.sleep(0.05)
+            children = {int(p) for p in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()}
+        assert len(children) >= 3
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()  # of a run that has ended, nothing
     assert process.returncode == 130
     assert "Traceback" not in errors
     assert [p.name for p in tmp_path.iterdir()] == ["run.py"]
