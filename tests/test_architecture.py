@@ -17,7 +17,7 @@ PACKAGE = ROOT / "rovgraph"
 LAYERS = (
     {"errors", "process"},
     {"geometry", "workers", "fast_csv"},
-    {"gauss_markov", "units"},
+    {"gauss_markov", "units", "gps_time"},
     {"kernels"},
     {"state", "calibration", "thesis"},
     {"vehicle"},
