@@ -118,7 +118,7 @@ precise = smooth(units + "dvl: {mount_rpy_deg: [180, 0, -45], velocity_sd_mps: [
 for assumption in precise.assumptions:
     if "noise" in assumption:
         print(assumption)
-print("believed in the end:", precise.config.dvl.velocity_sd_mps)
+print("used in the end:", precise.config.dvl.velocity_sd_mps)
 
 # %% [markdown]
 # With the right noise the normalised residuals have a mean square near 1, sensor by sensor:

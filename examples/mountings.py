@@ -1,7 +1,7 @@
 """Compare two mountings: is the DVL turned to port or to starboard?
 
 Nobody wrote it down. Give the estimate a chance to correct each of them: whenever the vehicle speeds up or turns, the
-IMU tells where forward is. The right mounting stays where it was stated; the wrong one moves by many sd, and the
+IMU shows where forward is. The estimate stays at the right mounting and moves many sd away from the wrong one, and the
 verdict says so. Writes mountings.png.
 """
 

@@ -34,7 +34,7 @@ class BeaconRange:
         return distance, {POSE: by_pose[:, None]}
 
 
-def believed(config: rg.Config, origin_b: Array) -> Instrument:
+def instrument(config: rg.Config, origin_b: Array) -> Instrument:
     own = extend.settings(config, "beacon")
     return extend.instrument(own, BeaconRange(), own.sd, ("range",))
 
@@ -43,7 +43,7 @@ extend.register(
     extend.Sensor(
         name="beacon",
         columns=(extend.Column("beacon", "length"),),
-        instrument=believed,
+        instrument=instrument,
         observes=extend.Observed("position", (0, 1)),
         may_begin_later=True,
         simulated_hz=1.0,

@@ -1,7 +1,7 @@
 """Simulate, plan and observe: which manoeuvre shows how the DVL is turned, and did the dive show it?
 
 Writes simulate_plan_observe.png. The work stands in a function because rg.plan starts processes, which import this
-file anew.
+file again.
 """
 
 import math

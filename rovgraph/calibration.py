@@ -290,7 +290,7 @@ TABLE: dict[str, Variable] = {
             0.2,
             ("depth",),
             "offset of the depth sensor",
-            "a start at a known depth (start.down_m), and vertical velocity that is believed to keep it",
+            "a start at a known depth (start.down_m), and a precise vertical velocity afterwards",
             considered=True,
         ),
         Variable(
@@ -362,7 +362,7 @@ TABLE: dict[str, Variable] = {
             1.0,
             ("fix",),
             "error of the fixes that lasts (multipath, a ship's heading, satellites)",
-            "motion that the IMU and the DVL know better over its time constant",
+            "motion that the IMU and the DVL measure better over its time constant",
             time_constant=60.0,
         ),
         _compass_error("ahrs", "2", "ahrs", "the IMU's own heading"),

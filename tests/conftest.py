@@ -1,6 +1,7 @@
 """What holds for all tests."""
 
 import importlib
+import os
 import signal
 
 import pytest
@@ -11,6 +12,8 @@ SAME = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], der
 settings.register_profile("any machine", SAME)
 settings.register_profile("other examples", SAME, derandomize=False, database=None)  # --hypothesis-profile
 settings.load_profile("any machine")
+
+os.environ.pop("COLUMNS", None)  # or commands would fold their sentences
 
 # whoever starts the tests in the background has them ignore SIGINT, and so would every command that they interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)

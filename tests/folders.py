@@ -3,8 +3,6 @@
 import json
 from pathlib import Path
 
-import pandas as pd
-
 
 def same_files(one: Path, other: Path) -> None:
     """Two folders hold the same bytes, but for the times that the work took."""
@@ -15,15 +13,6 @@ def same_files(one: Path, other: Path) -> None:
             assert _without_times(one / name) == _without_times(other / name)
         else:
             assert (one / name).read_bytes() == (other / name).read_bytes(), name
-
-
-def same_tables(one: Path, other: Path, *timed: str) -> None:
-    """Two folders hold the same CSV files, but for the columns of times that the work took."""
-    names = sorted(path.name for path in one.glob("*.csv"))
-    assert names == sorted(path.name for path in other.glob("*.csv")) and names
-    for name in names:
-        tables = [pd.read_csv(folder / name) for folder in (one, other)]
-        pd.testing.assert_frame_equal(*(table.drop(columns=[*timed], errors="ignore") for table in tables))
 
 
 def _without_times(summary: Path) -> dict[str, object]:

@@ -7,17 +7,20 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
 import warnings
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from folders import same_files, same_tables
+from folders import same_files
+from typer.main import get_command
 
 import rovgraph as rg
 from rovgraph.api.demo import CHOICES, SCENARIO, SEED
-from rovgraph.cli.app import main
+from rovgraph.cli.app import app, main
 from rovgraph.studies.plan import Sensors
 
 SHIPPED = Path(__file__).parents[1] / "data" / "falcon"
@@ -113,6 +116,39 @@ def test_the_example_of_the_manual_runs(monkeypatch, tmp_path):
 
 # twins
 
+TWINS = {  # command -> the test that compares it with its function, in this file unless one is named
+    "demo": "test_demo_writes_what_the_command_writes",
+    "smooth": "test_smooth_writes_what_the_command_writes",
+    "online": "test_a_run_of_sources_gives_sends_and_keeps_what_the_command_does",
+    "convert": "test_convert_writes_what_the_command_writes",
+    "export": "test_export.test_commands_write_what_the_library_does",
+    "tag": "test_export.test_commands_write_what_the_library_does",
+    "report": "test_report_and_check_write_the_pages_that_the_commands_write",
+    "evaluate": "test_evaluate_measures_what_the_command_measures",
+    "compare": "test_compare_writes_what_the_command_writes",
+    "observe": "test_observe_writes_what_the_command_writes",
+    "plan": "test_plan_writes_what_the_command_writes",
+    "check": "test_check_finds_what_the_command_finds",
+    "config": "test_config_prints_the_effective_configuration",
+    "simulate": "test_simulate_writes_what_the_command_writes",
+    "calibrate magnetometer": "test_calibrate_magnetometer.test_the_library_writes_what_the_command_writes_"
+    "and_wants_samples_as_measured",
+    "calibrate noise": "test_calibrate_noise.test_the_library_writes_what_the_command_writes",
+    "study misalignment": "test_study.test_the_library_writes_what_the_command_writes",
+}
+
+
+def test_every_command_is_compared_with_its_function():
+    def leaves(command: object, words: tuple[str, ...] = ()) -> set[str]:
+        inner = getattr(command, "commands", {})
+        return {" ".join(words)} if not inner else {x for n, c in inner.items() for x in leaves(c, (*words, n))}
+
+    assert leaves(get_command(app)) == set(TWINS)
+    for place in TWINS.values():
+        file, _, name = place.rpartition(".")
+        text = (Path(__file__).parent / f"{file or Path(__file__).stem}.py").read_text(encoding="utf-8")
+        assert f"\ndef {name}(" in text, place
+
 
 def test_smooth_writes_what_the_command_writes(monkeypatch, capsys, tmp_path, faulty, result):
     assert command(monkeypatch, "smooth", faulty, "-c", SHIPPED / "config.yaml", "-o", tmp_path / "command") == 0
@@ -155,9 +191,9 @@ def test_evaluate_measures_what_the_command_measures(monkeypatch, capsys, tmp_pa
     result.save(tmp_path / "dive", figures=False)
     track = tmp_path / "dive" / "trajectory_smoothed.csv"
     reference = SHIPPED / "truth.csv.gz"
-    assert command(monkeypatch, "evaluate", track, reference, "--from", 10, "--align", "--json") == 0
+    assert command(monkeypatch, "evaluate", track, reference, "--from", 10, "--to", 50, "--align", "--json") == 0
     said = json.loads(capsys.readouterr().out)
-    twin = rg.evaluate(rg.read_trajectory(track), rg.read_reference(reference), 10.0, True)
+    twin = rg.evaluate(rg.read_trajectory(track), rg.read_reference(reference), 10.0, True, 50.0)
     assert json.loads(json.dumps(twin.as_dict())) == said
     assert rg.evaluate(result.smoothed.trajectory, rg.read_reference(reference)).rms_m < 0.5
 
@@ -179,7 +215,11 @@ def test_demo_writes_what_the_command_writes(monkeypatch, capsys, tmp_path):
     assert command(monkeypatch, "demo") == 0
     said = capsys.readouterr().out
     assert "verdict: trusted" in said and f"{Path('demo/results/report.html')}: " in said
-    done = rg.demo("demo", force=True)  # in the same place, which the summary names
+    Path("demo").rename("command")
+    done = rg.demo("demo")  # in the same place, which the summary names
+    same_files(Path("command/results"), Path("demo/results"))
+    for name in ("log.csv", "truth.csv", "truth.json", "config.yaml", "summary.json"):
+        assert Path("command", name).read_bytes() == Path("demo", name).read_bytes(), name
     assert f"{done.metrics.rms_m:.3f} m" in said and done.metrics.rms_m < 0.1
     assert done.result.verdict == "trusted" and (done.results / "report.html").is_file()
     assert command(monkeypatch, "demo") == 2
@@ -200,7 +240,7 @@ def test_observe_writes_what_the_command_writes(monkeypatch, tmp_path, short, co
     assert command(monkeypatch, "observe", log, *options) == 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rg.DataWarning)
-        seen = rg.observe(rg.read_log(log, config), config, ["dvl_scale"])
+        seen = rg.observe(rg.read_log(log, config), config, "dvl_scale")
     seen.save(tmp_path / "twin")
     same_files(tmp_path / "command", tmp_path / "twin")
     assert "dvl_scale" in seen.verdicts
@@ -275,15 +315,19 @@ def test_a_run_that_cannot_be_is_refused_and_leaves_no_output_open(tmp_path):
         rg.Online().run("tcp://127.0.0.1:5", resume=True)
 
 
-@pytest.mark.slow
-def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path):
-    options = ["--scenario", "circle", "--duration", 40, "--seeds", 1, "--estimators", "dead-reckoning", "--jobs", 1]
+def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path, short, config):
+    short[short["time"] < short["time"].iloc[0] + 20.0].to_csv(tmp_path / "log.csv", index=False)
+    for name in ("process_time", "thread_time", "perf_counter"):  # the same work takes the same time
+        monkeypatch.setattr(time, name, count(0.0, 0.5).__next__)
+    files = [tmp_path / "log.csv", "-c", SHIPPED / "config.yaml", "--reference", SHIPPED / "truth.csv.gz"]
+    options = [*files, "--estimators", "dead-reckoning,ekf-a", "--jobs", 1]
     assert command(monkeypatch, "compare", *options, "-o", tmp_path / "command") == 0
-    twin = rg.compare(scenario="circle", seeds=[1], duration=40.0, estimators=["dead-reckoning"], jobs=1)
+    log = rg.read_log(tmp_path / "log.csv", config)
+    twin = rg.compare(log, config, SHIPPED / "truth.csv.gz", estimators="dead-reckoning,ekf-a", jobs=1)
     twin.save(tmp_path / "twin")
-    same_tables(tmp_path / "command", tmp_path / "twin", "cpu_per_s")
-    names = {path.name for path in (tmp_path / "command").iterdir()}
-    assert names == {path.name for path in (tmp_path / "twin").iterdir()}
+    same_files(tmp_path / "command", tmp_path / "twin")
+    with pytest.raises(rg.InputError, match="a reference goes with a log"):
+        rg.compare(reference=SHIPPED / "truth.csv.gz", scenario="circle")
 
 
 def test_plan_writes_what_the_command_writes(monkeypatch, tmp_path):
@@ -538,6 +582,16 @@ def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
         rg.Choices(duration=1e5)
     with pytest.raises(rg.InputError, match="compare wants either a log"):
         rg.compare()
+    with pytest.raises(rg.InputError, match="seeds: expected a list or range of at least one, found 3"):
+        rg.compare(scenario="circle", seeds=3)
+    with pytest.raises(rg.InputError, match="choices: expected Choices"):
+        rg.simulate("circle", choices={"duration": 60})
+    with pytest.raises(rg.InputError, match=r"table 2 is a Config, .* config="):
+        rg.Log.from_arrays({"time": T, "depth": T}, rg.Config())
+    with pytest.raises(rg.InputError, match="goal dvl_yaw: 'wide', expected an sd"):
+        rg.plan(goals={"dvl_yaw": "wide"}, estimate="dvl_yaw")
+    with pytest.raises(rg.InputError, match="unknown calibration variable 'dvl_yav', did you mean dvl_yaw"):
+        rg.observe(log, estimate="dvl_yav,dvl_scale")
 
 
 def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
@@ -547,6 +601,7 @@ def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
         lambda: rg.simulate("circle", "vehicle.yaml"),
         lambda: rg.simulate("vattern", {}),
         lambda: rg.plan("vehicle.yaml"),
+        lambda: rg.Online("vehicle.yaml"),
     ):
         with pytest.raises(
             rg.InputError, match=r"config: expected a Config, as load_config gives it, found a (str|di)"
@@ -554,6 +609,10 @@ def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
             use()
     with pytest.raises(rg.InputError, match="configuration: expected YAML text, found a dict"):
         rg.parse_config({"imu": {}})
+    with pytest.raises(rg.InputError, match="choose: expected a mapping"):
+        rg.convert(SHIPPED / "log.csv.gz", choose="dvl=dvl.csv")
+    with pytest.raises(rg.InputError, match="shift dvl: expected seconds"):
+        rg.convert(SHIPPED / "log.csv.gz", shift={"dvl": "late"})
     with pytest.raises(rg.InputError, match=r"is a DataFrame, .* use Log\.from_frame"):
         rg.read_log(short)
     with pytest.raises(rg.InputError, match="trajectory: expected a Trajectory, as read_trajectory gives it"):

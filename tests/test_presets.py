@@ -95,9 +95,9 @@ def test_a_wrong_preset_is_one_clear_line(text: str, said: str) -> None:
         ("imu: {noise: {gyr: 3.5e-6}}", "imu.gyr_bias_sd_dps = 0.6 is that of a much coarser instrument"),
         ("imu: {preset: kvh-1750}", "imu.gyr_bias_sd_dps = 0.6 is that of a much coarser instrument"),
         ("imu: {noise: {gyr: 3.5e-6}, gyr_bias_sd_dps: 0.0006}", None),
-        ("imu: {gyr_bias_sd_dps: 0.0005}", "imu.gyr_bias_sd_dps = 0.0005 claims more"),
+        ("imu: {gyr_bias_sd_dps: 0.0005}", "imu.gyr_bias_sd_dps = 0.0005 is that of a much finer"),
         ("imu: {noise: {acc: 3.0e-5}}", "imu.acc_bias_sd_mps2 = 0.05 is that of"),
-        ("imu: {acc_bias_sd_mps2: 1.0e-5}", "imu.acc_bias_sd_mps2 = 1e-05 claims more"),
+        ("imu: {acc_bias_sd_mps2: 1.0e-5}", "imu.acc_bias_sd_mps2 = 1e-05 is that of a much finer"),
         ("{}", None),
     ],
 )

@@ -12,9 +12,11 @@ from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import Progress, no_progress
+from rovgraph.evaluate import read_reference
 from rovgraph.log import Log
 from rovgraph.simulate.named import require_known
 from rovgraph.studies import compare as library
+from rovgraph.studies.choices import listed
 from rovgraph.studies.compare import Comparison
 from rovgraph.studies.estimators import select
 from rovgraph.studies.runs import Case, Recorded, Run, Simulated
@@ -67,11 +69,11 @@ class ComparisonResult:
 def compare(
     log: Log | None = None,
     config: Config | None = None,
-    reference: Trajectory | None = None,
+    reference: Trajectory | Path | str | None = None,
     scenario: str | None = None,
     seeds: Sequence[int] = SEEDS,
     duration: float | None = None,
-    estimators: Sequence[str] | None = None,
+    estimators: str | Sequence[str] | None = None,
     jobs: int | None = None,
     progress: Progress = no_progress,
 ) -> ComparisonResult:
@@ -81,11 +83,11 @@ def compare(
     ----------
     log : as read with the configuration
     config : of vehicle and sensors; None = all defaults, or the scenario's
-    reference : the track that the log's estimates are compared with
+    reference : the track that the log's estimates are compared with, or its file
     scenario : simulate dives of this one instead of a log
     seeds : of the simulated dives
     duration : of a simulated dive [s]; None = the scenario's
-    estimators : names or patterns, such as "graph-*"; None = all that need no thrusters
+    estimators : names or patterns, such as "graph-*", a list or separated by commas; None = all that need no thrusters
     jobs : processes; None = one per core
     progress : called at times with the current task and its progress from 0 to 1
 
@@ -97,7 +99,8 @@ def compare(
     -----
     DataWarning : findings of the check
     """
-    select(estimators)
+    names = None if estimators is None else listed(estimators)
+    select(names)
     require_one(log, reference, scenario, seeds, duration)
     runs: list[Run]
     about: dict[str, Any]
@@ -109,10 +112,13 @@ def compare(
     else:
         assert log is not None
         assert reference is not None
-        config, title = given(log, config), Path(log.source).name
-        runs, about = [Recorded(title, Case(prepared(log, config), config, reference))], {"log": log.source}
+        config, title, about = given(log, config), Path(log.source).name, {"log": log.source}
+        if isinstance(reference, Path | str):
+            about["reference"] = str(reference)
+            reference = read_reference(reference)
+        runs = [Recorded(title, Case(prepared(log, config), config, reference))]
     began = time.perf_counter()
-    comparison = library.compare(runs, estimators, jobs, lambda done: progress("comparing", done))
+    comparison = library.compare(runs, names, jobs, lambda done: progress("comparing", done))
     about["seconds"] = time.perf_counter() - began
     return ComparisonResult(comparison, title, scenario == THESIS, about)
 
@@ -131,8 +137,8 @@ def require_one(
     if scenario is not None:
         if reference is not None:
             raise InputError("a reference goes with a log; a simulated dive has its own")
-        if not len(seeds):
-            raise InputError("seeds: at least 1 is expected")
+        if not (isinstance(seeds, Sequence) and len(seeds)):
+            raise InputError(f"seeds: expected a list or range of at least one, found {seeds!r}")
         return
     if duration is not None:
         raise InputError("a duration goes with a scenario; a log has its own")

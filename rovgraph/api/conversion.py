@@ -3,10 +3,11 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from rovgraph.config import Config, completed
+from rovgraph.config import Config, completed, config_or_defaults
 from rovgraph.errors import InputError, collected_warnings, warn
 from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.interchange.account import account, notes
@@ -120,7 +121,13 @@ def convert(
     -----
     DataWarning : what was ignored, sorted, or looks wrong
     """
-    config = Config() if config is None else config
+    config = config_or_defaults(config)
+    for name, stated in (("choose", choose), ("shift", shift)):
+        if not isinstance(stated, Mapping):
+            raise InputError(f"{name}: expected a mapping of sensors or files, found {stated!r}")
+    for name, seconds in shift.items():
+        if not isinstance(seconds, Real):
+            raise InputError(f"shift {name}: expected seconds, a number, found {seconds!r}")
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not files:
         raise InputError("no file was given; expected native files or logs of one dive")

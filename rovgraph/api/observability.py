@@ -11,7 +11,8 @@ from rovgraph.errors import collected_warnings
 from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.log import Log
 from rovgraph.studies import observability as library
-from rovgraph.studies.choices import read_known
+from rovgraph.studies.choices import goals as read_goals
+from rovgraph.studies.choices import listed, read_known
 from rovgraph.studies.manoeuvres import manoeuvres as chosen
 from rovgraph.studies.observability import Observability, estimating
 from rovgraph.studies.plan import Known, Plan, Sensors
@@ -95,7 +96,7 @@ class PlanResult:
 
 
 def observe(
-    log: Log, config: Config | None = None, estimate: Sequence[str] = (), progress: Progress = no_progress
+    log: Log, config: Config | None = None, estimate: str | Sequence[str] = (), progress: Progress = no_progress
 ) -> ObservabilityResult:
     """Determine how well a dive shows each calibration variable, when it did, and what is missing.
 
@@ -103,7 +104,7 @@ def observe(
     ----------
     log : as read with the configuration
     config : of vehicle and sensors; None = all defaults
-    estimate : calibration variables to estimate beside those of the configuration
+    estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
     progress : called at times with the current task and its progress from 0 to 1
 
     Raises
@@ -114,6 +115,7 @@ def observe(
     -----
     DataWarning : findings of the check
     """
+    estimate = listed(estimate)
     config = estimating(given(log, config), estimate)
     with collected_warnings() as texts:
         log = prepared(log, config)
@@ -124,11 +126,11 @@ def observe(
 
 def plan(
     config: Config | None = None,
-    goals: Mapping[str, float] | None = None,
+    goals: Mapping[str, float] | Sequence[str] | None = None,
     known: ObservabilityResult | Path | str | None = None,
     duration: float = DURATION_S,
-    manoeuvres: Sequence[str] | None = None,
-    estimate: Sequence[str] = (),
+    manoeuvres: str | Sequence[str] | None = None,
+    estimate: str | Sequence[str] = (),
     sensors: Sensors = USUAL,
     progress: Progress = no_progress,
 ) -> PlanResult:
@@ -137,11 +139,11 @@ def plan(
     Parameters
     ----------
     config : of vehicle and sensors; None = all defaults
-    goals : label of a component -> wanted sd, radians and SI
+    goals : label of a component -> wanted sd, radians and SI; or texts such as "dvl_yaw=1deg"
     known : result of an earlier dive, or its ``observability.json``; None = none
     duration : of each manoeuvre [s]
     manoeuvres : scenarios, such as "circle" or "circle@0.3" (m/s); None = all
-    estimate : calibration variables to estimate beside those of the configuration
+    estimate : calibration variables to estimate beside those of the configuration, a list or "dvl_yaw,dvl_scale"
     sensors : their rates
     progress : called at times with the current task and its progress from 0 to 1
 
@@ -149,14 +151,15 @@ def plan(
     ------
     InputError : an unknown manoeuvre or variable, nothing to estimate, a goal for a variable that is not estimated
     """
-    config = estimating(config_or_defaults(config), estimate)
-    candidates = chosen(manoeuvres or None, duration)
+    config = estimating(config_or_defaults(config), listed(estimate))
+    candidates = chosen(listed(manoeuvres) or None, duration)
+    wanted = read_goals(goals)
     before: Known | None
     if isinstance(known, ObservabilityResult):
         seen, source = known.observability, known.about["log"]
         before = Known(seen.labels, seen.covariance, seen.prior_sd)
     else:
         before, source = (None, None) if known is None else (read_known(Path(known)), str(known))
-    result = ranked(config, candidates, duration, before, goals, sensors, lambda done: progress("manoeuvres", done))
+    result = ranked(config, candidates, duration, before, wanted, sensors, lambda done: progress("manoeuvres", done))
     about = {"duration_s": duration, "known": source, "fix_interval_s": sensors.fix_interval}
     return PlanResult(result, config, about)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rovgraph.api.live_folder import prepare, settings_of, summarise
 from rovgraph.api.live_page import live_page
 from rovgraph.api.logs import given, warn_of_unused
-from rovgraph.config import Config
+from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import InputError
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.feed import Feed
@@ -17,7 +17,7 @@ from rovgraph.live.files import Files
 from rovgraph.live.marks import Marks
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs import Output, open_output
-from rovgraph.live.session import RATE_HZ, Session
+from rovgraph.live.session import PAGE_RATE_HZ, RATE_HZ, Session
 from rovgraph.live.solution import Solution
 from rovgraph.live.sources import open_sources
 from rovgraph.live.sources.replay import LogReplay
@@ -122,16 +122,17 @@ class Online:
     Attributes
     ----------
     config : of vehicle and sensors; None = all defaults, or the configuration of the resumed run
-    rate_hz : of solutions, by the log's time
+    rate_hz : of solutions, by the log's time; None = 5, or 10 with a live page
     engine : "fixed-lag", or "isam2", which smooths the whole dive during the run
     """
 
     config: Config | None = None
-    rate_hz: float = RATE_HZ
+    rate_hz: float | None = None
     engine: str = "fixed-lag"
 
     def __post_init__(self) -> None:
-        if not 0.01 <= self.rate_hz <= 200.0:
+        config_or_defaults(self.config)
+        if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 200.0:
             raise InputError(f"rate_hz {self.rate_hz:g}: between 0.01 and 200 solutions per second are expected")
         if self.engine not in ENGINES:
             raise InputError(f"engine {self.engine!r}: expected {', '.join(ENGINES)}")
@@ -144,7 +145,7 @@ class Online:
         out: Path | str | None = None,
         resume: bool = False,
         force: bool = False,
-        complain: Complain | None = None,
+        on_warning: Complain | None = None,
         http: str | None = None,
         page: Mapping[str, Any] | None = None,
     ) -> LiveRun:
@@ -158,8 +159,8 @@ class Online:
         out : folder for recording, track and checkpoint; None = none
         resume : continue after a crash with the files in ``out``
         force : replace an older folder
-        complain : called with source, kind and text of a problem with sources, outputs or disk, also from other
-            threads; None = problems are only counted
+        on_warning : called with source, kind and text of a warning about sources, outputs or disk, also from other
+            threads; None = warnings are only counted
         http : ``host:port`` of a live page for a browser (docs/live-page.md); None = none
         page : its ``charts``, ``origins``, ``token`` and ``position_sd_limit_m``, as for `rovgraph.live_page`
 
@@ -177,7 +178,7 @@ class Online:
         if self.config is None and not resume:
             warn_of_unused(*(url.removeprefix("file:").partition("?")[0] for url in sources if url.startswith("file:")))
         config = self.config or (settings_of(folder) if resume and folder is not None else Config())
-        warnings = Warnings(complain)
+        warnings = Warnings(on_warning)
         opened = open_sources(sources, warnings, config, speed)
         if resume and any(source.pace == 1.0 for source in opened):
             raise InputError("--resume cannot continue a replay at speed 1; add --speed max")
@@ -203,7 +204,8 @@ class Online:
         told: list[Callable[[Solution], None]] = [each.send for each in receivers]
         if watched is not None:
             told.append(watched.send)
-        session = Session(navigator, told, warnings, self.rate_hz, files, marks)
+        usual = RATE_HZ if http is None else PAGE_RATE_HZ
+        session = Session(navigator, told, warnings, self.rate_hz or usual, files, marks)
         return LiveRun(sources, session, feed, tuple(receivers), watched, folder, resume)
 
     def replay(self, log: Log) -> Iterator[Solution]:
@@ -223,7 +225,7 @@ class Online:
         delays = {} if log.config is None else log.config.delay_s
         config = config.with_raw_magnetometer().model_copy(update={"delay_s": delays})  # the log holds the field
         feed = Feed([LogReplay(log.source, _as_it_arrived(log, delays), AS_FAST_AS_POSSIBLE)])
-        session = Session(self._navigator(config, patient=True, trust=True), [], Warnings(), self.rate_hz)
+        session = Session(self._navigator(config, patient=True, trust=True), [], Warnings(), self.rate_hz or RATE_HZ)
         yield from LiveRun((log.source,), session, feed, ())
 
     def _navigator(self, config: Config, patient: bool, trust: bool) -> Navigator:

@@ -16,6 +16,7 @@ from rovgraph.cli.calibrate import calibrate
 from rovgraph.cli.check import check
 from rovgraph.cli.compare import compare
 from rovgraph.cli.config import config
+from rovgraph.cli.console import folded
 from rovgraph.cli.convert import convert
 from rovgraph.cli.demo import demo
 from rovgraph.cli.evaluate import evaluate
@@ -65,7 +66,7 @@ app.add_typer(study, name="study")
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     if issubclass(category, DataWarning):
-        print(f"warning: {message}", file=sys.stderr)
+        print(folded(f"warning: {message}", sys.stderr), file=sys.stderr)
 
 
 def main() -> None:
@@ -91,7 +92,7 @@ def main() -> None:
 
 
 def _refuse(reason: str) -> NoReturn:
-    print(f"error: {reason}", file=sys.stderr)
+    print(folded(f"error: {reason}", sys.stderr), file=sys.stderr)
     sys.exit(2)
 
 

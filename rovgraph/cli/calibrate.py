@@ -42,9 +42,8 @@ def magnetometer(
 
     Example: rovgraph calibrate magnetometer turned.csv --out magnetometer
     """
-    from rich.console import Console
-
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
     from rovgraph.report.folder import check_writable
 
     check_writable(out, force, [log, config])
@@ -52,9 +51,9 @@ def magnetometer(
     recorded = rg.read_log(log, settings.with_raw_magnetometer())
     result = rg.calibrate_magnetometer(recorded, settings, method.value)
     result.save(out, force)
-    console = Console()
-    console.print(_magnetometer_table(result.found))
-    console.print(f"for the configuration: {out / 'magnetometer.yaml'}", highlight=False, markup=False)
+    shown = console()
+    shown.print(_magnetometer_table(result.found))
+    say(shown, f"for the configuration: {out / 'magnetometer.yaml'}")
 
 
 @calibrate.command()
@@ -63,21 +62,20 @@ def noise(log: LogPath, out: OutPath, config: ConfigPath = None, force: Force = 
 
     Example: rovgraph calibrate noise standing.csv --out noise
     """
-    from rich.console import Console
-
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
     from rovgraph.report.folder import check_writable
 
     check_writable(out, force, [log, config])
     settings = rg.load_config(config)
     result = rg.calibrate_noise(rg.read_log(log, settings), settings)
     result.save(out, force)
-    console = Console()
+    shown = console()
     for table in _noise_tables(result.found):
-        console.print(table)
+        shown.print(table)
     for line in result.found.remarks:
-        console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
-    console.print(f"for the configuration: {out / 'noise.yaml'}", highlight=False, markup=False)
+        say(shown, f"note: {line}")
+    say(shown, f"for the configuration: {out / 'noise.yaml'}")
 
 
 def _magnetometer_table(found: "MagnetometerCalibration") -> "Table":

@@ -26,10 +26,9 @@ def check(
     """Check a log: sensors, rates, gaps, units, signs, clocks, and the assumptions of an estimate."""
     import json
 
-    from rich.console import Console
-
     import rovgraph as rg
     from rovgraph.check import refuse
+    from rovgraph.cli.console import console, say
 
     settings = None if config is None else rg.load_config(config)
     log = read_files(files, settings, choose, shift)
@@ -39,14 +38,14 @@ def check(
     if as_json:
         typer.echo(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:
-        console = Console()
-        console.print(_timing_table(report))
+        out = console()
+        out.print(_timing_table(report))
         for finding in report.findings:
-            _print_finding(console, finding.level, f"{finding.sensor}: {finding.text}")
+            _print_finding(out, finding.level, f"{finding.sensor}: {finding.text}")
         for note in log.notes:
-            console.print(f"assumed: {note}", highlight=False, markup=False, soft_wrap=True)
+            say(out, f"assumed: {note}")
         errors, doubts = len(report.at("error")), len(report.at("warning"))
-        console.print(f"{_plural(errors, 'error')}, {_plural(doubts, 'warning')}", style="bold")
+        out.print(f"{_plural(errors, 'error')}, {_plural(doubts, 'warning')}", style="bold")
     refuse(report)
 
 
@@ -55,10 +54,10 @@ def _plural(n: int, what: str) -> str:
 
 
 def _print_finding(console: "Console", level: str, text: str) -> None:
-    from rich.text import Text
+    from rovgraph.cli.console import say
 
     style = {"ok": "green", "warning": "yellow", "error": "bold red"}[level]
-    console.print(Text.assemble((f"{level:8}", style), text), soft_wrap=True)
+    say(console, f"{level:8}{text}", style, styled=8, indent=8)
 
 
 def _timing_table(report: "Report") -> "Table":
@@ -74,6 +73,7 @@ def _timing_table(report: "Report") -> "Table":
     for t in report.timings:
         gap = f"{t.gap:.3g}" if t.gap < 1000.0 else f"{t.gap:.0f}"
         numbers = (f"{t.rate:.4g}", f"{t.first - start:.1f}", f"{t.last - start:.1f}", gap)
-        table.add_row(t.sensor, str(t.count), *numbers, f"{t.gap_at - start:.1f}", f"{t.jitter:.2g}", str(t.repeats))
+        jitter = f"{t.jitter:.2g}" if t.jitter >= 1e-4 else "0"
+        table.add_row(t.sensor, str(t.count), *numbers, f"{t.gap_at - start:.1f}", jitter, str(t.repeats))
     table.caption = f"0 s is {start:.3f} s of the log's clock; gap: the largest, and when"
     return table

@@ -38,34 +38,28 @@ def compare(
 
     Example: rovgraph compare --scenario vattern --seeds 30 --out comparison
     """
-    from rich.console import Console
-
     import rovgraph as rg
     from rovgraph.api.comparison import require_one
+    from rovgraph.cli.console import console, say
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.comparison import comparison_table
     from rovgraph.report.folder import check_writable
     from rovgraph.report.narrow import fitting
+    from rovgraph.studies.choices import listed
     from rovgraph.studies.estimators import select
 
-    names = None if estimators is None else [name.strip() for name in estimators.split(",") if name.strip()]
     chosen = range(first_seed, first_seed + seeds)
-    select(names)
+    select(None if estimators is None else listed(estimators))
     require_one(files[0] if files else None, reference, scenario, chosen, duration)
     check_writable(out, force, [*(files or []), config, reference])
     settings = None if config is None else rg.load_config(config)
     dive_log = read_files(files, settings, choose, shift) if files else None
-    track = None if reference is None else rg.read_reference(reference)
     with progress_bar() as progress:
-        result = rg.compare(dive_log, settings, track, scenario, chosen, duration, names, jobs, progress)
-    if reference is not None:
-        result.about["reference"] = str(reference)
+        result = rg.compare(dive_log, settings, reference, scenario, chosen, duration, estimators, jobs, progress)
     result.save(out, force)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDE)
-    for part in fitting(comparison_table(result.comparison, result.title, result.thesis), console):
-        console.print(part)
+    shown = console(WIDE)
+    for part in fitting(comparison_table(result.comparison, result.title, result.thesis), shown):
+        shown.print(part)
     for row in result.comparison.runs.dropna(subset="error").drop_duplicates("estimator").itertuples():
-        console.print(f"{row.estimator} failed on {row.run}: {row.error}", highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False, markup=False)
+        say(shown, f"{row.estimator} failed on {row.run}: {row.error}")
+    say(shown, f"results in {out}")

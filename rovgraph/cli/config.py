@@ -131,9 +131,10 @@ def _sections() -> Iterator[tuple[str, list[tuple[str, str, str, str]]]]:
 
 def _print_keys() -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from rovgraph.cli.console import console
 
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("key", "default", "meaning"):
@@ -142,7 +143,4 @@ def _print_keys() -> None:
         for key, unit, default, meaning in rows:
             table.add_row(key, Text(default), Text(f"{meaning} [{unit}]" if unit else meaning))
         table.add_section()
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=200)  # a file or a pipe has no width to fold at
-    console.print(table)
+    console(wide=200).print(table)

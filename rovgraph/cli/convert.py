@@ -23,9 +23,8 @@ def convert(
 
     Example: rovgraph convert dive.BIN dvl.jsonl --out log.csv --config-out vehicle.yaml
     """
-    from rich.console import Console
-
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.conversion import check_suffix, conversion_tables
 
@@ -34,14 +33,10 @@ def convert(
     with progress_bar() as progress:
         result = rg.convert(files, settings, pairs("choose", choose), seconds("shift", shift), progress)
     written = result.save(out, config_out, force)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDE)
+    shown = console(WIDE)
     for table in conversion_tables(result.report):
-        console.print(table)
-        console.print()
+        shown.print(table)
+        shown.print()
     for note in result.notes:
-        console.print(f"assumed: {note}", highlight=False, markup=False, soft_wrap=True)
-    console.print(
-        f"log in {written[0]}, with {', '.join(path.name for path in written[1:])}", highlight=False, markup=False
-    )
+        say(shown, f"assumed: {note}")
+    say(shown, f"log in {written[0]}, with {', '.join(path.name for path in written[1:])}")

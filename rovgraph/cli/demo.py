@@ -30,5 +30,5 @@ def demo(
 Look next at
   {done.results / "report.html"}: the dive as a page, in any browser
   {done.results / "residuals.png"}: every measurement against its prediction
-  {out / "config.yaml"}: what the estimator was told about the vehicle
+  {out / "config.yaml"}: the vehicle's configuration
 For your own log: rovgraph check LOG, then rovgraph smooth LOG --config CONFIG""")

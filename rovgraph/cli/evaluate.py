@@ -42,13 +42,14 @@ def evaluate(
 
 def show_metrics(metrics: "Metrics", title: str) -> None:
     """Print the table; unknown metrics have no row."""
-    from rich.console import Console
     from rich.table import Table
+
+    from rovgraph.cli.console import console
 
     table = Table("", "", title=title, show_header=False)
     for label, value in rows(metrics):
         table.add_row(label, value)
-    Console().print(table)
+    console().print(table)
 
 
 def rows(metrics: "Metrics") -> list[tuple[str, str]]:
@@ -67,7 +68,7 @@ def rows(metrics: "Metrics") -> list[tuple[str, str]]:
         ("depth error, rms", _format("{:.3f} m", m.rms_down_m)),
         ("heading error, rms", _format("{:.2f}°", m.heading_rms_deg)),
         ("heading error, mean", _format("{:+.2f}°", m.heading_mean_deg)),
-        ("normalised error squared (consistent: 2)", _format("{:.2f}", m.nees)),
+        ("NEES, 2 if consistent", _format("{:.2f}", m.nees)),
         ("inside the 99 % ellipse", _format("{:.1f} %", None if m.inside_ellipse is None else 100 * m.inside_ellipse)),
     ]
     return [(label, value) for label, value in every if value]

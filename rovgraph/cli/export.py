@@ -28,18 +28,18 @@ def export(
 
     Example: rovgraph export results --to kml --to geojson
     """
-    from rich.console import Console
     from rich.table import Table
 
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
     from rovgraph.export import export_formats
 
-    console = Console()
+    shown = console()
     if not to:
         table = Table("--to", "format", "needs")
         for each in export_formats().values():
             table.add_row(each.name, each.title, f"rovgraph\\[{each.extra}]" if each.extra else "")
-        console.print(table)
+        shown.print(table)
         return
     for path in rg.export(results, to, out, estimate, rate, crs, unix_offset, force):
-        console.print(f"written: {path}", highlight=False, markup=False, soft_wrap=True)
+        say(shown, f"written: {path}")

@@ -25,26 +25,22 @@ def observe(
 
     Example: rovgraph observe log.csv --config vehicle.yaml --estimate dvl_yaw,dvl_scale
     """
-    from rich.console import Console
-
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.folder import check_writable
     from rovgraph.report.observability import observability_table, words
-    from rovgraph.studies.choices import listed
 
     out = Path("observed-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     check_writable(out, force, [*files, config])
     dive_log = read_files(files, settings, choose, shift)
     with progress_bar() as progress:
-        result = rg.observe(dive_log, settings, listed(estimate), progress)
+        result = rg.observe(dive_log, settings, estimate or (), progress)
     result.save(out, force)
     seen = result.observability
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDE)
-    console.print(observability_table(seen, f"what {files[0].name} shows"))
+    shown = console(WIDE)
+    shown.print(observability_table(seen, f"what {files[0].name} shows"))
     for sentence in words(seen):
-        console.print(sentence, highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False, markup=False)
+        say(shown, sentence)
+    say(shown, f"results in {out}")

@@ -54,20 +54,18 @@ def online(
 
     import rovgraph as rg
     from rovgraph.cli.ending import asked_by_signal, ended_by_signals
-    from rovgraph.live.session import PAGE_RATE_HZ, RATE_HZ
     from rovgraph.report.status import StatusLine
 
     believed = None if config is None else rg.load_config(config)
     wanted = output if output is not None else ([] if sys.stdout.isatty() else ["-"])
-    usual = RATE_HZ if http is None else PAGE_RATE_HZ
-    run = rg.Online(believed, usual if rate is None else rate, engine.value).run(
+    run = rg.Online(believed, rate, engine.value).run(
         *sources,
         outputs=wanted,
         speed=speed,
         out=out,
         resume=resume,
         force=force,
-        complain=_say,
+        on_warning=_say,
         http=http,
         page={
             "charts": chart or (),
@@ -120,8 +118,10 @@ def _note(text: str) -> None:
     import contextlib
     import sys
 
+    from rovgraph.cli.console import folded
+
     with contextlib.suppress(OSError, ValueError):
-        print(text, file=sys.stderr, flush=True)
+        print(folded(text, sys.stderr), file=sys.stderr, flush=True)
 
 
 def _tell(solution: "Solution") -> None:

@@ -30,21 +30,22 @@ def plan(
 
     Example: rovgraph plan --config vehicle.yaml --goal dvl_yaw=1deg --out plan
     """
-    from rich.console import Console
-
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.folder import check_writable
+    from rovgraph.report.narrow import fitting
     from rovgraph.report.observability import plan_table
-    from rovgraph.studies.choices import goals, listed
+    from rovgraph.studies.choices import goals
     from rovgraph.studies.plan import Sensors
 
     check_writable(out, force)
     sensors, wanted = Sensors(imu_rate, dvl_rate, fix_interval), goals(goal or [])
-    settings, chosen = rg.load_config(config), listed(manoeuvres)
+    settings = rg.load_config(config)
     with progress_bar() as progress:
-        result = rg.plan(settings, wanted, known, duration, chosen, listed(estimate), sensors, progress)
+        result = rg.plan(settings, wanted, known, duration, manoeuvres, estimate or (), sensors, progress)
     result.save(out, force)
-    console = Console()
-    console.print(plan_table(result.plan, f"manoeuvres of {duration:g} s"))
-    console.print(f"results in {out}", highlight=False, markup=False)
+    shown = console()
+    for part in fitting(plan_table(result.plan, f"manoeuvres of {duration:g} s"), shown):
+        shown.print(part)
+    say(shown, f"results in {out}")

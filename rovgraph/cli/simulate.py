@@ -97,8 +97,9 @@ def _pair(text: str) -> tuple[float, float]:
 
 def _show(out: Path, dive: "SimulatedDive") -> None:
     """The table that the command prints."""
-    from rich.console import Console
     from rich.table import Table
+
+    from rovgraph.cli.console import console
 
     figures = dive.figures
     table = Table("", "", title=f"Simulated dive in {out}", show_header=False)
@@ -108,4 +109,4 @@ def _show(out: Path, dive: "SimulatedDive") -> None:
     for sensor, count in figures["measurements"].items():
         table.add_row(sensor, f"{count} measurements")
     table.add_row("log", f"{len(dive.dive.log_frame)} rows in log.csv")
-    Console().print(table)
+    console().print(table)

@@ -80,17 +80,16 @@ def smooth(
 
 def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
     """Print verdict, alarms, tables and assumptions."""
-    from rich.console import Console
-
+    from rovgraph.cli.console import console, say
     from rovgraph.report.tables import calibration_table, summary_table
 
-    console = Console()
-    console.print(f"verdict: {result.verdict}", style=VERDICT_STYLE[result.verdict], highlight=False)
+    shown = console()
+    say(shown, f"verdict: {result.verdict}", VERDICT_STYLE[result.verdict])
     for alarm in result.alarms:
-        console.print(f"{alarm.severity}: {alarm.text}", highlight=False, markup=False, soft_wrap=True)
-    console.print(summary_table(result.dive.estimates, summary))
-    console.print(calibration_table(result.dive.estimates))
+        say(shown, f"{alarm.severity}: {alarm.text}")
+    shown.print(summary_table(result.dive.estimates, summary))
+    shown.print(calibration_table(result.dive.estimates))
     for line in result.assumptions:
-        console.print(f"assumed: {line}", highlight=False, markup=False)
+        say(shown, f"assumed: {line}")
     page = " (open report.html)" if (out / "report.html").exists() else ""
-    console.print(f"results in {out}{page}", highlight=False, markup=False)
+    say(shown, f"results in {out}{page}")

@@ -29,21 +29,18 @@ def misalignment(
 
     Example: rovgraph study misalignment --config configs/studies/quick.yaml --out quick
     """
-    from rich.console import Console
-
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
     from rovgraph.cli.progress import progress_bar
     from rovgraph.errors import InputError
     from rovgraph.report.narrow import fitting
     from rovgraph.report.study import plan_table, study_table
     from rovgraph.studies.misalignment import read_study
 
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDE)
+    shown = console(WIDE)
     if show:
-        for part in fitting(plan_table(read_study(config)), console):
-            console.print(part)
+        for part in fitting(plan_table(read_study(config)), shown):
+            shown.print(part)
         return
     if out is None:
         raise InputError("--out is needed: a folder for the results")
@@ -51,10 +48,10 @@ def misalignment(
         with progress_bar() as progress:
             tables = rg.study_misalignment(config, out, resume, only, jobs, scheduler, progress)
     except KeyboardInterrupt:
-        console.print(f"interrupted; {out} keeps every run that was made, --resume goes on", highlight=False)
+        say(shown, f"interrupted; {out} keeps every finished run, --resume continues")
         raise typer.Exit(130) from None
-    for part in fitting(study_table(tables), console):
-        console.print(part)
+    for part in fitting(study_table(tables), shown):
+        shown.print(part)
     for row in tables.runs.dropna(subset="failure").drop_duplicates("cell").itertuples():
-        console.print(f"{row.cell} failed in run {row.run}: {row.failure}", highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False, markup=False)
+        say(shown, f"{row.cell} failed in run {row.run}: {row.failure}")
+    say(shown, f"results in {out}")

@@ -24,11 +24,10 @@ def tag(
 
     Example: rovgraph tag photos.csv results --time taken --out placed.csv
     """
-    from rich.console import Console
-
     import rovgraph as rg
+    from rovgraph.cli.console import console, say
 
     tagged = rg.tag(table, results, out, time, offset, estimate, exif, force)
     inside, rows = int(tagged.inside.sum()), len(tagged.inside)
     outside = f", {rows - inside} outside the dive" if inside < rows else ""
-    Console().print(f"{inside} of {rows} rows placed{outside}: {out}", highlight=False, markup=False, soft_wrap=True)
+    say(console(), f"{inside} of {rows} rows placed{outside}: {out}")

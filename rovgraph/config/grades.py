@@ -31,7 +31,7 @@ def warn_of_mixed_grades(imu: Imu, source: str) -> None:
         if sd > WIDEST * density:
             verdict = "is that of a much coarser instrument"
         elif sd < SHARPEST * density:
-            verdict = "claims more than ten minutes at rest would show"
+            verdict = "is that of a much finer instrument"
         else:
             continue
         text = f"{source}: {bias} = {shown:g} {verdict} than {noise} = {density:.3g}; state both of one data sheet"

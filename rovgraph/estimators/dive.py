@@ -189,7 +189,11 @@ def _taken_as_exact(beginning: InitialConditions) -> list[str]:
     """What iSAM2's filtered estimate does not doubt although the configuration does, in a line."""
     config = beginning.config
     names = unknowns(beliefs(config), beginning.instruments).considered if config.graph.solver == "isam2" else ()
-    return [f"the filtered estimate of iSAM2 takes as exact what is considered: {', '.join(names)}"] if names else []
+    return (
+        [f"the filtered estimate of iSAM2 takes these considered variables as exact: {', '.join(names)}"]
+        if names
+        else []
+    )
 
 
 def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:

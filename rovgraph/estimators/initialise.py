@@ -137,7 +137,7 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
             assumptions.append(f"environment.dip_deg {changes['dip_deg']:.1f}, from the log")
             if not beliefs(config)["field_dip"].estimate:
                 hint = "give it, or estimate calibration.field_dip"
-                assumptions[-1] += f", and held although it errs as the levelling does: {hint}"
+                assumptions[-1] += f", and held, with the error of the levelling in it: {hint}"
     if env.latitude_deg is None and log.origin is not None:
         changes["latitude_deg"] = log.origin[0]
     if env.earth_rotation and env.latitude_deg is None and log.origin is None:

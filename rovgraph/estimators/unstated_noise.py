@@ -107,7 +107,7 @@ def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | 
     if factor is None or factor < LARGER or not _is_stated(best, sensor):
         return None
     value = tuple(factor * s for s in stated) if isinstance(stated, tuple) else factor * stated
-    text = f"{sensor}: its noise is {factor:.2g} times what {key} states, as its residuals vary; it is believed so"
+    text = f"{sensor}: its noise is {factor:.2g} times what {key} states, by its residuals; the larger noise is used"
     return UnstatedNoise(sensor, key, value, text)
 
 

@@ -135,7 +135,7 @@ def require_place(name: str, origin: tuple[float, float] | None) -> tuple[float,
     """
     if origin is None:
         raise InputError(
-            f"{name}: it is not known where on Earth the dive was; state environment.origin_lat_deg and "
+            f"{name}: the dive's place on Earth is unknown; state environment.origin_lat_deg and "
             "origin_lon_deg, or log fixes as fix_lat and fix_lon, and smooth again"
         )
     return origin

@@ -312,8 +312,8 @@ def _not_joined(axis: _Axis, base: _Axis, recordings: Sequence[Recording], names
         told = f"clock {next(iter(axis.lines))} reads {spans[0]}, {names[base.file]} {spans[1]}"
     sensors = sorted({channel.sensor for channel in axis.channels(recordings[axis.file])})
     return (
-        f"{names[axis.file]}: {told}, and no motion that both show tells how far the clocks are apart; are they of one "
-        f"dive? If you know it, state what to add to its stamps: --shift {sensors[0]}=SECONDS"
+        f"{names[axis.file]}: {told}, and no common motion shows the offset of their clocks; are they of one dive? "
+        f"If you know the offset, state what to add to its stamps: --shift {sensors[0]}=SECONDS"
     )
 
 

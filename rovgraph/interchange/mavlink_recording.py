@@ -39,8 +39,8 @@ _REASONS = {
     "DISTANCE_SENSOR": "not downwards, or no echo",
     "SERVO_OUTPUT_RAW": "of another port",
     "VISION_POSITION_ESTIMATE": "a position that a companion computed, no measurement",
-    "GPS_INPUT": "what the autopilot was told; GPS_RAW_INT is what it made of it",
-    **dict.fromkeys(OF_PARAMETERS, "parameters, used where they tell of a sensor"),
+    "GPS_INPUT": "input of the autopilot; GPS_RAW_INT has its output",
+    **dict.fromkeys(OF_PARAMETERS, "parameters, used where they concern a sensor"),
 }
 
 

@@ -166,9 +166,9 @@ class _Made:
             return
         clock = receiver_clock(np.arange(len(rows)), stamp[rows], received[rows])
         stamp[rows] = clock.corrected(np.arange(len(rows)), stamp[rows])
-        steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "what too few messages tell"
+        steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "an amount that too few messages show"
         self.warnings.append(
-            f"{topic.name}: the clock of its headers was set by {steps}; what came before is put on it"
+            f"{topic.name}: the clock of its headers was set by {steps}; earlier stamps are moved to it"
         )
         apart = received[rows] - stamp[rows]
         other = np.abs(apart - np.median(apart)) > APART_S  # too few to tell how their clock was set

@@ -90,7 +90,7 @@ class Session:
         elif state is not None:
             self.navigator.restore(state)
         if self.files.received is None:
-            self.navigator.say("start", "resumed", "nothing had been received before; begins anew")
+            self.navigator.say("start", "resumed", "nothing had been received before; starts again")
             return
         self.navigator.replay(self.files.received)
         self._resumed = self.navigator.time

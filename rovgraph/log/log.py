@@ -110,7 +110,7 @@ class Log:
         for key in ("columns", "units", "delay_s", "imu.mag", "environment.origin"):
             if _entry(self.config, key) != _entry(config, key):
                 raise InputError(
-                    f"{self.source}: was read with another {key} than that of the configuration; "
+                    f"{self.source}: was read with another value of {key} than the configuration has; "
                     "read it with this configuration"
                 )
 

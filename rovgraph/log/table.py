@@ -125,7 +125,10 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
     InputError : columns that are no arrays of one dimension and the same length; or as `table_of_frame`
     """
     frames = []
-    for table in tables:
+    for number, table in enumerate(tables, 1):
+        if not isinstance(table, Mapping):
+            what = f"table {number} is a {type(table).__name__}, expected a mapping of column names to arrays"
+            raise InputError(f"{source}: {what}; a configuration is given as config=...")
         arrays = {name: _array(name, values, source) for name, values in table.items()}
         for name, values in arrays.items():
             if values.ndim != 1:

@@ -105,7 +105,7 @@ def _map(dives: dict[str, DiveSource]) -> tuple[list[str], list[Item]]:
     lead = (
         ["All tracks stand where they were, in metres from the origin of the first dive."]
         if common
-        else ["Not every dive knows its latitude and longitude: each track begins at its own origin."]
+        else ["Some dives have no latitude and longitude: each track begins at its own origin."]
     )
     traces: list[Trace] = []
     for k, (name, dive) in enumerate(dives.items()):

@@ -53,7 +53,7 @@ CAUSES = (
     Cause(
         ("dvl",),
         "the small errors of the DVL's velocity, which add up over the way",
-        "take a position fix now and then, or pass a place twice that a camera or a sonar knows again",
+        "take a position fix now and then, or pass a place twice that a camera or a sonar recognises",
     ),
     Cause(
         ("imu", "gyr", "acc", "start bias", "start velocity"),

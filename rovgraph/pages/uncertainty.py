@@ -34,7 +34,7 @@ def uncertainty_section(source: DiveSource) -> Section:
         marks = _marks(source, followed, of(followed))
         note = f"Marks: where the sd of the {followed.name} estimate fell by more than 15 % within 10 s, and by what."
         items.append(Panel(title, source.clock.label, f"sd [{unit}]", [*lines, *marks], note=note))
-    lead = ["The filtered sd is what was known at the moment, the smoothed one what the whole dive tells."]
+    lead = ["The filtered sd uses the measurements so far, the smoothed one those of the whole dive."]
     return Section("uncertainty", "How well it is known", lead, items)
 
 

@@ -125,7 +125,7 @@ def _by_direction(source: DiveSource) -> tuple[str, str]:
         )
     noise = (
         f"the small errors of the DVL's velocity, which add up over the way since {since}",
-        "take a position fix now and then, or pass a place twice that a camera or a sonar knows again",
+        "take a position fix now and then, or pass a place twice that a camera or a sonar recognises",
     )
     if distance < max(SHORT * float(np.nansum(steps)), 1.0):
         return noise
@@ -157,7 +157,7 @@ def _position_there(source: DiveSource, known: float, since: str) -> tuple[str, 
             "take a position fix at the start, or state start.position_sd_m where it is known better",
         )
     return (
-        f"the position fixes, which tell the position to {_metres(known)} (one standard deviation)",
+        f"the position fixes, which give the position to {_metres(known)} (one standard deviation)",
         "take better fixes, or state fix.sd_m where they are better than that",
     )
 

@@ -45,7 +45,7 @@ def summary_table(estimates: Sequence[Estimate], summary: Mapping[str, Any]) -> 
     for sensor in sensors:
         table.add_row(sensor, *(_counts(n["sensors"].get(sensor)) for n in numbers))
     if sensors:
-        table.caption = "sensors: used / rejected / mean square of the innovations, 1 where the noise is as believed"
+        table.caption = "sensors: used / rejected / mean square of the innovations, 1 where the noise is as stated"
     return table
 
 
@@ -90,7 +90,7 @@ def _calibration_cells(entry: CalibrationEstimate) -> tuple[str, str, str, str]:
     factor = shown(entry.unit)[0]
     value, sd, mean, prior_sd = (factor * x for x in (entry.value, entry.sd, entry.prior_mean, entry.prior_sd))
     if not entry.estimated:
-        return plus_minus(value, sd), "", "considered" if sd > 0.0 else "held", ""
+        return plus_minus(value, sd), "", "", "considered" if sd > 0.0 else "held"
     ratio = narrowing(entry)
     narrowed = "unknown" if not np.isfinite(ratio) else percent(ratio)
     return plus_minus(value, sd), plus_minus(mean, prior_sd), narrowed, entry.verdict

@@ -63,8 +63,10 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
     InputError : no such scenario, or a choice that it does not have
     """
     require_known(name)
-    if seed < 0:
-        raise InputError(f"seed {seed}: 0 or more is expected")
+    if not (isinstance(seed, int) and seed >= 0):
+        raise InputError(f"seed {seed!r}: an integer of 0 or more is expected")
+    if not isinstance(choices, Choices):
+        raise InputError(f"choices: expected Choices(duration=60), for example, found a {type(choices).__name__}")
     if name in DRIVEN:
         driven = DRIVEN[name]
         choices.require(name, driven.choices, driven.variants)

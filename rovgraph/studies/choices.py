@@ -3,7 +3,7 @@
 import difflib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +13,31 @@ from rovgraph.errors import InputError
 from rovgraph.studies.plan import Known
 
 
-def listed(text: str | None) -> list[str]:
-    """Names that are separated by commas, each once."""
-    return list(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))
+def listed(names: str | Iterable[str] | None) -> list[str]:
+    """Names, each once, of a list or of a text with commas between them."""
+    each = names.split(",") if isinstance(names, str) else names or ()
+    return list(dict.fromkeys(name.strip() for name in each if name.strip()))
 
 
-def goals(texts: Sequence[str]) -> dict[str, float]:
-    """Label of a component -> sd that is wanted, of such as ``dvl_yaw=1deg`` and ``dvl_scale=0.002``.
+def goals(wanted: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
+    """Label of a component -> wanted sd, radians and SI.
+
+    Parameters
+    ----------
+    wanted : such a mapping, or texts such as ``dvl_yaw=1deg`` and ``dvl_scale=0.002``
 
     Raises
     ------
     InputError : no such component, no positive number, degrees for what is no angle or the reverse
     """
-    return dict(_goal(text) for text in texts)
+    if not isinstance(wanted, Mapping):
+        return dict(_goal(text) for text in wanted or ())
+    for label, sd in wanted.items():
+        if not (isinstance(sd, int | float) and math.isfinite(sd) and sd > 0.0):
+            raise InputError(
+                f"goal {label}: {sd!r}, expected an sd above 0 in radians or SI, or the text '{label}=1deg'"
+            )
+    return dict(wanted)
 
 
 def _goal(text: str) -> tuple[str, float]:
@@ -68,5 +80,5 @@ def read_known(path: Path) -> Known:
     if not (
         square and np.isfinite(covariance).all() and (np.linalg.eigvalsh(covariance) > 0.0).all() and (sd > 0).all()
     ):
-        raise InputError(f"{path}: its covariance is none; make it anew with rovgraph observe")
+        raise InputError(f"{path}: its covariance is not valid; make the file again with rovgraph observe")
     return Known(tuple(components), covariance, sd)

@@ -90,10 +90,10 @@ class _Work:
 
     def _killed(self, at_hand: list[int]) -> list[int]:
         """A pool takes tasks in their order, so the first of the lost ones were at hand."""
-        message = "a worker process was killed (out of memory?); what it had at hand is made again"
+        message = "a worker process was killed (out of memory?); its task is done again"
         warn(message)
         if len(at_hand) == 1:
-            self._failed(at_hand[0], RuntimeError("its process was killed again and again (out of memory?)"))
+            self._failed(at_hand[0], RuntimeError("its process was killed repeatedly (out of memory?)"))
         return at_hand
 
     def _failed(self, task: int, error: BaseException) -> None:

@@ -129,7 +129,7 @@ def _demand(variant: Filter, log: Log, config: Config) -> None:
             raise InputError(f"{log.source}: filter {variant.name} needs {_NEEDED[sensor]}, the log has none")
     if variant.magnetometer and beliefs(config)["mag_deviation"].mean.any():
         raise InputError(
-            f"calibration.mag_deviation.mean_deg: filter {variant.name} knows no deviation curve of the magnetometer; "
+            f"calibration.mag_deviation.mean_deg: filter {variant.name} has no deviation curve of the magnetometer; "
             "set it to 0"
         )
     time = log["imu"].time
