@@ -122,12 +122,7 @@ def convert(
     DataWarning : what was ignored, sorted, or looks wrong
     """
     config = config_or_defaults(config)
-    for name, stated in (("choose", choose), ("shift", shift)):
-        if not isinstance(stated, Mapping):
-            raise InputError(f"{name}: expected a mapping of sensors or files, found {stated!r}")
-    for name, seconds in shift.items():
-        if not isinstance(seconds, Real):
-            raise InputError(f"shift {name}: expected seconds, a number, found {seconds!r}")
+    _require_mappings(choose, shift)
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not files:
         raise InputError("no file was given; expected native files or logs of one dive")
@@ -160,6 +155,21 @@ def convert(
         notes=(*notes(merged), *_settings_told(merged, used)),
     )
     return Conversion(merged, log, bare, used)
+
+
+def _require_mappings(choose: object, shift: object) -> None:
+    """Check what feeds a sensor, and the seconds that are added to stamps.
+
+    Raises
+    ------
+    InputError : no mappings, or a shift that is not a number
+    """
+    for name, given in (("choose", choose), ("shift", shift)):
+        if not isinstance(given, Mapping):
+            raise InputError(f"{name}: expected a mapping of sensors or files, found {given!r}")
+    for name, seconds in shift.items() if isinstance(shift, Mapping) else ():
+        if not isinstance(seconds, Real):
+            raise InputError(f"shift {name}: expected seconds, a number, found {seconds!r}")
 
 
 def _read(path: Path, options: Options, format_: Format | None, alone: bool) -> Recording:
