@@ -157,7 +157,7 @@ def convert(
     return Conversion(merged, log, bare, used)
 
 
-def _require_mappings(choose: object, shift: object) -> None:
+def _require_mappings(choose: Mapping[str, str], shift: Mapping[str, float]) -> None:
     """Check what feeds a sensor, and the seconds that are added to stamps.
 
     Raises
@@ -167,7 +167,7 @@ def _require_mappings(choose: object, shift: object) -> None:
     for name, given in (("choose", choose), ("shift", shift)):
         if not isinstance(given, Mapping):
             raise InputError(f"{name}: expected a mapping of sensors or files, found {given!r}")
-    for name, seconds in shift.items() if isinstance(shift, Mapping) else ():
+    for name, seconds in shift.items():
         if not isinstance(seconds, Real):
             raise InputError(f"shift {name}: expected seconds, a number, found {seconds!r}")
 
