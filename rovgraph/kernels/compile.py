@@ -5,7 +5,8 @@ The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_C
 Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
 calls another one in a changed module is compiled again, which numba's own cache does not notice.
 
-Where several modules are missing, each is compiled by a process of its own, as many at a time as there are cores.
+Where several modules are missing, each is compiled by a process of its own, after those that it imports, as many at a
+time as there are cores.
 """
 
 import contextlib
@@ -16,8 +17,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -35,8 +37,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 config: Any = numba.config
 KERNEL: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}  # nothing in C calls them
 HELPER: Any = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # only kernels call them
-ONLY = "ROVGRAPH_COMPILE_ONLY"  # in the environment of a process that compiles: its module
-LONGEST_FIRST = ("filtering", "dive", "prediction", "correction", "chain_posterior", "motion_residual")
+HELPS = "ROVGRAPH_HELPS_COMPILE"  # in the environment of a process that compiles for another one
 logger = logging.getLogger("rovgraph")
 
 
@@ -73,9 +74,6 @@ def kernel(signature: str) -> Callable[[F], F]:
     """
 
     def decorate(function: F) -> F:
-        only = os.environ.get(ONLY)
-        if only is not None and only != function.__module__:
-            return cast(F, njit(**KERNEL)(function))  # compiled if the module that is meant calls it
         folder = cache_folder(function.__module__)
         try:
             with _cache_in(folder):
@@ -99,7 +97,7 @@ def cache_folder(module: str) -> Path | None:
         return None
     folder = _folder_in(parent, module)
     if not folder.exists():
-        if ONLY not in os.environ:
+        if HELPS not in os.environ:
             _say_once("compiling rovgraph's kernels, once: this takes a minute or so")
             if module.rpartition(".")[0] == __package__:
                 _compile_missing(parent)
@@ -115,32 +113,38 @@ def _folder_in(parent: Path, module: str) -> Path:
 def _compile_missing(parent: Path) -> None:
     """Have other processes compile what is missing; what they leave, this one compiles when it imports it."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    missing = [module for module in _modules() if not _folder_in(parent, module).exists()]
+    missing = {module for module in _modules() if not _folder_in(parent, f"{__package__}.{module}").exists()}
     if cores < 2 or len(missing) < 2:
         return
     root = str(Path(rovgraph.__file__).parents[1])
     code = "import importlib, sys; sys.path.insert(0, sys.argv[1]); importlib.import_module(sys.argv[2])"
 
-    def compile_one(module: str) -> None:
+    def compile_one(module: str) -> str:
         subprocess.run(
-            [sys.executable, "-c", code, root, module],
-            env={**os.environ, ONLY: module, "ROVGRAPH_CACHE_DIR": str(parent)},
+            [sys.executable, "-c", code, root, f"{__package__}.{module}"],
+            env={**os.environ, HELPS: "1", "ROVGRAPH_CACHE_DIR": str(parent)},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             check=False,
         )
+        return module
 
+    # a module comes after those that it imports: their kernels are then loaded, not compiled once more
+    order = TopologicalSorter({module: (_imported_kernels(module) - {module}) & missing for module in missing})
+    order.prepare()
     with ThreadPoolExecutor(cores) as pool:
-        list(pool.map(compile_one, missing))
+        running: set[Future[str]] = set()
+        while order.is_active():
+            running |= {pool.submit(compile_one, module) for module in order.get_ready()}
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            order.done(*(each.result() for each in done))
 
 
 def _modules() -> list[str]:
-    """All modules of this package that have kernels, those first that take longest."""
+    """All modules of this package that have kernels."""
     sources = {path.stem: path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py")}
-    names = [name for name, text in sources.items() if re.search(r"^@kernel\(", text, re.MULTILINE)]
-    place = {name: k for k, name in enumerate(LONGEST_FIRST)}
-    return [f"{__package__}.{name}" for name in sorted(names, key=lambda name: place.get(name, len(place)))]
+    return [name for name, text in sources.items() if re.search(r"^@kernel\(", text, re.MULTILINE)]
 
 
 @cache
