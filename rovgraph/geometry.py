@@ -264,6 +264,24 @@ def quaternion_from_matrix(R: ArrayLike) -> Array:
 
 
 _XYZ = [0, 1, 2]
+UNIT = 0.01  # by which the length of a unit quaternion that somebody wrote may differ from 1
+
+
+def matrix_from_quaternion(xyzw: ArrayLike) -> Array:
+    """Rotation matrices, shape (..., 3, 3), of quaternions x, y, z, w, shape (..., 4).
+
+    NaN where a quaternion's length differs from 1 by more than `UNIT`, as that of the zeros which stand for none.
+    """
+    q = np.asarray(xyzw, dtype=float)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    unit = np.divide(q, length, where=np.abs(length - 1.0) < UNIT, out=np.full(q.shape, np.nan))
+    x, y, z, w = np.moveaxis(unit, -1, 0)
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def earth_rate_n(latitude: float) -> Array:

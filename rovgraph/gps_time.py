@@ -1,4 +1,7 @@
-"""GPS time, weeks and seconds since 1980 without leap seconds, as Unix time."""
+"""GPS time, weeks and seconds since 1980 without leap seconds, as Unix time, and back.
+
+Leap seconds are those of IERS Bulletin C; the last was that of 2017.
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -6,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from rovgraph.geometry import Array
 
 EPOCH, WEEK_S = 315_964_800.0, 604_800.0  # in Unix time; [s]
-LEAP_S = 18.0  # by which it is ahead of UTC since 2017
 WEEKS = 1356, 4000  # a receiver that states another has not learnt the week: 2006 to 2056
 _LEAPS = np.array([1136073600.0, 1230768000.0, 1341100800.0, 1435708800.0, 1483228800.0])  # Unix times of leap seconds
 _FIRST_LEAP = 13  # seconds that GPS was ahead of UTC before the first of them
@@ -17,6 +19,13 @@ def unix_of_gps(week: ArrayLike, seconds: ArrayLike) -> Array:
     ahead = EPOCH + WEEK_S * np.asarray(week, dtype=float) + np.asarray(seconds, dtype=float)
     leaps = np.searchsorted(_LEAPS + _FIRST_LEAP + 1 + np.arange(len(_LEAPS)), ahead, side="right")
     return np.asarray(ahead - _FIRST_LEAP - leaps)
+
+
+def gps_of_unix(unix: ArrayLike) -> tuple[Array, Array]:
+    """Weeks and seconds of the week [s] of Unix times [s], each of their shape."""
+    time = np.asarray(unix, dtype=float)
+    week, seconds = np.divmod(time - EPOCH + _FIRST_LEAP + np.searchsorted(_LEAPS, time, side="right"), WEEK_S)
+    return np.asarray(week), np.asarray(seconds)
 
 
 def is_week(week: ArrayLike) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from rovgraph.geometry import (
     cross,
     exp_rotation,
     log_rotation,
+    matrix_from_quaternion,
     matrix_from_rpy,
     quaternion_from_matrix,
     right_jacobian,
@@ -110,3 +111,16 @@ def test_quaternions_and_logarithms_are_those_of_scipy(size):
     R = expected.as_matrix()
     np.testing.assert_allclose(quaternion_from_matrix(R), Rotation.from_matrix(R).as_quat(), atol=1e-14)
     np.testing.assert_allclose(log_rotation(R), expected.as_rotvec(), rtol=1e-9, atol=1e-14)
+
+
+def test_a_quaternion_becomes_the_matrix_that_scipy_makes_of_it_and_comes_back():
+    q = np.random.default_rng(3).normal(size=(50, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    R = matrix_from_quaternion(q * 1.005)  # rounded by whoever wrote it
+    np.testing.assert_allclose(R, Rotation.from_quat(q).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(np.abs(np.sum(quaternion_from_matrix(R) * q, axis=1)), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.02), (np.nan, 0.0, 0.0, 1.0)])
+def test_a_quaternion_that_is_not_of_unit_length_is_no_rotation(q):
+    assert np.isnan(matrix_from_quaternion(q)).all()

@@ -9,7 +9,7 @@ from recordings import check_dive_comes_back, check_refused_or_whole, close, fir
 import rovgraph as rg
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
-from rovgraph.gps_time import unix_of_gps
+from rovgraph.gps_time import gps_of_unix, unix_of_gps
 from rovgraph.interchange.formats import recognise
 
 G = 9.80665
@@ -102,6 +102,7 @@ def test_rows_from_before_the_clock_was_set_are_counted(tmp_path):
 @pytest.mark.parametrize(("unix", "seconds"), [(1483228799, 16.0), (1483228800, 18.0), (1483228801, 19.0)])
 def test_gps_time_counts_leap_seconds(unix, seconds):
     assert unix_of_gps(1930, seconds) == unix
+    assert gps_of_unix(unix) == (1930, seconds)
 
 
 @pytest.mark.parametrize("world", ["NED", "ENU"])

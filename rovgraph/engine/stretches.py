@@ -14,6 +14,9 @@ with n a sensor's measurements in its stretches, Q the quantile of chi-square be
 the mean square of normalised residuals of what is let in, at least 1. So a stretch is taken out only where its
 measurements cost more than good ones ever do, by the standard of the rest of the dive. A sensor that is wrong most of
 the time, or a dive that is no better without it, is not as configured: alarms say so, and nothing is taken out.
+
+The search frees what the dive holds and does not know exactly, such as the mounting of the DVL: a tilt that is held at
+zero makes all pings cost more than they should, so that leaving out more of them would always pay.
 """
 
 import math
@@ -176,7 +179,7 @@ def _with_fitted_edge(
     """The same for one edge: in by bisection until it is clear, then out by doubled steps until nothing shows."""
     newest, least, nearest = best.stretches[-1], best.cost, best
 
-    @cache
+    @cache  # from whichever edge was nearest when it was first asked for
     def at(index: int) -> Solution[Point] | None:
         edge = float(time[min(max(index, 0), len(time) - 1)])
         moved = replace(newest, end=edge) if end else replace(newest, begin=edge)

@@ -6,7 +6,7 @@ import numpy as np
 
 from rovgraph.export.formats import ExportFormat, Options
 from rovgraph.export.track import Track
-from rovgraph.gps_time import EPOCH, LEAP_S, WEEK_S
+from rovgraph.gps_time import WEEK_S, gps_of_unix
 
 RATE = 100.0  # of records, unless told otherwise [Hz]
 NAMES = (
@@ -21,8 +21,8 @@ ERRORS = (
 
 def week_seconds(unix: np.ndarray) -> np.ndarray:
     """GPS seconds of the week in which the first time lies, going on beyond its end; shape as given."""
-    gps = unix - EPOCH + LEAP_S
-    return np.asarray(gps - np.floor(gps[0] / WEEK_S) * WEEK_S)
+    week, seconds = gps_of_unix(unix)
+    return np.asarray(seconds + WEEK_S * (week - week[0]))
 
 
 def write(track: Track, path: Path, options: Options) -> None:

@@ -36,6 +36,7 @@ COLUMNS = {
     "fix": ("fix_lat", "fix_lon", "fix_sd"),
 }
 AXES = "the IMU's"
+SINCE_START = "the instrument's time since its start"
 GRAVITY = 7.0, 13.0  # medians of a vehicle's acceleration [m/s^2]
 MOST = {"rate": 40.0, "angle": 2.0 * np.pi + 0.01}  # no instrument gives more [rad/s], [rad]
 OTHERS = {"acceleration": ("m/s2", "g", "mg"), "rate": ("deg/s",), "angle": ("deg",)}  # than the documented unit
@@ -127,6 +128,21 @@ class Account:
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     left: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+    def count(self, table: Table) -> None:
+        """What of a table was not read: rows, and columns that hold no measurement of a log."""
+        self.left.update({("rows", why): count for why, count in table.left.items()})
+        self.left["columns", f"no measurement that a log has: {', '.join(table.others)[:120]}"] += len(table.others)
+
+
+def xyz(name: str) -> tuple[str, ...]:
+    """Plain names of the columns of three axes."""
+    return tuple(f"{name}{axis}" for axis in "xyz")
+
+
+def flags_of(values: Array) -> NDArray[np.int64]:
+    """Bits that a column of numbers holds, shape (n,); none where there is no number."""
+    return np.nan_to_num(values).clip(0.0, 2.0**31).astype(np.int64)
 
 
 def name_and_unit(written: str) -> tuple[str, str]:

@@ -5,6 +5,7 @@ with ``DATA_START``. SensorConnect writes the names of MSCL behind the device's,
 Names state no units: those of the MIP protocol are g, rad/s, gauss, and radians relative to NED.
 """
 
+import contextlib
 import re
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -17,25 +18,25 @@ from rovgraph.geometry import Array
 from rovgraph.gps_time import WEEK_S, is_week, unix_of_gps
 from rovgraph.interchange.formats import HEAD, Options
 from rovgraph.interchange.inertial import (
+    SINCE_START,
     Account,
     Measured,
     Source,
     Vector,
+    flags_of,
     measured_of,
     name_and_unit,
     recording_of_inertial,
+    xyz,
 )
 from rovgraph.interchange.recording import Clock, Recording
+from rovgraph.interchange.stamps import UNIX_S, unix_of_text, unwrapped
 from rovgraph.interchange.text_table import Layout, Table, cells_of, read_table
 
 START = b"DATA_START"
 DESCRIPTOR = re.compile(r"^(.*?)\s*\[x([0-9A-F]{4})\]$", re.IGNORECASE)
 CORRECTED = "values are corrected by the instrument's own filter; record the scaled ones for a filter of ours"
 NORTH = "the yaw is taken relative to magnetic north; state declination_deg: 0 if the instrument adds a declination"
-
-
-def _xyz(name: str) -> tuple[str, ...]:
-    return tuple(f"{name}{axis}" for axis in "xyz")
 
 
 def _field(descriptor: str, *names: str) -> tuple[str, ...]:
@@ -49,25 +50,25 @@ def _imu(label: str, acc: tuple[str, ...], gyr: tuple[str, ...], summed: bool = 
 
 SOURCES = (
     _imu("Accel, Gyro", _field("8004", "xaccel", "yaccel", "zaccel"), _field("8005", "xgyro", "ygyro", "zgyro")),
-    _imu("scaledAccel, scaledGyro", _xyz("scaledaccel"), _xyz("scaledgyro")),
+    _imu("scaledAccel, scaledGyro", xyz("scaledaccel"), xyz("scaledgyro")),
     _imu(
         "Delta Vel, Delta Theta",
         _field("8008", "deltavelx", "deltavely", "deltavelz"),
         _field("8007", "deltathetax", "deltathetay", "deltathetaz"),
         summed=True,
     ),
-    _imu("deltaVel, deltaTheta", _xyz("deltavel"), _xyz("deltatheta"), summed=True),
+    _imu("deltaVel, deltaTheta", xyz("deltavel"), xyz("deltatheta"), summed=True),
     Source(
         "imu",
         "estCompensatedAccel, estAngularRate",
         (
-            Vector(_xyz("estcompensatedaccel"), "acceleration", "m/s2"),
-            Vector(_xyz("estangularrate"), "rate", "rad/s"),
+            Vector(xyz("estcompensatedaccel"), "acceleration", "m/s2"),
+            Vector(xyz("estangularrate"), "rate", "rad/s"),
         ),
         f"estCompensatedAccel, estAngularRate: {CORRECTED}",
     ),
     Source("mag", "Mag", (Vector(_field("8006", "xmag", "ymag", "zmag"), "field", "gauss"),)),
-    Source("mag", "scaledMag", (Vector(_xyz("scaledmag"), "field", "gauss"),)),
+    Source("mag", "scaledMag", (Vector(xyz("scaledmag"), "field", "gauss"),)),
     *(
         Source("ahrs", label, (Vector(names, "angle", "rad"),), f"{label}: {NORTH}")
         for label, names in (
@@ -91,15 +92,13 @@ SET, VALID = 0x4, 0x1  # flags of a clock that was set since the start, and of a
 REFERENCE, COMPUTER = "timeinforeferencetime", "time"  # [ns]; of the computer that recorded
 VECTORS = {name for source in SOURCES for vector in source.vectors for name in vector.names}
 KNOWN = VECTORS | {name for group in (*FIXES, *GPS) for name in group if name} | {REFERENCE}
-OWN = KNOWN - {"roll", "pitch", "yaw", "latitude", "longitude", "horizontalaccuracy", *_xyz("deltavel")}
+OWN = KNOWN - {"roll", "pitch", "yaw", "latitude", "longitude", "horizontalaccuracy", *xyz("deltavel")}
 FEW = 3  # names that nothing else has
 SEPARATORS = {b"comma": ",", b"semicolon": ";", b"tab": "\t"}
 DECIMALS = {b"period": ".", b"point": ".", b"comma": ","}
 DATES = ("%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S", "%m/%d/%Y %I:%M:%S.%f %p", "%m/%d/%Y %I:%M:%S %p")
 GPS_SD_S, COMPUTER_SD_S = 0.01, 1.0
 ZONE_SD_S = 6 * 3600.0  # of a computer's calendar, whose time zone nobody states
-UNIX_S = 9.5e8, 4.2e9
-SINCE_START = "the instrument's time since its start"
 
 
 class MicroStrain:
@@ -123,9 +122,7 @@ class MicroStrain:
         by_instrument = {naming(name)[0] for name in layout.names} & {REFERENCE, *(tow for _, tow, _ in GPS)}
         wanted = KNOWN if by_instrument else KNOWN | {COMPUTER}
         table = read_table(path, layout, naming, wanted, options.progress, {COMPUTER: _computer_time})
-        account.left.update({("rows", why): count for why, count in table.left.items()})
-        unread = [name for name in layout.names if naming(name)[0] not in {*wanted, COMPUTER}]
-        account.left["columns", f"no measurement that a log has: {', '.join(unread)[:120]}"] = len(unread)
+        account.count(table)
         time, clock = _stamps(path, table, account)
         found = measured_of(path, table, SOURCES, time, None, account)
         return recording_of_inertial(path, self.name, [*found, *_fixes(table, time)], clock, account, options)
@@ -183,13 +180,9 @@ def _fixes(table: Table, time: Array) -> list[Measured]:
             sd = table[names[2]] if names[2] in table else np.full(len(time), np.nan)
             lat, lon = (table[name] for name in names[:2])
             if flags in table:
-                lat = np.where(_flags(table[flags]) & VALID, lat, np.nan)
+                lat = np.where(flags_of(table[flags]) & VALID, lat, np.nan)
             return [Measured("fix", "latitude, longitude", time, np.column_stack([lat, lon, sd]))]
     return []
-
-
-def _flags(values: Array) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
-    return np.nan_to_num(values).clip(0.0, 2.0**31).astype(np.int64)
 
 
 def _stamps(path: Path, table: Table, account: Account) -> tuple[Array, Clock]:
@@ -216,7 +209,7 @@ def _by_gps(table: Table, week: str, tow: str, flags: str, account: Account) -> 
     known = is_week(weeks) & np.isfinite(seconds)
     inertial = np.isfinite(np.column_stack([table[name] for name in table.columns if name in VECTORS])).any(axis=1)
     if flags in table:
-        known &= ~inertial | (_flags(table[flags]) & SET > 0)  # rows of its GNSS have other flags
+        known &= ~inertial | (flags_of(table[flags]) & SET > 0)  # rows of its GNSS have other flags
     stamped = inertial & np.isfinite(seconds)
     if 2 * (known & stamped).sum() > stamped.sum():
         account.left["rows", "from before the instrument's clock was set"] += int((stamped & ~known).sum())
@@ -224,11 +217,7 @@ def _by_gps(table: Table, week: str, tow: str, flags: str, account: Account) -> 
         return time, Clock("the instrument's GPS time", 0.0, GPS_SD_S, "GPS week and time of week")
     account.left["rows", "from after the instrument's clock was set"] += int((stamped & known).sum())
     account.notes.append("the instrument's clock was not set: its GPS time counts from its start")
-    time = np.where(known, np.nan, seconds)
-    there = np.isfinite(time)
-    wraps = np.cumsum(np.diff(time[there], prepend=time[there][:1]) < -0.5 * WEEK_S)
-    time[there] += WEEK_S * wraps
-    return time, Clock(SINCE_START)
+    return unwrapped(np.where(known, np.nan, seconds), WEEK_S), Clock(SINCE_START)
 
 
 def _computer_time(cell: str) -> float:
@@ -247,15 +236,7 @@ def _computer_time(cell: str) -> float:
 
 def _date(cell: str) -> float:
     cell = re.sub(r"(\.\d{6})\d+", r"\1", cell)  # dates have six decimals
-    try:
-        found = datetime.fromisoformat(cell)
-    except ValueError:
-        for form in DATES:
-            try:
-                found = datetime.strptime(cell, form)
-                break
-            except ValueError:
-                continue
-        else:
-            raise
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+    for form in DATES:
+        with contextlib.suppress(ValueError):
+            return datetime.strptime(cell, form).replace(tzinfo=UTC).timestamp()
+    return unix_of_text(cell)

@@ -13,13 +13,13 @@ from rovgraph.errors import InputError, collected_warnings
 from rovgraph.geometry import Array
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.stamps import UNIX_S
 from rovgraph.log.reading import map_columns, numbers
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
 from rovgraph.log.table import read_table
 from rovgraph.log.units import factors
 
 SURE = 0.95
-UNIX_S = (9.5e8, 4.2e9)  # stamps within, 2000 to 2103, are taken for Unix time [s]
 IN_RECEIVED = "host that received"
 
 

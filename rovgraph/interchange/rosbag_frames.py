@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.geometry import Array, rpy_from_matrix
+from rovgraph.geometry import Array, matrix_from_quaternion, rpy_from_matrix
 
 FRD_OF_FLU = np.diag([1.0, -1.0, -1.0])
 BODIES = ("base_link", "base_link_frd", "base_footprint")
@@ -41,9 +41,8 @@ class Frames:
         """Transforms of a ``tf2_msgs/TFMessage``; what is no rotation is left out."""
         for each in transforms:
             q, t = each.transform.rotation, each.transform.translation
-            R = rotation((q.x, q.y, q.z, q.w))
-            moved = np.array([t.x, t.y, t.z])
-            if R is not None and np.isfinite(moved).all():
+            R, moved = matrix_from_quaternion((q.x, q.y, q.z, q.w)), np.array([t.x, t.y, t.z])
+            if np.isfinite(R).all() and np.isfinite(moved).all():
                 self._parents[_name(each.child_frame_id)] = _name(each.header.frame_id), R, moved
 
     def mounting(self, frame: str) -> Mounting | None:
@@ -58,14 +57,6 @@ class Frames:
             at, R_pc, t_pc = self._parents[at]
             R, t = R_pc @ R, R_pc @ t + t_pc
         return None  # a circle
-
-
-def rotation(xyzw: tuple[float, float, float, float]) -> Array | None:
-    """Rotation matrix of a quaternion, shape (3, 3); None where it is none, as the zeros of one that is not set."""
-    from scipy.spatial.transform import Rotation
-
-    norm = float(np.linalg.norm(xyzw))
-    return Rotation.from_quat(xyzw).as_matrix() if abs(norm - 1.0) < 0.01 else None
 
 
 def _name(frame: str) -> str:

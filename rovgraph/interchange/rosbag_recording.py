@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, rpy_from_matrix
+from rovgraph.geometry import Array, matrix_from_quaternion, rpy_from_matrix
 from rovgraph.interchange.alternatives import preferred_first
 from rovgraph.interchange.fixes import ONE_POINT, new_fixes, one_point
 from rovgraph.interchange.formats import Options
@@ -203,23 +203,19 @@ class _Made:
 
     def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
         """The IMU's axes relative to NED; gravity tells whether the messages' world has z up or down."""
-        from scipy.spatial.transform import Rotation
-
-        whole = np.abs(np.linalg.norm(xyzw, axis=1) - 1.0) < 0.01
-        R_ws = Rotation.from_quat(np.where(whole[:, None], xyzw, [0.0, 0.0, 0.0, 1.0])).as_matrix()
+        R_ws = matrix_from_quaternion(xyzw)
         up = -1.0
         if topic.clock == NUCLEUS:
             self.notes.append(f"{topic.name}: heading less the declination that the instrument has added")
         else:
             acc = np.nanmedian(topic.table("imu")[:, 2:5], axis=0)
-            up = float(np.median(R_ws[:, 2, :] @ acc))
+            whole = np.isfinite(R_ws[:, 2, 2])
+            up = float(np.median(R_ws[whole, 2, :] @ acc)) if whole.any() else 1.0
             if up < 0.0:
                 self.notes.append(f"{topic.name}: gravity says that its orientation is relative to NED, not to ENU")
         angles = rpy_from_matrix(R_ws if up < 0.0 else NED_OF_ENU @ R_ws)
         self.notes.append(f"{topic.name}: its yaw is taken relative to magnetic north")
-        return {
-            f"ahrs_{name}": np.where(whole, angles[:, k], np.nan) for k, name in enumerate(("roll", "pitch", "yaw"))
-        }
+        return {f"ahrs_{name}": angles[:, k] for k, name in enumerate(("roll", "pitch", "yaw"))}
 
     def look(self, channels: tuple[Channel, ...], topics: Mapping[str, Topic]) -> None:
         """State mountings, and warn of what is missing or contradicts."""

@@ -1,6 +1,7 @@
 """Stamps of a channel that are put in order: a clock that was set within a file is told, never believed."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from rovgraph.interchange.recording import Channel
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 JUMP = 86400.0  # ahead, after which a stamp is of another epoch [s]
+UNIX_S = 9.5e8, 4.2e9  # what lies within, 2000 to 2103, is taken for Unix time [s]
 LOST = 0.1  # of the rows, that stamps of another epoch may have
 
 
@@ -30,6 +32,25 @@ def unix_of_calendar(
     months = np.where(sound, 12 * (year - 1970) + month - 1, 0).astype("datetime64[M]")
     days = months.astype("datetime64[D]").astype(np.int64) + day - 1
     return np.where(sound, 86400.0 * days + 3600.0 * hour + 60.0 * minute + second, np.nan)
+
+
+def unix_of_text(text: str) -> float:
+    """Seconds since 1970 of an ISO 8601 date, which is in UTC where it states no zone.
+
+    Raises
+    ------
+    ValueError : it is no date
+    """
+    date = datetime.fromisoformat(text)
+    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+
+
+def unwrapped(count: Array, wrap: float) -> Array:
+    """A counter, shape (n,), without its wraps, which are where it goes back by more than half its range; NaN stays."""
+    out = np.full(len(count), np.nan)
+    known = np.isfinite(count)
+    out[known] = count[known] + wrap * np.cumsum(np.diff(count[known], prepend=count[known][:1]) < -0.5 * wrap)
+    return out
 
 
 def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:

@@ -61,10 +61,12 @@ class Table:
     ----------
     columns : plain name -> column; the first of several that are called alike
     left : why -> rows
+    others : names, as written, of the columns that were not asked for
     """
 
     columns: dict[str, Column]
     left: Counter[str] = field(default_factory=Counter)
+    others: tuple[str, ...] = ()
 
     def __contains__(self, name: str) -> bool:
         return name in self.columns
@@ -137,7 +139,7 @@ def read_table(
         plain: Column(written, unit, np.frombuffer(values).copy() if len(values) else np.empty(0))
         for (plain, (_, written, unit)), (_, _, values) in zip(places.items(), takes, strict=True)
     }
-    return Table(columns, left)
+    return Table(columns, left, tuple(name for name in layout.names if naming(name)[0] not in places))
 
 
 def _take(cells: list[str], takes: "list[tuple[int, Callable[[str], float], array[float]]]", decimal: str) -> bool:

@@ -9,17 +9,20 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, rpy_from_matrix
+from rovgraph.geometry import Array, matrix_from_quaternion, rpy_from_matrix
 from rovgraph.gps_time import WEEK_S, is_week, unix_of_gps
 from rovgraph.interchange.formats import HEAD, Options
 from rovgraph.interchange.inertial import (
+    SINCE_START,
     Account,
     Measured,
     Source,
     Vector,
+    flags_of,
     measured_of,
     name_and_unit,
     recording_of_inertial,
+    xyz,
 )
 from rovgraph.interchange.recording import Clock, Recording
 from rovgraph.interchange.text_table import Layout, Table, cells_of, read_table
@@ -30,12 +33,8 @@ NORTH = (
 )
 
 
-def _xyz(name: str) -> tuple[str, ...]:
-    return tuple(f"{name}{axis}" for axis in "xyz")
-
-
 def _imu(label: str, acc: str, gyr: str) -> Source:
-    vectors = Vector(_xyz(acc), "acceleration", "m/s2"), Vector(_xyz(gyr), "rate", "rad/s")
+    vectors = Vector(xyz(acc), "acceleration", "m/s2"), Vector(xyz(gyr), "rate", "rad/s")
     return Source("imu", label, vectors)
 
 
@@ -49,12 +48,12 @@ SOURCES = (
         "imu",
         "DeltaVel, DeltaTheta",
         (
-            Vector(_xyz("deltavel"), "acceleration", "m/s2", summed=True),
-            Vector(_xyz("deltatheta"), "rate", "deg/s", summed=True),
+            Vector(xyz("deltavel"), "acceleration", "m/s2", summed=True),
+            Vector(xyz("deltatheta"), "rate", "deg/s", summed=True),
         ),
     ),
-    Source("mag", "Mag", (Vector(_xyz("mag"), "field", "gauss"),)),
-    Source("mag", "UncompMag", (Vector(_xyz("uncompmag"), "field", "gauss"),)),
+    Source("mag", "Mag", (Vector(xyz("mag"), "field", "gauss"),)),
+    Source("mag", "UncompMag", (Vector(xyz("uncompmag"), "field", "gauss"),)),
     Source(
         "ahrs",
         "Roll, Pitch, Yaw",
@@ -71,11 +70,10 @@ VECTORS = {name for source in SOURCES for vector in source.vectors for name in v
 KNOWN = VECTORS | {*QUATERNION, *FIX, STARTUP, GPS, TOW, WEEK, STATUS, INTERVAL}
 MARKS = {  # names that no other maker's columns have, as far as is known
     STARTUP, TOW, WEEK, "timesyncin", "timegpspps", "syncincnt", "syncoutcnt", "senssat", "imustatus", "insstatus",
-    *_xyz("uncompacc"), *_xyz("uncompaccel"), *_xyz("uncompgyro"), *_xyz("uncompmag"), *QUATERNION,
+    *xyz("uncompacc"), *xyz("uncompaccel"), *xyz("uncompgyro"), *xyz("uncompmag"), *QUATERNION,
 }  # fmt: skip
 FEW = 2  # of these
 NS, GPS_SD_S = 1e-9, 0.01
-SINCE_START = "the instrument's time since its start"
 
 
 class VectorNav:
@@ -97,9 +95,7 @@ class VectorNav:
         if layout is None:
             raise InputError(f"{path}: no line names columns of VectorNav; export it again as CSV")
         table, account = read_table(path, layout, name_and_unit, KNOWN, options.progress), Account()
-        account.left.update({("rows", why): count for why, count in table.left.items()})
-        unread = [name for name in layout.names if name_and_unit(name)[0] not in KNOWN]
-        account.left["columns", f"no measurement that a log has: {', '.join(unread)[:120]}"] = len(unread)
+        account.count(table)
         time, clock = _stamps(path, table)
         step = float(np.nanmedian(table[INTERVAL])) if table.holds(INTERVAL) else None
         found = measured_of(path, table, SOURCES, time, step, account)
@@ -150,8 +146,7 @@ def _unix(table: Table) -> Array | None:
         return None
     known = is_week(week) & np.isfinite(seconds)
     if STATUS in table:
-        status = np.nan_to_num(table[STATUS]).clip(0.0, 255.0).astype(np.int64)
-        known &= status & STATUS_VALID == STATUS_VALID
+        known &= flags_of(table[STATUS]) & STATUS_VALID == STATUS_VALID
     unix = unix_of_gps(np.where(known, week, 0.0), np.where(known, seconds, 0.0))
     return np.where(known, unix, np.nan) if known.any() else None
 
@@ -165,12 +160,7 @@ def _quaternions(table: Table, time: Array) -> list[Measured]:
 
 def attitude_of(label: str, time: Array, xyzw: Array) -> Measured:
     """An attitude that is given by quaternions, shape (n, 4), scalar last; what is no rotation is left out."""
-    from scipy.spatial.transform import Rotation
-
-    whole = np.abs(np.linalg.norm(np.nan_to_num(xyzw), axis=1) - 1.0) < 0.01
-    R = Rotation.from_quat(np.where(whole[:, None], xyzw, [0.0, 0.0, 0.0, 1.0])).as_matrix()
-    values = np.where(whole[:, None], rpy_from_matrix(R), np.nan)
-    return Measured("ahrs", label, time, values, f"{label}: {NORTH}")
+    return Measured("ahrs", label, time, rpy_from_matrix(matrix_from_quaternion(xyzw)), f"{label}: {NORTH}")
 
 
 def _fixes(table: Table, time: Array) -> list[Measured]:

@@ -11,7 +11,6 @@ from array import array
 from binascii import crc_hqx
 from collections import Counter
 from collections.abc import Callable
-from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -23,9 +22,10 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.gps_time import WEEK_S, is_week, unix_of_gps
 from rovgraph.interchange.formats import Options
-from rovgraph.interchange.inertial import Account, Measured, recording_of_inertial
+from rovgraph.interchange.inertial import SINCE_START, Account, Measured, recording_of_inertial
 from rovgraph.interchange.recording import Clock, Recording
-from rovgraph.interchange.vectornav import NORTH, SINCE_START, attitude_of, gnss
+from rovgraph.interchange.stamps import UNIX_S, unix_of_text, unwrapped
+from rovgraph.interchange.vectornav import NORTH, attitude_of, gnss
 from rovgraph.log.units import UNITS
 
 SENTENCE = re.compile(rb"^([^$]*)\$(VN([A-Z]{3}),([^*$]*))\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})\W*$")
@@ -45,7 +45,6 @@ PLACE, LOGGED, COUNT, FIRST = range(4)  # columns before the cells
 BROKEN, SHORT = "a wrong checksum, or no sentence", "cells that are missing or no numbers"
 COMMANDS = ("RRG", "WRG", "ERR", "WNV", "RST", "RFS", "TAR", "ASY")
 DAY_S, US, COUNT_WRAP = 86_400.0, 1e-6, 2.0**32
-UNIX_S = 9.5e8, 4.2e9
 LEAST_US = 500.0  # between two messages; a counter that goes on by less counts events
 GPS_SD_S, LOGGER_SD_S = 0.02, 1.0
 
@@ -175,10 +174,9 @@ def _calendar(text: str) -> float:
     if found := re.fullmatch(r"(\d\d?):(\d\d):(\d\d(?:\.\d+)?)", text):
         return 3600.0 * float(found[1]) + 60.0 * float(found[2]) + float(found[3])
     try:
-        date = datetime.fromisoformat(text)
+        return unix_of_text(text)
     except ValueError:
         return np.nan
-    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
 def _stamp(path: Path, tables: dict[str, Array], capture: _Capture, account: Account) -> Clock:
@@ -215,9 +213,9 @@ def _times(
         account.warnings.append("stamps are those that a logger wrote before the sentences, after the transport")
         if UNIX_S[0] < float(np.nanmedian(logged)) < UNIX_S[1]:
             return logged, Clock("the logger's time", 0.0, LOGGER_SD_S, "its stamps look like Unix time")
-        return _unwrapped(logged, DAY_S) if np.nanmax(logged) <= DAY_S else logged, Clock("the logger's time")
+        return unwrapped(logged, DAY_S) if np.nanmax(logged) <= DAY_S else logged, Clock("the logger's time")
     if np.isfinite(count).mean() > 0.5:
-        since = US * _unwrapped(count, COUNT_WRAP)
+        since = US * unwrapped(count, COUNT_WRAP)
         steps = np.diff(since[np.isfinite(since)])
         if len(steps) and steps.min() >= 0.0 and np.median(steps[steps > 0.0], keepdims=True)[0] >= US * LEAST_US:
             account.notes.append("stamps are the counter behind the sentences, in microseconds")
@@ -245,21 +243,13 @@ def _by_gps(place: Array, tow: Array, week: Array, timed: NDArray[np.bool_], acc
         clock = Clock("the instrument's GPS time", 0.0, GPS_SD_S, "GPS week and time of week")
     else:
         at = timed & ~known
-        seconds, clock = _unwrapped(tow[at], WEEK_S), Clock(SINCE_START)
+        seconds, clock = unwrapped(tow[at], WEEK_S), Clock(SINCE_START)
         account.notes.append("the instrument's clock was not set: its time of week counts from its start")
     account.left["sentences", "a time from before or after the clock was set"] += int(timed.sum() - at.sum())
     account.warnings.append("sentences are stamped by their place between those with a time (VNINS, VNGPS)")
     time = np.interp(place, place[at], seconds, left=np.nan, right=np.nan)
     time[at] = seconds
     return time, clock
-
-
-def _unwrapped(count: Array, wrap: float) -> Array:
-    """Without its wraps, which are where it goes back by more than half its range."""
-    out = np.full(len(count), np.nan)
-    known = np.isfinite(count)
-    out[known] = count[known] + wrap * np.cumsum(np.diff(count[known], prepend=count[known][:1]) < -0.5 * wrap)
-    return out
 
 
 def _measured(kind: str, table: Array) -> list[Measured]:

@@ -12,9 +12,11 @@ import numpy as np
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.interchange.formats import Options
+from rovgraph.interchange.formats import HEAD, Options
 from rovgraph.interchange.inertial import Account, Measured, recording_of_inertial
 from rovgraph.interchange.recording import Clock, Recording
+from rovgraph.interchange.stamps import unwrapped
+from rovgraph.interchange.text_table import Layout, cells_of, read_table
 
 FINE_S, FINE_WRAP = 1e-4, 2**32
 COUNTER_WRAP = 2**16
@@ -22,7 +24,8 @@ IMU = tuple(f"{name}_{axis}" for name in ("Acc", "Gyr") for axis in "XYZ")
 MAG = ("Mag_X", "Mag_Y", "Mag_Z")
 ANGLES = ("Roll", "Pitch", "Yaw")
 SENSOR = "the IMU's time"
-LONGEST = 1 << 14
+COUNTER, FINE = "PacketCounter", "SampleTimeFine"
+KNOWN = {COUNTER, FINE, *IMU, *MAG, *ANGLES}
 
 
 class Xsens:
@@ -33,50 +36,36 @@ class Xsens:
     extra = ""
 
     def recognise(self, path: Path, head: bytes) -> float:
-        names = next((line for line in head.split(b"\n")[:60] if line.strip() and not line.startswith(b"//")), b"")
-        return 0.9 if {"PacketCounter", "SampleTimeFine"} & set(_cells(names)) else 0.0
+        layout = _layout(head)
+        return 0.9 if layout is not None and {COUNTER, FINE} & set(layout.names) else 0.0
 
     def read(self, path: Path, options: Options) -> Recording:
-        header: list[str] = []
-        names: list[str] = []
-        left: Counter[str] = Counter()
-        rows: list[list[float]] = []
-        size = path.stat().st_size
         with path.open("rb") as file:
-            while line := file.readline(LONGEST):
-                options.progress(min(file.tell(), size), size)
-                if line.startswith(b"//"):
-                    header.append(line.decode("utf-8", "replace"))
-                elif not names:
-                    names = _cells(line) if line.strip() else []
-                elif (row := _row(line, len(names), left)) is not None:
-                    rows.append(row)
-        if not rows:
+            head = file.read(HEAD)
+        layout = _layout(head)
+        if layout is None:
+            raise InputError(f"{path}: no line names columns of MT Manager; export it again as text")
+        table = read_table(path, layout, lambda name: (name, ""), KNOWN, options.progress)
+        columns = {name: table[name] for name in table.columns}
+        if not any(len(values) for values in columns.values()):
             raise InputError(f"{path}: holds no row of measurements; export it again with Acc, Gyr and SampleTimeFine")
-        table = dict(zip(names, np.array(rows).T, strict=True))
-        return recording_of(path, self.name, table, "".join(header), left, options)
+        header = head[: layout.start].decode("utf-8", "replace")
+        return recording_of(path, self.name, columns, header, table.left, options)
 
 
 FORMAT = Xsens()
 
 
-def _cells(line: bytes) -> list[str]:
-    text = line.decode("utf-8-sig", "replace").strip("\r\n")
-    return [cell.strip() for cell in re.split(r"[\t;,]", text)]
-
-
-def _row(line: bytes, count: int, left: Counter[str]) -> list[float] | None:
-    cells = _cells(line)
-    if len(cells) == count + 1 and not cells[-1]:  # some versions end a line with a tab
-        del cells[-1]
-    if len(cells) != count:
-        left["more or fewer cells than the names"] += bool(line.strip())
-        return None
-    try:
-        return [float(cell) if cell else np.nan for cell in cells]
-    except ValueError:
-        left["a cell that is no number"] += 1
-        return None
+def _layout(head: bytes) -> Layout | None:
+    """The first line that is neither blank nor of the header."""
+    at = 0
+    for line in head.splitlines(keepends=True):
+        at += len(line)
+        if line.strip() and not line.startswith(b"//"):
+            separator = next((mark for mark in "\t;," if mark.encode() in line), ",")
+            names = tuple(name for name in cells_of(line, separator) if name)  # some versions end a line with a tab
+            return Layout(names, at, separator) if len(names) > 1 else None
+    return None
 
 
 def recording_of(
@@ -116,21 +105,12 @@ def recording_of(
 
 def _times(path: Path, table: dict[str, Array], header: str) -> tuple[Array, list[str]]:
     """Stamps [s], of ``SampleTimeFine``, else of ``PacketCounter`` and the rate that the header states."""
-    fine = table.get("SampleTimeFine")
+    fine = table.get(FINE)
     if fine is not None and np.isfinite(fine).any():
-        return FINE_S * _unwrapped(fine, FINE_WRAP), []
+        return FINE_S * unwrapped(fine, FINE_WRAP), []
     rate = re.search(r"(?:sample|update) ?rate:\s*([0-9.]+)", header, re.IGNORECASE)
-    if rate is None or float(rate[1].strip(".") or 0.0) <= 0.0:
+    if COUNTER not in table or rate is None or float(rate[1].strip(".") or 0.0) <= 0.0:
         raise InputError(f"{path}: has neither SampleTimeFine nor a rate in its header; export it with SampleTimeFine")
     hertz = float(rate[1].strip("."))
     note = f"times are PacketCounter by the header's rate of {hertz:g} Hz"
-    return _unwrapped(table["PacketCounter"], COUNTER_WRAP) / hertz, [note]
-
-
-def _unwrapped(count: Array, wrap: int) -> Array:
-    """A counter without its wraps; it wraps where it goes back by more than half its range."""
-    out = np.full(len(count), np.nan)
-    known = np.isfinite(count)
-    values = count[known]
-    out[known] = values + wrap * np.concatenate([[0], np.cumsum(np.diff(values) < -0.5 * wrap)])
-    return out
+    return unwrapped(table[COUNTER], COUNTER_WRAP) / hertz, [note]

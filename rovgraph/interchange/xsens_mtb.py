@@ -8,16 +8,15 @@ columns go (`rovgraph.interchange.xsens`).
 
 import mmap
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rovgraph.errors import InputError
-from rovgraph.geometry import Array, rpy_from_matrix
+from rovgraph.geometry import Array, log_rotation, matrix_from_quaternion, rpy_from_matrix
 from rovgraph.interchange.binary_records import ROWS
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Clock, Recording
@@ -49,7 +48,6 @@ CALENDAR = ("year", "month", "day", "h", "min", "s")
 UTC_FIELDS = np.dtype([("ns", ">u4"), ("year", ">u2"), *((name, "u1") for name in (*CALENDAR[1:], "flags"))])
 UTC_VALID = 0x7  # date, time of day, and leap seconds known
 UTC_SD_S = 0.01
-UNIT = 0.01  # from which a quaternion's length may differ from 1
 
 Layout = tuple[tuple[int, int, int], ...]  # identifier, first byte, size of each item
 
@@ -201,8 +199,7 @@ def _table(values: dict[int, Array]) -> dict[str, Array]:
     if acceleration is None and DELTA_V in values:
         acceleration = values[DELTA_V] / _period(values, DELTA_V)
     if rate is None and DELTA_Q in values:
-        turn = _of_unit_quaternions(values[DELTA_Q], Rotation.as_rotvec, (3,))
-        rate = turn / _period(values, DELTA_Q)
+        rate = log_rotation(_matrices(values[DELTA_Q])) / _period(values, DELTA_Q)
     if acceleration is None or rate is None:
         return {}
     table = {"PacketCounter": values[COUNTER][:, 0]} if COUNTER in values else {}
@@ -213,10 +210,14 @@ def _table(values: dict[int, Array]) -> dict[str, Array]:
             table |= {f"{name}_{axis}": vectors[:, k] for k, axis in enumerate("XYZ")}
     angles = values.get(EULER)
     if angles is None and QUATERNION in values:
-        angles = np.rad2deg(rpy_from_matrix(_of_unit_quaternions(values[QUATERNION], Rotation.as_matrix, (3, 3))))
+        angles = np.rad2deg(rpy_from_matrix(_matrices(values[QUATERNION])))
     if angles is not None:
         table |= {name: angles[:, k] for k, name in enumerate(("Roll", "Pitch", "Yaw"))}
     return table
+
+
+def _matrices(wxyz: Array) -> Array:
+    return matrix_from_quaternion(np.roll(wxyz, -1, axis=1))
 
 
 def _period(values: dict[int, Array], increment: int) -> float:
@@ -225,14 +226,6 @@ def _period(values: dict[int, Array], increment: int) -> float:
         return np.nan
     ticks = values[FINE][np.isfinite(values[increment][:, 0]), 0]
     return FINE_S * float(np.nanmedian(np.diff(ticks))) if len(ticks) > 1 else np.nan
-
-
-def _of_unit_quaternions(q: Array, form: Callable[[Rotation], Array], shape: tuple[int, ...]) -> Array:
-    """A form of rotation, (n, shape), of quaternions w, x, y, z (n, 4); NaN where one has not the length 1."""
-    unit = np.abs(np.linalg.norm(q, axis=1) - 1.0) < UNIT
-    out = np.full((len(q), *shape), np.nan)
-    out[unit] = form(Rotation.from_quat(q[unit], scalar_first=True))
-    return out
 
 
 def _clock(values: dict[int, Array], table: dict[str, Array]) -> Clock:

@@ -97,7 +97,7 @@ def plan_page(source: Source) -> str:
     head = ("manoeuvre", "bits", *(f"{label_with_unit(label, unit_of(label))}, sd" for label in labels))
     told = [("as known before", "", summary.get("sd_before") or {})]
     told += [(name, f"{p['bits']:.1f}", p["sd"] or {}) for name, p in zip(names, ranking, strict=True)]
-    rows = [(name, bits, *(_times(factors[label], sd.get(label)) for label in labels)) for name, bits, sd in told]
+    rows = [(name, bits, *(_scaled(factors[label], sd.get(label)) for label in labels)) for name, bits, sd in told]
     place = np.arange(1, len(ranking) + 1)
     drawn = [bars("bits", [p["bits"] for p in ranking], place, "#8FBBD9", 0.7, orientation="h", showlegend=False)]
     items: list[Item] = [
@@ -119,7 +119,7 @@ def _reached(label: str, wanted: float, sd: float | None) -> str:
     return f"{label}: sd {factor * sd:.2g}{behind(unit)}, wanted {factor * wanted:.2g}{behind(unit)}; {verdict}."
 
 
-def _times(factor: float, value: float | None) -> str:
+def _scaled(factor: float, value: float | None) -> str:
     return "–" if value is None else f"{factor * value:.3g}"
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.gps_time import EPOCH, LEAP_S, WEEK_S
+from rovgraph.gps_time import gps_of_unix
 from rovgraph.live.outputs.receiver import SATELLITES, dilution
 from rovgraph.live.solution import Solution
 
@@ -37,7 +37,7 @@ def gps_input(solution: Solution) -> Any:
         m.GPS_INPUT_IGNORE_FLAG_VEL_VERT: float(s.velocity[2]),
         m.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY: speed_sd,
     }
-    week, of_week = divmod(s.time - EPOCH + LEAP_S, WEEK_S) if s.time > UNIX else (0, 0.0)
+    week, of_week = gps_of_unix(s.time) if s.time > UNIX else (0, 0.0)
     north, east, downwards = (_finite(v) for v in s.velocity.tolist())
     return m.MAVLink_gps_input_message(
         time_usec=_microseconds(s.time),
