@@ -11,6 +11,8 @@ import pytest
 
 import rovgraph as rg
 from rovgraph.api.reporting import report
+from rovgraph.log.beams import usable_beams
+from rovgraph.pages.beams import valid_share
 from rovgraph.pages.page import render
 from rovgraph.pages.parts import Panel, Section, line, packed
 from rovgraph.pages.reporting import page_of
@@ -37,10 +39,21 @@ SECTIONS = [
 
 @pytest.fixture(scope="session")
 def dive():
-    """A short dive with faults: without bottom lock for a while, wrong pings, places seen twice."""
+    """A short dive with faults: without bottom lock for a while, wrong pings, places seen twice, a weak beam."""
     choices = rg.Choices(duration=90, dropouts=((30.0, 50.0),), outliers=0.02)
     simulated = rg.simulate("lawnmower", seed=4, choices=choices)
-    return rg.smooth(simulated.log, simulated.config)
+    return rg.smooth(with_beams(simulated.log), simulated.config)
+
+
+def with_beams(log):
+    """The log with four beams of its DVL: all valid with bottom lock, the fourth in every second ping."""
+    pings = log["dvl"]
+    valid = np.tile(pings["dvl_valid"][:, None], 4)
+    valid[::2, 3] = 0.0
+    columns = {f"valid_{k + 1}": valid[:, k] for k in range(4)} | {
+        f"range_{k + 1}": 2.0 + k + valid[:, k] for k in range(4)
+    }
+    return log.with_beams(usable_beams({"time": pings.time, **columns}))
 
 
 @pytest.fixture(scope="session")
@@ -123,6 +136,7 @@ MISSING = {
     "history.csv": "the folder has no history.csv",
     "calibration.csv": "calibration.csv is missing",
     "dvl.csv": "the folder has no dvl.csv",
+    "dvl_beams.csv": "the folder has no dvl_beams.csv",
     "left_out.csv": "the folder has no left_out.csv",
     "config.yaml": "config.yaml is missing",
 }
@@ -153,6 +167,11 @@ def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
         (lambda f: summary_with(f, end={"north_m": "x"}), "incomplete or of another version"),
         (lambda f: summary_with(f, sensors={"dvl": None}), "incomplete or of another version"),
         (lambda f: (f / "dvl.csv").write_text("time,lock,altitude,figure_of_merit,row\nx,1,1,1,1\n"), "incomplete or"),
+        (lambda f: (f / "dvl_beams.csv").write_text("time,valid_1\n1,x\n"), "line 2, column valid_1: 'x' is not a num"),
+        (
+            lambda f: (f / "dvl_beams.csv").write_text("time,valid_1\n1,7\n"),
+            "line 2, column valid_1: 7, expected 0 or 1",
+        ),
     ],
 )
 def test_what_is_no_results_folder_is_refused_in_a_line_and_an_old_page_stays(own, spoil, said):
@@ -162,6 +181,50 @@ def test_what_is_no_results_folder_is_refused_in_a_line_and_an_old_page_stays(ow
         report(own)
     assert "\n" not in str(refusal.value)
     assert not own.exists() or (own / "report.html").read_text() == before
+
+
+def panels_of(html):
+    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)[1]
+    return {panel["title"]: panel for panel in json.loads(data)["panels"].values()}
+
+
+def unpacked(text):
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+def test_each_beam_shows_its_valid_pings_and_its_range(own, folder):
+    panels = panels_of((folder / "report.html").read_text())
+    validity, far = panels["Valid pings of each beam"], panels["Range of each beam"]
+    assert validity["names"] == ["1", "2", "3", "4"]
+    shares = {t["name"]: unpacked(t["value"]) for t in validity["traces"] if "not valid" not in t["name"]}
+    assert [*shares] == [line["name"] for line in far["traces"]] == ["beam 1", "beam 2", "beam 3", "beam 4"]
+    locked = shares["beam 1"] == 100.0
+    assert 0.7 < locked.mean() < 0.8  # without lock from 30 to 50 s of 90
+    np.testing.assert_allclose(shares["beam 4"][locked], 50.0, atol=20.0)  # of four to six pings
+    (own / "dvl_beams.csv").unlink()
+    assert not panels_of(page_of(own)).keys() & {"Valid pings of each beam", "Range of each beam"}
+
+
+def test_beams_without_a_range_or_outside_of_the_track_leave_no_empty_panel(own):
+    table = pd.read_csv(own / "dvl_beams.csv")
+    table[["time", "valid_2", "valid_4"]].to_csv(own / "dvl_beams.csv", index=False)
+    panels = panels_of(page_of(own))
+    assert panels["Valid pings of each beam"]["names"] == ["2", "4"]
+    assert "Range of each beam" not in panels
+    table.assign(time=table["time"] + 1e6).to_csv(own / "dvl_beams.csv", index=False)
+    assert "no ping of the beams lies within the track" in page_of(own)
+
+
+def test_shares_of_valid_pings_stay_few_over_a_long_dive_and_know_where_there_is_no_ping():
+    time = np.arange(0.0, 36_000.0, 0.2)
+    time = time[(time < 9000.0) | (time > 18_000.0)]
+    valid = (time > 26_999.9).astype(float)
+    edges, share = valid_share(usable_beams({"time": time, "valid_0": valid, "valid_7": 1.0 - valid}), 0.0, 36_000.0)
+    assert share.shape == (len(edges) - 1, 2) == (240, 2)
+    np.testing.assert_array_equal(np.isnan(share).all(axis=1), (edges[:-1] >= 9000.0) & (edges[:-1] < 18_000.0))
+    np.testing.assert_array_equal(share[180:], [[100.0, 0.0]] * 60)
+    edges, share = valid_share(usable_beams({"time": [5.0], "valid_1": [1.0]}), 5.0, 5.0)
+    np.testing.assert_array_equal(share, [[100.0]])
 
 
 def test_every_compass_is_shown_with_the_curve_that_was_estimated(own):

@@ -71,11 +71,31 @@ def test_pings_without_lock_beams_and_the_dvls_own_position_are_kept_as_what_the
     assert np.isnan([dvl["dvl_vx"][2], dvl["dvl_sd"][2]]).all()
     assert len(first(recording, "dvl_altitude").columns["time"]) == 2
     beams = recording.tables["dvl_beams"]
-    np.testing.assert_array_equal(beams["id"], [0, 1, 2, 3] * 3)
-    close(beams["time"], np.repeat(dvl["time"], 4))
+    close(beams["time"], dvl["time"])
+    for number in range(4):
+        close(beams[f"distance_{number}"], [1.6] * 3)
+        np.testing.assert_array_equal(beams[f"valid_{number}"], [1, 1, 1])
     close(recording.tables["dvl_position"]["yaw"], np.pi / 2)
     assert recording.notes == ("the DVL's settings: mounting_rotation_offset 45.0",)
     assert sum(left(recording).values()) == 2
+
+
+def test_a_beam_that_a_report_lacks_or_misnames_is_not_known(tmp_path):
+    whole = [{"id": k, "beam_valid": k != 2, "distance": 2.0} for k in (3, 0, 2)]
+    odd = [
+        {"id": "1", "beam_valid": True},
+        {"id": 0.5},
+        {"id": 99},
+        None,
+        {"id": 3, "beam_valid": "yes", "distance": "far"},
+    ]
+    water = pings(1, START + 2.0, type="velocity_water", transducers=whole)
+    reports = [*pings(1, transducers=whole), *pings(1, START + 1.0, transducers=odd), *water]
+    beams = read(b"".join(reports), tmp_path).tables["dvl_beams"]
+    close(beams["time"], [START, START + 1.0])
+    for number, valid in ((0, [1, np.nan]), (2, [0, np.nan]), (3, [1, np.nan])):
+        np.testing.assert_array_equal(beams[f"valid_{number}"], valid)
+    assert "valid_1" not in beams
 
 
 def test_rows_of_the_makers_script_are_stamped_by_arrival_with_a_warning(tmp_path):

@@ -19,6 +19,8 @@ from rovgraph.interchange.own_log import is_own_log
 from rovgraph.interchange.recording import Recording
 from rovgraph.interchange.unknown import is_text, purpose, refusal
 from rovgraph.log import Log
+from rovgraph.log.beams import BEAMS, usable_beams
+from rovgraph.log.table import table_beside
 
 Paths = Path | str | Sequence[Path | str]
 NOTHING: Mapping[str, Any] = {}
@@ -76,11 +78,7 @@ class Conversion:
         path = Path(path)
         stem = check_suffix(path)
         inputs = {Path(recording.path).resolve() for recording in self.merged.recordings}
-        tables = {
-            path.with_name(f"{stem}.{name}.csv"): table
-            for recording in self.merged.recordings
-            for name, table in recording.tables.items()
-        }
+        tables = {table_beside(path, name): table for name, table in self.merged.tables.items()}
         report, config_path = path.with_name(stem + REPORT), None if config_out is None else Path(config_out)
         paths = [path, report, *tables, *([] if config_path is None else [config_path])]
         if clash := next((p for p in paths if p.resolve() in inputs), None):
@@ -146,11 +144,12 @@ def convert(
     full, used = completed(config, merged.nested_settings(), f"settings in {source}")
     bare = full.model_copy(update={"columns": {}, "units": {}})
     with collected_warnings() as texts:
-        log = Log.from_frame(merged.frame, bare, source)
+        beams = usable_beams(merged.tables[BEAMS], f"beams of {source}") if BEAMS in merged.tables else None
+    log = Log.from_frame(merged.frame, bare, source).with_beams(beams)
     log = replace(
         log,
         config=full,
-        warnings=(*merged.warnings, *texts),
+        warnings=(*merged.warnings, *texts, *log.warnings),
         settings=merged.nested_settings(),
         notes=(*notes(merged), *_settings_told(merged, used)),
     )

@@ -15,6 +15,7 @@ from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config
 from rovgraph.errors import warn
 from rovgraph.log import Log, Stream
+from rovgraph.log.beams import BEAMS
 
 ENOUGH_PINGS = 50
 JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
@@ -26,7 +27,10 @@ MOST_JUMPS = 5  # of one dive, that are bridged
 SURE_S = 0.1  # sd of a jump that is bridged [s]
 SURE = 3.0  # standard deviations
 SMALL_S = 0.05  # between the gap and the jump, that tells of nothing missing [s]
-CLOCKED = {"imu": ("imu", "mag", "ahrs"), "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude")}  # by one clock
+CLOCKED = {  # by one clock
+    "imu": ("imu", "mag", "ahrs"),
+    "dvl": ("dvl", "dvl_water", "dvl_heading", "dvl_altitude", BEAMS),
+}
 NAMES = {"imu": "IMU", "dvl": "DVL"}
 
 
@@ -144,7 +148,8 @@ def bridge_jumps(log: Log, config: Config) -> Log:
             f"{since(log, jump.before)} and {since(log, jump.after)}: bridged; the later stamps of "
             f"{', '.join(shifted)} are moved back by as much"
         )
-        log = replace(log, streams=streams)
+        beams = None if log.beams is None else _put_back(log.beams, jump)
+        log = replace(log, streams=streams, beams=beams)
     return log
 
 

@@ -23,6 +23,7 @@ from rovgraph.interchange.nortek_tracks import (
 from rovgraph.interchange.pressure import FRESH, GRAVITY
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.stamps import unix_of_calendar
+from rovgraph.log.beams import BEAMS
 
 SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
 CLOCK = "instrument's clock"
@@ -63,7 +64,8 @@ class AD2CP:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         found = find_records(content, AD2CP_FAMILIES, lambda done: options.progress(done, len(content)))
         channels: list[Channel] = []
-        tables, notes = {}, []
+        tables: dict[str, dict[str, Array]] = {}
+        notes = []
         signature, refused = decoded_signature(content, found)
         tracks = {SIGNATURE: signature} | {k: decoded_dvl(content, found, k) for k in (DVL_BOTTOM, DVL_WATER)}
         for kind, track in tracks.items():
@@ -73,7 +75,7 @@ class AD2CP:
                 channels += water_channels(track, f"water track {kind:#x}", CLOCK)
             else:
                 channels += bottom_channels(track, f"bottom track {kind:#x}", CLOCK)
-                tables[f"dvl_beams_{kind:x}"] = beam_table(track)
+                tables[BEAMS if not tables else f"{BEAMS}_{kind:x}"] = beam_table(track)
         channels += _attitude(content, found)
         channels += _depth(content, found)
         if not channels:

@@ -39,6 +39,8 @@ class Merged:
     unix : that is Unix time
     settings : what the files know, dotted key -> (value, file)
     warnings : what looks wrong, a sentence each
+    tables : other tables of the files (name -> column -> ndarray, shape (n,)), their ``time`` by the log's clock [s].
+        Those of file k have ``_k`` behind their names, but for the file that feeds the log's DVL
     """
 
     frame: pd.DataFrame
@@ -49,6 +51,7 @@ class Merged:
     unix: bool
     settings: Mapping[str, tuple[Any, str]]
     warnings: Sequence[str]
+    tables: Mapping[str, Mapping[str, Array]]
 
     @property
     def names(self) -> list[str]:
@@ -85,14 +88,14 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
     selected, unused = select(recordings, choose)
     clocks, beside, unix, told = join_clocks(recordings, selected, shift, _motion)
     by_name = {(clock.file, clock.name): clock for clock in clocks}
-    times = [
-        clock(np.asarray(each.channel.columns["time"])) + beside.get(each.channel.sensor, 0.0)
-        for each in selected
-        for clock in [by_name[each.file, each.channel.clock]]
-    ]
+    times = []
+    for each in selected:
+        clock = by_name[each.file, each.channel.clock]
+        times.append(clock(np.asarray(each.channel.columns["time"])) + beside.get(each.channel.sensor, 0.0))
     frame = _frame([each.channel for each in selected], times)
     settings = _settings(recordings, selected, clocks)
-    return Merged(frame, recordings, selected, unused, clocks, unix, settings, (*said, *told))
+    tables = _tables(recordings, selected, by_name, beside.get("dvl", 0.0))
+    return Merged(frame, recordings, selected, unused, clocks, unix, settings, (*said, *told), tables)
 
 
 def _frame(channels: Sequence[Channel], times: Sequence[Array]) -> pd.DataFrame:
@@ -115,6 +118,36 @@ def _frame(channels: Sequence[Channel], times: Sequence[Array]) -> pd.DataFrame:
     if LABEL in frame:
         frame[LABEL] = frame[LABEL].astype("Int64")
     return frame
+
+
+def _tables(
+    recordings: Sequence[Recording],
+    selected: Sequence[Selected],
+    clocks: Mapping[tuple[int, str], JoinedClock],
+    shift: float,
+) -> dict[str, dict[str, Array]]:
+    """Other tables of the files by the log's clock; those whose clock stamps nothing of the log are left out.
+
+    Parameters
+    ----------
+    clocks : file and clock -> JoinedClock
+    shift : that is stated of the DVL alone [s]
+    """
+    feeds = next((each.file for each in selected if each.channel.sensor == "dvl"), None)
+    out: dict[str, dict[str, Array]] = {}
+    for k, recording in enumerate(recordings):
+        stamping = sorted(recording.channels, key=lambda channel: not channel.sensor.startswith("dvl"))
+        clock = clocks.get((k, stamping[0].clock)) if stamping else None
+        if clock is None:
+            continue
+        for name, table in recording.tables.items():
+            time = clock(np.asarray(table["time"], dtype=float)) + (shift if k == feeds else 0.0)
+            stamped = np.isfinite(time)
+            rows = {column: np.asarray(values)[stamped] for column, values in table.items()}
+            rows["time"] = np.round(time[stamped], STAMP_DIGITS)
+            if stamped.any():
+                out[name if k == feeds else f"{name}_{k + 1}"] = rows
+    return out
 
 
 def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:

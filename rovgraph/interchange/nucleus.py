@@ -27,6 +27,7 @@ from rovgraph.interchange.nortek_tracks import (
     where_bits,
 )
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.log.beams import BEAMS
 
 IMU, MAGNETOMETER, BOTTOM, WATER, AHRS, INS = 0x82, 0x87, 0xB4, 0xBE, 0xD2, 0xDC
 POSIX, BOOT = "Nucleus's Unix time", "Nucleus's time since its start"
@@ -96,7 +97,7 @@ class Nucleus:
             settings["environment"] = {"declination_deg": round(float(declination[0]), 3)}
         mixed = stamped and not unix and any(flags.any() for flags in stamped)
         more = ["its clock was set meanwhile: stamps are of two clocks"] if mixed else []
-        tables = {"dvl_beams": beam_table(track_of(said[BOTTOM]))} if len(said[BOTTOM].time) else {}
+        tables = {BEAMS: beam_table(track_of(said[BOTTOM]))} if len(said[BOTTOM].time) else {}
         return Recording(
             str(path), self.name, channels, {clock.name: clock}, tuple(_left(found)), settings,
             warnings=(*more, *_warnings(found, channels)), tables=tables,

@@ -14,6 +14,7 @@ from rovgraph.geometry import Array
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.stamps import UNIX_S
+from rovgraph.log.beams import BEAMS, beams_beside, beams_frame
 from rovgraph.log.reading import map_columns, numbers
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
 from rovgraph.log.table import read_table
@@ -41,6 +42,7 @@ class OwnLog:
             names = map_columns(table, options.columns)
             scale = factors(options.units, table.source)
             cells = {name: numbers(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
+            beams = beams_beside(path)
         if RECEIVED in table.names:
             cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
         channels = tuple(_channels(cells))
@@ -52,7 +54,8 @@ class OwnLog:
             clocks[IN_RECEIVED] = Clock(IN_RECEIVED, 0.0, 0.0, "Unix time of arrival")
         ignored = [name for name in table.names if name not in names.values() and name != RECEIVED]
         left = tuple(Left(name, int(table.frame[name].notna().sum()), "no column of a log") for name in ignored)
-        return Recording(str(path), self.name, channels, clocks, left, warnings=tuple(texts))
+        tables = {} if beams is None else {BEAMS: {str(n): c.to_numpy(float) for n, c in beams_frame(beams).items()}}
+        return Recording(str(path), self.name, channels, clocks, left, warnings=tuple(texts), tables=tables)
 
 
 FORMAT = OwnLog()

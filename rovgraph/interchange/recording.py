@@ -84,7 +84,9 @@ class Recording:
     settings : configuration that the file knows (mountings, lever arms, declination, ...), nested as in YAML
     notes : assumptions and what was found on the way, a sentence each
     warnings : what looks wrong, a sentence each
-    tables : other tables that are worth keeping (name -> column -> ndarray), such as the DVL's beams
+    tables : other tables that are worth keeping (name -> column -> ndarray, shape (n,)), with a column ``time`` [s] by
+        the clock of the DVL's channels, or of the first channel where there is none. ``dvl_beams`` has what each beam
+        of the DVL measured, its columns as `rovgraph.log.beams` names them
     """
 
     path: str

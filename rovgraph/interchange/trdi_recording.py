@@ -15,6 +15,7 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.trdi_axes import EARTH, SHIP, SYSTEMS
+from rovgraph.log.beams import BEAMS
 
 CLOCK = "DVL's clock"
 FRAME = "forward (beam 3, or the ship's bow), starboard, down"
@@ -187,7 +188,7 @@ def _tables(pings: Pings, dated: NDArray[np.bool_]) -> dict[str, dict[str, Array
         if not np.isfinite(pings.beams).any():
             del by_beam["velocity"]
         columns = {f"{name}_{k + 1}": values[rows, k] for name, values in by_beam.items() for k in range(4)}
-        out["dvl_beams"] = {"time": pings.time[rows], **columns, "error_velocity": pings.error[rows]}
+        out[BEAMS] = {"time": pings.time[rows], **columns, "error_velocity": pings.error[rows]}
     located = dated & np.isfinite(pings.position[:, 0])
     if located.any():
         lat, lon = pings.position[located].T

@@ -21,6 +21,7 @@ from rovgraph.interchange.formats import Options
 from rovgraph.interchange.lines import Refused, json_number, json_object
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.waterlinked_reports import Report, is_report, velocity_report
+from rovgraph.log.beams import BEAMS, MOST_BEAMS
 
 DVL, RECORDER, ELAPSED = "DVL", "recorder", "DVL's time between reports"
 SET = 1e9  # [s] since 1970: a clock that shows less has never been set
@@ -41,7 +42,13 @@ _NUMBERS = (
     "log_time",
     "status",
 )
-_BEAM = ("id", "velocity", "distance", "rssi", "nsd", "beam_valid")
+_BEAM = {  # of a transducer -> quantity of a beam
+    "velocity": "velocity",
+    "distance": "distance",
+    "rssi": "rssi",
+    "nsd": "nsd",
+    "beam_valid": "valid",
+}
 _POSITION = ("ts", "x", "y", "z", "std", "roll", "pitch", "yaw")
 
 
@@ -120,7 +127,7 @@ class _Reports:
         self.notes: list[str] = []
         self.warnings: list[str] = []
         self._rows = array("d")  # of `_ROW`
-        self._beams = array("d")  # row, `_BEAM`
+        self._beams = array("d")  # row, id, `_BEAM`
         self._position = array("d")  # `_POSITION`
         self._faults = self._taken = 0
 
@@ -147,9 +154,9 @@ class _Reports:
         self._rows.extend((validity, 1e-6 * log_time, 1e-3 * since, report.water, *velocity, report.sd, altitude))
         self._faults += report.fault
         beams = row.get("transducers")
-        for beam in beams[:8] if isinstance(beams, list) else ():
-            if isinstance(beam, dict):
-                self._beams.extend((self._taken, *(_number(beam.get(name)) for name in _BEAM)))
+        for beam in beams[:MOST_BEAMS] if isinstance(beams, list) and not report.water else ():
+            if isinstance(beam, dict) and _number(beam.get("id")) in range(MOST_BEAMS):
+                self._beams.extend((self._taken, *(_number(beam.get(name)) for name in ("id", *_BEAM))))
         self._taken += 1
 
     def _response(self, row: dict[str, Any]) -> None:
@@ -257,14 +264,16 @@ class _Reports:
 
     def _tables(self, keep: Array, time: Array) -> dict[str, dict[str, Array]]:
         found = {}
-        beams = np.frombuffer(self._beams).reshape(-1, 1 + len(_BEAM))
+        beams = np.frombuffer(self._beams).reshape(-1, 2 + len(_BEAM))
         beams = beams[keep[beams[:, 0].astype(int)]]
         if len(beams):
-            place = np.cumsum(keep) - 1
-            found["dvl_beams"] = {
-                "time": time[place[beams[:, 0].astype(int)]],
-                **dict(zip(_BEAM, beams[:, 1:].T, strict=True)),
-            }
+            reports, row = np.unique(beams[:, 0].astype(int), return_inverse=True)
+            numbers, column = np.unique(beams[:, 1].astype(int), return_inverse=True)
+            found[BEAMS] = {"time": time[(np.cumsum(keep) - 1)[reports]]}
+            for quantity, values in zip(_BEAM.values(), beams[:, 2:].T, strict=True):
+                cells = np.full((len(reports), len(numbers)), np.nan)
+                cells[row, column] = values
+                found[BEAMS] |= {f"{quantity}_{number}": cells[:, k] for k, number in enumerate(numbers.tolist())}
         position = np.frombuffer(self._position).reshape(-1, len(_POSITION))
         if len(position):
             found["dvl_position"] = dict(zip(("time", *_POSITION[1:5]), position[:, :5].T, strict=True)) | {

@@ -1,7 +1,7 @@
 """What a dive has recorded, from a file, a data frame or arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,8 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.config import Config, config_or_defaults
-from rovgraph.errors import InputError, collected_warnings
+from rovgraph.errors import InputError, collected_warnings, warn
+from rovgraph.log.beams import beams_beside
 from rovgraph.log.reading import read_streams
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
 from rovgraph.log.table import Table, read_table, table_of_arrays, table_of_frame
@@ -30,6 +31,7 @@ class Log:
     warnings : what was ignored or sorted on reading
     settings : what its files state of the vehicle, nested as in YAML; a configuration takes precedence
     notes : how it was converted from native files, a sentence each
+    beams : what each beam of the DVL measured (`rovgraph.log.beams.beams_of`), for reports; None = not known
     """
 
     source: str
@@ -39,6 +41,7 @@ class Log:
     warnings: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    beams: Stream | None = None
 
     @staticmethod
     def from_frame(frame: pd.DataFrame, config: Config | None = None, source: str = "log") -> "Log":
@@ -98,6 +101,37 @@ class Log:
         """Time of the first measurement [s]."""
         return min(float(stream.time[0]) for stream in self.streams.values())
 
+    @property
+    def end(self) -> float:
+        """Time of the last measurement [s]."""
+        return max(float(stream.time[-1]) for stream in self.streams.values())
+
+    def with_beams(self, beams: Stream | None) -> "Log":
+        """The log with what each beam of its DVL measured.
+
+        Parameters
+        ----------
+        beams : of `rovgraph.log.beams.beams_of`, stamped by the log's clock as recorded: the configuration's
+            ``delay_s.dvl`` is subtracted; None = not known
+
+        Warns
+        -----
+        DataWarning : beams of another time than the log's; they are left out
+        """
+        if beams is None:
+            return self
+        delay = 0.0 if self.config is None else self.config.delay_s.get("dvl", 0.0)
+        beams = replace(beams, time=beams.time - delay)
+        first, last = float(beams.time[0]), float(beams.time[-1])
+        if first <= self.end and last >= self.start:
+            return replace(self, beams=beams)
+        with collected_warnings() as texts:
+            warn(
+                f"{self.source}: the DVL's beams have times from {first:.1f} to {last:.1f} s, the log from "
+                f"{self.start:.1f} to {self.end:.1f} s; the beams are left out; convert the native files again"
+            )
+        return replace(self, warnings=(*self.warnings, *texts))
+
     def require_read_with(self, config: Config) -> None:
         """Check that the log was read with this configuration's columns, units, delays and magnetometer calibration.
 
@@ -129,7 +163,7 @@ class Log:
 
 
 def read_log(path: Path | str, config: Config | None = None) -> Log:
-    """Read a log.
+    """Read a log, and what each beam of its DVL measured where ``log.dvl_beams.csv`` lies beside it.
 
     Parameters
     ----------
@@ -143,11 +177,12 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
 
     Warns
     -----
-    DataWarning : what was ignored or sorted
+    DataWarning : what was ignored or sorted; beams that cannot be used, which are left out
     """
     with collected_warnings() as texts:
         table = read_table(path)
-    return _log(table, config, texts)
+        beams = beams_beside(Path(path))
+    return _log(table, config, texts).with_beams(beams)
 
 
 def _log(table: Table, config: Config | None, before: Iterable[str] = ()) -> Log:

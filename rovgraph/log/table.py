@@ -24,6 +24,7 @@ from rovgraph.geometry import Array
 from rovgraph.log.streams import label_number
 
 NUMBERS = Real, Decimal, np.bool_  # what a cell of a column of objects may be
+SUFFIXES = (".csv.gz", ".csv", ".parquet")  # of a log that is written
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,12 @@ def read_table(path: Path | str) -> Table:
         frame, line = _csv(content, str(path))
     _check_rows(frame, str(path))
     return Table(str(path), frame, line)
+
+
+def table_beside(log: Path, name: str) -> Path:
+    """Where another table of a log is kept: ``log.NAME.csv`` beside ``log.csv`` or ``log.csv.gz``."""
+    suffix = next((s for s in SUFFIXES if log.name.endswith(s)), log.suffix)
+    return log.with_name(f"{log.name.removesuffix(suffix)}.{name}.csv")
 
 
 def table_of_frame(frame: pd.DataFrame, source: str) -> Table:

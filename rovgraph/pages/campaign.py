@@ -14,10 +14,10 @@ from rovgraph.pages.source import DiveSource, Source, damage_named
 from rovgraph.pages.thinning import extremes
 from rovgraph.pages.track import origin
 from rovgraph.pages.verdict import limits
+from rovgraph.report.colours import SERIES
 from rovgraph.report.units import plus_minus
 
 CAMPAIGN = "campaign.html"
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#7B3294", "#A3206B", "#333333", "#8C6D00", "#56808F")
 DASHES = ("solid", "dash", "dot", "dashdot")
 
 
@@ -95,7 +95,7 @@ def _limited(dives: dict[str, DiveSource]) -> list[str]:
 
 
 def _look(k: int) -> tuple[str, str]:
-    return COLOURS[k % len(COLOURS)], DASHES[k // len(COLOURS) % len(DASHES)]
+    return SERIES[k % len(SERIES)], DASHES[k // len(SERIES) % len(DASHES)]
 
 
 def _map(dives: dict[str, DiveSource]) -> tuple[list[str], list[Item]]:

@@ -6,10 +6,11 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.geometry import Array
+from rovgraph.pages.beams import beam_items
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Table, Trace, bars, line, packed, points
 from rovgraph.pages.source import DiveSource
 from rovgraph.pages.thinning import cloud, extremes, spread
-from rovgraph.report.colours import REJECTED
+from rovgraph.report.colours import REJECTED, SERIES
 
 BLUE, RED, DARK = "#0072B2", "#D55E00", "#333333"
 LAGS = 60  # of an autocorrelation, in measurements
@@ -18,7 +19,7 @@ SHADE = "#B35900"
 
 
 def dvl_section(source: DiveSource) -> Section:
-    """Lock, altitude, figure of merit, silences and velocities."""
+    """Lock, altitude, beams, figure of merit, silences and velocities."""
     title, clock, pings = "DVL", source.clock, source.pings
     if pings is None:
         return Section("dvl", title, (), [Missing("Pings", "the folder has no dvl.csv: no DVL, or an older version")])
@@ -36,6 +37,7 @@ def dvl_section(source: DiveSource) -> Section:
     drawn = [line("bottom lock", clock(time[some]), lock[some], BLUE, line_shape="hv")]
     note = f"{100 * lock.mean():.1f} % of {len(lock)} pings saw the bottom. Shaded: silences."
     items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans))
+    items += beam_items(source, spans)
     items.append(_silences(time[lock == 1]))
     items += _merit(source, pings)
     items += _velocities(source, spans)
@@ -197,13 +199,12 @@ def _periods(source: DiveSource) -> list[Item]:
     if rows is None or rows.empty:
         return []
     drawn: list[Trace] = []
-    colours = ("#0072B2", "#D55E00", "#009E73", "#7B3294", "#333333", "#CC79A7")
     for k, (sensor, own) in enumerate(rows.groupby("sensor", sort=False)):
         time = np.unique(own["time"].to_numpy(float))
         if len(time) > 1:
             period = np.diff(time)
             some = extremes(period)
-            drawn.append(line(str(sensor), source.clock(time[1:])[some], period[some], colours[k % len(colours)]))
+            drawn.append(line(str(sensor), source.clock(time[1:])[some], period[some], SERIES[k % len(SERIES)]))
     if not drawn:
         return []
     note = "One keyframe takes one heading, so a compass shows the rate of the keyframes here."

@@ -14,8 +14,11 @@ import pandas as pd
 from rovgraph import __version__
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.log import Stream
+from rovgraph.log.beams import beams_of
+from rovgraph.log.table import read_table
 from rovgraph.report.folder import STAMP, SUMMARY
-from rovgraph.report.results import CHI2_99
+from rovgraph.report.results import BEAMS_FILE, CHI2_99
 
 KINDS = ("smoothed", "filtered", "dead_reckoning")
 
@@ -240,6 +243,17 @@ class DiveSource(Source):
     @cached_property
     def pings(self) -> pd.DataFrame | None:
         return self.frame("dvl.csv", "time", "lock", "altitude", "figure_of_merit", "row")
+
+    @cached_property
+    def beams(self) -> Stream | None:
+        """What each beam of the DVL measured; None where the folder does not tell.
+
+        Raises
+        ------
+        InputError : a file that cannot be used
+        """
+        path = self.folder / BEAMS_FILE
+        return beams_of(read_table(path)) if path.is_file() else None
 
     @cached_property
     def silences(self) -> list[tuple[float, float]]:

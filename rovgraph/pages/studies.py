@@ -13,10 +13,10 @@ from rovgraph.pages.page import render
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Table, Trace, bars, line
 from rovgraph.pages.source import Clock, Source
 from rovgraph.pages.thinning import extremes
+from rovgraph.report.colours import SERIES
 from rovgraph.report.units import label_with_unit
 from rovgraph.units import behind, shown
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#7B3294", "#A3206B", "#333333", "#8C6D00", "#56808F")
 OF_TIMING = {  # key of a timing -> what a reader calls it
     "sensor": "sensor",
     "count": "measurements",
@@ -77,8 +77,8 @@ def observe_page(source: Source) -> str:
     sd = np.array(seen["history"]["sd"], float).reshape(len(time), -1)
     learning: list[Trace] = []
     for k, (label, c) in enumerate(seen["components"].items()):
-        look = {"dash": ("solid", "dash", "dot")[k // len(COLOURS) % 3]}
-        learning.append(line(label, clock(time), sd[:, k] / c["prior_sd"], COLOURS[k % len(COLOURS)], **look))
+        look = {"dash": ("solid", "dash", "dot")[k // len(SERIES) % 3]}
+        learning.append(line(label, clock(time), sd[:, k] / c["prior_sd"], SERIES[k % len(SERIES)], **look))
     note = "1: nothing is known beyond the prior."
     items.insert(1, Panel("When the dive showed it", clock.label, "sd / prior sd", learning, note=note))
     words = [sentence(s) for s in seen["in_words"]]
@@ -155,7 +155,7 @@ def _curves(table: pd.DataFrame, title: str, x: str, y: str, label: str, channel
             own = table[table["channel"].astype(str) == name]
             values = own[y].to_numpy(float)
             some = extremes(np.log(np.where(values > 0, values, np.nan)))
-            drawn.append(line(name, own[x].to_numpy(float)[some], values[some], COLOURS[k % len(COLOURS)]))
+            drawn.append(line(name, own[x].to_numpy(float)[some], values[some], SERIES[k % len(SERIES)]))
         unit = str((channels.get(names[0]) or {}).get("unit", ""))
         unit = f"({unit})²/Hz" if title == "Spectrum" else unit
         axis = f"{title.lower()} [{unit}]"

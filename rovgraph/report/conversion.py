@@ -18,10 +18,10 @@ from rovgraph.errors import InputError
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.log.table import SUFFIXES
 
 DIGITS = 10  # significant, of a cell: latitudes to a centimetre
 DECIMALS = {"time": 6}
-SUFFIXES = (".csv.gz", ".csv", ".parquet")
 MOUNTED = {"imu": "x forward, y starboard, z down", "dvl": "x forward, y starboard, z down"}
 
 
@@ -57,8 +57,10 @@ def write_frame(frame: pd.DataFrame, path: Path) -> None:
 
 
 def write_table(table: Mapping[str, Array], path: Path) -> None:
-    """Write one of the other tables of a file."""
-    write_csv(pd.DataFrame({name: np.asarray(values) for name, values in table.items()}), path, DIGITS)
+    """Write one of the other tables of a file, its times as those of the log."""
+    write_csv(
+        pd.DataFrame({name: np.asarray(values) for name, values in table.items()}), path, DIGITS, decimals=DECIMALS
+    )
 
 
 def starter(config: Config, log: Log, sources: Mapping[str, str], name: str) -> str:

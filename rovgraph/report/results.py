@@ -19,6 +19,7 @@ from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, 
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.log.beams import BEAMS, beams_frame
 from rovgraph.report.dive_files import dvl_frame, input_file, left_out_frame, timings, versions
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
@@ -26,6 +27,7 @@ from rovgraph.trajectory import TUM, Trajectory
 from rovgraph.units import shown
 
 CHI2_99 = 9.21  # of two degrees of freedom, so sqrt(9.21) semi-axes hold 99 %
+BEAMS_FILE = f"{BEAMS}.csv"
 _ORDER = ("smoothed", "filtered", "dead_reckoning")
 
 
@@ -84,10 +86,12 @@ def write_results(
 
 
 def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config) -> None:
-    """Write dvl.csv, where there is a DVL, and left_out.csv."""
+    """Write dvl.csv, where there is a DVL, dvl_beams.csv, where its beams are known, and left_out.csv."""
     pings = dvl_frame(log)
     if pings is not None:
         write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
+    if log.beams is not None:
+        write_csv(beams_frame(log.beams), folder / BEAMS_FILE, decimals={"time": 4})
     left_out = left_out_frame(log, config, main.residuals, main.summary.get("stretches_taken_out", []))
     write_csv(left_out, folder / "left_out.csv", decimals={"time": 4})
 

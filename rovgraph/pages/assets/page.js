@@ -51,7 +51,7 @@
     const layout = {
       margin: { l: 60, r: 12, t: 6, b: 44 }, font: { family: "system-ui, sans-serif", color: "#1c1c1c" },
       xaxis: axis(panel.x, panel.log.includes("x"), 12), yaxis: axis(panel.y, panel.log.includes("y"), panel.kind === "map" ? 12 : 6),
-      hovermode: "closest", bargap: 0, showlegend: panel.traces.some((t) => t.name && t.showlegend !== false),
+      hovermode: "closest", bargap: 0, barmode: "overlay", showlegend: panel.traces.some((t) => t.name && t.showlegend !== false),
       legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0, font: { size: 12 } },
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
     };
@@ -69,7 +69,9 @@
     const digits = panel.kind === "map" ? ".2f" : ".5g";
     const arrays = { x: unpack(trace.x), y: unpack(trace.y) };
     if (trace.t) arrays.t = unpack(trace.t);
-    return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : `%{x:${digits}}, %{y:${digits}}`, ...trace, ...arrays };
+    if (trace.value) arrays.value = arrays.customdata = unpack(trace.value); // what is told in the place of y
+    const told = `%{x:${digits}}, %{${trace.value ? "customdata" : "y"}:${digits}}`;
+    return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : told, ...trace, ...arrays };
   };
 
   const draw = async (figure) => {
@@ -79,7 +81,7 @@
     const series = panel.traces.map((trace) => traceOf(panel, trace));
     const entry = { panel, plot, series, readout: figure.querySelector(".readout") };
     drawn.set(key, entry);
-    if (panel.names.length) plot.style.height = `${110 + 22 * panel.names.length}px`;
+    if (panel.names.length && panel.kind !== "time") plot.style.height = `${110 + 22 * panel.names.length}px`;
     const options = { responsive: true, displaylogo: false, scrollZoom: false,
       toImageButtonOptions: { format: "png", scale: 2, filename: key },
       modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], modeBarButtonsToAdd: [exportButton(entry)] };
@@ -109,7 +111,7 @@
     click: () => {
       const quoted = (s) => `"${String(s).replaceAll('"', '""')}"`;
       const lines = [["series", entry.panel.x, entry.panel.y].map(quoted).join(",")];
-      for (const s of entry.series) for (let i = 0; i < s.x.length; i++) lines.push(`${quoted(s.name)},${s.x[i]},${s.y[i]}`);
+      for (const s of entry.series) for (let i = 0; i < s.x.length; i++) lines.push(`${quoted(s.name)},${s.x[i]},${(s.value || s.y)[i]}`);
       const link = document.createElement("a");
       link.href = URL.createObjectURL(new Blob([lines.join("\n") + "\n"], { type: "text/csv" }));
       link.download = entry.panel.title.replace(/[^\w-]+/g, "_") + ".csv";
@@ -196,7 +198,8 @@
     if (now < xaxis.range[0] || now > xaxis.range[1]) { entry.readout.textContent = ""; return; }
     const x = xaxis._offset + xaxis.d2p(now);
     add(entry.layer, "line", { x1: x, x2: x, y1: yaxis._offset, y2: yaxis._offset + yaxis._length, stroke: "#000", "stroke-width": 1 });
-    const told = entry.series.filter((s) => !s.quiet && s.x.length).map((s) => `${s.name} ${number(s.y[nearest(s.x, now)])}`);
+    const named = (s) => (/\d$/.test(s.name) ? `${s.name}:` : s.name); // a number beside a number
+    const told = entry.series.filter((s) => !s.quiet && s.x.length).map((s) => `${named(s)} ${number((s.value || s.y)[nearest(s.x, now)])}`);
     entry.readout.textContent = `at ${number(now)} ${data.clock.unit}: ${told.join(" · ")}`;
   };
   const place = (entry) => { // the vehicle with its ellipse, and the scale bar
