@@ -69,6 +69,15 @@ def times(merged: Merged, column: str) -> np.ndarray:
     return merged.frame.loc[merged.frame[column].notna(), "time"].to_numpy()
 
 
+@pytest.mark.parametrize(("duration", "seed"), [(120.0, 1), (120.0, 7), (420.0, 4)], ids=str)
+def test_clocks_apart_by_a_period_of_regular_waves_are_not_taken_for_one_another(duration, seed):
+    frame = simulated(falcon(), duration, seed).dive.log_frame
+    merged = merge([autopilot(frame, imu=IMU, depth=("depth",)), instrument(frame, 3.0)], {}, {})
+    late = times(merged, "dvl_vx") - frame.loc[frame["dvl_vx"].notna(), "time"].to_numpy()
+    clock = next(c for c in merged.clocks if c.file == 1)
+    assert np.abs(late).max() < 2.0 * clock.sd < 0.15
+
+
 @pytest.mark.parametrize(("offset", "drift"), [(3.2, 0.0), (-40.0, 0.0), (1_735_689_600.0, 0.0), (3.2, 50e-6)], ids=str)
 def test_clocks_apart_are_found_within_their_sd(dive, offset, drift):
     merged = merge([autopilot(dive), instrument(dive, offset, drift)], {}, {})

@@ -4,13 +4,14 @@ For a quantity y on clock A and the same one x on clock B, both as changes over 
 
     y(t) = c + b x(t + lag),
 
-and for an IMU's acceleration a and rate w against a DVL's velocity v, with s R from the DVL's axes to the IMU's and l
-the DVL's arm from the IMU,
+and for an IMU's acceleration a and rate w against a DVL's velocity v, with R from the DVL's axes to the IMU's and l the
+DVL's arm from the IMU,
 
-    a(t) = s (R dv/dt + w x R v)(t + lag) - w' x l - w x (w x l).
+    a(t) = (R dv/dt + w x R v)(t + lag) - w' x l - w x (w x l).
 
 The sums of these least-squares problems at all lags come from FFTs. R is then the best of a set of rotations that is
-dense enough for any mounting at right angles, and any about the vertical.
+dense enough for any mounting at right angles, and any about the vertical, each with the arm that fits it best. In waves
+the arm's part may be most of the motion: it counts for no lag.
 """
 
 from dataclasses import dataclass
@@ -29,7 +30,8 @@ TURNS = np.deg2rad(np.arange(0.0, 90.0, 15.0))  # about the vertical, between ri
 FLOOR_S = {"turning": 0.03, "depth": 0.05, "speed": 0.1}  # least sd of a lag [s]
 COMPASSES, COMPASS_S = {"ahrs", "dvl_heading"}, 0.3  # a compass that is filtered slowly comes late [s]
 ARM_SD = 0.5  # [m]
-ARM_INFORMATION = np.array([0.0, 0.0, 0.0, 0.0, *[ARM_SD**-2] * 3])
+RIDGE, TINY = 1e-3, 1e-9  # of an arm's information, that it is known where nothing turns
+ARM_INFORMATION = np.array([0.0, 0.0, 0.0, *[ARM_SD**-2] * 3])
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,10 @@ class Changes:
 
 @dataclass(frozen=True)
 class Accelerations:
-    """An IMU's acceleration against a DVL's; the parameters are s R, row by row, and l."""
+    """An IMU's acceleration against a DVL's; the parameters are R, row by row, and l.
+
+    A free scale would go to zero at a wrong lag, where the IMU's own rates and an arm explain most of the motion.
+    """
 
     a: Acceleration
     velocity: Signal
@@ -181,13 +186,25 @@ class Accelerations:
         normal = np.einsum("lm,tkn->tlkmn", np.eye(3), own) + np.einsum("tlmkn->tlkmn", mixed + turned)
         normal = (normal + np.einsum("tmlnk->tlkmn", mixed)).reshape(-1, 81)
         right = _correlate(a, dv) + _correlate(np.einsum("til,ti->tl", G, a), v)
-        total = np.maximum(_correlate(np.sum(a**2, axis=1), seen)[:, 0], 1e-12)
+        # and those of the arm's part Y l, which clock A alone knows, with what it explains without the DVL
+        Y = _by_arm(both[:, 3:6], both[:, 6:9])
+        information = _correlate(np.einsum("tij,tik->tjk", Y, Y), seen).reshape(-1, 3, 3)
+        ridge = RIDGE * np.trace(information, axis1=1, axis2=2) + TINY
+        covariance = np.linalg.inv(information + ridge[:, None, None] * np.eye(3))
+        crossed = _correlate(np.einsum("tlj->tjl", Y), dv) + _correlate(np.einsum("tij,til->tjl", Y, G), v)
+        crossed = crossed.reshape(-1, 3, 9)
+        alone = _correlate(np.einsum("tij,ti->tj", Y, a), seen)
+        total = _correlate(np.sum(a**2, axis=1), seen)[:, 0]
         M = _rotations().reshape(-1, 9)
-        errors = normal @ _products(M, M).reshape(-1, 81).T - 2.0 * right @ M.T
+        errors = total[:, None] + normal @ _products(M, M).reshape(-1, 81).T - 2.0 * right @ M.T
+        for k, rotation in enumerate(M):
+            errors[:, k] -= _explained(alone - crossed @ rotation, covariance)
+        total = np.maximum(total - _explained(alone, covariance), 1e-12)
         best = np.argmin(errors, axis=1)
-        error = np.clip(total + errors[np.arange(len(best)), best], 1e-9 * total, None)
+        error = np.clip(errors[np.arange(len(best)), best], 1e-9 * total, None)
+        arm = np.einsum("tij,tj->ti", covariance, alone - np.einsum("tjk,tk->tj", crossed, M[best]))
         seconds = _correlate(known, seen)[:, 0] * step
-        return Sums(_lags(grids), seconds, total, error, np.column_stack([M[best], np.zeros((len(best), 3))]))
+        return Sums(_lags(grids), seconds, total, error, np.column_stack([M[best], arm]))
 
     def observed(self, times: Array) -> tuple[Array, Array]:
         a, w, spin = self.a.means(times, self.window)
@@ -195,20 +212,19 @@ class Accelerations:
 
     def regressors(self, shown: Array, others: Array) -> Array:
         dv, v = self._moved(others)
-        G, S = skew(shown[:, :3]), skew(shown[:, 3:])
-        by_M = np.einsum("il,tk->tilk", np.eye(3), dv) + np.einsum("til,tk->tilk", G, v)
-        return np.concatenate([by_M.reshape(-1, 3, 9), -S - G @ G], axis=2)
+        by_M = np.einsum("il,tk->tilk", np.eye(3), dv) + np.einsum("til,tk->tilk", skew(shown[:, :3]), v)
+        return np.concatenate([by_M.reshape(-1, 3, 9), _by_arm(shown[:, :3], shown[:, 3:])], axis=2)
 
     def tangent(self, parameters: Array) -> Array:
         M = parameters[:9].reshape(3, 3)
-        out = np.zeros((12, 7))
-        out[:9, :4] = np.column_stack([*((skew(axis) @ M).ravel() for axis in np.eye(3)), M.ravel()])
-        out[9:, 4:] = np.eye(3)
+        out = np.zeros((12, 6))
+        out[:9, :3] = np.column_stack([(skew(axis) @ M).ravel() for axis in np.eye(3)])
+        out[9:, 3:] = np.eye(3)
         return out
 
     def moved(self, parameters: Array, step: Array) -> Array:
-        M = (1.0 + step[3]) * exp_rotation(step[:3]) @ parameters[:9].reshape(3, 3)
-        return np.concatenate([M.ravel(), parameters[9:] + step[4:]])
+        M = exp_rotation(step[:3]) @ parameters[:9].reshape(3, 3)
+        return np.concatenate([M.ravel(), parameters[9:] + step[3:]])
 
     def _moved(self, times: Array) -> tuple[Array, Array]:
         """Mean acceleration and velocity along the DVL's axes around each time, shape (n, 3) each."""
@@ -232,6 +248,17 @@ def coarse_step(comparison: Comparison) -> float:
     """Of the times at which lags are searched for [s]."""
     longest = max(float(np.ptp(span)) for span in chain(comparison.spans))
     return max(comparison.window / STEPS, longest / MOST_SAMPLES)
+
+
+def _explained(sums: Array, covariance: Array) -> Array:
+    """What the arm (3,) explains of the squares at every lag, of its sums (l, 3) and inverse information (l, 3, 3)."""
+    return np.asarray(np.einsum("ti,tij,tj->t", sums, covariance, sums))
+
+
+def _by_arm(rate: Array, spin: Array) -> Array:
+    """What an arm is multiplied by to give an acceleration, of rates w and their changes w' (n, 3), shape (n, 3, 3)."""
+    G = skew(rate)
+    return np.asarray(-skew(spin) - G @ G)
 
 
 def _rotations() -> Array:
