@@ -19,6 +19,7 @@ from rovgraph.config import Config, Mag, load_config, parse_config
 from rovgraph.errors import InputError
 from rovgraph.geometry import exp_rotation, rotate, rpy_from_matrix, transpose
 from rovgraph.log import STREAMS, Log, Stream, read_log
+from rovgraph.pages.reporting import write_page
 from rovgraph.sensors import field_direction
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -278,6 +279,13 @@ def test_the_command_writes_what_smooth_takes(run, turned, tmp_path):
     whole = load_config(out / "config.yaml")
     assert (whole.name, whole.imu.lever_arm_m) == ("mine", (0.1, 0.2, 0.3))
     assert whole.imu.mag == load_config(out / "magnetometer.yaml").imu.mag
+    page = (out / "report.html").read_text(encoding="utf-8")
+    after = 100 * summary["length_rms_after"]
+    assert f"and by {after:.3g} % with the calibration" in page
+    assert "do not use it" not in page
+    (out / "summary.json").write_text(json.dumps(summary | {"length_rms_before": summary["length_rms_after"]}))
+    write_page(out)
+    assert "do not use it" in (out / "report.html").read_text(encoding="utf-8")
     assert whole.imu.mag.centre == pytest.approx(summary["centre"], rel=1e-4)
 
 

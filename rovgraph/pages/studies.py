@@ -1,6 +1,6 @@
 """Pages of `observe`, `plan`, `calibrate` and `check`; and which page a results folder that is no dive's has."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,24 @@ OF_TIMING = {  # key of a timing -> what a reader calls it
     "jitter": "jitter [s]",
     "repeats": "repeated values",
 }
+
+OF_MAGNETOMETER = {  # key of a summary -> what a reader calls it
+    "log": "log",
+    "method": "method",
+    "samples": "samples",
+    "samples_used": "of these used",
+    "centre": "centre (hard iron), in the log's unit",
+    "centre_sd": "its sd",
+    "matrix": "matrix (soft iron)",
+    "radii": "radii, in the log's unit",
+    "field_length": "length of the field, calibrated",
+    "length_rms_before": "its scatter as recorded, part of it",
+    "length_rms_after": "its scatter, calibrated",
+    "dip_deg": "dip [deg]",
+    "dip_rms_before_deg": "its scatter as recorded [deg]",
+    "dip_rms_after_deg": "its scatter, calibrated [deg]",
+}
+WORSE = 0.8  # of the scatter before, that is hardly less
 
 
 def study_page_of(source: Source) -> Callable[[Source], str] | None:
@@ -139,8 +157,18 @@ def noise_page(source: Source) -> str:
         )
     items.append(piece(source, "noise.yaml"))
     remarks = {"Remarks": source.summary.get("remarks") or []}
-    sections = [Section("noise", "Noise", (), items, {k: v for k, v in remarks.items() if v})]
+    told = [f"Noise of {len(channels)} channels over {source.summary.get('duration_s') or 0.0:.0f} s at rest."]
+    found = source.summary.get("lines") or []
+    if found:
+        told.append("Regular motion or vibration, which the noise is stated without: " + _lines_told(found) + ".")
+    sections = [Section("noise", "Noise", told, items, {k: v for k, v in remarks.items() if v})]
     return rendered(source, "Noise of the instruments", sections)
+
+
+def _lines_told(found: Sequence[dict[str, Any]]) -> str:
+    return ", ".join(
+        f"{cell(one.get('frequency_hz'))} Hz of the {one.get('sensor')} ({one.get('kind')})" for one in found
+    )
 
 
 def _curves(table: pd.DataFrame, title: str, x: str, y: str, label: str, channels: dict[str, Any]) -> list[Item]:
@@ -165,15 +193,35 @@ def _curves(table: pd.DataFrame, title: str, x: str, y: str, label: str, channel
 
 def magnetometer_page(source: Source) -> str:
     """The calibration of a magnetometer."""
-    hidden = {"program", "version", "calibration", "turns", "disturbances"}
-    rows = [(key.replace("_", " "), cell(value)) for key, value in source.summary.items() if key not in hidden]
+    summary = source.summary
+    rows = [(label, cell(summary.get(key))) for key, label in OF_MAGNETOMETER.items()]
     items: list[Item] = [Table("Calibration", ("", ""), rows)]
     for key in ("disturbances", "turns"):
-        entries = source.summary.get(key) or []
+        entries = summary.get(key) or []
         if entries:
-            items.append(Table(key.capitalize(), [*entries[0]], [tuple(map(cell, e.values())) for e in entries]))
+            head = [name.removesuffix("_s") + " [s]" if name.endswith("_s") else name for name in entries[0]]
+            items.append(Table(key.capitalize(), head, [tuple(map(cell, e.values())) for e in entries]))
     items += [*images(source), piece(source, "magnetometer.yaml")]
-    return rendered(source, "Magnetometer", [Section("magnetometer", "Magnetometer", (), items)])
+    return rendered(source, "Magnetometer", [Section("magnetometer", "Magnetometer", _field_told(summary), items)])
+
+
+def _field_told(summary: dict[str, Any]) -> list[str]:
+    """How much the calibration improves, in sentences."""
+    before, after = (summary.get(f"length_rms_{when}") for when in ("before", "after"))
+    if before is None or after is None:
+        return []
+    told = [
+        f"The length of the measured field scatters by {100 * before:.3g} % as recorded and by {100 * after:.3g} % "
+        f"with the calibration ({summary.get('samples_used')} of {summary.get('samples')} samples were used)."
+    ]
+    if summary.get("dip_deg") is not None:
+        sideways = float(np.rad2deg(after / max(np.cos(np.deg2rad(summary["dip_deg"])), 0.01)))
+        told.append(f"So much error across the field turns a level heading by {sideways:.2g}° (rms).")
+    if after > WORSE * before:
+        told.append("The calibration hardly improves the field: do not use it; turn the vehicle anew, far from steel.")
+    if summary.get("disturbances"):
+        told.append("The field changed with something on the vehicle, at the times below, which are left out.")
+    return told
 
 
 def check_page(report: dict[str, Any], title: str) -> str:
