@@ -148,7 +148,9 @@ def test_blueos_and_cockpit_find_the_page(server):
     service = server.client.get("/register_service").json()
     assert service["works_in_relative_paths"] is True
     extras = server.client.get(service["extras"]["cockpit"]).json()
-    assert extras["target_system"] == "Cockpit" and extras["widgets"][0]["iframe_url"].startswith("/")
+    (widget,) = extras["widgets"]
+    assert extras["target_system"] == "Cockpit" and widget["use_extension_path_as_base_url"] is True
+    assert all(server.client.get(widget[name]).status_code == 200 for name in ("iframe_url", "iframe_icon"))
     page = server.client.get("/").text
     assert re.findall(r'(?:src|href)="(/|https?:|//)', page) == []
 

@@ -1,5 +1,6 @@
 """What is released is whole: the sdist builds the wheel, and the wheel runs outside the repository."""
 
+import json
 import os
 import re
 import shutil
@@ -16,10 +17,12 @@ import pytest
 from packaging.markers import Marker
 from packaging.requirements import Requirement
 
+import rovgraph
+
 ROOT = Path(__file__).parents[1]
 BUILT_FROM = (
     *("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE", "Makefile", "Dockerfile"),
-    *(".dockerignore", "rovgraph", "tests", "docs", "data", "configs", "benchmarks"),
+    *(".dockerignore", "rovgraph", "tests", "docs", "data", "configs", "benchmarks", "blueos"),
 )
 LEFT_BEHIND = ("__pycache__", ".*_cache")
 LINUX = {"sys_platform": "linux", "platform_machine": "x86_64"}
@@ -119,11 +122,24 @@ def test_the_metadata_say_what_was_tried(metadata):
     assert stated == {"3.11", "3.12", "3.13"}
 
 
-def test_the_image_is_built_from_files_that_are_there_and_not_ignored():
-    copied = re.findall(r"^COPY (.+) \S+$", (ROOT / "Dockerfile").read_text(encoding="utf-8"), re.MULTILINE)
+@pytest.mark.parametrize("dockerfile", ["Dockerfile", "blueos/Dockerfile"])
+def test_the_image_is_built_from_files_that_are_there_and_not_ignored(dockerfile):
+    copied = re.findall(r"^COPY (.+) \S+$", (ROOT / dockerfile).read_text(encoding="utf-8"), re.MULTILINE)
     names = [name for line in copied for name in line.split()]
     let_in = (ROOT / ".dockerignore").read_text(encoding="utf-8").split()
     assert names and all((ROOT / name).exists() and f"!{name}" in let_in for name in names)
+
+
+def test_the_extension_of_blueos_says_what_blueos_reads():
+    text = (ROOT / "blueos/Dockerfile").read_text(encoding="utf-8").replace("\\\n", "")
+    labels = {name: value.strip("'\"") for name, value in re.findall(r"^LABEL (\w+)=(.*)$", text, re.MULTILINE)}
+    assert labels["version"] == rovgraph.__version__ and labels["type"] == "device-integration"
+    read = {name: json.loads(labels[name]) for name in ("permissions", "authors", "company", "tags", "links")}
+    assert read["authors"][0].keys() == {"name", "email"} and read["company"]["name"]
+    ports, host = read["permissions"]["ExposedPorts"], read["permissions"]["HostConfig"]
+    (exposed,) = re.findall(r"^EXPOSE (.+)$", text, re.MULTILINE)
+    assert ports.keys() == host["PortBindings"].keys() == set(exposed.split())
+    assert [bind.partition(":")[2] for bind in host["Binds"]] == ["/data"]
 
 
 NO_GTSAM = "import sys; sys.modules['gtsam'] = None; from rovgraph.cli.app import main; main()"

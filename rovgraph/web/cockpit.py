@@ -31,8 +31,15 @@ def service() -> dict[str, Any]:
 
 
 def extras() -> dict[str, Any]:
-    """The widget that Cockpit offers: the page itself, without its panels."""
-    widget = {"name": "rovgraph", "config_iframe_url": None, "iframe_url": "/#widget", "version": __version__}
+    """The widget that Cockpit offers: the page itself, without its panels. Cockpit refuses one without an icon."""
+    widget = {
+        "name": "rovgraph",
+        "config_iframe_url": None,
+        "iframe_url": "/#widget",
+        "iframe_icon": "/assets/icon.svg",
+        "use_extension_path_as_base_url": True,
+        "version": __version__,
+    }
     return {
         "target_system": "Cockpit",
         "target_cockpit_api_version": "1.0.0",
