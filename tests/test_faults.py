@@ -16,7 +16,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import faults  # noqa: E402
 from fault_campaign import earth  # noqa: E402
-from fault_campaign.campaign import keep_dive, read_dives, run, table  # noqa: E402
+from fault_campaign.campaign import keep_dive, read_dives, run, run_case, table  # noqa: E402
 from fault_campaign.cases import CASES, FAULTS, HEALTHY  # noqa: E402
 from fault_campaign.instruments import at_arm, dvl, log_table, sample  # noqa: E402
 from fault_campaign.judge import QUANTITIES, Dive, NoTrace, Result, honest_nees, judge, nees, run_dive  # noqa: E402
@@ -344,6 +344,14 @@ def test_perfect_instruments_give_the_true_track():
     assert not result.refused, result.said
     assert result.rms["smoothed"] < 0.03
     assert result.rms["filtered"] < 0.1
+
+
+def test_a_dvls_arm_that_is_off_is_named_and_estimated_not_taken_for_an_error_that_lasts():
+    result = run_case(CASES["dvl arm"], 0)
+    told = [text for text in result.said if "calibration.dvl" in text]
+    assert len(told) == 1 and "(calibration.dvl_lever_arm)" in told[0]
+    assert result.rms["smoothed"] < 0.3  # 0.42 m with dvl_error in its place
+    assert result.nees["smoothed"]["dvl_yaw"] < 2.0  # 3.3
 
 
 @pytest.mark.slow

@@ -12,6 +12,9 @@ that are off for a minute take the track along. One elimination at the optimum, 
 tells whether to look for more; that is all that a healthy dive costs. The most likely sd and time constant are those of
 the dive linearised at its optimum, and the dive is solved once with them. Where it gains other than promised, it is
 linearised there for another search: fixes that were rejected without the error come back with it.
+
+A constant that is off makes residuals that look like an error that lasts, as a DVL's arm does in turns. Where one makes
+the dive likelier, it is found instead, as an error of infinite time constant.
 """
 
 from collections.abc import Collection
@@ -45,7 +48,7 @@ SHORTEST = 5.0  # time constant in intervals between measurements: what is short
 LONGEST = {"dvl": 0.5}  # time constant in the length of the dive, 1 where none stands here
 SMALLEST = 0.01  # sd, in that of the table
 IMPLAUSIBLE = 10.0  # the same: a heading that is mirrored is no noise
-CONSTANT = np.array([1.0, 10.0])  # sds of the same error as a constant, in that of the table
+CONSTANT = np.array([1.0, 3.0, 10.0])  # sds of constants that may be the cause, in those they are believed to have
 FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
 EVALUATIONS = 12  # of the likelihood in it
 AT_LONGEST = 0.9  # of that time constant
@@ -59,8 +62,8 @@ class LastingError:
 
     Attributes
     ----------
-    sensor, variable : of `LASTING`
-    sd, time_constant : of the process [unit of the variable, s]
+    sensor, variable : of `LASTING`, or a constant of that sensor
+    sd, time_constant : of the process [unit of the variable, s]; infinite for a constant
     gain : of log likelihood
     """
 
@@ -168,7 +171,8 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     """The most likely error of a sensor, and the dive with it.
 
     Its gain is that over the same error as a constant, where that is more likely than none: a scale or an offset that
-    is held wrongly is no error that lasts for a while.
+    is held wrongly is no error that lasts for a while. What of the sensor is considered is found instead, where that
+    makes the dive likelier.
     """
     error, fitted = candidate, now.with_error(candidate.variable, candidate.sd, candidate.time_constant)
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
@@ -178,15 +182,25 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     if _implausible(now.chain, error):
         return replace(error, gain=-np.inf), fitted
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
-    return replace(error, gain=gain - _gain_of_constant(now, error.variable)), fitted
+    constant, held = _as_constant(now, error, [n for n in now.chain.unknowns.considered if not TABLE[n].time_offset])
+    if constant.gain >= max(gain, CLEAR):
+        return constant, held
+    return replace(error, gain=gain - _as_constant(now, error, [error.variable])[0].gain), fitted
 
 
-def _gain_of_constant(now: _Baseline, name: str) -> float:
-    """Of log likelihood, by an error that is constant over the dive, at least 0."""
-    gain, sd = max((now.linear_gain(name, sd, np.inf), sd) for sd in CONSTANT * TABLE[name].sd)
-    if gain <= LIKELY:
-        return 0.0
-    return max(0.0, now.minus_log_likelihood - now.with_error(name, sd, np.inf).minus_log_likelihood)
+def _as_constant(now: _Baseline, error: LastingError, names: Collection[str]) -> tuple[LastingError, _Baseline]:
+    """The most likely of some constants of an error's sensor, its gain at least 0, and the dive with it."""
+    rivals = [
+        replace(error, variable=name, sd=sd, time_constant=np.inf, gain=now.linear_gain(name, sd, np.inf))
+        for name in names
+        if error.sensor in TABLE[name].sensors
+        for sd in CONSTANT * now.chain.beliefs[name].sd
+    ]
+    best = max(rivals, key=lambda rival: rival.gain, default=replace(error, gain=0.0))
+    if best.gain <= LIKELY:
+        return replace(best, gain=0.0), now
+    held = now.with_error(best.variable, best.sd, np.inf)
+    return replace(best, gain=max(0.0, now.minus_log_likelihood - held.minus_log_likelihood)), held
 
 
 def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
@@ -252,17 +266,18 @@ def _begin(chain: Chain, point: State) -> State:
 def _with(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
     """The chain with an error that lasts among its unknowns; one of infinite time constant is constant."""
     walk = stationary_walk(sd, time_constant)
-    believed = replace(chain.beliefs[name], estimate=True, sd=sd, walk=walk, time_constant=time_constant)
+    believed = replace(
+        chain.beliefs[name], estimate=True, considered=False, sd=sd, walk=walk, time_constant=time_constant
+    )
     return replace(chain, beliefs={**chain.beliefs, name: believed}, unknowns=chain.unknowns.with_lasting(believed))
 
 
 def _freedom(chain: Chain, log_determinant: float) -> float:
-    """Minus log likelihood of a dive less its cost, up to what does not change with the errors that last.
+    """Minus log likelihood of a dive less its cost, up to what does not change with what is estimated.
 
     Parameters
     ----------
     log_determinant : of its information
     """
-    own = [name for name in LASTING.values() if name in chain.unknowns.estimated]
-    priors = sum(TABLE[name].dim * float(np.log(chain.beliefs[name].sd)) for name in own)
+    priors = sum(TABLE[n].dim * float(np.log(chain.beliefs[n].sd)) for n in chain.unknowns.estimated)
     return 0.5 * log_determinant - float(np.sum(np.log(chain.walk[0]))) + priors
