@@ -1,6 +1,6 @@
 """Pages of `observe`, `plan`, `calibrate` and `check`; and which page a results folder that is no dive's has."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -165,7 +165,7 @@ def noise_page(source: Source) -> str:
     return rendered(source, "Noise of the instruments", sections)
 
 
-def _lines_told(found: Sequence[dict[str, Any]]) -> str:
+def _lines_told(found: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(
         f"{cell(one.get('frequency_hz'))} Hz of the {one.get('sensor')} ({one.get('kind')})" for one in found
     )
@@ -205,7 +205,7 @@ def magnetometer_page(source: Source) -> str:
     return rendered(source, "Magnetometer", [Section("magnetometer", "Magnetometer", _field_told(summary), items)])
 
 
-def _field_told(summary: dict[str, Any]) -> list[str]:
+def _field_told(summary: Mapping[str, Any]) -> list[str]:
     """How much the calibration improves, in sentences."""
     before, after = (summary.get(f"length_rms_{when}") for when in ("before", "after"))
     if before is None or after is None:
