@@ -6,7 +6,7 @@
 #
 # --network host gives the container the host's ports; a serial port needs --device and --group-add dialout too.
 # `docker stop` ends the recording, which is then smoothed; without --stop-timeout it has 10 s for that.
-# Kernels are compiled for the processor that builds the image. On another one each start compiles for a minute or two,
+# Kernels are compiled for the processor that builds the image. On another one each start compiles for some minutes,
 # unless `-v rovgraph-kernels:/var/cache/rovgraph` keeps what was compiled; --read-only needs that volume, too.
 FROM python:3.13-slim
 

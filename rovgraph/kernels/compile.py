@@ -98,7 +98,7 @@ def cache_folder(module: str) -> Path | None:
     folder = _folder_in(parent, module)
     if not folder.exists():
         if HELPS not in os.environ:
-            _say_once("compiling rovgraph's kernels, once: this takes a minute or so")
+            _say_once("compiling rovgraph's kernels, once: this takes some minutes")
             if module.rpartition(".")[0] == __package__:
                 _compile_missing(parent)
         folder.mkdir(parents=True, exist_ok=True)
