@@ -48,7 +48,7 @@ SHORTEST = 5.0  # time constant in intervals between measurements: what is short
 LONGEST = {"dvl": 0.5}  # time constant in the length of the dive, 1 where none stands here
 SMALLEST = 0.01  # sd, in that of the table
 IMPLAUSIBLE = 10.0  # the same: a heading that is mirrored is no noise
-CONSTANT = np.array([1.0, 3.0, 10.0])  # sds of constants that may be the cause, in those they are believed to have
+CONSTANT = np.array([1.0, 10.0])  # sds of constants that may be the cause, in those they are believed to have
 FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
 EVALUATIONS = 12  # of the likelihood in it
 AT_LONGEST = 0.9  # of that time constant
@@ -170,9 +170,9 @@ def unity(block: Block, state: State, H: Array, gate: NDArray[np.bool_]) -> floa
 def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseline]:
     """The most likely error of a sensor, and the dive with it.
 
-    Its gain is that over the same error as a constant, where that is more likely than none: a scale or an offset that
-    is held wrongly is no error that lasts for a while. What of the sensor is considered is found instead, where that
-    makes the dive likelier.
+    Its gain is that over the same error as a constant, and over constants that are estimated but believed too well: a
+    scale or an offset that is held wrongly is no error that lasts for a while. What of the sensor is considered is
+    found instead, where that makes the dive likelier.
     """
     error, fitted = candidate, now.with_error(candidate.variable, candidate.sd, candidate.time_constant)
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
@@ -182,19 +182,22 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     if _implausible(now.chain, error):
         return replace(error, gain=-np.inf), fitted
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
-    constant, held = _as_constant(now, error, [n for n in now.chain.unknowns.considered if not TABLE[n].time_offset])
+    unknowns = now.chain.unknowns
+    own = [n for n in unknowns.considered if error.sensor in TABLE[n].sensors and not TABLE[n].time_offset]
+    constant, held = _as_constant(now, error, own)
     if constant.gain >= max(gain, CLEAR):
         return constant, held
-    return replace(error, gain=gain - _as_constant(now, error, [error.variable])[0].gain), fitted
+    known = [n for n, walk in unknowns.walks.items() if walk == 0.0]
+    return replace(error, gain=gain - _as_constant(now, error, [error.variable, *known])[0].gain), fitted
 
 
 def _as_constant(now: _Baseline, error: LastingError, names: Collection[str]) -> tuple[LastingError, _Baseline]:
-    """The most likely of some constants of an error's sensor, its gain at least 0, and the dive with it."""
+    """The constant that explains the dive best where an error might, its gain at least 0, and the dive with it."""
     rivals = [
         replace(error, variable=name, sd=sd, time_constant=np.inf, gain=now.linear_gain(name, sd, np.inf))
         for name in names
-        if error.sensor in TABLE[name].sensors
         for sd in CONSTANT * now.chain.beliefs[name].sd
+        if name not in now.chain.unknowns.walks or sd > now.chain.beliefs[name].sd
     ]
     best = max(rivals, key=lambda rival: rival.gain, default=replace(error, gain=0.0))
     if best.gain <= LIKELY:
