@@ -18,7 +18,7 @@ from rovgraph.pages.parts import Panel, Section, line, packed
 from rovgraph.pages.reporting import page_of
 from rovgraph.pages.sensors import autocorrelation
 from rovgraph.pages.source import Track
-from rovgraph.pages.thinning import extremes
+from rovgraph.pages.thinning import broken, extremes
 from rovgraph.pages.uncertainty import falls, separation
 
 NASTY = "</script><script>alert(1)</script> \"quotes' & <b>δύτης 潜水</b>"
@@ -75,6 +75,18 @@ def summary_with(path, **entries):
     file.write_text(json.dumps({**json.loads(file.read_text()), **entries}))
 
 
+def with_track(path, change):
+    table = pd.read_csv(path / "trajectory_smoothed.csv")
+    change(table)
+    table.to_csv(path / "trajectory_smoothed.csv", index=False)
+
+
+def cut(path):
+    """The second half of the dive is missing."""
+    rows = (path / "trajectory_smoothed.csv").read_text().splitlines(keepends=True)
+    (path / "trajectory_smoothed.csv").write_text("".join(rows[: len(rows) // 2]))
+
+
 def test_smooth_and_report_make_the_same_page(own):
     made = (own / "report.html").read_text()
     assert report(own) == own / "report.html"
@@ -108,6 +120,20 @@ def test_what_did_not_count_is_written_with_its_reason(folder):
     residuals = pd.read_csv(folder / "residuals.csv")
     rejected = residuals[residuals["weight"] <= 0].drop_duplicates(["sensor", "time", "row"])
     assert (table["reason"] == "beyond its gate").sum() == len(rejected)
+
+
+def test_a_frozen_ping_saw_nothing_and_is_written_with_what_did_not_count(tmp_path):
+    simulated = rg.simulate("lawnmower", seed=4, choices=rg.Choices(duration=60))
+    frame = simulated.dive.log_frame
+    pinged = frame["dvl_vx"].notna() & frame["time"].between(20.0, 30.0)
+    names = ["dvl_vx", "dvl_vy", "dvl_vz"]
+    frame.loc[pinged, names] = frame.loc[pinged, names].iloc[0].to_numpy()
+    result = rg.smooth(rg.Log.from_frame(frame, simulated.config), simulated.config, "smoothed")
+    result.save(tmp_path / "out", figures=False, page=False)
+    left_out, pings = (pd.read_csv(tmp_path / "out" / name) for name in ("left_out.csv", "dvl.csv"))
+    frozen = left_out.loc[left_out["reason"] == "frozen"]
+    assert set(frozen["sensor"]) == {"dvl"} and len(frozen) == pinged.sum()
+    np.testing.assert_allclose(pings.loc[pings["lock"] == 0, "time"], frozen["time"])
 
 
 def test_text_of_any_kind_is_shown_and_not_run(own):
@@ -162,6 +188,7 @@ def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
         (lambda f: (f / "residuals.csv").write_text(""), "is empty"),
         (lambda f: (f / "residuals.csv").write_text("time,sensor\n1,dvl\n"), "column component is missing"),
         (lambda f: (f / "trajectory_smoothed.csv").write_text("time,north,east\n"), "no rows with a time"),
+        (cut, "the last 45 s of the dive are missing"),
         (shutil.rmtree, "no such folder"),
         (lambda f: summary_with(f, alarms="x"), "incomplete or of another version"),
         (lambda f: summary_with(f, end={"north_m": "x"}), "incomplete or of another version"),
@@ -240,12 +267,6 @@ def test_every_compass_is_shown_with_the_curve_that_was_estimated(own):
     assert "No deviation curve was estimated" not in html
 
 
-def with_track(path, change):
-    table = pd.read_csv(path / "trajectory_smoothed.csv")
-    change(table)
-    table.to_csv(path / "trajectory_smoothed.csv", index=False)
-
-
 def widen(table):
     """The start is known to 30 m."""
     for name in ("north_sd", "east_sd"):
@@ -299,6 +320,7 @@ def test_a_dive_of_two_keyframes_without_any_sd_has_a_page(own):
         table.to_csv(path, index=False)
     for name in ("residuals.csv", "history.csv", "dvl.csv", "left_out.csv"):
         pd.read_csv(own / name).head(2).to_csv(own / name, index=False)
+    summary_with(own, duration_s=0.2)
     html = page_of(own)
     assert "How far it may be off is not known" in html
     assert "no estimate of the folder states a standard deviation" in html
@@ -341,6 +363,15 @@ def test_thinning_keeps_extremes_ends_and_gaps():
     assert {0, 12_345, 77_777, 99_999} <= set(some.tolist())
     assert np.isnan(values[some]).any()
     assert (np.diff(some) > 0).all()
+
+
+def test_a_line_breaks_at_both_ends_of_a_gap():
+    time = np.array([0.0, 1.0, 2.0, 9.0, 10.0])
+    broken_time, values = broken(time, np.arange(5.0))
+    np.testing.assert_array_equal(broken_time, [0.0, 1.0, 2.0, 3.0, 8.0, 9.0, 10.0])
+    np.testing.assert_array_equal(values, [0.0, 1.0, 2.0, np.nan, np.nan, 3.0, 4.0])
+    for few in (time[:1], time[:3]):
+        np.testing.assert_array_equal(broken(few, few)[0], few)
 
 
 def test_numbers_far_from_zero_keep_their_digits():

@@ -69,6 +69,28 @@ def test_every_axis_has_a_name_that_is_seen_and_the_unit_of_what_has_one(page):
     assert all("scale" in text or text.startswith("hard_iron") or "soft" in text for text in biases)
 
 
+def test_every_axis_has_a_number(page):
+    bare = page.evaluate(
+        """[...rovgraph.drawn.values()].flatMap(e => ["x", "y"].filter(
+            axis => ![...e.plot.querySelectorAll(`.${axis}tick text`)].some(text => text.textContent.trim())
+        ).map(axis => `${e.panel.title}: ${axis}`))"""
+    )
+    assert bare == []
+
+
+def test_the_readout_invents_nothing_where_nothing_was_measured(page):
+    """From 30 to 50 s the DVL saw no bottom."""
+    panel = page.locator("figure", has_text="Velocity along the DVL's x axis")
+    panel.scroll_into_view_if_needed()
+    told = {}
+    for time in (20, 40, 70):
+        page.evaluate(f"rovgraph.setTime({time})")
+        frames(page)
+        told[time] = panel.locator(".readout").inner_text()
+    assert "measured" in told[20] and "measured" in told[70]
+    assert told[40] == "at 40 s: smoothed unknown"
+
+
 def test_the_slider_moves_the_vehicle_and_tells_where_it_is(page):
     at = "(() => { const v = document.querySelector('.map .vehicle'); return [+v.dataset.x, +v.dataset.y]; })()"
     page.locator("figure.map").scroll_into_view_if_needed()

@@ -56,7 +56,7 @@ def test_poor_compasses_limit_a_dive(tmp_path):
 def test_a_long_loss_of_lock_limits_a_dive(tmp_path):
     page = verdict_page(tmp_path, simulated(dropouts=((15.0, 50.0),)))
     assert "What limits it:" in page
-    assert "the DVL did not see the bottom" in page
+    assert "without a velocity from the DVL" in page
 
 
 def test_every_sensor_but_depth_belongs_to_a_cause():

@@ -154,6 +154,7 @@ class Result:
                 seconds,
                 self.alarms,
                 self.warnings,
+                self.dive.frozen,
             )
             marks = marks_beside(Path(self.log.source), self.main.trajectory, self.log.origin)
             if marks:

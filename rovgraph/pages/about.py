@@ -2,6 +2,7 @@
 
 import hashlib
 import shlex
+from pathlib import Path
 
 from rovgraph.pages.parts import Item, Missing, Section, Table, Text
 from rovgraph.pages.source import Source
@@ -14,7 +15,9 @@ def about_section(source: Source, command: str = "") -> Section:
     """Configuration, versions, files and, where it is known, the command."""
     items: list[Item] = []
     if command:
-        items.append(Text("Command to reproduce it, in this folder", command, shown=True))
+        items.append(
+            Text("Command to reproduce it, where the log and the config.yaml of this folder are", command, shown=True)
+        )
     versions = {"rovgraph": source.summary.get("version"), **(source.summary.get("versions") or {})}
     items.append(Table("Versions", ("", ""), [(name, str(v)) for name, v in versions.items()]))
     items.append(_files(source))
@@ -29,8 +32,8 @@ def about_section(source: Source, command: str = "") -> Section:
 def smooth_command(source: Source) -> str:
     """What makes the same results from the effective configuration."""
     kinds = [k for k in ("smoothed", "filtered") if k in (source.summary.get("estimates") or {})]
-    log = str(source.summary.get("log", "LOG"))
-    words = ["rovgraph", "smooth", log, "--config", "config.yaml", "--out", "again"]
+    logs = [Path(name).name for name in str(source.summary.get("log", "LOG")).split(" + ")]
+    words = ["rovgraph", "smooth", *logs, "--config", "config.yaml", "--out", "again"]
     return shlex.join(words + (["--estimate", kinds[0]] if len(kinds) == 1 else []))
 
 

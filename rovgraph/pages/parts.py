@@ -61,6 +61,7 @@ class Panel:
     log : which axes are logarithmic, of "x" and "y"
     wide : over the whole width
     names : of the places 1, 2, ... on the y axis, the first on top
+    reach : what is shown of y at first, to both sides of zero; 0 = all
     """
 
     title: str
@@ -74,12 +75,14 @@ class Panel:
     log: str = ""
     wide: bool = True
     names: Sequence[str] = ()
+    reach: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """What ``page.js`` draws."""
         chosen = {"kind": self.kind, "x": self.x, "y": self.y, "title": self.title, "traces": [*self.traces]}
         spans = [list(s) for s in self.spans]
-        return {**chosen, "levels": [*self.levels], "spans": spans, "log": self.log, "names": [*self.names]}
+        more = {"log": self.log, "names": [*self.names], "reach": self.reach}
+        return {**chosen, "levels": [*self.levels], "spans": spans, **more}
 
 
 @dataclass(frozen=True)

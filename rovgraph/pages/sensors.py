@@ -9,7 +9,7 @@ from rovgraph.geometry import Array
 from rovgraph.pages.beams import beam_items
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Table, Trace, bars, line, packed, points
 from rovgraph.pages.source import DiveSource
-from rovgraph.pages.thinning import cloud, extremes, spread
+from rovgraph.pages.thinning import broken, cloud, extremes, spread
 from rovgraph.report.colours import REJECTED, SERIES
 
 BLUE, RED, DARK = "#0072B2", "#D55E00", "#333333"
@@ -28,20 +28,26 @@ def dvl_section(source: DiveSource) -> Section:
     altitude = pings["altitude"].to_numpy(float)
     spans = [(*clock(np.array(s)).tolist(), SHADE) for s in source.silences]
     if np.isfinite(altitude).any():
-        some = extremes(altitude)
-        drawn = [line("altitude", clock(time[some]), altitude[some], BLUE)]
+        drawn = [_over_time(source, "altitude", time, altitude)]
         items.append(Panel("Altitude over the bottom", clock.label, "altitude [m]", drawn, spans=spans))
     else:
         items.append(Missing("Altitude over the bottom", "the log has no dvl_altitude"))
-    some = extremes(lock)
-    drawn = [line("bottom lock", clock(time[some]), lock[some], BLUE, line_shape="hv")]
-    note = f"{100 * lock.mean():.1f} % of {len(lock)} pings saw the bottom. Shaded: silences."
+    drawn = [_over_time(source, "bottom lock", time, lock, line_shape="hv")]
+    seen = f"{100 * lock.mean():.1f} % of {len(lock)} pings saw the bottom" if len(lock) else "There is no ping"
+    note = f"{seen}; one that repeats the ping before it saw nothing. Shaded: silences."
     items.append(Panel("Bottom lock", clock.label, "1 = lock", drawn, note=note, spans=spans))
     items += beam_items(source, spans)
     items.append(_silences(time[lock == 1]))
     items += _merit(source, pings)
     items += _velocities(source, spans)
     return Section("dvl", title, (), items)
+
+
+def _over_time(source: DiveSource, name: str, time: Array, values: Array, **look: str) -> Trace:
+    """A line over the page's clock that breaks in gaps."""
+    time, values = broken(time, values)
+    some = extremes(values)
+    return line(name, source.clock(time[some]), values[some], BLUE, **look)
 
 
 def _silences(locked: Array) -> Item:
@@ -84,12 +90,11 @@ def _velocities(source: DiveSource, spans: list[tuple[float, float, str]]) -> li
         return [Missing("Velocities", "residuals.csv is missing or incomplete")]
     items: list[Item] = []
     for component, own in rows[rows["sensor"] == "dvl"].groupby("component", sort=False):
-        time = source.clock(own["time"].to_numpy(float))
-        measured, predicted = own["measured"].to_numpy(float), own["predicted"].to_numpy(float)
-        first, second = cloud(measured), extremes(predicted)
+        time, measured = own["time"].to_numpy(float), own["measured"].to_numpy(float)
+        some = cloud(measured)
         drawn = [
-            points("measured", time[first], measured[first], "#7A7A7A", size=3),
-            line(source.main.name, time[second], predicted[second], BLUE),
+            points("measured", source.clock(time[some]), measured[some], "#7A7A7A", size=3),
+            _over_time(source, source.main.name, time, own["predicted"].to_numpy(float)),
         ]
         title = f"Velocity along the DVL's {component} axis"
         items.append(Panel(title, source.clock.label, f"v_{component} [m/s]", drawn, spans=spans))
@@ -123,7 +128,11 @@ def _residual_panels(source: DiveSource, name: str, own: pd.DataFrame) -> Iterat
         if len(values):
             some = cloud(values)
             drawn.append(points(f"{label} ({len(values)})", t[some], values[some], colour, size=3))
-    yield Panel(f"{name}: residual", source.clock.label, "residual / sd", drawn, levels=(-3.0, 0.0, 3.0))
+    reach = 1.1 * max(float(np.nanmax(np.abs(z[used]), initial=0.0)), 5.0)
+    beyond = int(np.count_nonzero(np.abs(z) > reach))
+    note = f"{beyond} lie beyond what is shown: a double click shows all." if beyond else ""
+    labels = (source.clock.label, "residual / sd")
+    yield Panel(f"{name}: residual", *labels, drawn, note=note, levels=(-3.0, 0.0, 3.0), reach=reach)
     fitted = z[used & np.isfinite(z)]
     if len(fitted) < 2:
         yield Missing(f"{name}: distribution", "fewer than two measurements were used")

@@ -20,6 +20,7 @@ from rovgraph.log.table import read_table
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import BEAMS_FILE, CHI2_99
 
+LACKS_S = 1.0  # that a track may end before its dive
 KINDS = ("smoothed", "filtered", "dead_reckoning")
 
 
@@ -213,9 +214,24 @@ class DiveSource(Source):
             if not known.any():
                 raise InputError(f"{self.folder / name}: has no rows with a time; make the results again")
             found[kind] = Track(kind, {c: values[known] for c, values in numbers.items()})
+            self._require_whole(name, float(numbers["time"][known][-1]))
         if not found:
             raise InputError(f"{self.folder}: has no trajectory_smoothed.csv; make the results again")
         return found
+
+    def _require_whole(self, name: str, last: float) -> None:
+        """Refuse a track that ends before the dive does.
+
+        Raises
+        ------
+        InputError : it does
+        """
+        start, duration = (self.summary.get(key) for key in ("start_time_s", "duration_s"))
+        missing = 0.0 if start is None or duration is None else start + duration - last
+        if missing > LACKS_S:
+            raise InputError(
+                f"{self.folder / name}: the last {missing:.0f} s of the dive are missing; make the results again"
+            )
 
     @property
     def main(self) -> Track:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array
 
 STRETCHES = 700  # of a series; a screen is hardly wider
+GAP = 5.0  # usual periods
 
 
 def extremes(*series: Array, stretches: int = STRETCHES) -> NDArray[np.intp]:
@@ -37,6 +38,21 @@ def extremes(*series: Array, stretches: int = STRETCHES) -> NDArray[np.intp]:
         chosen.append((begin + unknown.argmax(axis=1))[gap])
     index = np.unique(np.concatenate(chosen))
     return index[index < n]
+
+
+def broken(time: Array, values: Array) -> tuple[Array, Array]:
+    """A line that breaks where nothing was measured: NaN at both ends of every gap of `GAP` usual periods or more.
+
+    Parameters
+    ----------
+    time, values : ndarray, shape (n,), time increasing
+    """
+    period = np.diff(time)
+    usual = float(np.median(period)) if len(period) else 0.0
+    gaps = np.flatnonzero(period > GAP * max(usual, 1e-6))
+    ends = np.column_stack([time[gaps] + usual, time[gaps + 1] - usual]).ravel()
+    place = np.repeat(gaps + 1, 2)
+    return np.insert(time, place, ends), np.insert(values, place, np.nan)
 
 
 def cloud(values: Array, most: int = 1500) -> NDArray[np.intp]:

@@ -16,6 +16,7 @@ from rovgraph.report.colours import ESTIMATES, OTHER, REJECTED, USED
 ELLIPSES = 24
 SPACED = np.linspace(0.0, 2 * np.pi, 41)
 SILENT, MARK = "#B35900", "#6A3D9A"
+POLAR_DEG = 89.0  # beyond it a degree of longitude is no length to draw with
 
 
 def track_section(source: DiveSource) -> Section:
@@ -62,11 +63,13 @@ def cursor(source: DiveSource) -> dict[str, Any]:
 
 
 def origin(source: DiveSource) -> dict[str, float] | None:
-    """Latitude and longitude of north = east = 0 with metres of a degree of each; None where not known."""
+    """Latitude and longitude of north = east = 0 and metres of a degree of each; None if not known, or polar."""
     place = source.summary.get("origin")
     if not isinstance(place, dict) or not all(isinstance(place.get(k), int | float) for k in ("lat_deg", "lon_deg")):
         return None
     lat = float(place["lat_deg"])
+    if not abs(lat) <= POLAR_DEG:
+        return None
     degree = np.deg2rad(1.0)
     metres = {
         "lat_m": float(meridian(lat) * degree),

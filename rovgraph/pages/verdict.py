@@ -77,8 +77,9 @@ def _cause(source: DiveSource) -> tuple[str, str]:
     silent = _share_in_silence(source, track)
     if silent > 0.5 and not (found and found[0].known):
         return (
-            f"{100 * silent:.0f} % of what the variance grew fell into times in which the DVL did not see the bottom",
-            "keep the DVL within its range of the bottom, or take a position fix after each silence",
+            f"{100 * silent:.0f} % of what the variance grew fell into times without a velocity from the DVL",
+            "keep the DVL within its range of the bottom and see that it records throughout, or take a position fix "
+            "after each silence",
         )
     if found:
         limit, share = found

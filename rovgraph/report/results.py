@@ -20,6 +20,7 @@ from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.log.beams import BEAMS, beams_frame
+from rovgraph.log.frozen import FrozenStretch
 from rovgraph.report.dive_files import dvl_frame, input_file, left_out_frame, timings, versions
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.units import key_suffix
@@ -47,6 +48,7 @@ def write_results(
     seconds: dict[str, float],
     alarms: Sequence[Alarm] = (),
     warnings: Sequence[str] = (),
+    frozen: Sequence[FrozenStretch] = (),
 ) -> dict[str, Any]:
     """Write every file of a results folder but the figures and the page.
 
@@ -59,6 +61,7 @@ def write_results(
     seconds : stage of the work -> wall time [s]
     alarms : what the estimates say against themselves
     warnings : what was said of the log, a line each
+    frozen : times in which a sensor repeated itself
 
     Returns
     -------
@@ -71,7 +74,7 @@ def write_results(
     write_csv(calibration_frame(estimates), folder / "calibration.csv")
     write_csv(estimates[0].residuals[RESIDUAL_COLUMNS], folder / "residuals.csv", decimals={"time": 4})
     write_csv(_history_frame(estimates), folder / "history.csv", decimals={"time": 4})
-    _write_of_log(folder, estimates[0], log, config)
+    _write_of_log(folder, estimates[0], log, config, frozen)
     (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
     summary = {
         **summarise(estimates, log, config, assumptions, seconds, alarms),
@@ -85,14 +88,14 @@ def write_results(
     return summary
 
 
-def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config) -> None:
+def _write_of_log(folder: Path, main: Estimate, log: Log, config: Config, frozen: Sequence[FrozenStretch]) -> None:
     """Write dvl.csv, where there is a DVL, dvl_beams.csv, where its beams are known, and left_out.csv."""
-    pings = dvl_frame(log)
+    pings = dvl_frame(log, frozen)
     if pings is not None:
         write_csv(pings, folder / "dvl.csv", decimals={"time": 4})
     if log.beams is not None:
         write_csv(beams_frame(log.beams), folder / BEAMS_FILE, decimals={"time": 4})
-    left_out = left_out_frame(log, config, main.residuals, main.summary.get("stretches_taken_out", []))
+    left_out = left_out_frame(log, config, main.residuals, main.summary.get("stretches_taken_out", []), frozen)
     write_csv(left_out, folder / "left_out.csv", decimals={"time": 4})
 
 

@@ -44,7 +44,12 @@
     gridcolor: "#e4e4e4", type: log ? "log" : "linear", tickfont: { size: 12 }, nticks: log ? undefined : ticks,
     exponentformat: log ? "power" : "none", ...(log ? { dtick: 1 } : {}),
   });
-  const layoutOf = (panel) => {
+  const spansDecade = (series, key) => {
+    let low = Infinity, high = 0;
+    for (const s of series) for (const v of s[key]) if (v > 0) { low = Math.min(low, v); high = Math.max(high, v); }
+    return high > 20 * low;
+  };
+  const layoutOf = (panel, series) => {
     const plain = (v) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: v, y1: v, line: { color: "#666", width: 1, dash: "dot" } });
     const shaded = ([from, to, colour]) => ({ type: "rect", yref: "paper", y0: 0, y1: 1, x0: from, x1: to,
       fillcolor: colour, opacity: 0.18, line: { width: 0 }, layer: "below" });
@@ -55,6 +60,8 @@
       legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0, font: { size: 12 } },
       shapes: [...panel.levels.map(plain), ...panel.spans.map(shaded)], uirevision: "kept",
     };
+    for (const key of panel.log) if (!spansDecade(series, key)) layout[`${key}axis`].dtick = "D1"; // else it has no number
+    if (panel.reach) layout.yaxis.range = [-panel.reach, panel.reach];
     if (panel.kind === "time") layout.xaxis.range = range || [0, data.clock.end];
     if (panel.names.length) Object.assign(layout.yaxis, { tickvals: panel.names.map((_, i) => i + 1), ticktext: panel.names,
       range: [panel.names.length + 0.7, 0.3] });
@@ -71,7 +78,8 @@
     if (trace.t) arrays.t = unpack(trace.t);
     if (trace.value) arrays.value = arrays.customdata = unpack(trace.value); // what is told in the place of y
     const told = `%{x:${digits}}, %{${trace.value ? "customdata" : "y"}:${digits}}`;
-    return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : told, ...trace, ...arrays };
+    const plain = String(trace.name ?? "").replaceAll("&", "&amp;").replaceAll("<", "&lt;"); // Plotly takes tags in names
+    return { type: "scatter", connectgaps: false, hovertemplate: trace.hoverinfo ? undefined : told, ...trace, ...arrays, name: plain, label: trace.name };
   };
 
   const draw = async (figure) => {
@@ -87,7 +95,7 @@
       modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], modeBarButtonsToAdd: [exportButton(entry)] };
     // an axis shows only where something stands over it
     const degrees = panel.kind === "map" && data.origin ? [{ x: [null], y: [null], xaxis: "x2", yaxis: "y2", showlegend: false, hoverinfo: "skip", mode: "markers" }] : [];
-    await Plotly.newPlot(plot, [...series, ...degrees], layoutOf(panel), options);
+    await Plotly.newPlot(plot, [...series, ...degrees], layoutOf(panel, series), options);
     plot.querySelectorAll(".modebar-btn").forEach((b) => { b.setAttribute("role", "button"); b.setAttribute("aria-label", b.dataset.title || "tool"); });
     entry.layer = plot.appendChild(document.createElementNS(svg, "svg"));
     entry.layer.setAttribute("class", "cursor");
@@ -111,7 +119,7 @@
     click: () => {
       const quoted = (s) => `"${String(s).replaceAll('"', '""')}"`;
       const lines = [["series", entry.panel.x, entry.panel.y].map(quoted).join(",")];
-      for (const s of entry.series) for (let i = 0; i < s.x.length; i++) lines.push(`${quoted(s.name)},${s.x[i]},${(s.value || s.y)[i]}`);
+      for (const s of entry.series) for (let i = 0; i < s.x.length; i++) lines.push(`${quoted(s.label)},${s.x[i]},${(s.value || s.y)[i]}`);
       const link = document.createElement("a");
       link.href = URL.createObjectURL(new Blob([lines.join("\n") + "\n"], { type: "text/csv" }));
       link.download = entry.panel.title.replace(/[^\w-]+/g, "_") + ".csv";
@@ -198,9 +206,11 @@
     if (now < xaxis.range[0] || now > xaxis.range[1]) { entry.readout.textContent = ""; return; }
     const x = xaxis._offset + xaxis.d2p(now);
     add(entry.layer, "line", { x1: x, x2: x, y1: yaxis._offset, y2: yaxis._offset + yaxis._length, stroke: "#000", "stroke-width": 1 });
-    const named = (s) => (/\d$/.test(s.name) ? `${s.name}:` : s.name); // a number beside a number
-    const told = entry.series.filter((s) => !s.quiet && s.x.length).map((s) => `${named(s)} ${number((s.value || s.y)[nearest(s.x, now)])}`);
-    entry.readout.textContent = `at ${number(now)} ${data.clock.unit}: ${told.join(" · ")}`;
+    const named = (s) => (/\d$/.test(s.label) ? `${s.label}:` : s.label); // a number beside a number
+    const near = (xaxis.range[1] - xaxis.range[0]) / 200; // under the mouse; a line is known between its points
+    const here = (s) => s.x.length && (s.mode !== "markers" || Math.abs(s.x[nearest(s.x, now)] - now) <= near);
+    const told = entry.series.filter((s) => !s.quiet && here(s)).map((s) => `${named(s)} ${number((s.value || s.y)[nearest(s.x, now)])}`);
+    entry.readout.textContent = `at ${number(now)} ${data.clock.unit}: ${told.join(" · ") || "nothing was measured"}`;
   };
   const place = (entry) => { // the vehicle with its ellipse, and the scale bar
     if (!entry.layer || !entry.plot._fullLayout.xaxis._length) return;
