@@ -188,7 +188,7 @@ def test_a_missing_file_leaves_a_page_that_says_so(own, name, said):
         (lambda f: (f / "residuals.csv").write_text(""), "is empty"),
         (lambda f: (f / "residuals.csv").write_text("time,sensor\n1,dvl\n"), "column component is missing"),
         (lambda f: (f / "trajectory_smoothed.csv").write_text("time,north,east\n"), "no rows with a time"),
-        (cut, "the last 45 s of the dive are missing"),
+        (cut, "s of the dive are missing; make the results again"),
         (shutil.rmtree, "no such folder"),
         (lambda f: summary_with(f, alarms="x"), "incomplete or of another version"),
         (lambda f: summary_with(f, end={"north_m": "x"}), "incomplete or of another version"),
