@@ -298,6 +298,13 @@ def test_without_a_split_a_dive_without_a_dvl_is_not_limited_by_its_dvl(own):
     assert "errors of the DVL" not in html
 
 
+def test_a_filter_that_is_surer_than_the_smoother_is_explained(own):
+    said = "believe the smoothed"
+    assert said not in page_of(own)
+    with_track(own, widen)
+    assert said in page_of(own)
+
+
 def test_a_wrong_track_is_not_said_to_be_right_within_metres(own):
     assert "99 times in 100" in page_of(own)
     summary_with(own, verdict="wrong")

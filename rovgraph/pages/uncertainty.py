@@ -15,6 +15,7 @@ HELPED = 0.85  # an sd that falls to this part of itself within `WITHIN_S` was h
 WITHIN_S = 10.0
 TURN = np.deg2rad(45.0)  # of the heading around that time: a manoeuvre
 SAME = 0.05  # P_filtered - P_smoothed below this part of P_filtered: as good as the same, no separation to expect
+SURER, OFTEN = 1.1, 0.1  # smoothed over filtered sd, and the share of epochs, from which that is explained
 SHOWN: tuple[tuple[str, str, Callable[[Track], Array]], ...] = (
     ("Horizontal position, one standard deviation along the worst direction", "m", lambda t: t.horizontal_sd),
     ("Heading, one standard deviation", "°", lambda t: np.rad2deg(t["yaw_sd"])),
@@ -35,6 +36,13 @@ def uncertainty_section(source: DiveSource) -> Section:
         note = f"Marks: where the sd of the {followed.name} estimate fell by more than 15 % within 10 s, and by what."
         items.append(Panel(title, source.clock.label, f"sd [{unit}]", [*lines, *marks], note=note))
     lead = ["The filtered sd uses the measurements so far, the smoothed one those of the whole dive."]
+    if {"filtered", "smoothed"} <= set(source.tracks):
+        sds = ([of(source.tracks[kind]) for kind in ("filtered", "smoothed")] for _, _, of in SHOWN)
+        if any(np.mean(smoothed > SURER * filtered) > OFTEN for filtered, smoothed in sds):
+            lead.append(
+                "Where the filtered sd is the smaller one, believe the smoothed: over a long time the filter takes "
+                "noise for knowledge of what nothing shows, such as a heading without position fixes."
+            )
     return Section("uncertainty", "How well it is known", lead, items)
 
 
