@@ -136,6 +136,13 @@ def test_a_frozen_ping_saw_nothing_and_is_written_with_what_did_not_count(tmp_pa
     np.testing.assert_allclose(pings.loc[pings["lock"] == 0, "time"], frozen["time"])
 
 
+def test_the_noise_of_the_configuration_is_shown_and_one_that_cannot_be_read_said(own):
+    assert "Allan deviation of the gyro, as configured" in page_of(own)
+    (own / "config.yaml").write_text("imu: {noise: {gyr: -1}}\n")
+    html = page_of(own)
+    assert "Allan deviation of the gyro, as configured" not in html and "imu.noise.gyr" in html
+
+
 def test_text_of_any_kind_is_shown_and_not_run(own):
     config = (own / "config.yaml").read_text()
     (own / "config.yaml").write_text(config + f"\n# {NASTY}\n")

@@ -6,6 +6,8 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.calibration import TABLE
+from rovgraph.config import parse_config
+from rovgraph.errors import InputError
 from rovgraph.estimators.observability import data_information
 from rovgraph.pages.parts import Item, Missing, Panel, Section, Table, Trace, line
 from rovgraph.pages.source import DiveSource
@@ -31,7 +33,7 @@ def calibration_section(source: DiveSource) -> Section:
     if isinstance(joint, dict):
         lead += _words(joint)
         items.append(correlation_table(joint["labels"], np.array(joint["covariance"], float)))
-    items += _histories(source)
+    items += [*_histories(source), *_allan(source)]
     return Section("calibration", "Calibration and biases", lead, items)
 
 
@@ -99,6 +101,31 @@ def correlation_table(labels: Sequence[str], covariance: np.ndarray) -> Item:
     rows = [(label, *(float(r) for r in row)) for label, row in zip(labels, rho, strict=True)]
     note = "Near ±1: the dive shows a combination of the two only."
     return Table(title, ("", *labels), rows, note=note, shaded=True)
+
+
+def _allan(source: DiveSource) -> list[Item]:
+    """Allan deviations that the configuration states: N and K of sigma^2 = N^2 / tau + K^2 tau / 3."""
+    text = source.text("config.yaml")
+    if text is None or "imu" not in (source.summary.get("sensors") or {}):
+        return []
+    try:
+        noise = parse_config(text, "config.yaml").imu.noise
+    except InputError as error:
+        return [Missing("Allan deviation, as configured", str(error))]
+    tau = np.geomspace(0.01, max(source.clock.end - source.clock.start, 1.0), 100)
+    note = (
+        "Falling: noise of the samples. Rising: walk of the bias. The command rovgraph calibrate noise measures both."
+    )
+    items: list[Item] = []
+    for name, unit, density, walk in (
+        ("accelerometer", "m/s²", noise.acc, noise.acc_walk),
+        ("gyro", "rad/s", noise.gyr, noise.gyr_walk),
+    ):
+        drawn = [line("stated", tau, np.sqrt(density**2 / tau + walk**2 * tau / 3.0), ESTIMATES["smoothed"])]
+        labels = ("averaging time [s]", f"Allan deviation [{unit}]")
+        title = f"Allan deviation of the {name}, as configured"
+        items.append(Panel(title, *labels, drawn, kind="xy", note=note, log="xy", wide=False))
+    return items
 
 
 def _histories(source: DiveSource) -> list[Item]:
