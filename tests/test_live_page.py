@@ -26,12 +26,14 @@ from rovgraph.live.feed import Feed
 from rovgraph.live.marks import Marks
 from rovgraph.live.solution import Event, SensorHealth, Solution
 from rovgraph.web import broadcast as broadcasting
+from rovgraph.web import connections
 from rovgraph.web import track as tracking
 from rovgraph.web.address import parse_address, parse_origin, token_of
 from rovgraph.web.app import application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import Charts, read_charts
 from rovgraph.web.guard import Guard
+from rovgraph.web.page import MOST_CONNECTIONS
 from rovgraph.web.requests import BURST, LARGEST_BODY
 from rovgraph.web.track import PIECE, Track
 from rovgraph.web.view import Limits, View
@@ -559,4 +561,35 @@ def test_too_many_pages_are_turned_away(page, monkeypatch):
     with live(page) as link:
         until(link, "begin")
         with pytest.raises(InvalidStatus), live(page):
+            pass
+
+
+START = b"GET /api/state HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+HEAD = b"POST /api/marks HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
+
+
+@pytest.mark.parametrize("said", [b"", START], ids=["silent", "half"])
+def test_connections_without_a_whole_request_lock_nobody_out(page, monkeypatch, said):
+    monkeypatch.setattr(connections, "REQUEST_S", 1.0)
+    url, links = f"{page.address.url}api/state", []
+    try:
+        for _ in range(MOST_CONNECTIONS + 6):
+            links.append(socket.create_connection(("127.0.0.1", page.address.port), timeout=20))
+            links[-1].sendall(said)
+        assert httpx.get(url, timeout=20).status_code == 503
+        end = time.monotonic() + 20
+        while httpx.get(url, timeout=20).status_code == 503 and time.monotonic() < end:
+            time.sleep(0.1)
+        assert httpx.get(url, timeout=20).status_code == 200
+    finally:
+        for link in links:
+            link.close()
+
+
+@pytest.mark.parametrize("said", [b"", START, HEAD, START + b"\r\n" + START], ids=["silent", "half", "body", "second"])
+def test_a_connection_without_a_whole_request_is_ended(page, monkeypatch, said):
+    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
+    with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
+        link.sendall(said)
+        while link.recv(1000):
             pass

@@ -15,6 +15,7 @@ from rovgraph.web.address import Address, listening, parse_address, parse_origin
 from rovgraph.web.app import Offer, application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import read_charts
+from rovgraph.web.connections import Connection, PageSocket
 from rovgraph.web.guard import Guard
 from rovgraph.web.view import Limits, View
 
@@ -75,7 +76,8 @@ class LivePage:
                 log_config=None,
                 access_log=False,
                 lifespan="on",
-                ws="websockets-sansio",
+                http=Connection,
+                ws=PageSocket,
                 ws_max_size=LARGEST_MESSAGE,
                 ws_per_message_deflate=False,
                 limit_concurrency=MOST_CONNECTIONS,
