@@ -67,6 +67,7 @@ def test_a_position_becomes_a_fix_that_moves_the_estimate(case, told, tmp_path):
     assert np.linalg.norm(first[-1].position - last[-1].position) > 0.1
     (said,) = [e for s in first for e in s.events if e.source == "pilot" and e.kind == "position"]
     assert said.text == "a fix at north 0.30 m, east -0.20 m, sd 0.05 m"
+    assert not first[-1].sensors["fix"].failed_s and first[-1].sensors["fix"].used == 1
 
 
 def test_a_position_that_contradicts_the_estimate_is_refused_aloud(case, tmp_path):
