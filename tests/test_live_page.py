@@ -345,6 +345,28 @@ def test_a_geotiff_lies_where_its_coordinates_say(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"crs": 'LOCAL_CS["pool",UNIT["metre",1]]'}, "cannot be converted to WGS 84 .* gdal_translate"),
+        ({"at": (1e8, 1e9)}, "gdal_translate"),
+        ({"crs": "EPSG:4326", "at": (15.0, 6e6)}, "outside its coordinate system"),
+        ({"dtype": "complex64"}, "complex values"),
+    ],
+    ids=["local", "outside", "degrees", "complex"],
+)
+def test_a_geotiff_that_cannot_be_shown_is_refused_in_one_line(tmp_path, changes, says):
+    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: no GeoTIFF was read")
+    wanted = {"crs": "EPSG:32633", "at": (5e5, 6.4e6), "dtype": "float32"} | changes
+    place = rasterio.transform.from_origin(*wanted.pop("at"), 2.0, 2.0)
+    path = tmp_path / "c.tif"
+    with rasterio.open(path, "w", driver="GTiff", height=4, width=4, count=1, transform=place, **wanted) as file:
+        file.write(np.ones((1, 4, 4), wanted["dtype"]))
+    with pytest.raises(InputError, match=says) as error:
+        read_charts([path])
+    assert "\n" not in str(error.value) and str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
     ("name", "content", "says"),
     [
         ("c.tif", b"II*\0broken", "no GeoTIFF"),
