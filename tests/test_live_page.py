@@ -165,6 +165,8 @@ def test_commands_reach_the_estimator_as_they_were_meant(server):
     for path, body in (("marks", {"name": NASTY}), ("marks", {"name": "w\n", "north": 1, "east": 2.5})):
         assert server.client.post(f"/api/{path}", json=body, headers=OWN).status_code == 202
     assert server.client.post("/api/position", json={"north": 1, "east": 2, "sd": 3}, headers=OWN).status_code == 202
+    for _ in range(7):
+        server.marks.drop("", solution())
     assert server.client.delete("/api/marks/7", headers=OWN).status_code == 202
     assert server.commands == [DropMark(NASTY), DropMark("w", 1.0, 2.5), SetPosition(1.0, 2.0, 3.0), RemoveMark(7)]
 
@@ -193,6 +195,15 @@ def test_a_command_that_cannot_be_meant_is_refused_in_one_line(server, path, bod
 
 def test_before_the_first_position_nothing_can_be_marked(server):
     assert server.client.post("/api/marks", json={}, headers=OWN).status_code == 409
+
+
+@pytest.mark.parametrize("number", ["7", "9" * 400, "9" * 5000])
+def test_what_is_not_there_is_not_found(server, number):
+    server.show(solution())
+    assert server.client.delete(f"/api/marks/{number}", headers=OWN).status_code == 404
+    assert server.client.get(f"/api/charts/{number}.png").status_code == 404
+    assert server.client.get(f"/api/charts/0/1/2/{number}.png").status_code == 404
+    assert server.commands == []
 
 
 # who is kept out

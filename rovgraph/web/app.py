@@ -114,7 +114,10 @@ def _commands(broadcast: Broadcast, offer: Offer | None, allowance: Allowance) -
 
     async def remove(request: Request) -> Response:
         allowance.take()
-        give(RemoveMark(request.path_params["number"]))
+        number = request.path_params["number"]
+        if all(mark.number != number for mark in view.marks.all):
+            raise Refusal(404, f"there is no mark {number}")
+        give(RemoveMark(number))
         return JSONResponse({}, 202)
 
     async def position(request: Request) -> Response:
@@ -125,7 +128,7 @@ def _commands(broadcast: Broadcast, offer: Offer | None, allowance: Allowance) -
 
     return [
         Route("/api/marks", mark, methods=["POST"]),
-        Route("/api/marks/{number:int}", remove, methods=["DELETE"]),
+        Route("/api/marks/{number:number}", remove, methods=["DELETE"]),
         Route("/api/position", position, methods=["POST"]),
     ]
 

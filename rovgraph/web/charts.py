@@ -123,8 +123,8 @@ class Charts:
 
         return [
             Route("/api/charts", listed),
-            Route("/api/charts/{number:int}.png", image),
-            Route("/api/charts/{number:int}/{z:int}/{x:int}/{y:int}.png", tile),
+            Route("/api/charts/{number:number}.png", image),
+            Route("/api/charts/{number:number}/{z:number}/{x:number}/{y:number}.png", tile),
         ]
 
     def _get(self, number: int) -> Chart | None:

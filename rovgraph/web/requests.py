@@ -5,6 +5,7 @@ import unicodedata
 from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import Request
 
 from rovgraph.live.commands import DropMark, SetPosition
@@ -12,6 +13,15 @@ from rovgraph.live.commands import DropMark, SetPosition
 LARGEST_BODY = 4096  # [bytes]
 FARTHEST_M = 1e5  # n is flat
 BURST, PER_S = 20, 5.0  # commands that are taken at once, and a second in the long run
+
+
+class _Number(IntegerConvertor):
+    """A number in a path; one of thousands of digits, which Python does not convert, is none."""
+
+    regex = "[0-9]{1,10}"
+
+
+register_url_convertor("number", _Number())
 
 
 class Refusal(Exception):
