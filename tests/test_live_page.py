@@ -539,15 +539,18 @@ def test_a_page_that_speaks_while_it_is_told_something_is_closed_too():
     assert asyncio.run(serve()) == 1008
 
 
+HANDSHAKE = (
+    b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
 def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(page, monkeypatch):
     monkeypatch.setattr(broadcasting, "STALL_S", 0.5)
     text = "x" * 20_000
     with socket.create_connection(("127.0.0.1", page.address.port)) as deaf, live(page) as link:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        deaf.sendall(
-            b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-        )
+        deaf.sendall(HANDSHAKE)
         end, k = time.monotonic() + 40, 0
         while not page.broadcast.dropped:
             assert time.monotonic() < end
@@ -558,6 +561,21 @@ def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(page, monkeyp
                     break
         assert page.broadcast.pages == 1
         assert httpx.get(page.address.url + "api/state", timeout=20).json()["time"] == float(k)
+
+
+def test_a_page_that_answers_no_ping_is_dropped_and_counted(monkeypatch):
+    """What little it was sent fits into its buffers."""
+    monkeypatch.setattr(connections, "PING_S", 0.3)
+    monkeypatch.setattr(connections, "PONG_S", 0.3)
+    with rg.live_page("127.0.0.1:0") as page, socket.create_connection(("127.0.0.1", page.address.port)) as deaf:
+        deaf.sendall(HANDSHAKE)
+        end = time.monotonic() + 20
+        while not page.broadcast.dropped:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert page.broadcast.pages == 0
+        metrics = httpx.get(page.address.url + "metrics", timeout=20).text
+        assert "rovgraph_pages_dropped_total 1.0" in metrics
 
 
 def test_the_estimator_only_queues_and_never_waits(page):

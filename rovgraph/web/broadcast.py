@@ -11,13 +11,14 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rovgraph.live.solution import Solution
+from rovgraph.web.connections import unanswered
 from rovgraph.web.guard import SUBPROTOCOL
 from rovgraph.web.track import COLUMNS
 from rovgraph.web.view import Cursor, View
 
 PERIOD_S = 0.05  # least time between messages to a page
 IDLE_S = 1.0  # after which a page is told that there is nothing new
-STALL_S = 5.0  # a page that takes longer to read is dropped
+STALL_S = 5.0  # a page that takes longer to read one message, when its buffers are full, is dropped
 MOST_PAGES = 32
 
 
@@ -146,6 +147,16 @@ class Broadcast:
 
 
 async def _silence(socket: WebSocket) -> None:
-    """Return when a page goes, or says something, which pages do by requests only."""
-    with contextlib.suppress(WebSocketDisconnect, KeyError):
+    """Return when a page goes, or says something, which pages do by requests only.
+
+    Raises
+    ------
+    TimeoutError : it answers no ping, as what it was sent before is not read
+    """
+    try:
         await socket.receive_text()
+    except WebSocketDisconnect as gone:
+        if unanswered(gone):
+            raise TimeoutError from None
+    except KeyError:  # it was no text
+        pass

@@ -13,6 +13,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 REQUEST_S = 10.0  # for a whole request, from the connection or the answer before it on
 ANSWER_S = 60.0  # for the client to read the answer
+PING_S, PONG_S = 5.0, 10.0  # between pings to a page, and for it to answer one
 FAREWELL_S = 5.0  # for a WebSocket to end after its page was dropped
 UNANSWERED = 1011  # a WebSocket's code of a ping without an answer
 

@@ -11,6 +11,7 @@ import uvicorn
 from rovgraph.live.marks import Marks
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
+from rovgraph.web import connections
 from rovgraph.web.address import Address, listening, parse_address, parse_origin, token_of
 from rovgraph.web.app import Offer, application
 from rovgraph.web.broadcast import Broadcast
@@ -78,6 +79,8 @@ class LivePage:
                 lifespan="on",
                 http=Connection,
                 ws=PageSocket,
+                ws_ping_interval=connections.PING_S,
+                ws_ping_timeout=connections.PONG_S,
                 ws_max_size=LARGEST_MESSAGE,
                 ws_per_message_deflate=False,
                 limit_concurrency=MOST_CONNECTIONS,
