@@ -206,6 +206,29 @@ def test_what_is_not_there_is_not_found(server, number):
     assert server.commands == []
 
 
+def test_marks_are_limited(server, monkeypatch):
+    monkeypatch.setattr("rovgraph.web.app.MOST_MARKS", 2)
+    server.show(solution())
+    for _ in range(2):
+        server.marks.drop("", solution())
+    answer = server.client.post("/api/marks", json={}, headers=OWN)
+    assert answer.status_code == 409 and "2 marks already" in answer.json()["error"]
+    server.marks.remove(1)
+    assert server.client.post("/api/marks", json={}, headers=OWN).status_code == 202
+
+
+def test_marks_are_told_when_they_change(server):
+    server.show(solution())
+    first = server.view.update(replace(server.view.cursor, marks=-1))
+    assert json.loads(first)["marks"] == []
+    told = server.view.cursor
+    assert "marks" not in json.loads(server.view.update(told))
+    server.marks.drop("x", solution())
+    assert [mark["name"] for mark in json.loads(server.view.update(told))["marks"]] == ["x"]
+    server.marks.remove(1)
+    assert json.loads(server.view.update(told))["marks"] == []
+
+
 # who is kept out
 
 

@@ -6,6 +6,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -125,12 +126,13 @@ class Broadcast:
         while True:
             edition = self._edition
             if cursor is None:
-                cursor, pieces = view.cursor, list(view.track.pieces())
+                cursor, pieces = replace(view.cursor, marks=-1), list(view.track.pieces())
                 await self._send(socket, json.dumps({"type": "begin", "columns": COLUMNS, "events": view.events()}))
                 for piece in pieces:
                     await self._send(socket, f'{{"type":"track","points":{piece}}}')
             if cursor not in self._encoded:
-                self._encoded[cursor] = view.update(cursor), view.cursor
+                told = view.cursor  # before: marks that change meanwhile are told again
+                self._encoded[cursor] = view.update(cursor), told
             message, told = self._encoded[cursor]
             cursor = None if message is None else told
             if message is not None:

@@ -35,11 +35,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class Cursor:
-    """What a page has: points of an edition of the track, and events."""
+    """What a page has: points of an edition of the track, events, and an edition of the marks, -1 = none."""
 
     edition: int
     points: int
     events: int
+    marks: int = -1
 
 
 class View:
@@ -73,7 +74,7 @@ class View:
     @property
     def cursor(self) -> Cursor:
         """Of a page that has everything."""
-        return Cursor(self.track.edition, len(self.track), self._numbered)
+        return Cursor(self.track.edition, len(self.track), self._numbered, self.marks.edition)
 
     def events(self, since: int = 0) -> list[dict[str, Any]]:
         """Events after a number, oldest first."""
@@ -107,7 +108,10 @@ class View:
         if cursor.edition != self.track.edition:
             return None
         new = {"points": self.track.since(cursor.points), "events": self.events(cursor.events)}
-        return json.dumps({"type": "state", **self.state(), **new}, allow_nan=False, separators=(",", ":"))
+        state = self.state()
+        if cursor.marks == self.marks.edition:
+            state.pop("marks", None)
+        return json.dumps({"type": "state", **state, **new}, allow_nan=False, separators=(",", ":"))
 
     def geojson(self) -> dict[str, Any]:
         """The track as GeoJSON (RFC 7946) where the origin is known; elsewhere a feature without geometry."""

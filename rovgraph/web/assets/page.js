@@ -51,6 +51,7 @@ function showState(news) {
     connection("connected; rovgraph waits for its first position", false);
     return;
   }
+  news.marks ??= state?.marks ?? []; // told only when they change
   state = news;
   const old = news.age_s > STALE_S;
   connection(old ? `no solution for ${duration(news.age_s)}` : "live", old);
