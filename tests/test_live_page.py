@@ -263,9 +263,9 @@ def test_another_site_changes_nothing_and_hears_nothing(server, origin):
 
 
 def test_a_name_that_points_here_is_not_this_computer(server):
-    for host in ("evil.example", "evil.example:8080", "127.0.0.1.evil.example"):
+    for host in ("evil.example", "evil.example:8080", "127.0.0.1.evil.example", "192.168.2.2", "0.0.0.0"):
         assert server.client.get("/api/state", headers={"host": host}).status_code == 403
-    for host in ("localhost:1", "127.0.0.1", "[::1]:8080"):
+    for host in ("localhost:1", "127.0.0.1", "127.0.0.2:8090", "[::1]:8080"):
         assert server.client.get("/api/state", headers={"host": host}).status_code == 200
 
 

@@ -14,7 +14,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rovgraph.web.address import LOOPBACK_NAMES
+from rovgraph.web.address import is_loopback
 
 SUBPROTOCOL = "rovgraph"  # of the page's WebSocket; its token, where there is one, is offered beside it
 TOKEN_PREFIX = "token."
@@ -66,7 +66,7 @@ class Guard:
         """Status and reason; None = let through."""
         headers, path = Headers(scope=scope), str(scope["path"])
         host, origin = headers.get("host", ""), headers.get("origin")
-        if self._token is None and _hostname(host) not in LOOPBACK_NAMES:
+        if self._token is None and not is_loopback(_hostname(host)):
             return 403, "the request names another computer; open the page by 127.0.0.1 or localhost"
         stream = scope["type"] == "websocket"
         listed = origin is not None and origin.lower() in self._origins
