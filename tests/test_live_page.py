@@ -217,6 +217,14 @@ def test_marks_are_limited(server, monkeypatch):
     assert server.client.post("/api/marks", json={}, headers=OWN).status_code == 202
 
 
+def test_marks_of_a_resumed_run_are_told_with_the_first_solution(server):
+    server.marks.drop("x", solution())
+    told = server.view.cursor
+    assert json.loads(server.view.update(told))["time"] is None
+    server.show(solution())
+    assert len(json.loads(server.view.update(told))["marks"]) == 1
+
+
 def test_marks_are_told_when_they_change(server):
     server.show(solution())
     first = server.view.update(replace(server.view.cursor, marks=-1))
@@ -522,6 +530,13 @@ def test_what_is_new_comes_once_and_soon(page):
             time.sleep(0.01)
         assert [p[1] for p in points] == list(range(30))
         assert np.percentile(delays, 50) < 0.15
+
+
+def test_a_page_is_told_in_which_units_a_person_reads_the_calibration(page):
+    with live(page) as link:
+        units = until(link, "begin")["units"]
+    assert units["dvl_yaw"] == units["field_dip"] == [pytest.approx(57.29578), "°"]
+    assert units["dvl_time_offset"] == [1.0, "s"] and units["dvl_scale"] == [1.0, ""]
 
 
 def test_a_page_that_speaks_is_closed(page):

@@ -15,7 +15,7 @@ from rovgraph.live.solution import Solution
 from rovgraph.web.connections import unanswered
 from rovgraph.web.guard import SUBPROTOCOL
 from rovgraph.web.track import COLUMNS
-from rovgraph.web.view import Cursor, View
+from rovgraph.web.view import UNITS, Cursor, View
 
 PERIOD_S = 0.05  # least time between messages to a page
 IDLE_S = 1.0  # after which a page is told that there is nothing new
@@ -127,7 +127,8 @@ class Broadcast:
             edition = self._edition
             if cursor is None:
                 cursor, pieces = replace(view.cursor, marks=-1), list(view.track.pieces())
-                await self._send(socket, json.dumps({"type": "begin", "columns": COLUMNS, "events": view.events()}))
+                begin = {"type": "begin", "columns": COLUMNS, "units": UNITS, "events": view.events()}
+                await self._send(socket, json.dumps(begin))
                 for piece in pieces:
                     await self._send(socket, f'{{"type":"track","points":{piece}}}')
             if cursor not in self._encoded:

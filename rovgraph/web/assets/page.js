@@ -22,6 +22,7 @@ const link = new Link({
     document.body.classList.toggle("widget", widget);
     if (news.type === "begin") {
       map.track.clear();
+      gauges.units = news.units;
       at("events").replaceChildren();
       addEvents(news.events);
     } else if (news.type === "track") {
