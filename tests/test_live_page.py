@@ -32,7 +32,7 @@ from rovgraph.web.address import parse_address, parse_origin, token_of
 from rovgraph.web.app import application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import Charts, read_charts
-from rovgraph.web.guard import Guard
+from rovgraph.web.guard import LARGEST_HEADERS, Guard
 from rovgraph.web.page import MOST_CONNECTIONS
 from rovgraph.web.requests import BURST, LARGEST_BODY
 from rovgraph.web.track import PIECE, Track
@@ -235,6 +235,13 @@ def test_marks_are_told_when_they_change(server):
     assert [mark["name"] for mark in json.loads(server.view.update(told))["marks"]] == ["x"]
     server.marks.remove(1)
     assert json.loads(server.view.update(told))["marks"] == []
+
+
+def test_names_have_no_controls_of_direction(server):
+    server.show(solution())
+    for name in ("a\u202egnp.exe", "a\u2066\x1b[31mb\u2069\ufeff", "\u202e", "a\u200db"):
+        assert server.client.post("/api/marks", json={"name": name}, headers=OWN).status_code == 202
+    assert [command.name for command in server.commands] == ["agnp.exe", "a [31mb", "", "a\u200db"]
 
 
 # who is kept out
@@ -643,6 +650,24 @@ def test_a_header_that_is_too_long_is_refused(page):
     with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
         link.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"x" * 100_000)
         assert b"400" in link.recv(100)
+
+
+@pytest.mark.parametrize("size", [LARGEST_HEADERS, 70_000])
+def test_headers_that_are_too_long_are_refused_whole_and_in_pieces(page, size):
+    with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
+        link.sendall(b"GET /api/state HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"x" * size + b"\r\n\r\n")
+        assert link.recv(100).split()[1] in (b"400", b"431")
+    headers = {"X": "x" * 10_000}
+    assert httpx.get(page.address.url + "api/state", headers=headers, timeout=20).status_code == 200
+
+
+def test_what_clients_do_wrong_is_not_told_on_the_terminal(page, caplog, capfd):
+    with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
+        link.sendall(b"\x16\x03\x01 garbage\r\n\r\n")
+        assert b"400" in link.recv(100)
+    page._server.config.limit_concurrency = 0
+    assert httpx.get(page.address.url + "api/state", timeout=20).status_code == 503
+    assert caplog.text == "" and capfd.readouterr().err == ""
 
 
 def test_too_many_pages_are_turned_away(page, monkeypatch):

@@ -17,12 +17,11 @@ from rovgraph.web.app import Offer, application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import read_charts
 from rovgraph.web.connections import Connection, PageSocket
-from rovgraph.web.guard import Guard
+from rovgraph.web.guard import LARGEST_HEADERS, Guard
 from rovgraph.web.view import Limits, View
 
 START_S, CLOSE_S = 10.0, 2.0
 MOST_CONNECTIONS = 64
-LARGEST_HEADERS = 1 << 14  # [bytes]
 LARGEST_MESSAGE = 1 << 10  # from a page's WebSocket, which has nothing to say [bytes]
 
 
