@@ -57,6 +57,8 @@ def told(case, tmp_path_factory):
         (begin + 13.0, DropMark("way-point", 7.0, 8.0)),
         (begin + 15.0, here),
         (begin + 16.0, RemoveMark(2)),
+        (begin + 17.0, DropMark("")),
+        (begin + 18.0, RemoveMark(3)),
     ]
     return folder, run(case.log, case.config, folder, commands)
 
@@ -67,6 +69,7 @@ def test_a_position_becomes_a_fix_that_moves_the_estimate(case, told, tmp_path):
     assert np.linalg.norm(first[-1].position - last[-1].position) > 0.1
     (said,) = [e for s in first for e in s.events if e.source == "pilot" and e.kind == "position"]
     assert said.text == "a fix at north 0.30 m, east -0.20 m, sd 0.05 m"
+    assert not first[-1].sensors["fix"].failed_s and first[-1].sensors["fix"].used == 1
 
 
 def test_a_position_that_contradicts_the_estimate_is_refused_aloud(case, tmp_path):
@@ -98,7 +101,9 @@ def test_marks_are_kept_with_where_the_vehicle_was_and_come_back(told):
     assert mark.name == NASTY and mark.north == at.position[0]
     assert Marks(folder).all == ()
     kinds = [e.kind for s in solutions for e in s.events if e.source == "pilot"]
-    assert kinds == ["mark", "waypoint", "position", "removed"]
+    assert kinds == ["mark", "waypoint", "position", "removed", "mark", "removed"]
+    nameless = [e.text for s in solutions for e in s.events if e.source == "pilot"][-2:]
+    assert nameless[0].startswith("number 3: north ") and nameless[1] == "number 3"
     assert all(json.dumps(e.as_dict()) for s in solutions for e in s.events)
 
 

@@ -93,3 +93,20 @@ def test_silence_is_said_once_and_so_is_the_return():
     assert kinds(faults) == ["silent"]
     faults.look(moving(9.5))
     assert kinds(faults) == ["silent", "back"]
+
+
+def fix(time: float) -> Measurement:
+    return Measurement(time, "fix", np.array([1.0, 2.0, 0.5]), 0)
+
+
+def test_fixes_given_by_hand_are_not_missed():
+    faults = Faults()
+    for time in (0.0, 2.0, 4.0):
+        assert faults.accept(fix(time)).use
+    faults.tick(100.0)
+    assert faults.watches["fix"].time == 4.0 and faults.watches["fix"].state == "ok" and faults.events == []
+    for time in (100.0, 101.0):
+        faults.look(fix(time))
+    faults.accept(fix(110.0))
+    faults.tick(112.0)
+    assert kinds(faults) == ["silent"]

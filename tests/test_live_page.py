@@ -26,12 +26,14 @@ from rovgraph.live.feed import Feed
 from rovgraph.live.marks import Marks
 from rovgraph.live.solution import Event, SensorHealth, Solution
 from rovgraph.web import broadcast as broadcasting
+from rovgraph.web import connections
 from rovgraph.web import track as tracking
 from rovgraph.web.address import parse_address, parse_origin, token_of
 from rovgraph.web.app import application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import Charts, read_charts
-from rovgraph.web.guard import Guard
+from rovgraph.web.guard import LARGEST_HEADERS, Guard
+from rovgraph.web.page import MOST_CONNECTIONS
 from rovgraph.web.requests import BURST, LARGEST_BODY
 from rovgraph.web.track import PIECE, Track
 from rovgraph.web.view import Limits, View
@@ -163,6 +165,8 @@ def test_commands_reach_the_estimator_as_they_were_meant(server):
     for path, body in (("marks", {"name": NASTY}), ("marks", {"name": "w\n", "north": 1, "east": 2.5})):
         assert server.client.post(f"/api/{path}", json=body, headers=OWN).status_code == 202
     assert server.client.post("/api/position", json={"north": 1, "east": 2, "sd": 3}, headers=OWN).status_code == 202
+    for _ in range(7):
+        server.marks.drop("", solution())
     assert server.client.delete("/api/marks/7", headers=OWN).status_code == 202
     assert server.commands == [DropMark(NASTY), DropMark("w", 1.0, 2.5), SetPosition(1.0, 2.0, 3.0), RemoveMark(7)]
 
@@ -191,6 +195,53 @@ def test_a_command_that_cannot_be_meant_is_refused_in_one_line(server, path, bod
 
 def test_before_the_first_position_nothing_can_be_marked(server):
     assert server.client.post("/api/marks", json={}, headers=OWN).status_code == 409
+
+
+@pytest.mark.parametrize("number", ["7", "9" * 400, "9" * 5000])
+def test_what_is_not_there_is_not_found(server, number):
+    server.show(solution())
+    assert server.client.delete(f"/api/marks/{number}", headers=OWN).status_code == 404
+    assert server.client.get(f"/api/charts/{number}.png").status_code == 404
+    assert server.client.get(f"/api/charts/0/1/2/{number}.png").status_code == 404
+    assert server.commands == []
+
+
+def test_marks_are_limited(server, monkeypatch):
+    monkeypatch.setattr("rovgraph.web.app.MOST_MARKS", 2)
+    server.show(solution())
+    for _ in range(2):
+        server.marks.drop("", solution())
+    answer = server.client.post("/api/marks", json={}, headers=OWN)
+    assert answer.status_code == 409 and "2 marks already" in answer.json()["error"]
+    server.marks.remove(1)
+    assert server.client.post("/api/marks", json={}, headers=OWN).status_code == 202
+
+
+def test_marks_of_a_resumed_run_are_told_with_the_first_solution(server):
+    server.marks.drop("x", solution())
+    told = server.view.cursor
+    assert json.loads(server.view.update(told))["time"] is None
+    server.show(solution())
+    assert len(json.loads(server.view.update(told))["marks"]) == 1
+
+
+def test_marks_are_told_when_they_change(server):
+    server.show(solution())
+    first = server.view.update(replace(server.view.cursor, marks=-1))
+    assert json.loads(first)["marks"] == []
+    told = server.view.cursor
+    assert "marks" not in json.loads(server.view.update(told))
+    server.marks.drop("x", solution())
+    assert [mark["name"] for mark in json.loads(server.view.update(told))["marks"]] == ["x"]
+    server.marks.remove(1)
+    assert json.loads(server.view.update(told))["marks"] == []
+
+
+def test_names_have_no_controls_of_direction(server):
+    server.show(solution())
+    for name in ("a\u202egnp.exe", "a\u2066\x1b[31mb\u2069\ufeff", "\u202e", "a\u200db"):
+        assert server.client.post("/api/marks", json={"name": name}, headers=OWN).status_code == 202
+    assert [command.name for command in server.commands] == ["agnp.exe", "a [31mb", "", "a\u200db"]
 
 
 # who is kept out
@@ -227,9 +278,9 @@ def test_another_site_changes_nothing_and_hears_nothing(server, origin):
 
 
 def test_a_name_that_points_here_is_not_this_computer(server):
-    for host in ("evil.example", "evil.example:8080", "127.0.0.1.evil.example"):
+    for host in ("evil.example", "evil.example:8080", "127.0.0.1.evil.example", "192.168.2.2", "0.0.0.0"):
         assert server.client.get("/api/state", headers={"host": host}).status_code == 403
-    for host in ("localhost:1", "127.0.0.1", "[::1]:8080"):
+    for host in ("localhost:1", "127.0.0.1", "127.0.0.2:8090", "[::1]:8080"):
         assert server.client.get("/api/state", headers={"host": host}).status_code == 200
 
 
@@ -340,6 +391,28 @@ def test_a_geotiff_lies_where_its_coordinates_say(tmp_path):
     image = server.client.get("/api/charts/0.png").content
     with rasterio.MemoryFile(image) as memory, memory.open() as png:
         assert png.shape == (6, 10) and png.read(4)[0, 0] == 0 and png.read(4)[1:].min() == 255
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"crs": 'LOCAL_CS["pool",UNIT["metre",1]]'}, "cannot be converted to WGS 84 .* gdal_translate"),
+        ({"at": (1e8, 1e9)}, "gdal_translate"),
+        ({"crs": "EPSG:4326", "at": (15.0, 6e6)}, "outside its coordinate system"),
+        ({"dtype": "complex64"}, "complex values"),
+    ],
+    ids=["local", "outside", "degrees", "complex"],
+)
+def test_a_geotiff_that_cannot_be_shown_is_refused_in_one_line(tmp_path, changes, says):
+    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: no GeoTIFF was read")
+    wanted = {"crs": "EPSG:32633", "at": (5e5, 6.4e6), "dtype": "float32"} | changes
+    place = rasterio.transform.from_origin(*wanted.pop("at"), 2.0, 2.0)
+    path = tmp_path / "c.tif"
+    with rasterio.open(path, "w", driver="GTiff", height=4, width=4, count=1, transform=place, **wanted) as file:
+        file.write(np.ones((1, 4, 4), wanted["dtype"]))
+    with pytest.raises(InputError, match=says) as error:
+        read_charts([path])
+    assert "\n" not in str(error.value) and str(path) in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -466,6 +539,13 @@ def test_what_is_new_comes_once_and_soon(page):
         assert np.percentile(delays, 50) < 0.15
 
 
+def test_a_page_is_told_in_which_units_a_person_reads_the_calibration(page):
+    with live(page) as link:
+        units = until(link, "begin")["units"]
+    assert units["dvl_yaw"] == units["field_dip"] == [pytest.approx(57.29578), "°"]
+    assert units["dvl_time_offset"] == [1.0, "s"] and units["dvl_scale"] == [1.0, ""]
+
+
 def test_a_page_that_speaks_is_closed(page):
     with live(page) as link:
         link.send("x")
@@ -504,15 +584,18 @@ def test_a_page_that_speaks_while_it_is_told_something_is_closed_too():
     assert asyncio.run(serve()) == 1008
 
 
+HANDSHAKE = (
+    b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
 def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(page, monkeypatch):
     monkeypatch.setattr(broadcasting, "STALL_S", 0.5)
     text = "x" * 20_000
     with socket.create_connection(("127.0.0.1", page.address.port)) as deaf, live(page) as link:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        deaf.sendall(
-            b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-        )
+        deaf.sendall(HANDSHAKE)
         end, k = time.monotonic() + 40, 0
         while not page.broadcast.dropped:
             assert time.monotonic() < end
@@ -523,6 +606,21 @@ def test_a_page_that_does_not_read_is_dropped_and_the_others_go_on(page, monkeyp
                     break
         assert page.broadcast.pages == 1
         assert httpx.get(page.address.url + "api/state", timeout=20).json()["time"] == float(k)
+
+
+def test_a_page_that_answers_no_ping_is_dropped_and_counted(monkeypatch):
+    """What little it was sent fits into its buffers."""
+    monkeypatch.setattr(connections, "PING_S", 0.3)
+    monkeypatch.setattr(connections, "PONG_S", 0.3)
+    with rg.live_page("127.0.0.1:0") as page, socket.create_connection(("127.0.0.1", page.address.port)) as deaf:
+        deaf.sendall(HANDSHAKE)
+        end = time.monotonic() + 20
+        while not page.broadcast.dropped:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert page.broadcast.pages == 0
+        metrics = httpx.get(page.address.url + "metrics", timeout=20).text
+        assert "rovgraph_pages_dropped_total 1.0" in metrics
 
 
 def test_the_estimator_only_queues_and_never_waits(page):
@@ -554,9 +652,58 @@ def test_a_header_that_is_too_long_is_refused(page):
         assert b"400" in link.recv(100)
 
 
+@pytest.mark.parametrize("size", [LARGEST_HEADERS, 70_000])
+def test_headers_that_are_too_long_are_refused_whole_and_in_pieces(page, size):
+    with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
+        link.sendall(b"GET /api/state HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"x" * size + b"\r\n\r\n")
+        assert link.recv(100).split()[1] in (b"400", b"431")
+    headers = {"X": "x" * 10_000}
+    assert httpx.get(page.address.url + "api/state", headers=headers, timeout=20).status_code == 200
+
+
+def test_what_clients_do_wrong_is_not_told_on_the_terminal(page, caplog, capfd):
+    with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
+        link.sendall(b"\x16\x03\x01 garbage\r\n\r\n")
+        assert b"400" in link.recv(100)
+    page._server.config.limit_concurrency = 0
+    assert httpx.get(page.address.url + "api/state", timeout=20).status_code == 503
+    assert caplog.text == "" and capfd.readouterr().err == ""
+
+
 def test_too_many_pages_are_turned_away(page, monkeypatch):
     monkeypatch.setattr(broadcasting, "MOST_PAGES", 1)
     with live(page) as link:
         until(link, "begin")
         with pytest.raises(InvalidStatus), live(page):
+            pass
+
+
+START = b"GET /api/state HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+HEAD = b"POST /api/marks HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{"
+
+
+@pytest.mark.parametrize("said", [b"", START], ids=["silent", "half"])
+def test_connections_without_a_whole_request_lock_nobody_out(page, monkeypatch, said):
+    monkeypatch.setattr(connections, "REQUEST_S", 1.0)
+    url, links = f"{page.address.url}api/state", []
+    try:
+        for _ in range(MOST_CONNECTIONS + 6):
+            links.append(socket.create_connection(("127.0.0.1", page.address.port), timeout=20))
+            links[-1].sendall(said)
+        assert httpx.get(url, timeout=20).status_code == 503
+        end = time.monotonic() + 20
+        while httpx.get(url, timeout=20).status_code == 503 and time.monotonic() < end:
+            time.sleep(0.1)
+        assert httpx.get(url, timeout=20).status_code == 200
+    finally:
+        for link in links:
+            link.close()
+
+
+@pytest.mark.parametrize("said", [b"", START, HEAD, START + b"\r\n" + START], ids=["silent", "half", "body", "second"])
+def test_a_connection_without_a_whole_request_is_ended(page, monkeypatch, said):
+    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
+    with socket.create_connection(("127.0.0.1", page.address.port), timeout=20) as link:
+        link.sendall(said)
+        while link.recv(1000):
             pass

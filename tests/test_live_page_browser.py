@@ -55,6 +55,7 @@ def test_the_page_shows_the_dive_and_runs_nobodys_text(browser, dive, width):
         assert NASTY in page.inner_text(place)
     assert "no lock for 7 s" in page.inner_text("#alarms")
     assert "28.6°" in page.inner_text("#gauges")
+    assert "dvl_yaw 44.12 ± 0.57 °" in page.text_content("#learnt")
     sizes = page.evaluate("[...document.querySelectorAll('#tools button')].map(b => b.getBoundingClientRect().height)")
     assert min(sizes) >= 48
     assert errors == []

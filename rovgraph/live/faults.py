@@ -67,6 +67,7 @@ class Watch:
     since: float = 0.0  # of the first of equal values
     equal: int = 0
     turned: Array = field(default_factory=lambda: np.zeros(3))  # how far the vehicle had by then [rad]
+    by_hand: bool = False  # no sensor has measured yet: nothing is late
 
 
 @dataclass
@@ -88,7 +89,7 @@ class Faults:
     def look(self, m: Measurement) -> Verdict:
         """Whether a measurement is one."""
         watch = self.watches.get(m.sensor)
-        if watch is None:
+        if watch is None or watch.by_hand:
             watch = self.watches[m.sensor] = Watch()
         values = m.values.tobytes()
         if values == watch.values:
@@ -109,10 +110,17 @@ class Faults:
         )
         return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
 
+    def accept(self, m: Measurement) -> Verdict:
+        """Take a measurement that a person gives, as it is; a sensor that gives the like is not said to have spoken."""
+        watch = self.watches.setdefault(m.sensor, Watch(by_hand=True))
+        if watch.by_hand:
+            watch.time = max(m.time, watch.time)
+        return _GOOD
+
     def tick(self, time: float) -> None:
         """Note sensors that have said nothing for too long."""
         for sensor, watch in self.watches.items():
-            if sensor in OCCASIONAL:
+            if sensor in OCCASIONAL or watch.by_hand:
                 continue
             quiet = time - watch.heard  # what comes late all the time is not silent
             longest = max(SILENT_S, SILENT_PERIODS * watch.period) if watch.period else SILENT_AT_FIRST_S

@@ -13,6 +13,7 @@ from rovgraph.live.warnings import Warnings
 from rovgraph.trajectory import Trajectory
 
 MARKS = "marks.csv"
+MOST_MARKS = 500  # that pages may drop: the whole file is written at each
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,14 @@ class Marks:
     Attributes
     ----------
     all : tuple of Mark, oldest first; replaced, never changed, so that any thread may read it
+    edition : counts the changes of `all`; read it first
     """
 
     def __init__(self, folder: Path | None = None, warnings: Warnings | None = None, resume: bool = False) -> None:
         self._path = None if folder is None else folder / MARKS
         self._warnings = warnings or Warnings()
         self.all = _read(self._path, self._warnings) if self._path is not None and resume else ()
+        self.edition = 0
         self._newest = max((mark.number for mark in self.all), default=0)
 
     def drop(self, name: str, at: Solution, north: float | None = None, east: float | None = None) -> Mark:
@@ -74,17 +77,20 @@ class Marks:
             north_sd, east_sd, _ = at.position_sd.tolist()
             place = north, east, down, north_sd, east_sd, at.latitude, at.longitude
             mark = Mark(self._newest, "mark", name, at.time, *place)
-        self.all = (*self.all, mark)
-        self._write()
+        self._change((*self.all, mark))
         return mark
 
     def remove(self, number: int) -> Mark | None:
         """Forget a mark; the one that was there."""
         found = next((mark for mark in self.all if mark.number == number), None)
         if found is not None:
-            self.all = tuple(mark for mark in self.all if mark is not found)
-            self._write()
+            self._change(tuple(mark for mark in self.all if mark is not found))
         return found
+
+    def _change(self, marks: tuple[Mark, ...]) -> None:
+        self.all = marks
+        self.edition += 1
+        self._write()
 
     def _write(self) -> None:
         if self._path is None:

@@ -143,7 +143,7 @@ class Navigator:
         reading = self._intake.fix(north, east, sd)
         if (measurement := self._intake.measurement(self.time, reading)) is None:
             return ()
-        self._consider(measurement)
+        self._consider(measurement, by_hand=True)
         return (reading,)
 
     def _hear(self, message: Message) -> None:
@@ -163,7 +163,7 @@ class Navigator:
             if measurement.time > known:
                 taken = self._intake.measurement(measurement.time, Reading(measurement.sensor, measurement.values))
                 if taken is not None:
-                    self._consider(taken)
+                    self._consider(taken, by_hand=taken.sensor == "fix")  # some may be; the recording does not tell
         if self._reinitialisations is not None:
             self._reinitialisations.patient = self.patient
 
@@ -257,12 +257,12 @@ class Navigator:
         self.health.rejected.update(state["rejected"])
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
 
-    def _consider(self, m: Measurement) -> None:
-        """Give a measurement to the engine, unless it is none."""
+    def _consider(self, m: Measurement, by_hand: bool = False) -> None:
+        """Give a measurement, of a sensor or of a person, to the engine, unless it is none."""
         self.time = max(self.time, m.time)
         if m.sensor == "dvl_altitude":
             self._altitude = m.time, float(m.values[0])
-        verdict = self.faults.look(m)
+        verdict = self.faults.accept(m) if by_hand else self.faults.look(m)
         if m.sensor != "imu" and self.time > self._ticked + TICK_S:  # the IMU's silence is seen by others that go on
             self.faults.tick(self.time)
             self._ticked = self.time

@@ -165,9 +165,10 @@ class Session:
             return
         if isinstance(command, DropMark):
             mark = self.marks.drop(command.name, at, command.north, command.east)
-            navigator.say("pilot", mark.kind, f"{mark.name}: north {mark.north:.2f} m, east {mark.east:.2f} m")
+            name = mark.name or f"number {mark.number}"
+            navigator.say("pilot", mark.kind, f"{name}: north {mark.north:.2f} m, east {mark.east:.2f} m")
         elif isinstance(command, RemoveMark) and (gone := self.marks.remove(command.number)) is not None:
-            navigator.say("pilot", "removed", gone.name)
+            navigator.say("pilot", "removed", gone.name or f"number {gone.number}")
         elif isinstance(command, SetPosition):
             north, east, sd = command.north, command.east, command.sd
             readings = navigator.take_fix(north, east, sd)

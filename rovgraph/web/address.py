@@ -10,10 +10,17 @@ from urllib.parse import urlsplit
 
 from rovgraph.errors import InputError
 
-LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 TOKEN_BYTES = 24
 SHORTEST_TOKEN = 16  # characters
 BACKLOG = 64
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this computer by its own number or name, which no name server decides."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 @dataclass(frozen=True)
@@ -26,10 +33,7 @@ class Address:
     @property
     def loopback(self) -> bool:
         """Whether only this computer reaches it."""
-        try:
-            return ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return is_loopback(self.host)
 
     @property
     def url(self) -> str:

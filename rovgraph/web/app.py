@@ -13,6 +13,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from rovgraph.live.commands import Command, RemoveMark
+from rovgraph.live.marks import MOST_MARKS
 from rovgraph.web import cockpit
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import Charts
@@ -109,12 +110,18 @@ def _commands(broadcast: Broadcast, offer: Offer | None, allowance: Allowance) -
 
     async def mark(request: Request) -> Response:
         allowance.take()
-        give((await read_body(request, MarkBody)).command())
+        body = await read_body(request, MarkBody)
+        if len(view.marks.all) >= MOST_MARKS:
+            raise Refusal(409, f"there are {MOST_MARKS} marks already; remove one first")
+        give(body.command())
         return JSONResponse({}, 202)
 
     async def remove(request: Request) -> Response:
         allowance.take()
-        give(RemoveMark(request.path_params["number"]))
+        number = request.path_params["number"]
+        if all(mark.number != number for mark in view.marks.all):
+            raise Refusal(404, f"there is no mark {number}")
+        give(RemoveMark(number))
         return JSONResponse({}, 202)
 
     async def position(request: Request) -> Response:
@@ -125,7 +132,7 @@ def _commands(broadcast: Broadcast, offer: Offer | None, allowance: Allowance) -
 
     return [
         Route("/api/marks", mark, methods=["POST"]),
-        Route("/api/marks/{number:int}", remove, methods=["DELETE"]),
+        Route("/api/marks/{number:number}", remove, methods=["DELETE"]),
         Route("/api/position", position, methods=["POST"]),
     ]
 

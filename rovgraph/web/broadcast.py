@@ -6,18 +6,20 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rovgraph.live.solution import Solution
+from rovgraph.web.connections import unanswered
 from rovgraph.web.guard import SUBPROTOCOL
 from rovgraph.web.track import COLUMNS
-from rovgraph.web.view import Cursor, View
+from rovgraph.web.view import UNITS, Cursor, View
 
 PERIOD_S = 0.05  # least time between messages to a page
 IDLE_S = 1.0  # after which a page is told that there is nothing new
-STALL_S = 5.0  # a page that takes longer to read is dropped
+STALL_S = 5.0  # a page that takes longer to read one message, when its buffers are full, is dropped
 MOST_PAGES = 32
 
 
@@ -124,12 +126,14 @@ class Broadcast:
         while True:
             edition = self._edition
             if cursor is None:
-                cursor, pieces = view.cursor, list(view.track.pieces())
-                await self._send(socket, json.dumps({"type": "begin", "columns": COLUMNS, "events": view.events()}))
+                cursor, pieces = replace(view.cursor, marks=-1), list(view.track.pieces())
+                begin = {"type": "begin", "columns": COLUMNS, "units": UNITS, "events": view.events()}
+                await self._send(socket, json.dumps(begin))
                 for piece in pieces:
                     await self._send(socket, f'{{"type":"track","points":{piece}}}')
             if cursor not in self._encoded:
-                self._encoded[cursor] = view.update(cursor), view.cursor
+                told = view.cursor  # before: marks that change meanwhile are told again
+                self._encoded[cursor] = view.update(cursor), told
             message, told = self._encoded[cursor]
             cursor = None if message is None else told
             if message is not None:
@@ -146,6 +150,16 @@ class Broadcast:
 
 
 async def _silence(socket: WebSocket) -> None:
-    """Return when a page goes, or says something, which pages do by requests only."""
-    with contextlib.suppress(WebSocketDisconnect, KeyError):
+    """Return when a page goes, or says something, which pages do by requests only.
+
+    Raises
+    ------
+    TimeoutError : it answers no ping, as what it was sent before is not read
+    """
+    try:
         await socket.receive_text()
+    except WebSocketDisconnect as gone:
+        if unanswered(gone):
+            raise TimeoutError from None
+    except KeyError:  # it was no text
+        pass

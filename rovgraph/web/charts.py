@@ -123,8 +123,8 @@ class Charts:
 
         return [
             Route("/api/charts", listed),
-            Route("/api/charts/{number:int}.png", image),
-            Route("/api/charts/{number:int}/{z:int}/{x:int}/{y:int}.png", tile),
+            Route("/api/charts/{number:number}.png", image),
+            Route("/api/charts/{number:number}/{z:number}/{x:number}/{y:number}.png", tile),
         ]
 
     def _get(self, number: int) -> Chart | None:
@@ -160,7 +160,6 @@ def _geotiff(path: Path) -> ImageChart:
         import rasterio
         from rasterio.enums import Resampling
         from rasterio.errors import RasterioError
-        from rasterio.warp import transform
     except ImportError:
         raise InputError(f"--chart {path}: needs rasterio; install it with: pip install 'rovgraph[charts]'") from None
     try:
@@ -169,28 +168,53 @@ def _geotiff(path: Path) -> ImageChart:
                 raise InputError(
                     f"--chart {path}: says no coordinate system; assign one, as gdal_translate -a_srs does"
                 )
+            if any(np.issubdtype(kind, np.complexfloating) for kind in source.dtypes):
+                raise InputError(f"--chart {path}: has complex values; expected real ones, such as gdal_calc.py makes")
             size = max(source.width, source.height)
             shape = [max(1, round(n * min(1.0, LARGEST_PIXELS / size))) for n in (source.height, source.width)]
             bands = source.read(out_shape=(source.count, *shape), resampling=Resampling.average, masked=True)
             x, y = source.xy([0, 0, source.height], [0, source.width, 0], offset="ul")
-            longitude, latitude = transform(source.crs, "EPSG:4326", x, y)
+            corners = _corners(path, source.crs, x, y)
     except RasterioError as error:
         raise InputError(f"--chart {path}: is no GeoTIFF that can be read ({str(error)[:200]})") from None
-    return ImageChart(path.name, _png(bands), np.column_stack([latitude, longitude]))
+    return ImageChart(path.name, _png(bands), corners)
+
+
+def _corners(path: Path, crs: Any, x: Sequence[float], y: Sequence[float]) -> Array:
+    """Latitude and longitude [deg] of places in a coordinate system, shape (n, 2)."""
+    from rasterio.warp import transform
+
+    try:
+        longitude, latitude = transform(crs, "EPSG:4326", x, y)
+    except Exception as error:  # of GDAL, which has no public class for them
+        why = " ".join(str(error).split())[:100]
+        raise InputError(
+            f"--chart {path}: its corners cannot be converted to WGS 84 ({why}); "
+            "assign the coordinate system that it was made in, as gdal_translate -a_srs does"
+        ) from None
+    corners = np.column_stack([latitude, longitude])
+    if not np.isfinite(corners).all() or (np.abs(corners) > (90.0, 360.0)).any():
+        raise InputError(
+            f"--chart {path}: its corners lie outside its coordinate system; "
+            "assign the coordinate system that it was made in, as gdal_translate -a_srs does"
+        )
+    return corners
 
 
 def _png(bands: "np.ma.MaskedArray[Any, Any]") -> bytes:
     """Three bands as colours, one as shades; what is masked is transparent."""
     from rasterio.io import MemoryFile
 
+    bands = np.ma.masked_invalid(bands)
     shown: Any = bands[:3] if len(bands) >= 3 else bands[[0, 0, 0]]
     if shown.dtype != np.uint8:
         low, high = np.percentile(shown.compressed(), (1, 99)) if shown.count() else (0.0, 1.0)
-        shown = np.ma.clip((shown.astype(float) - low) * 255.0 / max(high - low, 1e-12), 0.0, 255.0).astype(np.uint8)
+        shown = np.ma.clip((shown.astype(float) - low) * 255.0 / max(high - low, 1e-12), 0.0, 255.0)
+        shown = shown.filled(0.0).astype(np.uint8)
     alpha = np.where(np.ma.getmaskarray(bands[:1]), 0, 255).astype(np.uint8)
     if len(bands) == 4 and bands.dtype == np.uint8:
         alpha = np.minimum(alpha, bands[3:4].filled(0))
-    colours = np.concatenate([shown.filled(0), alpha])
+    colours = np.concatenate([np.ma.filled(shown, 0), alpha])
     with MemoryFile() as file:
         with file.open(driver="PNG", height=colours.shape[1], width=colours.shape[2], count=4, dtype="uint8") as png:
             png.write(colours)

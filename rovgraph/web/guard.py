@@ -14,7 +14,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rovgraph.web.address import LOOPBACK_NAMES
+from rovgraph.web.address import is_loopback
 
 SUBPROTOCOL = "rovgraph"  # of the page's WebSocket; its token, where there is one, is offered beside it
 TOKEN_PREFIX = "token."
@@ -22,6 +22,7 @@ PUBLIC = {"/", "/register_service", "/cockpit_extras.json"}  # nothing of the di
 ASSETS = "/assets/"
 DATA_LAKE = "/cockpit"  # a WebSocket that Cockpit opens by its address alone
 SAFE = {"GET", "HEAD"}
+LARGEST_HEADERS = 1 << 14  # with the address [bytes]; uvicorn limits only what comes in pieces
 
 
 class Guard:
@@ -64,9 +65,12 @@ class Guard:
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
         """Status and reason; None = let through."""
+        size = len(scope["raw_path"]) + len(scope["query_string"]) + sum(len(k) + len(v) for k, v in scope["headers"])
+        if size > LARGEST_HEADERS:
+            return 431, f"expected at most {LARGEST_HEADERS} bytes of headers"
         headers, path = Headers(scope=scope), str(scope["path"])
         host, origin = headers.get("host", ""), headers.get("origin")
-        if self._token is None and _hostname(host) not in LOOPBACK_NAMES:
+        if self._token is None and not is_loopback(_hostname(host)):
             return 403, "the request names another computer; open the page by 127.0.0.1 or localhost"
         stream = scope["type"] == "websocket"
         listed = origin is not None and origin.lower() in self._origins

@@ -11,16 +11,17 @@ import uvicorn
 from rovgraph.live.marks import Marks
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
+from rovgraph.web import connections
 from rovgraph.web.address import Address, listening, parse_address, parse_origin, token_of
 from rovgraph.web.app import Offer, application
 from rovgraph.web.broadcast import Broadcast
 from rovgraph.web.charts import read_charts
-from rovgraph.web.guard import Guard
+from rovgraph.web.connections import Connection, PageSocket
+from rovgraph.web.guard import LARGEST_HEADERS, Guard
 from rovgraph.web.view import Limits, View
 
 START_S, CLOSE_S = 10.0, 2.0
 MOST_CONNECTIONS = 64
-LARGEST_HEADERS = 1 << 14  # [bytes]
 LARGEST_MESSAGE = 1 << 10  # from a page's WebSocket, which has nothing to say [bytes]
 
 
@@ -75,7 +76,10 @@ class LivePage:
                 log_config=None,
                 access_log=False,
                 lifespan="on",
-                ws="websockets-sansio",
+                http=Connection,
+                ws=PageSocket,
+                ws_ping_interval=connections.PING_S,
+                ws_ping_timeout=connections.PONG_S,
                 ws_max_size=LARGEST_MESSAGE,
                 ws_per_message_deflate=False,
                 limit_concurrency=MOST_CONNECTIONS,

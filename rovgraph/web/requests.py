@@ -5,13 +5,24 @@ import unicodedata
 from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import Request
 
 from rovgraph.live.commands import DropMark, SetPosition
 
 LARGEST_BODY = 4096  # [bytes]
 FARTHEST_M = 1e5  # n is flat
+JOINERS = "\u200c\u200d"  # of letters and emoji
 BURST, PER_S = 20, 5.0  # commands that are taken at once, and a second in the long run
+
+
+class _Number(IntegerConvertor):
+    """A number in a path; one of thousands of digits, which Python does not convert, is none."""
+
+    regex = "[0-9]{1,10}"
+
+
+register_url_convertor("number", _Number())
 
 
 class Refusal(Exception):
@@ -23,8 +34,9 @@ class Refusal(Exception):
 
 
 def _plain(text: str) -> str:
-    """Text in one line, without control characters."""
-    return " ".join("".join(" " if unicodedata.category(c) in ("Cc", "Cs") else c for c in text).split())
+    """Text in one line, without control characters and without those that turn its direction."""
+    spaced = "".join(" " if unicodedata.category(c) in ("Cc", "Cs") else c for c in text)
+    return " ".join("".join(c for c in spaced if c in JOINERS or unicodedata.category(c) != "Cf").split())
 
 
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False)]

@@ -9,13 +9,21 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.calibration import TABLE
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.live.marks import Marks
 from rovgraph.live.outputs.lines import as_dict
 from rovgraph.live.solution import Solution
+from rovgraph.units import shown
 from rovgraph.web.track import COLUMNS, Track, ellipse_sd
 
 EVENTS = 1000  # that are kept
+UNITS = {  # of each calibration variable: factor to what a person reads, and its unit
+    label: (factor, "" if unit == "1" else unit.replace("deg", "°"))
+    for variable in TABLE.values()
+    for factor, unit in [shown(variable.unit)]
+    for label in variable.labels
+}
 STALE_S = 2.0  # without a solution, after which a page says so
 
 
@@ -35,11 +43,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class Cursor:
-    """What a page has: points of an edition of the track, and events."""
+    """What a page has: points of an edition of the track, events, and an edition of the marks, -1 = none."""
 
     edition: int
     points: int
     events: int
+    marks: int = -1
 
 
 class View:
@@ -73,7 +82,8 @@ class View:
     @property
     def cursor(self) -> Cursor:
         """Of a page that has everything."""
-        return Cursor(self.track.edition, len(self.track), self._numbered)
+        marks = -1 if self.newest is None else self.marks.edition  # before a first solution they are not told
+        return Cursor(self.track.edition, len(self.track), self._numbered, marks)
 
     def events(self, since: int = 0) -> list[dict[str, Any]]:
         """Events after a number, oldest first."""
@@ -107,7 +117,10 @@ class View:
         if cursor.edition != self.track.edition:
             return None
         new = {"points": self.track.since(cursor.points), "events": self.events(cursor.events)}
-        return json.dumps({"type": "state", **self.state(), **new}, allow_nan=False, separators=(",", ":"))
+        state = self.state()
+        if cursor.marks == self.marks.edition:
+            state.pop("marks", None)
+        return json.dumps({"type": "state", **state, **new}, allow_nan=False, separators=(",", ":"))
 
     def geojson(self) -> dict[str, Any]:
         """The track as GeoJSON (RFC 7946) where the origin is known; elsewhere a feature without geometry."""

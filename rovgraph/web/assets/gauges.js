@@ -30,6 +30,7 @@ export class Gauges {
     this.gauges = new Map();
     this.rows = new Map();
     this.curves = new Map();
+    this.units = {}; // calibration variable -> factor to what is shown, and its unit
   }
 
   show(s) {
@@ -99,9 +100,8 @@ export class Gauges {
         document.getElementById("learnt").append(found.row);
         this.curves.set(name, found);
       }
-      const angle = name.includes("yaw") || name.includes("roll") || name.includes("pitch") || name.includes("compass");
-      const [k, unit] = angle ? [DEG, "°"] : [1, ""];
-      set(found.text, `${name} ${(k * value).toPrecision(4)}${unit} ± ${(k * sd).toPrecision(2)}${unit}`);
+      const [k, unit] = this.units[name] ?? [1, ""];
+      set(found.text, `${name} ${(k * value).toPrecision(4)} ± ${(k * sd).toPrecision(2)}${unit && ` ${unit}`}`);
       if (time < found.next) continue;
       found.next = time + found.every;
       found.values.push([value, sd]);

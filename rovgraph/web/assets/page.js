@@ -22,6 +22,7 @@ const link = new Link({
     document.body.classList.toggle("widget", widget);
     if (news.type === "begin") {
       map.track.clear();
+      gauges.units = news.units;
       at("events").replaceChildren();
       addEvents(news.events);
     } else if (news.type === "track") {
@@ -51,6 +52,7 @@ function showState(news) {
     connection("connected; rovgraph waits for its first position", false);
     return;
   }
+  news.marks ??= state?.marks ?? []; // told only when they change
   state = news;
   const old = news.age_s > STALE_S;
   connection(old ? `no solution for ${duration(news.age_s)}` : "live", old);
