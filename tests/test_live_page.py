@@ -684,7 +684,7 @@ HEAD = b"POST /api/marks HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: applicatio
 
 @pytest.mark.parametrize("said", [b"", START], ids=["silent", "half"])
 def test_connections_without_a_whole_request_lock_nobody_out(page, monkeypatch, said):
-    monkeypatch.setattr(connections, "REQUEST_S", 1.0)
+    monkeypatch.setattr(connections, "REQUEST_S", 4.0)
     url, links = f"{page.address.url}api/state", []
     try:
         for _ in range(MOST_CONNECTIONS + 6):
