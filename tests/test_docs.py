@@ -17,7 +17,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from ruamel.yaml import YAML
+from test_microstrain_files import as_export as microstrain_export
+from test_vectornav_files import as_csv as vectornav_csv
+from test_vectornav_files import as_sentences as vectornav_sentences
 from typer.main import get_command
+from wire import report
 
 import rovgraph as rg
 from rovgraph import extend
@@ -34,6 +38,7 @@ ELSEWHERE = (  # what is not run here: instruments, a browser, recordings that d
 SHORTER = {  # the same work on fewer and shorter dives
     "--scenario vattern --seeds 30": "--scenario circle --seeds 1 --duration 40 --estimators dead-reckoning --jobs 1",
     "--from 600": "--from 10",
+    "dvl.jsonl --out log.csv": "dvl.jsonl --out log.csv --force",  # each page's folder has a log
     "plan --config dive1.yaml": "plan --manoeuvres straight --config dive1.yaml",
     "plan --config vehicle.yaml --known": "plan --manoeuvres straight --config vehicle.yaml --known",
     "compare log.csv": "compare log.csv --estimators dead-reckoning --jobs 1",
@@ -135,6 +140,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         for copy in copies:
             shutil.copy(folder / "made" / name, folder / copy)
+    write_recordings(folder)
     pd.DataFrame({"time": [5.0, 20.0], "taken": [5.0, 20.0], "photo": ["a.jpg", "b.jpg"]}).to_csv(folder / "photos.csv")
     rg.simulate("stationary", choices=rg.Choices(variant="water")).save(folder / "still")
     for calibration in ("still.csv", "standing.csv"):
@@ -146,6 +152,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = rg.smooth(rg.read_log(folder / "log.csv", config), config)
     result.save(folder / "smoothed", figures=False)
     return folder
+
+
+def write_recordings(folder: Path) -> None:
+    """A dive as instruments record it, long enough to join their clocks: the IMU in three forms, the DVL in one."""
+    log = rg.simulate("lawnmower", seed=1, choices=rg.Choices(duration=120)).log
+    (folder / "microstrain.csv").write_bytes(microstrain_export(log))
+    (folder / "vectornav.csv").write_bytes(vectornav_csv(log))
+    (folder / "vn100.txt").write_bytes(vectornav_sentences(log))
+    pings = log["dvl"]
+    (folder / "dvl.jsonl").write_bytes(
+        b"".join(
+            report(vx=vx, vy=vy, vz=vz, time_of_validity=round(1e6 * time), covariance=[], fom=0.01)
+            for time, (vx, vy, vz) in zip(pings.time, pings.data[:, :3].tolist(), strict=True)
+        )
+    )
 
 
 def write_turns(path: Path) -> None:
