@@ -15,7 +15,7 @@ PACKAGE = ROOT / "rovgraph"
 
 # Bottom first. Members of one layer are independent: they may not import each other.
 LAYERS = (
-    {"errors", "process"},
+    {"errors", "process", "progress"},
     {"geometry", "workers", "fast_csv"},
     {"gauss_markov", "units", "gps_time"},
     {"kernels"},

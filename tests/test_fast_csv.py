@@ -1,10 +1,12 @@
 """Tables as CSV: to the byte as pandas writes them."""
 
+import gzip
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from rovgraph.fast_csv import write_csv
+from rovgraph.fast_csv import ROWS, write_csv, write_sparse_csv
 
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.5, 1e-12, 123456789.123, 1e300, np.pi, -2.5e-7])
 
@@ -54,3 +56,41 @@ def test_a_column_may_have_a_fixed_number_of_decimals(name, tmp_path):
         pd.read_csv(tmp_path / name, dtype=str).to_csv(index=False)
         == "time,value\n1700000000.2500,0.5\n2000000000.0000,\n"
     )
+
+
+def sparse(count):
+    """Three sensors' rows in turn at random, some cells of them empty, and the same as a table."""
+    rng = np.random.default_rng(2)
+    which = rng.integers(3, size=count)
+    which[:ROWS] = which[:ROWS] % 2  # one has no rows among the first that are formatted
+    time = np.sort(rng.uniform(1.7e9, 1.7e9 + 1e3, count))
+    parts, frame = [], pd.DataFrame({"time": time})
+    for k, names in enumerate((("acc", "gyr"), ("depth",), ("gyr", "speed"))):
+        place = np.flatnonzero(which == k)
+        own = {name: rng.standard_normal(len(place)) * 10.0 ** rng.integers(-9, 12, len(place)) for name in names}
+        own[names[-1]][rng.uniform(size=len(place)) < 0.2] = np.nan
+        for name, values in own.items():
+            frame.loc[place, name] = values
+        parts.append((place, {"time": time[place], **own}))
+    frame["empty"] = np.nan
+    return parts, frame
+
+
+@pytest.mark.parametrize("count", [1, 7, 3 * ROWS + 5])
+def test_rows_that_fill_few_columns_are_written_as_the_table_with_its_empty_cells(count, tmp_path):
+    parts, frame = sparse(count)
+    frame = frame.reindex(columns=["time", "speed", "acc", "gyr", "empty", "depth"])
+    expected = written(frame, tmp_path, digits=10, decimals={"time": 6})
+    for name, opened in (("sparse.csv", open), ("sparse.csv.gz", gzip.open)):
+        write_sparse_csv(list(frame), parts, tmp_path / name, 10, {"time": 6})
+        with opened(tmp_path / name, "rb") as file:
+            assert file.read() == expected
+
+
+def test_a_compressed_table_is_the_same_file_each_time(tmp_path, monkeypatch):
+    parts, frame = sparse(50)
+    for name, now in (("one", 1e9), ("two", 1.1e9)):
+        (tmp_path / name).mkdir()
+        monkeypatch.setattr("time.time", lambda now=now: now)
+        write_sparse_csv(list(frame), parts, tmp_path / name / "log.csv.gz")
+    assert (tmp_path / "one/log.csv.gz").read_bytes() == (tmp_path / "two/log.csv.gz").read_bytes()

@@ -11,9 +11,9 @@ import pandas as pd
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.evaluate import read_reference
 from rovgraph.log import Log
+from rovgraph.progress import Progress, no_progress
 from rovgraph.simulate.named import require_known
 from rovgraph.studies import compare as library
 from rovgraph.studies.choices import listed

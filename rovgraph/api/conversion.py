@@ -9,7 +9,6 @@ from typing import Any
 
 from rovgraph.config import Config, completed, config_or_defaults
 from rovgraph.errors import InputError, collected_warnings, warn
-from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.interchange.account import account, notes
 from rovgraph.interchange.alternatives import SourceMissing
 from rovgraph.interchange.formats import Format, Options, formats, head_of, read_recording, recognise
@@ -21,6 +20,7 @@ from rovgraph.interchange.unknown import is_text, purpose, refusal
 from rovgraph.log import Log
 from rovgraph.log.beams import BEAMS, usable_beams
 from rovgraph.log.table import table_beside
+from rovgraph.progress import Progress, no_progress
 
 Paths = Path | str | Sequence[Path | str]
 NOTHING: Mapping[str, Any] = {}
@@ -72,7 +72,7 @@ class Conversion:
         ------
         InputError : a file exists, or cannot be written
         """
-        from rovgraph.report.conversion import check_suffix, starter, write_frame, write_table
+        from rovgraph.report.conversion import check_suffix, starter, write_rows, write_table
         from rovgraph.report.folder import results_files
 
         path = Path(path)
@@ -84,7 +84,7 @@ class Conversion:
         if clash := next((p for p in paths if p.resolve() in inputs), None):
             raise InputError(f"{clash} is one of the files that are read; choose another --out")
         with results_files(paths, force) as temporary:
-            write_frame(self.merged.frame, temporary[0])
+            write_rows(self.merged.rows, temporary[0])
             temporary[1].write_text(json.dumps(self.report, indent=2, default=str) + "\n", encoding="utf-8")
             for place, table in zip(temporary[2:], tables.values(), strict=False):
                 write_table(table, place)
@@ -145,7 +145,7 @@ def convert(
     bare = full.model_copy(update={"columns": {}, "units": {}})
     with collected_warnings() as texts:
         beams = usable_beams(merged.tables[BEAMS], f"beams of {source}") if BEAMS in merged.tables else None
-    log = Log.from_frame(merged.frame, bare, source).with_beams(beams)
+    log = Log.from_rows(merged.rows, bare, source).with_beams(beams)
     log = replace(
         log,
         config=full,

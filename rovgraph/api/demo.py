@@ -8,8 +8,8 @@ from rovgraph.api.logs import read_log
 from rovgraph.api.simulation import SimulatedDive, simulate
 from rovgraph.api.smoothing import Result, smooth
 from rovgraph.config import load_config
-from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.evaluate import Metrics, evaluate, read_reference
+from rovgraph.progress import Progress, no_progress
 from rovgraph.simulate import Choices
 from rovgraph.simulate.named import falcon
 

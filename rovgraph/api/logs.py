@@ -12,9 +12,9 @@ from rovgraph.check import Finding, Report, bridge_jumps, examine
 from rovgraph.check import warn as warn_of_findings
 from rovgraph.config import Config, completed, config_or_defaults
 from rovgraph.errors import InputError, warn
-from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.estimators.initialise import refusal
 from rovgraph.log import Log
+from rovgraph.progress import Progress, no_progress
 
 
 def read_log(

@@ -8,8 +8,8 @@ from typing import Any
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import collected_warnings
-from rovgraph.estimators.dive import Progress, no_progress
 from rovgraph.log import Log
+from rovgraph.progress import Progress, no_progress
 from rovgraph.studies import observability as library
 from rovgraph.studies.choices import goals as read_goals
 from rovgraph.studies.choices import listed, read_known

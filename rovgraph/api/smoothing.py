@@ -11,11 +11,12 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError, collected_warnings
 from rovgraph.estimators import dive as library
 from rovgraph.estimators.alarms import Alarm, Verdict
-from rovgraph.estimators.dive import Dive, Progress, no_progress
+from rovgraph.estimators.dive import Dive
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.export import Options, Track, fixes_of, write_track
 from rovgraph.export.track import ESTIMATES as TRACKS
 from rovgraph.log import Log
+from rovgraph.progress import Progress, no_progress
 
 ENGINES = ("batch", "isam2")
 ESTIMATES = ("smoothed", "filtered", "both")

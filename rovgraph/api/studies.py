@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.dive import Progress, no_progress
+from rovgraph.progress import Progress, no_progress
 from rovgraph.studies import engines
 from rovgraph.studies.misalignment import Tables, chosen, open_results, read_study
 from rovgraph.studies.misalignment import study as library

@@ -1,6 +1,5 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
@@ -24,17 +23,13 @@ from rovgraph.estimators.unstated_noise import UnstatedNoise, find_noise
 from rovgraph.estimators.unstated_noise import changed as with_noise
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
+from rovgraph.progress import Progress, no_progress
 from rovgraph.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
 
-Progress = Callable[[str, float], None]
 MAX_NOISES = 3  # times that a dive is solved again with noise that was found in it
-
-
-def no_progress(what: str, done: float) -> None:
-    """Show no progress; ``what`` is the current task, ``done`` goes from 0 to 1."""
 
 
 @dataclass(frozen=True)

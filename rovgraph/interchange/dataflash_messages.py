@@ -25,6 +25,7 @@ FMT = 128  # type of the message that defines all others, itself too
 ENDINGS = (HEAD, HEAD[:1], b"")  # what may follow a message: the next one, or the end of the file
 INSTANCE = ("I", "Instance")  # fields that say which of several sensors it is
 BLOCK = 1 << 22  # bytes walked at a time
+_PLACE = " place"  # no field has a blank in its name
 
 _FMT = struct.Struct("<BB4s16s64s")
 # format character -> dtype, multiplier that it implies
@@ -151,6 +152,26 @@ def read_messages(
     return walk.contents()
 
 
+class _Growing:
+    """Rows that come in blocks, in one piece of memory that grows where it is: a copy would be as large as they are."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._held = np.zeros(0, dtype)
+        self._count = 0
+
+    def more(self, count: int) -> NDArray[Any]:
+        """So many new rows, to be filled before more are asked for."""
+        first, self._count = self._count, self._count + count
+        if self._count > len(self._held):
+            self._held.resize(max(self._count, len(self._held) * 4 // 3), refcheck=False)
+        return self._held[first : self._count]
+
+    def whole(self) -> NDArray[Any]:
+        """All rows."""
+        self._held.resize(self._count, refcheck=False)
+        return self._held
+
+
 class _Walk:
     """Goes from header to header, and keeps the rows that are wanted.
 
@@ -165,8 +186,7 @@ class _Walk:
         self._only = dict(only)
         self._instances: dict[str, set[int]] = {}
         self._formats: dict[int, MessageFormat] = {}
-        self._rows: dict[str, list[NDArray[Any]]] = {}
-        self._row_places: dict[str, list[NDArray[np.int64]]] = {}
+        self._rows: dict[str, _Growing] = {}
         self._counts: Counter[str] = Counter()
         self._damaged = self._damaged_bytes = 0
         self._sane = True
@@ -240,11 +260,12 @@ class _Walk:
                 if form.name in self._only and (numbers := instances(rows)) is not None:
                     chosen = self._choose(form.name, numbers)
                     rows, index = rows[chosen], index[chosen]
-                kept = np.empty(len(rows), dtype=[(n, form.dtype[n]) for n in names])
+                if form.name not in self._rows:
+                    self._rows[form.name] = _Growing(np.dtype([(_PLACE, "i8"), *((n, form.dtype[n]) for n in names)]))
+                kept = self._rows[form.name].more(len(rows))
+                kept[_PLACE] = index + start
                 for name in names:
                     kept[name] = rows[name]
-                self._rows.setdefault(form.name, []).append(kept)
-                self._row_places.setdefault(form.name, []).append(index + start)
             places.clear()
 
     def _choose(self, name: str, numbers: NDArray[Any]) -> NDArray[np.bool_]:
@@ -260,12 +281,10 @@ class _Walk:
     def contents(self) -> Contents:
         """All that was walked."""
         found = {}
-        for name in list(self._rows):
-            rows, place = self._rows.pop(name), np.concatenate(self._row_places.pop(name))
-            fields: dict[str, NDArray[Any]] = {
-                n: np.concatenate([part[n] for part in rows]) for n in rows[0].dtype.names or ()
-            }
-            found[name] = Messages(fields, place)
+        for name, growing in self._rows.items():
+            rows = growing.whole()
+            fields = {n: rows[n] for n in rows.dtype.names or () if n != _PLACE}
+            found[name] = Messages(fields, rows[_PLACE])
         self._give_units(found)
         return Contents(found, self._counts, self._instances, self._damaged, self._damaged_bytes)
 

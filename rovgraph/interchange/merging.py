@@ -18,10 +18,9 @@ from rovgraph.interchange.recording import Channel, Recording
 from rovgraph.interchange.selection import Selected, Unused, file_names, select
 from rovgraph.interchange.stamps import put_in_order
 from rovgraph.log import Log
-from rovgraph.log.streams import LABEL, all_columns
+from rovgraph.log.rows import STAMP_DIGITS, Rows, frame_of, in_order
 
 OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
-STAMP_DIGITS = 6  # of a second, as a log is written
 UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
 OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix")  # sensors with a calibration variable for it
 
@@ -32,7 +31,7 @@ class Merged:
 
     Attributes
     ----------
-    frame : columns of a log, in SI, one row per measurement, in the order of time
+    rows : of the log, in SI, those of each channel that feeds it
     recordings : as read
     selected, unused : what feeds the log, and what does not
     clocks : how the stamps were put on the log's clock
@@ -43,7 +42,7 @@ class Merged:
         Those of file k have ``_k`` behind their names, but for the file that feeds the log's DVL
     """
 
-    frame: pd.DataFrame
+    rows: Sequence[Rows]
     recordings: Sequence[Recording]
     selected: Sequence[Selected]
     unused: Sequence[Unused]
@@ -52,6 +51,11 @@ class Merged:
     settings: Mapping[str, tuple[Any, str]]
     warnings: Sequence[str]
     tables: Mapping[str, Mapping[str, Array]]
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """Columns of a log, in SI, one row per measurement, in the order of time."""
+        return frame_of(self.rows)
 
     @property
     def names(self) -> list[str]:
@@ -88,36 +92,15 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
     selected, unused = select(recordings, choose)
     clocks, beside, unix, told = join_clocks(recordings, selected, shift, _motion)
     by_name = {(clock.file, clock.name): clock for clock in clocks}
-    times = []
+    stamped = []
     for each in selected:
-        clock = by_name[each.file, each.channel.clock]
-        times.append(clock(np.asarray(each.channel.columns["time"])) + beside.get(each.channel.sensor, 0.0))
-    frame = _frame([each.channel for each in selected], times)
+        clock, columns = by_name[each.file, each.channel.clock], each.channel.columns
+        time = clock(np.asarray(columns["time"])) + beside.get(each.channel.sensor, 0.0)
+        stamped.append({**columns, "time": time})
+    rows = in_order(stamped)
     settings = _settings(recordings, selected, clocks)
     tables = _tables(recordings, selected, by_name, beside.get("dvl", 0.0))
-    return Merged(frame, recordings, selected, unused, clocks, unix, settings, (*said, *told), tables)
-
-
-def _frame(channels: Sequence[Channel], times: Sequence[Array]) -> pd.DataFrame:
-    """Rows of all channels in the order of their times [s], each column made once, as large logs need."""
-    time = np.round(np.concatenate(times), STAMP_DIGITS)  # equal stamps stay equal; a written log is read the same
-    order = np.argsort(time, kind="stable")
-    place = np.empty(len(time), dtype=np.int64)  # of a channel's rows among all
-    place[order] = np.arange(len(time))
-    columns: dict[str, Array] = {"time": np.asarray(time[order], dtype=float)}
-    first = 0
-    for channel, own in zip(channels, times, strict=True):
-        rows = place[first : first + len(own)]
-        first += len(own)
-        for name, values in channel.columns.items():
-            if name != "time":
-                columns.setdefault(name, np.full(len(time), np.nan))[rows] = values
-    known = [name for name in all_columns() if name in columns]
-    names = known + sorted(columns.keys() - set(known), key=_natural)
-    frame = pd.DataFrame({name: columns.pop(name) for name in names}, copy=False)
-    if LABEL in frame:
-        frame[LABEL] = frame[LABEL].astype("Int64")
-    return frame
+    return Merged(rows, recordings, selected, unused, clocks, unix, settings, (*said, *told), tables)
 
 
 def _tables(
@@ -163,11 +146,6 @@ def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[st
             said += text
         out.append(replace(recording, channels=tuple(channels)))
     return out, said
-
-
-def _natural(name: str) -> tuple[str, int]:
-    stem, _, number = name.rpartition("_")
-    return (stem, int(number)) if number.isdigit() else (name, 0)
 
 
 def _motion(channels: Sequence[Channel]) -> Motion:

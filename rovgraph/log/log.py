@@ -1,6 +1,6 @@
 """What a dive has recorded, from a file, a data frame or arrays."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from rovgraph.config import Config, config_or_defaults
 from rovgraph.errors import InputError, collected_warnings, warn
 from rovgraph.log.beams import beams_beside
 from rovgraph.log.reading import read_streams
+from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
 from rovgraph.log.table import Table, read_table, table_of_arrays, table_of_frame
 
@@ -61,7 +62,7 @@ class Log:
         -----
         DataWarning : what was ignored or sorted
         """
-        return _log(table_of_frame(frame, source), config)
+        return _log([table_of_frame(frame, source)], config, source)
 
     @staticmethod
     def from_arrays(*tables: Mapping[str, ArrayLike], config: Config | None = None, source: str = "log") -> "Log":
@@ -77,7 +78,22 @@ class Log:
         InputError : arrays of different length, or as `from_frame`
         """
         time = "time" if config is None else config.columns.get("time", "time")
-        return _log(table_of_arrays(tables, time, source), config)
+        return _log([table_of_arrays(tables, time, source)], config, source)
+
+    @staticmethod
+    def from_rows(rows: Sequence[Rows], config: Config | None = None, source: str = "log") -> "Log":
+        """Make a log from rows that fill few of its columns each, without a frame of mostly empty cells.
+
+        Parameters
+        ----------
+        rows : of `rovgraph.log.rows.in_order`
+        config, source : of `from_frame`
+
+        Raises
+        ------
+        InputError : as `from_frame`
+        """
+        return _log(tables_of(rows, source), config, source)
 
     def __contains__(self, sensor: str) -> bool:
         return sensor in self.streams
@@ -182,15 +198,15 @@ def read_log(path: Path | str, config: Config | None = None) -> Log:
     with collected_warnings() as texts:
         table = read_table(path)
         beams = beams_beside(Path(path))
-    return _log(table, config, texts).with_beams(beams)
+    return _log([table], config, table.source, texts).with_beams(beams)
 
 
-def _log(table: Table, config: Config | None, before: Iterable[str] = ()) -> Log:
-    """A log of a table, with what was warned of ``before`` and while its streams were made."""
+def _log(tables: Iterable[Table], config: Config | None, source: str, before: Iterable[str] = ()) -> Log:
+    """A log of tables that share no stream, with what was warned of ``before`` and while its streams were made."""
     config = config_or_defaults(config)
     with collected_warnings() as texts:
-        streams, origin = read_streams(table, config)
-    return Log(table.source, streams, origin, config, (*before, *texts))
+        streams, origin = read_streams(tables, config, source)
+    return Log(source, streams, origin, config, (*before, *texts))
 
 
 def _entry(config: Config, key: str) -> object:

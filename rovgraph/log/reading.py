@@ -3,7 +3,7 @@
 What can be repaired is repaired and said in a `DataWarning`; what cannot is an `InputError`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,12 +36,20 @@ Bools = NDArray[np.bool_]
 Lines = NDArray[np.int64]
 
 
-def read_streams(table: Table, config: Config) -> tuple[dict[str, Stream], tuple[float, float] | None]:
-    """The streams of a table, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
+Origin = tuple[float, float] | None  # latitude and longitude [deg] of north = east = 0
+
+
+def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[dict[str, Stream], Origin]:
+    """The streams of a log, by the columns, units, delays, origin and magnetometer's calibration of a configuration.
+
+    Parameters
+    ----------
+    tables : whose columns feed different streams
+    source : their name, for messages
 
     Returns
     -------
-    streams : sensor -> Stream, only those that the table has
+    streams : sensor -> Stream, only those that the tables have
     origin : latitude and longitude [deg] of north = east = 0, or None
 
     Raises
@@ -52,24 +60,39 @@ def read_streams(table: Table, config: Config) -> tuple[dict[str, Stream], tuple
     -----
     DataWarning : what was left out or put in order
     """
-    columns, units = config.columns, config.units
-    scale = factors(units, table.source)
-    names = map_columns(table, columns)
-    cells = {name: numbers(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
-    cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
-    cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
-    origin = _add_local_fixes(cells, line, table.source, config.environment.origin)
-    streams = [_imu(cells, line, table.source)]
-    streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
-    streams += [_thruster(cells, line, table.source)]
-    found = {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}
+    origin = config.environment.origin
+    found: dict[str, Stream] = {}
+    names: dict[str, None] = {}
+    for table in tables:
+        names |= dict.fromkeys(table.names)
+        streams, origin = _streams(table, config, origin)
+        found |= streams
     if not found:
-        raise InputError(f"{table.source}: no measurement of any sensor in it; {_found(table.names)}")
+        raise InputError(f"{source}: no measurement of any sensor in it; {_found(list(names))}")
+    found = {sensor: found[sensor] for sensor in (*STREAMS, "thruster") if sensor in found}
     if "mag" in found:
         found["mag"] = replace(found["mag"], data=config.imu.mag.calibrated(found["mag"].data))
     for sensor in config.delay_s.keys() & found.keys():
         found[sensor] = replace(found[sensor], time=found[sensor].time - config.delay_s[sensor])
     return found, origin
+
+
+def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, Stream], Origin]:
+    """The streams of one table as they stand in it, and the origin, which is its first fix where it was not known."""
+    scale = factors(config.units, table.source)
+    names = map_columns(table, config.columns)
+    cells = {name: _scaled(numbers(table, name, source), scale.get(name, 1.0)) for name, source in names.items()}
+    cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
+    cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
+    origin = _add_local_fixes(cells, line, table.source, origin)
+    streams = [_imu(cells, line, table.source)]
+    streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
+    streams += [_thruster(cells, line, table.source)]
+    return {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}, origin
+
+
+def _scaled(values: Array, factor: float) -> Array:
+    return values if factor == 1.0 else values * factor  # most are: a copy would cost as much as they hold
 
 
 def _found(names: Sequence[str]) -> str:
@@ -178,7 +201,7 @@ def _add_local_fixes(
     if "fix_north" in cells and "fix_east" in cells:
         warn(f"{source}: fix_lat and fix_lon are ignored beside fix_north and fix_east")
         return origin
-    lat, lon = (cells.pop(name) for name in LAT_LON)
+    lat, lon = (cells.pop(name).copy() for name in LAT_LON)
     wild = np.flatnonzero((np.abs(lat) > 90.0) | (np.abs(lon) > 360.0))
     if wild.size:
         raise InputError(
@@ -297,7 +320,8 @@ def _imu(cells: dict[str, Array], line: Lines, source: str) -> Stream | None:
     acc_gyr = (_select(name, part, cells, line, source) for name, part in (("acc", columns[:3]), ("gyr", columns[3:])))
     (acc, with_acc), (gyr, with_gyr) = (part for part in acc_gyr if part is not None)
     rows = np.flatnonzero(with_gyr)
-    data = np.hstack([acc, gyr])[rows]
+    data = np.empty((len(rows), 6))
+    data[:, :3], data[:, 3:] = acc[rows], gyr[rows]
     alone = ~with_acc[rows]
     if alone.any() and with_acc.any():
         data[alone, :3], near = _interpolated(time[rows[alone]], time[with_acc], acc[with_acc])

@@ -1,7 +1,7 @@
 """A converted log as files, the configuration to begin with, and the tables that a command prints."""
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,10 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from rovgraph.config import Config
 from rovgraph.errors import InputError
-from rovgraph.fast_csv import write_csv
+from rovgraph.fast_csv import write_csv, write_sparse_csv
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.log.rows import Rows, column_names, frame_of
 from rovgraph.log.table import SUFFIXES
 
 DIGITS = 10  # significant, of a cell: latitudes to a centimetre
@@ -38,7 +39,7 @@ def check_suffix(path: Path) -> str:
     return path.name.removesuffix(suffix)
 
 
-def write_frame(frame: pd.DataFrame, path: Path) -> None:
+def write_rows(rows: Sequence[Rows], path: Path) -> None:
     """Write a log as its suffix says.
 
     Raises
@@ -46,10 +47,10 @@ def write_frame(frame: pd.DataFrame, path: Path) -> None:
     InputError : Parquet, and pyarrow is not installed
     """
     if path.suffix != ".parquet":
-        write_csv(frame, path, DIGITS, decimals=DECIMALS)
+        write_sparse_csv(column_names(rows), [(own.place, own.columns) for own in rows], path, DIGITS, DECIMALS)
         return
     try:
-        frame.to_parquet(path, engine="pyarrow", index=False)
+        frame_of(rows).to_parquet(path, engine="pyarrow", index=False)
     except ImportError:
         raise InputError(
             f"{path.name}: writing Parquet needs pyarrow; install it with: pip install 'rovgraph[parquet]'"

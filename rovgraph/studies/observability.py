@@ -5,7 +5,7 @@ noise in the estimate pretends is taken off (`rovgraph.estimators.observability`
 """
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +25,8 @@ from rovgraph.estimators.observability import (
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.log.frozen import without_frozen
+from rovgraph.progress import Progress, no_progress
 
-Progress = Callable[[str, float], None]
 TIMES = 30  # at which the sd is told
 FEWEST_KEYFRAMES = 20
 OTHER_LABELS = (
@@ -119,9 +119,7 @@ def joint_bits(information: Array) -> float:
     return float(0.5 * np.linalg.slogdet(np.eye(len(information)) + information)[1] / np.log(2.0))
 
 
-def observe(
-    log: Log, config: Config, also: Sequence[str] = (), progress: Progress = lambda what, done: None
-) -> Observability:
+def observe(log: Log, config: Config, also: Sequence[str] = (), progress: Progress = no_progress) -> Observability:
     """What a recorded dive shows of the calibration.
 
     Parameters
@@ -161,7 +159,7 @@ def estimating(config: Config, also: Sequence[str]) -> Config:
     return config.model_copy(update={"calibration": config.calibration.model_copy(update=entries)})
 
 
-def solved(log: Log, config: Config, progress: Progress = lambda what, done: None) -> Optimum:
+def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimum:
     """The graph of a dive and its optimum.
 
     Raises
@@ -183,9 +181,7 @@ def solved(log: Log, config: Config, progress: Progress = lambda what, done: Non
     return dive
 
 
-def examined(
-    dive: Optimum, config: Config, noisy: bool = True, progress: Progress = lambda what, done: None
-) -> Observability:
+def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progress = no_progress) -> Observability:
     """What a solved dive shows of the calibration.
 
     Parameters
