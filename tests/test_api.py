@@ -510,7 +510,14 @@ BAD_FRAMES = {
         pd.DataFrame({"time": T, "depth": pd.Series([1j, 2.0, None], dtype=object)}),
         "column depth: '1j' is not a number",
     ),
-    "complex numbers": (pd.DataFrame({"time": T, "depth": T + 1j}), "depth holds complex numbers"),
+    "complex numbers": (
+        pd.DataFrame({"time": T, "depth": T + 1j}),
+        "column depth holds complex numbers, expected numbers; give one real number per row",
+    ),
+    "an integer too large": (
+        pd.DataFrame({"time": T, "depth": pd.Series([1, 10**400, 2], dtype=object)}),
+        "column depth holds an integer of hundreds of digits",
+    ),
     "a name twice": (pd.DataFrame(np.ones((3, 3)), columns=["time", "depth", "depth"]), "column 'depth' twice"),
     "no rows": (pd.DataFrame({"time": [], "depth": []}), "no rows"),
     "no sensor": (pd.DataFrame({"time": T, "temperature": T}), "no measurement of any sensor"),
@@ -524,6 +531,19 @@ def test_a_frame_that_is_no_log_is_refused_in_one_line(frame, said):
     with pytest.raises(rg.InputError, match=said) as caught:
         rg.Log.from_frame(frame)
     assert "\n" not in str(caught.value)
+
+
+def test_a_column_of_arrows_lists_is_refused():
+    arrow = pytest.importorskip("pyarrow")
+    depth = pd.Series([[1.0], [2.0], [3.0]], dtype=pd.ArrowDtype(arrow.list_(arrow.float64())))
+    with pytest.raises(rg.InputError, match="column depth holds lists, expected numbers; give one real number per row"):
+        rg.Log.from_frame(pd.DataFrame({"time": T, "depth": depth}))
+
+
+def test_what_an_array_masks_is_missing():
+    log = rg.Log.from_arrays({"time": T, "depth": np.ma.masked_array([1.0, 9999.0, 3.0], [False, True, False])})
+    assert log["depth"].time.tolist() == [0.0, 2.0]
+    assert log["depth"].data[:, 0].tolist() == [1.0, 3.0]
 
 
 @pytest.mark.parametrize("case", ["no time", "text", "a name twice", "no rows", "no sensor"])

@@ -24,6 +24,7 @@ from rovgraph.geometry import Array
 from rovgraph.log.streams import label_number
 
 NUMBERS = Real, Decimal, np.bool_  # what a cell of a column of objects may be
+_TIMES = "dates", "durations"
 SUFFIXES = (".csv.gz", ".csv", ".parquet")  # of a log that is written
 
 
@@ -55,12 +56,18 @@ class Table:
         """
         cells = self.frame[name]
         if held := _no_numbers(cells):
-            raise InputError(f"{self.source}: column {name} holds {held}, expected numbers; write it in seconds")
+            remedy = "write it in seconds" if held in _TIMES else "give one real number per row"
+            raise InputError(f"{self.source}: column {name} holds {held}, expected numbers; {remedy}")
         if pd.api.types.is_string_dtype(cells):  # the parser leaves blanks around numbers that stand among texts
             cells = cells.where(cells.isna(), cells.astype(str).str.strip()).replace("", None)
         if cells.dtype == object:  # what is neither a number nor a text becomes the text that the message shows
             cells = cells.map(lambda cell: cell if isinstance(cell, NUMBERS) else str(cell), na_action="ignore")
-        values = pd.to_numeric(cells, errors="coerce")
+        try:
+            values = pd.to_numeric(cells, errors="coerce")
+        except OverflowError:
+            raise InputError(
+                f"{self.source}: column {name} holds an integer of hundreds of digits, which no float is; correct it"
+            ) from None
         bad = np.flatnonzero(values.isna() & cells.notna())
         if bad.size:
             cell = _shortened(repr(str(cells.iloc[bad[0]])), 30)
@@ -154,6 +161,8 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
 
 def _array(name: str, values: ArrayLike, source: str) -> NDArray[Any]:
     try:
+        if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "biuf":
+            return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
         return np.asarray(values)
     except ValueError:  # rows of different length
         raise InputError(f"{source}: column {name} holds lists, expected one number per row") from None
@@ -275,9 +284,9 @@ def _no_numbers(cells: "pd.Series[Any]") -> str:
     kind = pd.api.types.infer_dtype(cells, skipna=True)
     if kind.startswith(("datetime", "date")):
         return "dates"
-    return {"timedelta": "durations", "timedelta64": "durations", "period": "dates", "complex": "complex numbers"}.get(
-        kind, ""
-    )
+    known = {"timedelta": "durations", "timedelta64": "durations", "period": "dates", "complex": "complex numbers"}
+    nested = str(cells.dtype).startswith(("list<", "struct<", "map<"))  # of Arrow: pandas reads it as nothing
+    return "lists" if nested else known.get(kind, "")
 
 
 def _without_torn_end(content: bytes, width: int, source: str) -> bytes:
