@@ -145,7 +145,7 @@ class Trajectory:
         lat, lon, _ = ned2geodetic(self.p_n[:, 0], self.p_n[:, 1], 0.0, *origin, 0.0)
         return lat, lon
 
-    def write_csv(self, path: Path, more: bool = False, origin: tuple[float, float] | None = None) -> None:
+    def write_csv(self, path: Path | str, more: bool = False, origin: tuple[float, float] | None = None) -> None:
         """Write the columns of the contract that are known; time to the millisecond's tenth.
 
         Parameters
@@ -163,14 +163,14 @@ class Trajectory:
         if origin is not None:
             frame["lat"], frame["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
-        write_csv(frame, path, append=more, decimals=decimals)
+        write_csv(frame, Path(path), append=more, decimals=decimals)
 
-    def write_tum(self, path: Path) -> None:
+    def write_tum(self, path: Path | str) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line says so (its name should: `TUM`)."""
         rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
         line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
         poses = line * len(rows) % tuple(rows.ravel().tolist())
-        path.write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
+        Path(path).write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
 
 
 def _sd(covariance: Array) -> Array:

@@ -5,10 +5,12 @@ import multiprocessing
 import multiprocessing.process
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.synchronize import Event
 from typing import TypeVar
 
 from rovgraph.errors import InputError
@@ -16,6 +18,11 @@ from rovgraph.process import ONE_THREAD, be_frugal
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+UNGUARDED = (
+    "worker processes ended while they started; they import your script again, so that its work has to stand under "
+    "if __name__ == '__main__'"
+)
 
 
 def cores() -> int:
@@ -32,10 +39,14 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
 
     Raises
     ------
-    InputError : a process was killed from outside
+    InputError : a process was killed from outside, or none could start
     """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker, which imports the caller's script
+        sys.exit(1)  # quietly: the caller says why
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _prepare)
+    context = multiprocessing.get_context("spawn")
+    started = context.Event()
+    pool = ProcessPoolExecutor(count, context, _prepare, (started,))
     try:
         yield pool
     except BaseException as error:
@@ -43,9 +54,12 @@ def workers(count: int) -> Iterator[ProcessPoolExecutor]:
             child.terminate()
         pool.shutdown(cancel_futures=True)  # waits for the pool's own thread, which would complain at exit
         if isinstance(error, BrokenProcessPool):
-            raise InputError("a worker process was killed (out of memory?); try again with fewer of them") from None
+            killed = "a worker process was killed (out of memory?); try again with fewer of them"
+            raise InputError(killed if started.is_set() else UNGUARDED) from None
         raise
     pool.shutdown()
+    if not started.is_set():
+        raise InputError(UNGUARDED)
 
 
 @contextlib.contextmanager
@@ -68,7 +82,7 @@ def in_workers(
 
     Raises
     ------
-    InputError : a process was killed from outside
+    InputError : a process was killed from outside, or none could start
     """
     if min(jobs, len(tasks)) == 1:  # a process more would only import everything once more
         results = []
@@ -85,8 +99,9 @@ def in_workers(
         return [future.result() for future in futures]
 
 
-def _prepare() -> None:
+def _prepare(started: Event) -> None:
     """In a worker: leave interrupts to the parent, and end when the parent has ended, however it did."""
+    started.set()
     be_frugal()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_parent, daemon=True).start()

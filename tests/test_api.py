@@ -614,6 +614,33 @@ def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
         rg.observe(log, estimate="dvl_yav,dvl_scale")
 
 
+def test_an_argument_of_the_wrong_kind_is_one_line(short):
+    log = rg.Log.from_frame(short)
+    for use, said in (
+        (lambda: rg.Choices(duration="40"), "duration '40': a number is expected"),
+        (lambda: rg.Choices(outliers="a"), "outliers 'a': a number is expected"),
+        (lambda: rg.Choices(current=3), "current 3: north and east in m/s"),
+        (lambda: rg.Choices(current=("a", 1)), r"current \('a', 1\): north and east"),
+        (lambda: rg.Choices(dropouts=((5,),)), r"dropouts \(\(5,\),\): pairs of numbers"),
+        (lambda: rg.Choices(dropouts=5), "dropouts 5: pairs of numbers"),
+        (lambda: rg.Choices(places=((1, 2, 3),)), "places .*: pairs of numbers are expected, as"),
+        (lambda: rg.Online(rate_hz="2"), "rate_hz 2: between 0.01 and 200"),
+        (lambda: rg.observe(log, estimate=[3]), "3: expected a name"),
+        (lambda: rg.plan(goals=3, estimate="dvl_yaw"), "goals: 3, expected a mapping"),
+        (lambda: rg.compare(log, reference="a.csv", estimators="graph-smoothd"), "nearest is graph-smoothed-"),
+    ):
+        with pytest.raises(rg.InputError, match=said):
+            use()
+
+
+def test_a_trajectory_is_written_to_a_path_given_as_text(tmp_path):
+    truth = rg.simulate("circle", choices=rg.Choices(duration=40.0)).truth
+    truth.write_csv(str(tmp_path / "truth.csv"))
+    truth.write_tum(str(tmp_path / "truth.ned.tum"))
+    assert len(rg.read_trajectory(tmp_path / "truth.csv")) == len(truth)
+    assert (tmp_path / "truth.ned.tum").read_text().startswith("# time [s]")
+
+
 def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
     for use in (
         lambda: rg.read_log(SHIPPED / "log.csv.gz", "vehicle.yaml"),

@@ -376,12 +376,12 @@ def test_bad_input_is_one_line_and_makes_no_folder(arguments, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unknown_estimator_is_answered_with_all_known_ones_the_nearest_first():
+def test_an_unknown_estimator_is_answered_with_the_nearest_and_all_known_ones():
     with pytest.raises(InputError) as caught:
         select(["graph-smothed-a"])
-    known = str(caught.value).partition("known are ")[2].split(", ")
-    assert known[0] == "graph-smoothed-a"
-    assert set(known) == set(ESTIMATORS)
+    nearest, _, known = str(caught.value).partition("nearest is ")[2].partition("; there are ")
+    assert nearest == "graph-smoothed-a"
+    assert known.split(", ") == list(ESTIMATORS)
 
 
 def test_a_pattern_stands_for_all_estimators_that_match_it():
@@ -397,6 +397,23 @@ def test_results_of_workers_come_in_the_order_of_the_tasks():
 def test_a_worker_that_is_killed_is_one_clear_line():
     with pytest.raises(InputError, match="a worker process was killed"):
         in_workers(os._exit, [1, 1], 2, lambda done: None)
+
+
+def test_a_script_whose_work_is_not_guarded_is_told_so_in_one_line(tmp_path):
+    script = tmp_path / "study.py"
+    script.write_text(
+        "import math\n"
+        "from rovgraph.errors import InputError\n"
+        "from rovgraph.workers import in_workers\n"
+        "try:\n"
+        "    print(in_workers(math.sqrt, [1.0, 4.0], 2, lambda done: None))\n"
+        "except InputError as error:\n"
+        "    print(error)\n"
+    )
+    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    assert ran.stderr == ""
+    assert ran.stdout.strip().endswith("its work has to stand under if __name__ == '__main__'")
+    assert ran.stdout.count("\n") == 1
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="interrupts cannot be held back here")

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,8 +133,8 @@ class Online:
 
     def __post_init__(self) -> None:
         config_or_defaults(self.config)
-        if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 200.0:
-            raise InputError(f"rate_hz {self.rate_hz:g}: between 0.01 and 200 solutions per second are expected")
+        if not (self.rate_hz is None or (isinstance(self.rate_hz, Real) and 0.01 <= self.rate_hz <= 200.0)):
+            raise InputError(f"rate_hz {self.rate_hz}: between 0.01 and 200 solutions per second are expected")
         if self.engine not in ENGINES:
             raise InputError(f"engine {self.engine!r}: expected {', '.join(ENGINES)}")
 

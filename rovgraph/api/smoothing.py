@@ -113,7 +113,7 @@ class Result:
         force: bool = False,
         figures: bool = True,
         page: bool = True,
-        export: Sequence[str] = (),
+        export: str | Sequence[str] = (),
     ) -> dict[str, Any]:
         """Write the results folder of ``rovgraph smooth`` (docs/results.md), complete or not at all.
 
@@ -123,7 +123,7 @@ class Result:
         force : replace an older results folder
         figures : draw them
         page : make report.html
-        export : further formats to write the track in
+        export : a further format to write the track in, or several
 
         Returns
         -------
@@ -144,7 +144,7 @@ class Result:
 
                 draw_figures(folder, self.dive.estimates, self.log, self.config)
             if export:
-                write_track(self.track(), export, folder, Options())
+                write_track(self.track(), [export] if isinstance(export, str) else export, folder, Options())
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
             summary = write_results(
                 folder,

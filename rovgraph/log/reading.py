@@ -97,7 +97,7 @@ def _scaled(values: Array, factor: float) -> Array:
 
 def _found(names: Sequence[str]) -> str:
     shown = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
-    return f"columns found: {shown[:200]}"
+    return f"columns found: {shown[:200] or 'none'}"
 
 
 def map_columns(table: Table, columns: Mapping[str, str]) -> dict[str, str]:

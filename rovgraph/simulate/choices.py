@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields
 from math import hypot, isfinite
+from numbers import Real
 from typing import Any
 
 from rovgraph.errors import InputError
@@ -45,8 +46,10 @@ class Choices:
 
         Raises
         ------
-        InputError : a duration, a time without bottom lock or a place that is none
+        InputError : something that is no number or no pair; a duration, a time without bottom lock or a place that
+            is none
         """
+        self._require_numbers()
         if self.duration is not None and self.duration > DURATION_MAX:
             raise InputError(f"duration of {self.duration} s: at most {DURATION_MAX:.0f} s")
         for first, last in self.dropouts:
@@ -55,6 +58,18 @@ class Choices:
         for north, east in self.places:
             if not (isfinite(north) and isfinite(east)):
                 raise InputError(f"place {north:g}:{east:g}: north and east in metres are expected, as 10:-5")
+
+    def _require_numbers(self) -> None:
+        for name in ("duration", "speed", "outliers", "false_places"):
+            value = getattr(self, name)
+            if not (value is None or isinstance(value, Real)):
+                raise InputError(f"{name} {value!r}: a number is expected")
+        if not (self.current is None or _is_pair(self.current)):
+            raise InputError(f"current {self.current!r}: north and east in m/s are expected, as (0.1, -0.05)")
+        for name, example in (("dropouts", "((100, 130),)"), ("places", "((10, -5),)")):
+            pairs = getattr(self, name)
+            if not (isinstance(pairs, tuple | list) and all(map(_is_pair, pairs))):
+                raise InputError(f"{name} {pairs!r}: pairs of numbers are expected, as {example}")
 
     def told(self) -> dict[str, Any]:
         """What ``summary.json`` says: the common ones always, the others where something was chosen."""
@@ -87,3 +102,7 @@ class Choices:
             )
         if self.variant is not None and self.variant not in variants:
             raise InputError(f"scenario {scenario}: no variant {self.variant!r}; it has {', '.join(variants)}")
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2 and all(isinstance(one, Real) for one in value)

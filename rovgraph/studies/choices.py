@@ -14,8 +14,15 @@ from rovgraph.studies.plan import Known
 
 
 def listed(names: str | Iterable[str] | None) -> list[str]:
-    """Names, each once, of a list or of a text with commas between them."""
-    each = names.split(",") if isinstance(names, str) else names or ()
+    """Names, each once, of a list or of a text with commas between them.
+
+    Raises
+    ------
+    InputError : something that is no name
+    """
+    each = names.split(",") if isinstance(names, str) else [*(names or ())]
+    if wrong := [name for name in each if not isinstance(name, str)]:
+        raise InputError(f"{wrong[0]!r}: expected a name, such as 'dvl_yaw'")
     return list(dict.fromkeys(name.strip() for name in each if name.strip()))
 
 
@@ -30,6 +37,8 @@ def goals(wanted: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
     ------
     InputError : no such component, no positive number, degrees for what is no angle or the reverse
     """
+    if wanted is not None and not isinstance(wanted, Mapping | Sequence):
+        raise InputError(f"goals: {wanted!r}, expected a mapping of components to sds, or texts such as 'dvl_yaw=1deg'")
     if not isinstance(wanted, Mapping):
         return dict(_goal(text) for text in wanted or ())
     for label, sd in wanted.items():

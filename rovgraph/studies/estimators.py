@@ -91,15 +91,15 @@ def select(names: Sequence[str] | None = None) -> list[EstimatorSpec]:
 
     Raises
     ------
-    InputError : an unknown name; the message lists the known ones, the nearest first
+    InputError : an unknown name; the message has the nearest and lists all
     """
     chosen = {name for name, named in ESTIMATORS.items() if names is None and not named.hydrodynamics}
     for name in names or ():
         matching = fnmatch.filter(ESTIMATORS, name)
         if not matching:
-            near = difflib.get_close_matches(name, ESTIMATORS, len(ESTIMATORS), cutoff=0.0)
-            raise InputError(f"unknown estimator {name!r}, known are {', '.join(near)}")
+            near = difflib.get_close_matches(name, ESTIMATORS, 1, cutoff=0.0)
+            raise InputError(f"unknown estimator {name!r}, nearest is {near[0]}; there are {', '.join(ESTIMATORS)}")
         chosen.update(matching)
     if not chosen:
-        raise InputError(f"no estimator named, known are {', '.join(ESTIMATORS)}")
+        raise InputError(f"no estimator named; there are {', '.join(ESTIMATORS)}")
     return [named for name, named in ESTIMATORS.items() if name in chosen]
