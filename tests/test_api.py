@@ -614,8 +614,9 @@ def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
         rg.observe(log, estimate="dvl_yav,dvl_scale")
 
 
-def test_an_argument_of_the_wrong_kind_is_one_line(short):
-    log = rg.Log.from_frame(short)
+def test_an_argument_of_the_wrong_kind_is_one_line(tmp_path, short):
+    log, path = rg.Log.from_frame(short), tmp_path / "log.csv"
+    short.to_csv(path, index=False)
     for use, said in (
         (lambda: rg.Choices(duration="40"), "duration '40': a number is expected"),
         (lambda: rg.Choices(outliers="a"), "outliers 'a': a number is expected"),
@@ -627,6 +628,7 @@ def test_an_argument_of_the_wrong_kind_is_one_line(short):
         (lambda: rg.Online(rate_hz="2"), "rate_hz 2: between 0.01 and 200"),
         (lambda: rg.observe(log, estimate=[3]), "3: expected a name"),
         (lambda: rg.plan(goals=3, estimate="dvl_yaw"), "goals: 3, expected a mapping"),
+        (lambda: rg.Online().run(f"file:{path}", outputs="jsonl"), "output 'jsonl' is of an unknown form"),
         (lambda: rg.compare(log, reference="a.csv", estimators="graph-smoothd"), "nearest is graph-smoothed-"),
     ):
         with pytest.raises(rg.InputError, match=said):

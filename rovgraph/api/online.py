@@ -141,7 +141,7 @@ class Online:
     def run(
         self,
         *sources: str,
-        outputs: Sequence[str] = (),
+        outputs: str | Sequence[str] = (),
         speed: str = "1",
         out: Path | str | None = None,
         resume: bool = False,
@@ -155,7 +155,8 @@ class Online:
         Parameters
         ----------
         sources : addresses as for ``rovgraph online`` (docs/online-sources.md), such as "tcp://192.168.2.2:5700"
-        outputs : where to send solutions as well (docs/online-output.md), such as "udp://127.0.0.1:5600"
+        outputs : where to send solutions as well (docs/online-output.md), one or several, such as
+            "udp://127.0.0.1:5600"
         speed : of replayed files, a number or "max"
         out : folder for recording, track and checkpoint; None = none
         resume : continue after a crash with the files in ``out``
@@ -189,7 +190,7 @@ class Online:
         )  # may refuse, before anything is written
         with ExitStack() as opened_outputs:  # they have threads, which a refused folder must not leave behind
             receivers: list[Output] = []
-            for url in outputs:
+            for url in [outputs] if isinstance(outputs, str) else outputs:
                 receivers.append(open_output(url, warnings, patient=feed.recorded))
                 opened_outputs.callback(receivers[-1].close)
             marks, watched = Marks(folder, warnings, resume), None

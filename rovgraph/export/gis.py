@@ -64,6 +64,8 @@ def projected(lon: Array, lat: Array, crs: str | None) -> tuple[Array, Array, st
     ------
     InputError : coordinates that are not known
     """
+    if not isinstance(crs, str | None):
+        raise InputError(f"crs {crs!r}: expected text, such as EPSG:25832, or utm")
     if crs is None:
         return lon, lat, WGS84
     import pyproj
