@@ -313,7 +313,7 @@ def test_bad_names_and_rates_and_files_that_are_there_are_refused(tmp_path):
         written("gpx", tmp_path, Options(rate=0.0))
     with pytest.raises(rg.InputError, match="crs 'EPSG:1': is not known"):
         written("gpkg", tmp_path, Options(crs="EPSG:1"))
-    with pytest.raises(InputError, match="crs 32632: expected text, such as EPSG:25832"):
+    with pytest.raises(rg.InputError, match="crs 32632: expected text, such as EPSG:25832"):
         written("gpkg", tmp_path, Options(crs=32632))  # type: ignore[arg-type]
     written("tum", tmp_path)
     with pytest.raises(rg.InputError, match="exists; choose another --out or give --force"):
