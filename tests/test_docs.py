@@ -228,6 +228,11 @@ def test_the_example_of_the_readme_runs(folder, monkeypatch):
     assert tried == 5 and failed == 0
 
 
+def test_the_table_of_the_api_has_every_function_and_every_result():
+    table = (DOCS / "api.md").read_text(encoding="utf-8")
+    assert [name for name in rg.__all__ if not re.search(rf"\b{name}\b", table)] == []
+
+
 def test_extensions_and_examples_import_public_modules_only():
     """What the manuals promise to keep: `rovgraph`, `rovgraph.extend`, and the command line's `main`."""
     texts = [(DOCS / f"{name}.md").read_text(encoding="utf-8") for name in ("own-sensor", "formats", "export", "api")]
