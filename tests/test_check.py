@@ -288,6 +288,33 @@ def test_a_dvl_turned_by_40_degrees_is_measured_against_fixes(sound):
     assert "turned by -40 deg and scaled by 1.0" in said
 
 
+def started(**start: float) -> Config:
+    return Config.model_validate({"start": start, "fix": {"sd_m": 0.3}})
+
+
+def test_fixes_that_begin_elsewhere_than_the_stated_start_are_named(sound):
+    away = changed(sound, "fix", lambda data, _: data.__setitem__((slice(None), 0), data[:, 0] + 8.0))
+    said = messages(away, started(north_m=0.0, east_m=0.0), sensor="fix")
+    assert "from start.north_m and start.east_m, of which the vehicle moved at most 0." in said
+    assert "the ship's heading" in said
+
+
+def test_fixes_that_begin_at_the_stated_start_or_without_one_are_not_named(sound):
+    away = changed(sound, "fix", lambda data, _: data.__setitem__((slice(None), 0), data[:, 0] + 8.0))
+    assert messages(sound, started(north_m=0.0, east_m=0.0), sensor="fix") == ""
+    assert messages(away, started(north_m=8.0, east_m=0.0), sensor="fix") == ""
+    assert messages(away, started(), sensor="fix") == ""
+    assert messages(away, started(north_m=0.0, position_sd_m=5.0), sensor="fix") == ""
+    far = changed(sound, "fix", lambda data, _: data.__setitem__((slice(None), 2), 3.0))
+    far = changed(far, "fix", lambda data, _: data.__setitem__((slice(None), 0), data[:, 0] + 8.0))
+    assert messages(far, started(north_m=0.0), sensor="fix") == ""
+
+
+def test_the_way_since_the_start_is_no_contradiction(sound):
+    later = sound["fix"].take(sound["fix"].time > 20.0)
+    assert messages(replace(sound, streams={**sound.streams, "fix": later}), started(north_m=0.0), sensor="fix") == ""
+
+
 def test_velocities_in_millimetres_are_refused(sound):
     assert "units: {dvl: mm/s}" in messages(scaled(sound, "dvl", slice(0, 3), 1e3), level="error", sensor="dvl")
 

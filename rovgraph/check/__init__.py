@@ -15,6 +15,7 @@ from rovgraph.check.frozen_sensors import standstill
 from rovgraph.check.jumps import bridge_jumps
 from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
+from rovgraph.check.start import start
 from rovgraph.check.times import overlap, presence, regularity, timing
 from rovgraph.check.values import angles, frozen_imu, gravity, own, turn_rates
 from rovgraph.config import Config
@@ -40,6 +41,7 @@ CHECKS: tuple[Check, ...] = (
     dvl_and_imu,
     vertical,
     repeated,
+    start,
     track,
     places,
     plan,
