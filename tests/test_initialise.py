@@ -121,9 +121,10 @@ def test_what_was_null_is_filled_in_and_said():
 
 
 def rests_on(log, yaml=""):
-    """What the lines on unchecked quantities say: of the heading, of the depth; "" where there is none."""
+    """What the lines on unchecked heading, depth and scale say; "" where there is none."""
     lines = initialise(log, parse_config(yaml)).assumptions
-    found = [[line for line in lines if f"constant error of the {what}" in line] for what in ("heading", "depth")]
+    unchecked = "heading", "depth", "DVL's scale"
+    found = [[line for line in lines if f"constant error of the {what}" in line] for what in unchecked]
     assert max(map(len, found)) <= 1, lines
     return ["".join(some).partition("rests on ")[2] for some in found]
 
@@ -133,21 +134,24 @@ DEPTH = {"depth": (AT, np.full((20, 1), 3.0))}
 FIXES = {"fix": (AT, np.tile([0.0, 0.0, 1.0], (20, 1)))}
 
 
-def test_what_heading_and_depth_rest_on_is_said_where_nothing_checks_them():
+def test_what_heading_depth_and_scale_rest_on_is_said_where_nothing_checks_them():
     yaml = "calibration: {dvl_compass_offset: {sd_deg: 2}}"
-    assert rests_on(still(LEVEL), yaml) == ["dvl_compass_offset, sd 2 deg", ""]
-    assert rests_on(still(LEVEL, **DEPTH), yaml) == ["dvl_compass_offset, sd 2 deg", "depth_offset, sd 0.2 m"]
-    exact = "calibration: {dvl_compass_offset: {estimate: false}, depth_offset: {estimate: false}}"
+    scale = "dvl_scale, sd 0.01"
+    assert rests_on(still(LEVEL), yaml) == ["dvl_compass_offset, sd 2 deg", "", scale]
+    assert rests_on(still(LEVEL, **DEPTH), yaml) == ["dvl_compass_offset, sd 2 deg", "depth_offset, sd 0.2 m", scale]
+    held = ("dvl_compass_offset", "depth_offset", "dvl_scale")
+    exact = "calibration: {" + ", ".join(f"{name}: {{estimate: false}}" for name in held) + "}"
     assert rests_on(still(LEVEL, **DEPTH), exact) == [
         "dvl_compass_offset, taken as exact",
         "depth_offset, taken as exact",
+        "dvl_scale, taken as exact",
     ]
     stated = "start: {heading_deg: 20, heading_sd_deg: 3}"
     assert rests_on(still(LEVEL), stated)[0] == "dvl_compass_offset, sd 5 deg; start.heading_deg, sd 3 deg"
 
 
 def test_nothing_is_said_of_what_a_fix_or_a_stated_start_checks():
-    assert rests_on(still(LEVEL, **FIXES, **DEPTH), "start: {down_m: 3}") == ["", ""]
+    assert rests_on(still(LEVEL, **FIXES, **DEPTH), "start: {down_m: 3}") == ["", "", ""]
 
 
 # heading

@@ -1,7 +1,8 @@
 """What no measurement of a dive can show to be wrong, and what it rests on instead.
 
 A dive that is turned as a whole about the vertical, or shifted along it, obeys the same equations: a constant error of
-the heading shows against position fixes only, one of the depth only against a start at a known depth.
+the heading shows against position fixes only, one of the depth only against a start at a known depth. So does nearly a
+dive whose velocities have another scale: the accelerations of a small vehicle hardly show it.
 """
 
 from collections.abc import Collection
@@ -13,7 +14,7 @@ from rovgraph.units import behind, shown
 
 
 def unchecked(config: Config, sources: Collection[str], present: Collection[str]) -> list[str]:
-    """What heading and depth rest on where nothing checks them, a line each.
+    """What heading, distances and depth rest on where nothing checks them, a line each.
 
     Parameters
     ----------
@@ -28,6 +29,9 @@ def unchecked(config: Config, sources: Collection[str], present: Collection[str]
         if start.heading_deg is not None:
             rests.append(f"start.heading_deg, sd {start.heading_sd_deg:g} deg")
         lines.append(f"no fix shows a constant error of the heading, which rests on {'; '.join(rests)}")
+        if "dvl" in present:
+            scale = _held_by(priors["dvl_scale"])
+            lines.append(f"no fix shows a constant error of the DVL's scale, which rests on {scale}")
     if "depth" in present and start.down_m is None:
         lines.append(f"nothing shows a constant error of the depth, which rests on {_held_by(priors['depth_offset'])}")
     return lines
