@@ -20,8 +20,8 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 UNGUARDED = (
-    "worker processes ended while they started; they import your script again, so that its work has to stand under "
-    "if __name__ == '__main__'"
+    "worker processes ended while they started; they import your script again, so that it has to be a file with its "
+    "work under if __name__ == '__main__'"
 )
 
 

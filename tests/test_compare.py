@@ -412,7 +412,7 @@ def test_a_script_whose_work_is_not_guarded_is_told_so_in_one_line(tmp_path):
     )
     ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
     assert ran.stderr == ""
-    assert ran.stdout.strip().endswith("its work has to stand under if __name__ == '__main__'")
+    assert ran.stdout.strip().endswith("it has to be a file with its work under if __name__ == '__main__'")
     assert ran.stdout.count("\n") == 1
 
 
