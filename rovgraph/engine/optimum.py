@@ -15,6 +15,7 @@ from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
 from rovgraph.state import State
 
+NEWEST = 15  # components of `Optimum.newest_covariance` before those of the calibration
 OTHERS = 9  # components of `Knowledge.covariance` before those of the calibration
 
 

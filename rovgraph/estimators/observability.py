@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.engine.optimum import Optimum, joint_prior_sd
+from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
 
@@ -76,7 +76,7 @@ def without_spurious_information(best: Optimum, keyframes: Sequence[int], inform
     return np.asarray((axes * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
 
-def relative_sd(best: Optimum, sd: Mapping[str, Array], prior: Mapping[str, Array]) -> dict[str, Array]:
+def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) -> dict[str, Array]:
     """sd of the calibration at the end as a part of the prior's, without spurious information.
 
     That is looked for only where it could change a verdict.
@@ -84,21 +84,20 @@ def relative_sd(best: Optimum, sd: Mapping[str, Array], prior: Mapping[str, Arra
     Parameters
     ----------
     best : the dive
-    sd, prior : name -> ndarray, shape (dim,), sd after and before, of the estimated variables
+    covariance : ndarray, shape (c, c), of the estimated variables at the end
+    prior : name -> ndarray, shape (dim,), their sd before
 
     Returns
     -------
     dict : name -> ndarray, shape (dim,)
     """
-    ratio = {name: sd[name] / prior[name] for name in best.unknowns.estimated}
+    ratio = {name: sd / prior[name] for name, sd in _sds(covariance, prior).items()}
     at_stake = [r for name in SPURIOUSLY_OBSERVABLE if name in ratio for r in ratio[name]]
     if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
     end, before = [len(best.intervals) - 1], np.concatenate([prior[name] for name in ratio])
-    seen = data_information(best.knowledge(end).calibration, before)
-    own = relative_covariance(without_spurious_information(best, end, seen, before[None]))[0]
-    parts = np.split(np.sqrt(np.diag(own)), np.cumsum([len(r) for r in ratio.values()])[:-1])
-    return dict(zip(ratio, parts, strict=True))
+    seen = data_information(covariance[None], before)
+    return _sds(relative_covariance(without_spurious_information(best, end, seen, before[None]))[0], prior)
 
 
 def shown(best: Optimum) -> list[str]:
@@ -134,9 +133,16 @@ def without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
     Optimum : the dive
     dict : name -> ndarray, shape (dim,), of what was estimated
     """
-    names = best.unknowns.estimated
-    sd = {name: np.sqrt(np.diag(best.covariances(name)[-1])) for name in names}
     before = joint_prior_sd(best, len(best.intervals) - 1)
-    relative = relative_sd(best, sd, before)
-    held = spuriously_observable(best.unknowns, {name: sd[name] / before[name] for name in sd}, relative)
+    own = slice(NEWEST, NEWEST + sum(map(len, before.values())))
+    covariance = best.newest_covariance()[own, own]
+    relative = relative_sd(best, covariance, before)
+    claimed = {name: sd / before[name] for name, sd in _sds(covariance, before).items()}
+    held = spuriously_observable(best.unknowns, claimed, relative)
     return (best.considering(held) if held else best), relative
+
+
+def _sds(covariance: Array, variables: Mapping[str, Array]) -> dict[str, Array]:
+    """sd of each variable, shape (dim,), from the joint covariance of all in their order."""
+    dims = [len(values) for values in variables.values()]
+    return dict(zip(variables, np.split(np.sqrt(np.diag(covariance)), np.cumsum(dims)[:-1]), strict=False))
