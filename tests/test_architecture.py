@@ -205,6 +205,16 @@ def test_help_loads_nothing_heavy(command):
     assert sorted(loaded & HEAVY) == []
 
 
+def test_smoothing_a_log_of_a_healthy_dive_loads_no_library_that_it_does_not_need(tmp_path):
+    log, config = (ROOT / "data" / "falcon" / name for name in ("log.csv.gz", "config.yaml"))
+    arguments = ["smooth", str(log), "--config", str(config), "--out", str(tmp_path / "out"), "--no-figures"]
+    done = run(HELP.format(arguments=[*arguments, "--estimate", "smoothed"]))
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.rpartition("MODULES ")[2].split())
+    assert "numba" in loaded
+    assert sorted(loaded & {"gtsam", "matplotlib", "scipy.optimize", "scipy.signal", "scipy.stats"}) == []
+
+
 PLAIN = """
 import sys
 import typer

@@ -19,10 +19,10 @@ the dive likelier, it is found instead, as an error of infinite time constant.
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, minimize
 
 from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
@@ -32,6 +32,9 @@ from rovgraph.engine.measurements import Block
 from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
 from rovgraph.state import State
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time_constant)}  # sensor -> its error
 ENOUGH = 30  # measurements
@@ -212,6 +215,8 @@ def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
     What the data tell best is how an error walks over short times, so that and the time constant are searched for: of
     sd and time constant the likelihood has a long ridge.
     """
+    from scipy.optimize import minimize  # takes 0.1 s to load; healthy dives do not need it
+
     name, seconds = begin.variable, _time_constants(now.chain, begin.sensor)
     sds = TABLE[name].sd * np.array([SMALLEST, IMPLAUSIBLE])
     walks = stationary_walk(sds[0], seconds[1]), stationary_walk(sds[1], seconds[0])
@@ -226,7 +231,7 @@ def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
         at = error(x)
         return -begin.gain if np.array_equal(x, start) else -now.linear_gain(name, at.sd, at.time_constant)
 
-    def stop(intermediate_result: OptimizeResult) -> None:
+    def stop(intermediate_result: "OptimizeResult") -> None:
         if error(intermediate_result.x).sd > IMPLAUSIBLE * TABLE[name].sd:
             raise StopIteration
 
