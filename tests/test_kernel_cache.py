@@ -100,7 +100,7 @@ def test_without_numba_one_line_says_what_to_install(command, tmp_path):
 
 @pytest.mark.slow
 def test_missing_modules_are_compiled_by_processes_of_their_own_and_nothing_else(tmp_path):
-    few = ["rovgraph.kernels.chain", "rovgraph.kernels.linear_chain"]
+    few = ["chain", "linear_chain"]
     code = (
         "from rovgraph.kernels import compile as c; c.__dict__['_modules'] = lambda: " + repr(few) + "; "
         "c.os.sched_getaffinity = lambda pid: {0, 1}; c.cache_folder('rovgraph.kernels.chain')"

@@ -5,8 +5,8 @@ The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_C
 Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
 calls another one in a changed module is compiled again, which numba's own cache does not notice.
 
-Where several modules are missing, each is compiled by a process of its own, after those that it imports, as many at a
-time as there are cores.
+Where several modules are missing, as many processes as there are cores compile them, each module after those that it
+imports. A process keeps the helpers that it has compiled for its next modules.
 """
 
 import contextlib
@@ -21,7 +21,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from queue import SimpleQueue
+from typing import IO, Any, TypeVar, cast
 
 import rovgraph
 from rovgraph.errors import InputError
@@ -30,13 +31,20 @@ try:
     import numba
     from numba import njit
     from numba.extending import register_jitable
+
+    from rovgraph.kernels.linked_helpers import HelperCompiler
 except ImportError as error:
     raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61'") from None
 
 F = TypeVar("F", bound=Callable[..., Any])
 config: Any = numba.config
 KERNEL: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}  # nothing in C calls them
-HELPER: Any = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # only kernels call them
+HELPER: Any = {  # only kernels call them
+    "error_model": "numpy",
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    "pipeline_class": HelperCompiler,
+}
 HELPS = "ROVGRAPH_HELPS_COMPILE"  # in the environment of a process that compiles for another one
 logger = logging.getLogger("rovgraph")
 
@@ -116,29 +124,59 @@ def _compile_missing(parent: Path) -> None:
     missing = {module for module in _modules() if not _folder_in(parent, f"{__package__}.{module}").exists()}
     if cores < 2 or len(missing) < 2:
         return
-    root = str(Path(rovgraph.__file__).parents[1])
-    code = "import importlib, sys; sys.path.insert(0, sys.argv[1]); importlib.import_module(sys.argv[2])"
-
-    def compile_one(module: str) -> str:
-        subprocess.run(
-            [sys.executable, "-c", code, root, f"{__package__}.{module}"],
-            env={**os.environ, HELPS: "1", "ROVGRAPH_CACHE_DIR": str(parent)},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            check=False,
-        )
-        return module
-
     # a module comes after those that it imports: their kernels are then loaded, not compiled once more
     order = TopologicalSorter({module: (_imported_kernels(module) - {module}) & missing for module in missing})
     order.prepare()
-    with ThreadPoolExecutor(cores) as pool:
+    with contextlib.ExitStack() as stack:
+        idle: SimpleQueue[subprocess.Popen[str]] = SimpleQueue()
+        for _ in range(min(cores, len(missing))):
+            idle.put(stack.enter_context(_worker(parent)))
+        pool = stack.enter_context(ThreadPoolExecutor(idle.qsize()))
+
+        def compile_one(module: str) -> str:
+            worker = idle.get()
+            with contextlib.suppress(OSError):  # it has died
+                print(f"{__package__}.{module}", file=worker.stdin, flush=True)
+                cast(IO[str], worker.stdout).readline()
+            idle.put(worker)
+            return module
+
         running: set[Future[str]] = set()
         while order.is_active():
-            running |= {pool.submit(compile_one, module) for module in order.get_ready()}
+            ready = sorted(order.get_ready(), key=lambda module: -len(_importing(module, missing)))
+            running |= {pool.submit(compile_one, module) for module in ready}
             done, running = wait(running, return_when=FIRST_COMPLETED)
             order.done(*(each.result() for each in done))
+
+
+def _importing(module: str, among: set[str]) -> set[str]:
+    """Those that wait for a module: the more there are, the sooner it should be compiled."""
+    return {other for other in among if module in _imported_kernels(other)}
+
+
+@contextlib.contextmanager
+def _worker(parent: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that imports each module whose name it is given, and answers when it has."""
+    root = str(Path(rovgraph.__file__).parents[1])
+    code = (
+        "import contextlib, importlib, sys; sys.path.insert(0, sys.argv[1])\n"
+        "for line in sys.stdin:\n"
+        "    with contextlib.suppress(Exception): importlib.import_module(line.strip())\n"
+        "    print(flush=True)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, root],
+        env={**os.environ, HELPS: "1", "ROVGRAPH_CACHE_DIR": str(parent)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(OSError):
+            process.communicate()
 
 
 def _modules() -> list[str]:

@@ -140,11 +140,12 @@ def relinearize(
         for i in range(n):
             for k in range(n):
                 P[i, k] = predicted_P[i, k]
+            for k in range(len(L)):
+                B[i, k] = predicted_B[i, k]
         change_basis(P, basis, layout.rows, np.empty((rows, n)), np.empty((rows, size + 1), np.int64))
-        B[:] = predicted_B
         turn_rows(B, basis, layout.rows, np.empty((rows, len(L))))
-        r[:] = 0.0
-        H[:] = 0.0
+        r.fill(0.0)
+        H.fill(0.0)
         linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
         for a in range(len(r)):
             for i in range(size):

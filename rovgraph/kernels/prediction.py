@@ -117,12 +117,13 @@ def predict_filter(
     )
     for i in range(15, 21):
         x_out[i] = x[i]
-    F_out[:] = 0.0
-    Q_out[:] = 0.0
+    F_out.fill(0.0)
+    Q_out.fill(0.0)
     for i in range(n):
         F_out[i, i] = 1.0
         Q_out[i, i] = walk[0, i] * motion[DURATION]
-    c_out[:] = c
+    for i in range(len(c)):
+        c_out[i] = c[i]
     for i in range(MOTION, len(column)):
         own = column[i]
         if 0 <= own < estimated and walk[1, own] > 0.0:

@@ -37,7 +37,7 @@ RIDGE = 1e-12  # of the trace, that keeps least squares of what a sensor hardly 
 def innovation_covariance(P: Array, H: Array, HP_out: Array, S_out: Array) -> None:
     """H P and S = H P H'."""
     m, n = H.shape
-    HP_out[:] = 0.0
+    HP_out.fill(0.0)
     for a in range(m):
         for j in range(n):
             h = H[a, j]
@@ -91,14 +91,18 @@ def normalised_squared(S: Array, r: Array, begin: int, end: int) -> float:
     if end == begin + 1:
         nis: float = r[begin] * r[begin] / (S[begin, begin] + 1.0)
         return nis
-    A, x = S[begin:end, begin:end].copy(), r[begin:end].copy()
-    for i in range(end - begin):
+    n = end - begin
+    A, x = np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        x[i] = r[begin + i]
+        for j in range(n):
+            A[i, j] = S[begin + i, begin + j]
         A[i, i] += 1.0
     L = np.empty_like(A)
     cholesky(A, L)
     solve_cholesky(L, x)
     total = 0.0
-    for i in range(end - begin):
+    for i in range(n):
         total += r[begin + i] * x[i]
     return total
 
@@ -106,12 +110,13 @@ def normalised_squared(S: Array, r: Array, begin: int, end: int) -> float:
 @helper
 def leave_out(r: Array, H: Array, H_y: Array, HP: Array, S: Array, begin: int, end: int) -> None:
     """Make nothing of the rows ``begin`` to ``end``."""
-    r[begin:end] = 0.0
-    H[begin:end] = 0.0
-    H_y[begin:end] = 0.0
-    HP[begin:end] = 0.0
-    S[begin:end] = 0.0
-    S[:, begin:end] = 0.0
+    for a in range(begin, end):
+        r[a] = 0.0
+        H[a].fill(0.0)
+        H_y[a].fill(0.0)
+        HP[a].fill(0.0)
+        for b in range(len(r)):
+            S[a, b] = S[b, a] = 0.0
 
 
 @helper
@@ -167,8 +172,8 @@ def reweight(
     """
     k, m = len(weight_out), len(r)
     A, L, gain = np.empty((m, m)), np.empty((m, m)), np.empty(m)
-    weight_out[:] = 1.0
-    root_out[:] = 1.0
+    weight_out.fill(1.0)
+    root_out.fill(1.0)
     for _ in range(MAX_REWEIGHTINGS):
         for a in range(m):
             for b in range(m):
@@ -196,7 +201,7 @@ def reweight(
         for j in range(k):
             for a in range(first[j], first[j + 1]):
                 root_out[a] = math.sqrt(weight_out[j])
-    inverse_out[:] = 0.0
+    inverse_out.fill(0.0)
     for a in range(m):
         inverse_out[a, a] = 1.0
         solve_cholesky(L, inverse_out[a])  # symmetric: a row is a column
@@ -205,7 +210,7 @@ def reweight(
 @helper
 def correction(r: Array, HP: Array, root: Array, inverse: Array, delta_out: Array) -> None:
     """The correction by itself: d = P H' W^1/2 (W^1/2 S W^1/2 + I)^-1 W^1/2 r."""
-    delta_out[:] = 0.0
+    delta_out.fill(0.0)
     for a in range(len(r)):
         share = 0.0
         for b in range(len(r)):
@@ -225,7 +230,7 @@ def joseph(
         for i in range(n):
             HP[a, i] *= root[a]
             H[a, i] *= root[a]
-    delta_out[:] = 0.0
+    delta_out.fill(0.0)
     for a in range(m):
         for b in range(m):
             share = inverse[a, b]
@@ -242,7 +247,7 @@ def joseph(
         for i in range(n):
             for a in range(m):
                 B[i, k] -= Kt[a, i] * HA[a, 0]
-    HA[:, 0] = 0.0
+    HA.fill(0.0)
     for i in range(n):  # P <- A'
         for a in range(m):
             share = HP[a, i]
