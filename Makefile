@@ -9,6 +9,9 @@ BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 DEMO   ?= results/demo
 
+# Tests start many programs, which load faster from bytecode that is kept.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help venv demo test lint docs bench clean
 .DELETE_ON_ERROR:
 

@@ -74,7 +74,7 @@ class Checkout:
         return json.loads(self.python(DRIVERS / self.driver, *arguments).said.splitlines()[-1])
 
     def compile(self) -> None:
-        """Have all kernels compiled, so that no measurement contains it."""
+        """Have all modules and kernels compiled, so that no measurement contains it."""
         self.python("-c", LOAD_ALL)
 
     def python(self, *arguments: object) -> Cost:
@@ -86,6 +86,7 @@ class Checkout:
         """
         command = [sys.executable, *map(str, arguments)]
         environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(self.root)}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # users load from bytecode, too
         with TemporaryDirectory() as folder, TemporaryFile() as said, TemporaryFile() as errors:
             process = subprocess.Popen(command, stdout=said, stderr=errors, env=environment, cwd=folder)
             _, status, usage = os.wait4(process.pid, 0)
