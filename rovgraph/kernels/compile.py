@@ -39,12 +39,8 @@ except ImportError as error:
 F = TypeVar("F", bound=Callable[..., Any])
 config: Any = numba.config
 KERNEL: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}  # nothing in C calls them
-HELPER: Any = {  # only kernels call them
-    "error_model": "numpy",
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-    "pipeline_class": HelperCompiler,
-}
+# only kernels call them; numba compiles a helper once more for each set of options that its callers have
+HELPER: Any = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # which makes none either
 HELPS = "ROVGRAPH_HELPS_COMPILE"  # in the environment of a process that compiles for another one
 logger = logging.getLogger("rovgraph")
 

@@ -38,7 +38,8 @@ class HelperCompiler(CompilerBase):
     """numba's compiler with such a library."""
 
     def define_pipelines(self) -> list[Any]:
-        """As numba's."""
+        """As numba's, without a wrapper for Python."""
+        self.state.flags.no_cpython_wrapper = True
         library: Any = LinkedLibrary  # numba's classes have no types
         builder: Any = DefaultPassBuilder
         self.state.library = library(self.state.targetctx.codegen(), "helper")
