@@ -94,7 +94,8 @@ def _known_before(chain: Chain, solution: Solution[State], keyframe: int) -> Arr
     (rows,) = chain.eliminate(solution.point, solution.gates, [keyframe], kept=1).filtered
     known = len(rows) - CLONED  # the clone of the first attitude stands last, and is eliminated first here
     order = np.r_[known : known + CLONED, :known, known + CLONED]
-    return np.asarray(np.linalg.qr(rows[:, order], mode="r")[CLONED:, CLONED:])
+    R: Array = np.asarray(np.linalg.qr(rows[:, order], mode="r"))
+    return R[CLONED:, CLONED:]
 
 
 @dataclass(frozen=True)

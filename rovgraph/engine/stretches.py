@@ -25,7 +25,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,10 +83,10 @@ class Part(Protocol[Point, Step]):
 
 
 class Partition(Protocol[Point, Step]):
-    """How parts of a dive are made."""
+    """How parts of a dive are made, of the kind of problem that is solved."""
 
     def __call__(
-        self, problem: Linearizable[Point, Step], solution: Solution[Point], begin: float, end: float
+        self, problem: Any, solution: Solution[Point], begin: float, end: float, /
     ) -> Part[Point, Step] | None:
         """The part between two times [s], about a solution; None = it is most of the dive."""
         ...
