@@ -6,16 +6,12 @@ python benchmarks/check.py --seeds 3 --cases "dvl 0.1 s late" "dvl y flipped"
 
 import argparse
 import re
-import zlib
 from collections.abc import Iterator, Sequence
 
-import numpy as np
 from alarms import healthy
-from fault_campaign.campaign import merge
+from fault_campaign.campaign import make_dive
 from fault_campaign.cases import CASES, FAULTS, HEALTHY, Case
-from fault_campaign.instruments import log_table, sample
-from fault_campaign.scenarios import make_motion
-from fault_campaign.vehicle import configuration, make_vehicle
+from fault_campaign.instruments import log_table
 
 from rovgraph.check import Finding, examine
 from rovgraph.config import Config
@@ -24,21 +20,10 @@ from rovgraph.log import Log
 
 
 def log_of_case(case: Case, seed: int) -> tuple[Log, Config]:
-    """The dive of a case of the fault campaign, as its `run_case` makes it, and its configuration."""
-    setting = zlib.crc32(repr(case.setting).encode())
-    rng = np.random.default_rng([setting, seed])
-    motion, vehicle = make_motion(case.scenario, rng), make_vehicle(case.grade, case.aids)
-    if case.dvl_rate is not None:
-        vehicle.dvl.rate = case.dvl_rate
-    vehicle.dvl.scale_sd = case.config.get("calibration", {}).get("dvl_scale", {}).get("sd", 0.0)
-    config = merge(merge(configuration(vehicle), case.config), case.wrong_config)
-    rng.normal(0.0, 0.1, 2)  # the campaign draws a start here
-    if case.on_vehicle is not None:
-        case.on_vehicle(vehicle)
-    streams, _ = sample(motion, vehicle, rng)
-    if case.on_log is not None:
-        case.on_log(streams, motion, np.random.default_rng([setting, seed, 1]))
-    return Log.from_frame(log_table(streams), source=f"{case.name} {seed}"), Config.model_validate(config)
+    """The dive of a case of the fault campaign, and its configuration."""
+    dive = make_dive(case, seed)
+    log = Log.from_frame(log_table(dive.streams), source=f"{case.name} {seed}")
+    return log, Config.model_validate(dive.configuration)
 
 
 def complaints(log: Log, config: Config) -> list[Finding]:

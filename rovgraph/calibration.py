@@ -186,7 +186,7 @@ TABLE: dict[str, Variable] = {
             "s",
             _ONE,
             "1",
-            0.01,
+            0.02,
             _DVL,
             "scale error of the DVL (sound speed)",
             "position fixes far apart; large changes of depth; starts and stops, against the accelerometer",

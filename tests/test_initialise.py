@@ -136,7 +136,7 @@ FIXES = {"fix": (AT, np.tile([0.0, 0.0, 1.0], (20, 1)))}
 
 def test_what_heading_depth_and_scale_rest_on_is_said_where_nothing_checks_them():
     yaml = "calibration: {dvl_compass_offset: {sd_deg: 2}}"
-    scale = "dvl_scale, sd 0.01"
+    scale = "dvl_scale, sd 0.02"
     assert rests_on(still(LEVEL), yaml) == ["dvl_compass_offset, sd 2 deg", "", scale]
     assert rests_on(still(LEVEL, **DEPTH), yaml) == ["dvl_compass_offset, sd 2 deg", "depth_offset, sd 0.2 m", scale]
     held = ("dvl_compass_offset", "depth_offset", "dvl_scale")

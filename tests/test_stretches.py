@@ -7,8 +7,10 @@ from dives import Simulated, altered, batch, falcon, interrupted, position_error
 
 import rovgraph as rg
 from rovgraph.config import beliefs
-from rovgraph.engine.chain import Chain
+from rovgraph.engine import chain_optimum, stretches
+from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
+from rovgraph.engine.chain_window import window
 from rovgraph.engine.gauss_newton import minimise
 from rovgraph.engine.measurements import cost_at_gate
 from rovgraph.estimators.dead_reckoning import dead_reckon
@@ -157,3 +159,44 @@ def test_chain_and_graph_take_out_the_same_stretch():
     assert len(chain.stretches) == 1
     assert chain.stretches == graph.stretches
     assert chain.cost == pytest.approx(graph.cost, rel=1e-4)
+
+
+def test_a_window_of_a_dive_knows_what_came_before_it(case):
+    """Up to the end of the dive, it has the dive's optimum from anywhere near, and its last covariance."""
+    best, rng = optimum(case.log, case), np.random.default_rng(3)
+    time, gates = best.chain.rows.time, best.solution.gates
+    part = window(best.chain, best.solution, time[-1] - 60.0, np.inf)
+    assert part is not None
+    whole, own = part.point(best.state), part.gates(gates)
+    assert len(whole) < len(time) / 2
+    off = ChainStep(0.01 * rng.standard_normal((len(whole), part.problem.layout.d)), np.zeros(part.problem.layout.c))
+    found = minimise(part.problem, part.problem.moved(whole, off, 1.0), own).point
+    np.testing.assert_allclose(found.p_n, whole.p_n, atol=2e-3)
+    np.testing.assert_allclose(found.R_nb, whole.R_nb, atol=2e-4)
+    covariances = [
+        (root := problem.eliminate(point, gate, kept=1)).newest_covariance(root.border_covariance())
+        for problem, point, gate in ((best.chain, best.state, gates), (part.problem, whole, own))
+    ]
+    np.testing.assert_allclose(covariances[1], covariances[0], rtol=1e-6, atol=1e-12)
+
+
+def test_there_is_no_window_where_it_would_be_most_of_the_dive(case):
+    best = optimum(case.log, case)
+    time = best.chain.rows.time
+    assert window(best.chain, best.solution, time[0] + 50.0, time[-1]) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reach", [40.0, 80.0])
+def test_a_stretch_is_found_in_a_part_of_the_dive_as_in_all_of_it(reach, monkeypatch):
+    """A part that begins after the dive, and one that begins with it."""
+    case = simulated(falcon(), 400.0, 1)
+    log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
+    (whole,) = optimum(log, case).solution.stretches
+    made, make = [], chain_optimum.window
+    monkeypatch.setattr(chain_optimum, "window", lambda *given: made.append(make(*given)) or made[-1])
+    monkeypatch.setattr(stretches, "REACH_S", reach)
+    (part,) = optimum(log, case).solution.stretches
+    assert made[0] is not None and (made[0].keyframes.start > 0) == (reach < FROM)
+    assert part.sensor == whole.sensor == "dvl"
+    assert (part.begin, part.end) == pytest.approx((whole.begin, whole.end), abs=1.0)

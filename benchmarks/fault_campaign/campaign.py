@@ -28,8 +28,8 @@ def merge(base: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def run_case(case: Case, seed: int, online: bool = False) -> Result:
-    """One dive of one case. A seed gives a faulty case and its healthy one the same motion and the same noise."""
+def make_dive(case: Case, seed: int) -> Dive:
+    """A dive of a case. A seed gives a faulty case and its healthy one the same motion and the same noise."""
     setting = zlib.crc32(repr(case.setting).encode())  # other settings have other draws
     rng = np.random.default_rng([setting, seed])
     motion, vehicle = make_motion(case.scenario, rng), make_vehicle(case.grade, case.aids)
@@ -43,7 +43,12 @@ def run_case(case: Case, seed: int, online: bool = False) -> Result:
     streams, hidden = sample(motion, vehicle, rng)
     if case.on_log is not None:
         case.on_log(streams, motion, np.random.default_rng([setting, seed, 1]))
-    return run_dive(Dive(streams, config, motion, hidden, case.clock, tuple(case.second_file)), online)
+    return Dive(streams, config, motion, hidden, case.clock, tuple(case.second_file))
+
+
+def run_case(case: Case, seed: int, online: bool = False) -> Result:
+    """One dive of one case."""
+    return run_dive(make_dive(case, seed), online)
 
 
 def run(

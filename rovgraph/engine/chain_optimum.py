@@ -11,6 +11,7 @@ from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_layout import COLUMNS, MOTION
+from rovgraph.engine.chain_window import window
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
@@ -187,4 +188,4 @@ def smooth_chain(
     chain = Chain(intervals, initial, beliefs, wanted, rows)
     held = [name for name in wanted.considered if not beliefs[name].variable.time_offset]
     freed = partial(widened, chain, names=tuple(held)) if held else None
-    return ChainOptimum(chain, solve(chain, chain.start(states, calibration), freed))
+    return ChainOptimum(chain, solve(chain, chain.start(states, calibration), freed, window))

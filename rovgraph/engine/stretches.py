@@ -17,12 +17,15 @@ the time, or a dive that is no better without it, is not as configured: alarms s
 
 The search frees what the dive holds and does not know exactly, such as the mounting of the DVL: a tilt that is held at
 zero makes all pings cost more than they should, so that leaving out more of them would always pay.
+
+It solves a dive some dozens of times. Of a long dive it solves the part around the burst, with what was known before.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,12 +58,45 @@ MOST_SHARE = 0.5  # of a sensor's measurements, that stretches may hold
 WELL = 1.5  # mean square of normalised residuals of the rest
 MAX_STRETCHES = 4
 TOLERANCE = 0.1  # decrease of the cost that is left when optima are compared
+REACH_S = 300.0  # before and after a burst, of the part of a long dive that is solved in the search
+
+
+class Part(Protocol[Point, Step]):
+    """A part of a dive that is a problem of its own."""
+
+    @property
+    def problem(self) -> Linearizable[Point, Step]:
+        """The part."""
+        ...
+
+    def point(self, whole: Point) -> Point:
+        """The point of the part at a point of the dive."""
+        ...
+
+    def gates(self, whole: Gates) -> Gates:
+        """Those of the part, of the dive's."""
+        ...
+
+    def with_gates(self, whole: Gates, own: Gates) -> Gates:
+        """The dive's, with those of the part in place of its own."""
+        ...
+
+
+class Partition(Protocol[Point, Step]):
+    """How parts of a dive are made, of the kind of problem that is solved."""
+
+    def __call__(
+        self, problem: Any, solution: Solution[Point], begin: float, end: float, /
+    ) -> Part[Point, Step] | None:
+        """The part between two times [s], about a solution; None = it is most of the dive."""
+        ...
 
 
 def solve(
     problem: Linearizable[Point, Step],
     point: Point,
     freed: Callable[[Point], Linearizable[Point, Step]] | None = None,
+    partition: Partition[Point, Step] | None = None,
 ) -> Solution[Point]:
     """The cheapest optimum of a dive: from ``point``, and without stretches in which a sensor contradicts the others.
 
@@ -69,6 +105,7 @@ def solve(
     problem, point : the dive, and where to begin
     freed : the dive, from where it is linearised, with what ``problem`` holds and does not know exactly estimated: an
         error that a mounting explains is no stretch's
+    partition : makes the parts of a long dive in which stretches are sought; None = they are sought in all of it
 
     Raises
     ------
@@ -78,14 +115,16 @@ def solve(
     if not _bursts(problem.measured(), best):
         return best
     if freed is None:
-        found = _without_stretches(problem, best)
+        found = _without_stretches(problem, best, partition)
         return resume(problem, found.point, found) if found.stretches else found
     free = freed(best.point)
-    found = _without_stretches(free, minimise(free, best.point, best.gates))
+    found = _without_stretches(free, minimise(free, best.point, best.gates), partition)
     return resume(problem, best.point, found) if found.stretches else replace(best, runner_up=found.runner_up)
 
 
-def _without_stretches(problem: Linearizable[Point, Step], best: Solution[Point]) -> Solution[Point]:
+def _without_stretches(
+    problem: Linearizable[Point, Step], best: Solution[Point], partition: Partition[Point, Step] | None
+) -> Solution[Point]:
     """The cheapest of an optimum and those without stretches in which a sensor contradicts the others."""
     tried: list[Stretch] = []
     measured, runner_up = problem.measured(), math.inf
@@ -93,16 +132,41 @@ def _without_stretches(problem: Linearizable[Point, Step], best: Solution[Point]
         burst = next((b for b in _bursts(measured, best) if not any(_overlap(b, t) for t in tried)), None)
         if burst is None:
             break
-        without = [_taken_out_around(problem, best, burst, sensor) for sensor in measured]
-        ranked = sorted([best, *filter(None, without)], key=lambda one: one.cost)
         tried.append(burst)
-        if _level(problem, ranked[0]) > WELL:
-            continue
-        fitted = best if ranked[0] is best else _with_fitted_edges(problem, ranked[0])
-        if _right_elsewhere(problem, fitted):
-            best = fitted
-            runner_up = min([runner_up, *(other.cost - ranked[0].cost for other in ranked[1:])])
+        part = partition and partition(problem, best, burst.begin - REACH_S, burst.end + REACH_S)
+        found = _without_stretch_in(part, problem, best, burst) if part else _without_stretch(problem, best, burst)
+        if found is not None and _right_elsewhere(problem, found):
+            best, runner_up = found, min(runner_up, found.runner_up)
     return replace(best, runner_up=runner_up)
+
+
+def _without_stretch(
+    problem: Linearizable[Point, Step], best: Solution[Point], burst: Stretch
+) -> Solution[Point] | None:
+    """The cheapest of an optimum and those without a sensor around a burst; None = the rest of it fits badly, too."""
+    without = [_taken_out_around(problem, best, burst, sensor) for sensor in problem.measured()]
+    ranked = sorted([best, *filter(None, without)], key=lambda one: one.cost)
+    if _level(problem, ranked[0]) > WELL:
+        return None
+    fitted = best if ranked[0] is best else _with_fitted_edges(problem, ranked[0])
+    return replace(fitted, runner_up=min((other.cost - ranked[0].cost for other in ranked[1:]), default=math.inf))
+
+
+def _without_stretch_in(
+    part: Part[Point, Step], problem: Linearizable[Point, Step], best: Solution[Point], burst: Stretch
+) -> Solution[Point] | None:
+    """The same, sought in a part of the dive; what is found there is solved in all of it."""
+    measured = part.problem.measured()
+    before = tuple(s for s in best.stretches if s.sensor in measured and _barred(measured, [s])[s.sensor].any())
+    own = replace(best, point=part.point(best.point), gates=part.gates(best.gates), stretches=before)
+    found = _without_stretch(part.problem, resume(part.problem, own.point, own), burst)
+    if found is None or found.stretches == before:
+        return found and replace(best, runner_up=found.runner_up)
+    known = replace(
+        found, gates=part.with_gates(best.gates, found.gates), stretches=(*best.stretches, found.stretches[-1])
+    )
+    whole = resume(problem, best.point, known)
+    return whole if whole.cost < best.cost else replace(best, runner_up=found.runner_up)
 
 
 def resume(problem: Linearizable[Point, Step], point: Point, known: Solution[Point]) -> Solution[Point]:
