@@ -88,7 +88,7 @@ class Source:
         return np.asarray(self.messages.fields[field_], dtype=float)
 
     def si(self, field_: str, documented: float = 1.0) -> Array:
-        """A field in SI, shape (n,).
+        """A field in SI, shape (n,), in single precision where what is stored has no more digits.
 
         Parameters
         ----------
@@ -97,13 +97,18 @@ class Source:
         factor = _SI.get(self.messages.units[field_])
         if factor is None:
             self.findings.undeclared.add(f"{self.name}.{field_}")
-        with np.errstate(over="ignore", invalid="ignore"):  # damaged values
-            values = self.messages.value(field_) * (documented if factor is None else factor)
-        return np.where(np.isfinite(values), values, np.nan)
+        values: Array = self.messages.fields[field_]
+        scale = self.messages.multipliers[field_] * (documented if factor is None else factor)
+        if values.dtype.kind != "f" or scale != 1.0:  # else as it is: a copy would be as large
+            with np.errstate(over="ignore", invalid="ignore"):  # damaged values
+                values = values.astype(np.result_type(values, np.float32))
+                values *= scale
+        sound = np.isfinite(values)
+        return values if sound.all() else np.where(sound, values, np.float32(np.nan))
 
     def time(self, own: str = "", documented: float = 1e-6) -> Array:
-        """Stamps [s], shape (n,): of a sample's own stamp, a counter of 32 bits, where there is one."""
-        time = self.si("TimeUS", 1e-6)
+        """Stamps [s] of messages `in_seconds`, shape (n,): a sample's own, a counter of 32 bits, where there is one."""
+        time: Array = self.messages.fields["TimeUS"]
         if own not in self.messages:
             return time
         stamp = self.si(own, documented)
@@ -126,10 +131,20 @@ class Source:
         return Channel(sensor, columns, f"{self.label}: {fields}", frame, CLOCK)
 
 
+def in_seconds(name: str, messages: Messages, findings: Findings) -> Messages:
+    """Messages whose stamps are made seconds where they are, not copied."""
+    declared = messages.units["TimeUS"] == "s"
+    if not declared:
+        findings.undeclared.add(f"{name}.TimeUS")
+    messages.fields["TimeUS"] *= messages.multipliers["TimeUS"] * (1.0 if declared else 1e-6)
+    return messages
+
+
 def imu(source: Source) -> Channel | None:
     """IMU: specific force and rate, board orientation applied."""
     if "GH" in source and "AH" in source:
-        source = source.where((source.raw("GH") > 0) & (source.raw("AH") > 0), "the autopilot took the IMU for failed")
+        healthy = (source.messages.fields["GH"] > 0) & (source.messages.fields["AH"] > 0)
+        source = source.where(healthy, "the autopilot took the IMU for failed")
     columns = {"time": source.time()}
     for axis in _XYZ:
         columns[f"acc_{axis.lower()}"] = source.si(f"Acc{axis}")
@@ -148,10 +163,11 @@ def magnetometer(source: Source) -> Channel | None:
             if f"{kind}{axis}" in source:
                 offsets[:, column] += source.si(f"{kind}{axis}", 0.1)
     low, high = EARTH_FIELD_UT
-    as_logged, raw = (_median(np.linalg.norm(v, axis=1)) for v in (field_, field_ - offsets))
+    without = field_ - offsets
+    as_logged, raw = (_median(np.linalg.norm(v, axis=1)) for v in (field_, without))
     said = f"{source.label}: magnitude {as_logged:.0f} uT with the autopilot's offsets, {raw:.0f} uT without"
     if not low <= as_logged <= high and low <= raw <= high:
-        field_ = field_ - offsets
+        field_ = without
         source.findings.warnings.append(f"{said}: the offsets are taken off, as no place on Earth has the first")
     elif not low <= as_logged <= high:
         source.findings.warnings.append(f"{said}: no place on Earth has either; calibrate the magnetometer")
@@ -176,7 +192,8 @@ def attitude(source: Source) -> Channel | None:
 
 def barometer(source: Source) -> Channel | None:
     """BARO: depth from pressure."""
-    found, said, good = depth_of(source.instance, source.si("Press"), source.parameters, source.label)
+    pressure = np.asarray(source.si("Press"), dtype=float)
+    found, said, good = depth_of(source.instance, pressure, source.parameters, source.label)
     (source.findings.notes if good else source.findings.warnings).append(said)
     return source.channel("depth", {"time": source.time("SMS", 1e-3), "depth": found}, "Press")
 
