@@ -1,6 +1,7 @@
 """Several recordings of one dive become one log: channels chosen, clocks joined, settings kept, or a clear refusal."""
 
 import json
+import subprocess
 import sys
 import tracemalloc
 import warnings
@@ -255,6 +256,12 @@ def test_settings_hold_where_the_configuration_states_nothing():
     assert used == {"dvl.lever_arm_m": [0.2, 0, 0], "environment.declination_deg": 4.0}
     with pytest.raises(InputError, match=r"^a\.bin: .*mount"):
         completed(config, {"dvl": {"mount": 1}}, "a.bin")
+
+
+def test_the_only_clock_of_a_log_has_no_time_offset_however_little_is_known_of_it(dive):
+    calendar = Clock("calendar", 0.0, 21600.0, "taken for UTC")
+    merged = merge([recording("gauge.log", dive, calendar, {"depth": ("depth",)}, START)], {}, {})
+    assert merged.unix and dict(merged.settings) == {}
 
 
 def test_settings_of_an_instrument_come_with_the_channel_that_feeds_it(dive):
@@ -547,6 +554,31 @@ def boxes(tmp_path_factory) -> list[Path]:
 def test_a_choice_names_a_file_or_what_one_of_several_files_has(boxes, choice):
     converted = rg.convert(boxes[::-1], choose={"imu": choice}, shift={"depth": 0.0})
     assert converted.report["columns"]["acc_x"].startswith("box.BIN: IMU 0")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what a process holds is read from /proc")
+def test_a_log_of_one_message_that_does_not_fit_into_memory_is_refused_and_not_called_damaged(tmp_path):
+    path, out = tmp_path / "long.BIN", tmp_path / "log.csv"
+    one = DataFlashWriter().add("IMU", 0, 0, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8, 1, 1).bytes()
+    head = len(DataFlashWriter().bytes())
+    with path.open("wb") as file:
+        file.write(one + one[head:] * 4_000_000)
+    code = f"""
+import resource, sys
+import rovgraph as rg
+from rovgraph.interchange import formats
+from rovgraph.cli.app import main
+formats()
+held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (held + 60_000_000,) * 2)
+sys.argv[1:] = ["convert", {str(path)!r}, "--out", {str(out)!r}]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    told = " ".join(done.stderr.split())
+    assert done.returncode == 2, told
+    assert "long.BIN: what it holds does not fit into the memory that is free; split it" in told
+    assert [each.name for each in tmp_path.iterdir()] == ["long.BIN"]
 
 
 def test_a_choice_that_no_file_has_is_refused_with_those_of_all(boxes):

@@ -11,7 +11,7 @@ import pandas as pd
 from rovgraph.config.completion import leaves
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.interchange.clocks import JoinedClock, join_clocks
+from rovgraph.interchange.clocks import BASES, JoinedClock, join_clocks
 from rovgraph.interchange.motion import Motion
 from rovgraph.interchange.motion import motion_of as motion_of_log
 from rovgraph.interchange.recording import Channel, Recording
@@ -196,7 +196,7 @@ def _settings(
         each.channel.sensor: next(c for c in clocks if (c.file, c.name) == (each.file, each.channel.clock))
         for each in selected
     }
-    reference = next((stamps[sensor] for sensor in ("imu", "dvl") if sensor in stamps), None)
+    reference = next((stamps[sensor] for sensor in BASES if sensor in stamps), stamps[selected[0].channel.sensor])
     for each in selected:
         clock = stamps[each.channel.sensor]  # how late it is against the reference is all that an estimate knows of
         if each.channel.sensor in OFFSETS and clock is not reference and clock.sd > UNSURE_S:
