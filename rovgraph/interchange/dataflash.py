@@ -190,11 +190,14 @@ def _channels(
                 sources |= {s.label: (kind, s) for s in _sources(kind, messages, parameters, findings)}
         labels = _sea_first(sources, parameters, findings) if sensor == "depth" else list(sources)
         for place, label in enumerate(preferred_first(path, sensor, labels, choose)):
-            kind, source = sources.pop(label)
-            channel = kind.channel(source if place == 0 else source.quietly())
+            channel = _channel(*sources.pop(label), quietly=place > 0)
             if channel is not None and len(channel.columns["time"]):
                 made.append(channel)
     return made
+
+
+def _channel(kind: Kind, source: Source, quietly: bool) -> Channel | None:
+    return kind.channel(source.quietly() if quietly else source)
 
 
 def _sources(
