@@ -147,7 +147,8 @@ def join_clocks(
     stated, beside = _stated(axes, base, selected, recordings, shift)
     joined: list[tuple[_Axis, Line, float, float, str]] = [(base, Line(), 0.0, 0.0, "")]
     pool: list[_Joined] = []
-    if len(axes) > 1:
+    sought = any(axis is not base and id(axis) not in stated for axis in axes)  # by motion
+    if sought:
         pool.append(_known(base.channels(recordings[base.file]), motion_of))
     waiting = [axis for axis in axes if axis is not base]
     while waiting:
@@ -161,7 +162,8 @@ def join_clocks(
             line, sd, drift_sd, how, text = result  # sd: of the clock that is known best
             said += [f"{names[axis.file]}: {text}"] if text else []
             joined.append((axis, line, sd, drift_sd, how))
-            pool.append(_known([_moved(channel, line) for channel in channels], motion_of))
+            if sought:
+                pool.append(_known([_moved(channel, line) for channel in channels], motion_of))
             waiting.remove(axis)
         if len(waiting) == before:
             raise InputError(_not_joined(waiting[0], base, recordings, names))

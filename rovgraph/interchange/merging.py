@@ -18,7 +18,7 @@ from rovgraph.interchange.recording import Channel, Recording
 from rovgraph.interchange.selection import Selected, Unused, file_names, select
 from rovgraph.interchange.stamps import put_in_order
 from rovgraph.log import Log
-from rovgraph.log.rows import STAMP_DIGITS, Part, Rows, frame_of, whole
+from rovgraph.log.rows import STAMP_DIGITS, Part, Rows, frame_of, in_order, whole
 
 OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
 UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
@@ -172,14 +172,10 @@ def _motion(channels: Sequence[Channel]) -> Motion:
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore")  # the log that is made of them is read again
         try:
-            log = Log.from_arrays(*(_tabled(channel) for channel in first.values()))
+            log = Log.from_rows(in_order([channel.columns for channel in first.values()]))
         except InputError:
             return Motion((), None)
     return motion_of_log(log)
-
-
-def _tabled(channel: Channel) -> dict[str, Any]:
-    return {name: np.asarray(values) for name, values in channel.columns.items()}
 
 
 def _settings(
