@@ -2,8 +2,7 @@
 
 import gzip
 import io
-import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -50,7 +49,7 @@ def write_csv(
 
 def write_sparse_csv(
     names: Sequence[str],
-    parts: Sequence[tuple[NDArray[np.int64], Mapping[str, NDArray[np.float64]]]],
+    pieces: Iterable[Sequence[tuple[NDArray[np.int64], Mapping[str, NDArray[np.floating[Any]]]]]],
     path: Path,
     digits: int = 7,
     decimals: Mapping[str, int] | None = None,
@@ -60,21 +59,16 @@ def write_sparse_csv(
     Parameters
     ----------
     names : of the columns
-    parts : which rows of the table, increasing, and what they fill: column -> ndarray, shape (n,); NaN is an empty cell
+    pieces : of the table, one after the other, each in parts: which rows of the piece, and what they fill, column ->
+        ndarray, shape (n,); NaN is an empty cell
     path : of the file, compressed if it ends in ``.gz``
     digits, decimals : of `write_csv`
     """
-    count = sum(len(place) for place, _ in parts)
+    form = {name: f"%.{decimals[name]}f" if decimals and name in decimals else f"%.{digits}g" for name in names}
     with _opened(path) as file:
         file.write(",".join(names) + "\n")
-        for begin in range(0, count, ROWS):
-            lines = np.empty(min(ROWS, count - begin), dtype=object)
-            for place, columns in parts:
-                first, last = np.searchsorted(place, (begin, begin + ROWS))
-                if first < last:
-                    own = {name: values[first:last] for name, values in columns.items()}
-                    lines[place[first:last] - begin] = _lines(names, own, digits, decimals or {})
-            file.write("".join(lines.tolist()))
+        for parts in pieces:
+            file.write(_text(form, [rows for place, columns in parts for rows in _alike(place, columns)]))
 
 
 @contextmanager
@@ -91,24 +85,42 @@ def _opened(path: Path) -> Iterator[TextIO]:
         yield file
 
 
-def _lines(
-    names: Sequence[str], columns: Mapping[str, NDArray[np.float64]], digits: int, decimals: Mapping[str, int]
-) -> list[str]:
-    """Rows that fill the same columns, formatted."""
-    filled = {name: values for name, values in columns.items() if not np.isnan(values).all()}
-    formats = {name: f"%.{decimals[name]}f" if name in decimals else f"%.{digits}g" for name in filled}
-    cells: list[list[object]] = []
-    for name in names:
-        if name not in filled:
-            continue
-        if np.isnan(filled[name]).any():
-            cells.append(["" if value != value else formats[name] % value for value in filled[name].tolist()])
-            formats[name] = "%s"
-        else:
-            cells.append(filled[name].tolist())
-    row = ",".join(formats.get(name, "") for name in names) + "\n"
-    count = len(next(iter(columns.values())))
-    return (row * count % tuple(itertools.chain.from_iterable(zip(*cells, strict=True)))).splitlines(keepends=True)
+def _alike(
+    place: NDArray[np.int64], columns: Mapping[str, NDArray[np.floating[Any]]]
+) -> Iterator[tuple[NDArray[np.int64], Mapping[str, NDArray[np.floating[Any]]]]]:
+    """Rows of a part in sets that fill the same columns, of which no cell is empty."""
+    holey = {name: np.isnan(values) for name, values in columns.items()}
+    holey = {name: empty for name, empty in holey.items() if empty.any()}
+    if not holey:
+        yield place, columns
+        return
+    patterns, which = np.unique(np.column_stack([*holey.values()]), axis=0, return_inverse=True)
+    for k, empty in enumerate(patterns):
+        rows, without = which == k, {name for name, gone in zip(holey, empty, strict=True) if gone}
+        yield place[rows], {name: values[rows] for name, values in columns.items() if name not in without}
+
+
+def _text(
+    form: Mapping[str, str], sets: Sequence[tuple[NDArray[np.int64], Mapping[str, NDArray[np.floating[Any]]]]]
+) -> str:
+    """Rows, formatted all at once.
+
+    Parameters
+    ----------
+    form : column -> how a number is formatted
+    sets : of `_alike`
+    """
+    lines, count = [], sum(len(place) for place, _ in sets)
+    which, width = np.empty(count, np.int64), np.empty(count, np.int64)
+    for k, (place, columns) in enumerate(sets):
+        lines.append(",".join(own if name in columns else "" for name, own in form.items()) + "\n")
+        which[place], width[place] = k, len(columns)
+    first = np.cumsum(width) - width  # of a row's numbers among all
+    numbers = np.empty(int(width.sum()))
+    for place, columns in sets:
+        for k, name in enumerate(name for name in form if name in columns):
+            numbers[first[place] + k] = columns[name]
+    return "".join([lines[k] for k in which.tolist()]) % tuple(numbers.tolist())
 
 
 def _format(column: "pd.Series[Any]", digits: int) -> str | None:

@@ -59,7 +59,7 @@ def test_a_column_may_have_a_fixed_number_of_decimals(name, tmp_path):
 
 
 def sparse(count):
-    """Three sensors' rows in turn at random, some cells of them empty, and the same as a table."""
+    """Three sensors' rows in turn at random, some cells of them empty, in pieces, and the same as a table."""
     rng = np.random.default_rng(2)
     which = rng.integers(3, size=count)
     which[:ROWS] = which[:ROWS] % 2  # one has no rows among the first that are formatted
@@ -73,24 +73,28 @@ def sparse(count):
             frame.loc[place, name] = values
         parts.append((place, {"time": time[place], **own}))
     frame["empty"] = np.nan
-    return parts, frame
+    pieces = []
+    for begin in range(0, count, ROWS):
+        inside = [(place, (begin <= place) & (place < begin + ROWS), own) for place, own in parts]
+        pieces.append([(place[own] - begin, {n: v[own] for n, v in columns.items()}) for place, own, columns in inside])
+    return pieces, frame
 
 
 @pytest.mark.parametrize("count", [1, 7, 3 * ROWS + 5])
 def test_rows_that_fill_few_columns_are_written_as_the_table_with_its_empty_cells(count, tmp_path):
-    parts, frame = sparse(count)
+    pieces, frame = sparse(count)
     frame = frame.reindex(columns=["time", "speed", "acc", "gyr", "empty", "depth"])
     expected = written(frame, tmp_path, digits=10, decimals={"time": 6})
     for name, opened in (("sparse.csv", open), ("sparse.csv.gz", gzip.open)):
-        write_sparse_csv(list(frame), parts, tmp_path / name, 10, {"time": 6})
+        write_sparse_csv(list(frame), pieces, tmp_path / name, 10, {"time": 6})
         with opened(tmp_path / name, "rb") as file:
             assert file.read() == expected
 
 
 def test_a_compressed_table_is_the_same_file_each_time(tmp_path, monkeypatch):
-    parts, frame = sparse(50)
+    pieces, frame = sparse(50)
     for name, now in (("one", 1e9), ("two", 1.1e9)):
         (tmp_path / name).mkdir()
         monkeypatch.setattr("time.time", lambda now=now: now)
-        write_sparse_csv(list(frame), parts, tmp_path / name / "log.csv.gz")
+        write_sparse_csv(list(frame), pieces, tmp_path / name / "log.csv.gz")
     assert (tmp_path / "one/log.csv.gz").read_bytes() == (tmp_path / "two/log.csv.gz").read_bytes()

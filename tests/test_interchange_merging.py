@@ -1,7 +1,9 @@
 """Several recordings of one dive become one log: channels chosen, clocks joined, settings kept, or a clear refusal."""
 
 import json
+import subprocess
 import sys
+import tracemalloc
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from autopilot_files import autopilot_messages, dataflash_of, packed, short_dive, tlog
+from autopilot_files import DataFlashWriter, autopilot_messages, dataflash_of, packed, short_dive, tlog
 from dives import changed, falcon, rms, simulated
 from test_api import command
 
@@ -256,6 +258,12 @@ def test_settings_hold_where_the_configuration_states_nothing():
         completed(config, {"dvl": {"mount": 1}}, "a.bin")
 
 
+def test_the_only_clock_of_a_log_has_no_time_offset_however_little_is_known_of_it(dive):
+    calendar = Clock("calendar", 0.0, 21600.0, "taken for UTC")
+    merged = merge([recording("gauge.log", dive, calendar, {"depth": ("depth",)}, START)], {}, {})
+    assert merged.unix and dict(merged.settings) == {}
+
+
 def test_settings_of_an_instrument_come_with_the_channel_that_feeds_it(dive):
     files = [
         replace(autopilot(dive, imu=IMU, dvl=DVL), settings={"dvl": {"mount_rpy_deg": [0, 0, 1]}, "name": "rov"}),
@@ -378,6 +386,56 @@ def test_a_log_is_written_as_its_name_says(files, tmp_path, name):
     np.testing.assert_allclose(again["dvl"].data, converted.log["dvl"].data, rtol=1e-8)
 
 
+def test_a_large_log_is_converted_in_few_bytes_a_sample_and_shows_how_far_it_is(tmp_path):
+    """NumPy tells tracemalloc of its arrays."""
+    second = DataFlashWriter()
+    for k in range(400):
+        second.add("IMU", 2500 * k, 0, 0.1, 0.2, 0.3, 0.01 * k, 0.0, -9.8, 1, 1)
+        if k % 40 == 0:
+            second.add("ATT", 2500 * k, 0, 0, 0)
+    head = len(DataFlashWriter().bytes())
+    rows, seconds, body = 400, 400, bytearray(second.bytes()[head:])
+    starts = [at for at in range(len(body) - 8) if body[at : at + 2] == b"\xa3\x95"]
+    stamps = np.ndarray(len(body) - 7, "<u8", body, 0, (1,))
+    path = tmp_path / "long.BIN"
+    with path.open("wb") as file:
+        file.write(second.bytes()[:head])
+        for _ in range(seconds):
+            file.write(body)
+            stamps[[at + 3 for at in starts]] += 10**6
+    told = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rg.DataWarning)
+        rg.convert(path).save(tmp_path / "warm.csv")  # whatever is loaded or kept once
+        tracemalloc.start()
+        converted = rg.convert(path)
+        converted.save(tmp_path / "log.csv", tmp_path / "v.yaml", progress=lambda what, done: told.append((what, done)))
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert most < 50 * rows * seconds + 18e6  # a row is 32 bytes in the log; a block of the file and its rows
+    assert {what for what, _ in told} == {"writing log.csv"}
+    assert len(told) > 20 and told[-1][1] == 1.0 and [done for _, done in told] == sorted(done for _, done in told)
+    with (tmp_path / "log.csv").open("rb") as file:
+        assert sum(1 for _ in file) == 1 + (rows + 10) * seconds
+
+
+def test_values_that_are_left_out_are_told_with_the_log_that_lacks_them(tmp_path):
+    """`convert` writes what the files hold; what reads them, and the log that was written, says what it cannot use."""
+    table = "time,depth,fix_north,fix_east,fix_sd\n" + "".join(f"{k},{k},{k},0,{k - 2}\n" for k in range(9))
+    for name in ("one.csv", "two.csv"):
+        (tmp_path / name).write_text(table if name == "one.csv" else "time,dvl_altitude\n1,5\n2,5\n", encoding="utf-8")
+    files = [tmp_path / "one.csv", tmp_path / "two.csv"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        converted = rg.convert(files, shift={"two.csv": 0.0})
+        converted.save(tmp_path / "log.csv")
+    for read in (lambda: converted.log, lambda: rg.read_log(tmp_path / "log.csv")):
+        with pytest.warns(rg.DataWarning, match="fix_sd: 3 times 0 or less"):
+            log = read()
+        assert any("fix_sd: 3 times" in text for text in log.warnings)
+    assert converted.log is converted.log
+
+
 def test_nothing_is_left_where_writing_fails(files, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -496,6 +554,31 @@ def boxes(tmp_path_factory) -> list[Path]:
 def test_a_choice_names_a_file_or_what_one_of_several_files_has(boxes, choice):
     converted = rg.convert(boxes[::-1], choose={"imu": choice}, shift={"depth": 0.0})
     assert converted.report["columns"]["acc_x"].startswith("box.BIN: IMU 0")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what a process holds is read from /proc")
+def test_a_log_of_one_message_that_does_not_fit_into_memory_is_refused_and_not_called_damaged(tmp_path):
+    path, out = tmp_path / "long.BIN", tmp_path / "log.csv"
+    one = DataFlashWriter().add("IMU", 0, 0, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8, 1, 1).bytes()
+    head = len(DataFlashWriter().bytes())
+    with path.open("wb") as file:
+        file.write(one + one[head:] * 4_000_000)
+    code = f"""
+import resource, sys
+import rovgraph as rg
+from rovgraph.interchange import formats
+from rovgraph.cli.app import main
+formats()
+held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (held + 60_000_000,) * 2)
+sys.argv[1:] = ["convert", {str(path)!r}, "--out", {str(out)!r}]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    told = " ".join(done.stderr.split())
+    assert done.returncode == 2, told
+    assert "long.BIN: what it holds does not fit into the memory that is free; split it" in told
+    assert [each.name for each in tmp_path.iterdir()] == ["long.BIN"]
 
 
 def test_a_choice_that_no_file_has_is_refused_with_those_of_all(boxes):

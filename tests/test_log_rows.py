@@ -1,11 +1,12 @@
 """A log of rows that fill few columns each is the log of the table that they make."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import rovgraph as rg
 from rovgraph.errors import InputError
-from rovgraph.log.rows import frame_of, in_order
+from rovgraph.log.rows import Part, frame_of, in_order, pieces, whole
 
 
 def parts():
@@ -51,3 +52,23 @@ def test_rows_without_a_measurement_are_refused_by_the_names_that_they_have():
         rg.Log.from_rows(
             in_order([{"time": np.zeros(1), "depth": np.full(1, np.nan)}, {"time": np.ones(1), "salt": np.ones(1)}])
         )
+
+
+@pytest.mark.parametrize("count", [1, 7, 10_000])
+def test_pieces_follow_each_other_as_the_rows_of_the_whole_log(count):
+    """Stamps of several sensors are equal, too, and one clock drifts."""
+    rng = np.random.default_rng(6)
+    times = [np.sort(rng.integers(0, 500, size)) * 0.01 for size in (300, 40, 1, 90)]
+    clocks = [lambda t: t, lambda t: 5.0 + 1.0001 * t, lambda t: t + 2.0, lambda t: t]
+    parts = [
+        Part({"time": time, name: rng.standard_normal(len(time))}, clock)
+        for time, clock, name in zip(times, clocks, ("depth", "dvl_altitude", "fix_sd", "depth"), strict=True)
+    ]
+    expected, done = frame_of(whole(parts)), 0
+    for rows in pieces(parts, count):
+        piece = frame_of(rows).reindex(columns=expected.columns)
+        here = expected.iloc[done : done + len(piece)].reset_index(drop=True)
+        pd.testing.assert_frame_equal(piece, here)
+        done += len(piece)
+        assert done == len(expected) or here["time"].iloc[-1] < expected["time"].iloc[done]
+    assert done == len(expected) == 431

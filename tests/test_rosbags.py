@@ -195,7 +195,8 @@ def test_a_velocity_of_no_dvl_is_one_only_if_it_is_chosen(tmp_path):
     path = bag(tmp_path, imus(), [twist(0.1 * k, "/velocity") for k in range(5)])
     recording = read_recording(path)
     assert not any(channel.sensor == "dvl" for channel in recording.channels)
-    assert any(w.startswith("no DVL in the bag; other topics: /velocity") for w in recording.warnings)
+    (told,) = [w for w in recording.warnings if w.startswith("no DVL in the bag; its topics: ")]
+    assert "/imu/data (sensor_msgs/msg/Imu), /velocity (geometry_msgs/msg/TwistWithCovarianceStamped)" in told
     chosen = read_recording(path, Options(choose={"dvl": "/velocity"}))
     close(first(chosen, "dvl").columns["dvl_sd"], 0.01)
     assert chosen.settings["dvl"]["mount_rpy_deg"] == [180.0, 0.0, 0.0]

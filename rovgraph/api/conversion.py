@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -34,15 +35,42 @@ class Conversion:
     Attributes
     ----------
     merged : columns, sources, clocks and what was ignored
-    log : ready for an estimate
-    config : the given one, completed by settings of the files, for the log that `save` writes: without columns, units
+    completed : the given configuration, completed by settings of the files
     used : dotted key -> value of the settings that come from the files
     """
 
     merged: Merged
-    log: Log
-    config: Config
+    completed: Config
     used: Mapping[str, Any]
+
+    @property
+    def config(self) -> Config:
+        """For the log that `save` writes: completed, without columns and units."""
+        return self.completed.model_copy(update={"columns": {}, "units": {}})
+
+    @cached_property
+    def log(self) -> Log:
+        """Ready for an estimate; made when it is asked for, since it takes as much memory again.
+
+        Raises
+        ------
+        InputError : no measurement that can be used
+
+        Warns
+        -----
+        DataWarning : values that are left out or look wrong
+        """
+        merged, source = self.merged, " + ".join(self.merged.names)
+        with collected_warnings() as texts:
+            beams = usable_beams(merged.tables[BEAMS], f"beams of {source}") if BEAMS in merged.tables else None
+        log = Log.from_rows(merged.rows, self.config, source).with_beams(beams)
+        return replace(
+            log,
+            config=self.completed,
+            warnings=(*merged.warnings, *texts, *log.warnings),
+            settings=merged.nested_settings(),
+            notes=(*notes(merged), *_settings_told(merged, self.used)),
+        )
 
     @property
     def notes(self) -> list[str]:
@@ -55,7 +83,13 @@ class Conversion:
         """Where each part comes from, for JSON: files, columns, clocks, settings, warnings."""
         return account(self.merged)
 
-    def save(self, path: Path | str, config_out: Path | str | None = None, force: bool = False) -> list[Path]:
+    def save(
+        self,
+        path: Path | str,
+        config_out: Path | str | None = None,
+        force: bool = False,
+        progress: Progress = no_progress,
+    ) -> list[Path]:
         """Write the log, its report and other tables beside it, and a configuration to begin with; all or nothing.
 
         Parameters
@@ -63,6 +97,7 @@ class Conversion:
         path : CSV, gzipped CSV (``.csv.gz``) or Parquet (``.parquet``)
         config_out : YAML; None = none
         force : replace older files
+        progress : called at times with the current task and its progress from 0 to 1
 
         Returns
         -------
@@ -72,7 +107,7 @@ class Conversion:
         ------
         InputError : a file exists, or cannot be written
         """
-        from rovgraph.report.conversion import check_suffix, starter, write_rows, write_table
+        from rovgraph.report.conversion import check_suffix, starter, write_parts, write_table
         from rovgraph.report.folder import results_files
 
         path = Path(path)
@@ -84,13 +119,15 @@ class Conversion:
         if clash := next((p for p in paths if p.resolve() in inputs), None):
             raise InputError(f"{clash} is one of the files that are read; choose another --out")
         with results_files(paths, force) as temporary:
-            write_rows(self.merged.rows, temporary[0])
+            write_parts(self.merged.parts, temporary[0], progress)
             temporary[1].write_text(json.dumps(self.report, indent=2, default=str) + "\n", encoding="utf-8")
             for place, table in zip(temporary[2:], tables.values(), strict=False):
                 write_table(table, place)
             if config_path is not None:
                 sources = {key: self.merged.settings[key][1] for key in self.used}
-                temporary[-1].write_text(starter(self.config, self.log, sources, path.name), encoding="utf-8")
+                counts = {s.channel.sensor: len(s.channel.columns["time"]) for s in self.merged.selected}
+                text = starter(self.config, counts, self.merged.first_fix, sources, path.name)
+                temporary[-1].write_text(text, encoding="utf-8")
         return paths
 
 
@@ -117,7 +154,7 @@ def convert(
 
     Warns
     -----
-    DataWarning : what was ignored, sorted, or looks wrong
+    DataWarning : stamps that were left out or sorted, and what readers warn of; of values, `Conversion.log` warns
     """
     config = config_or_defaults(config)
     _require_mappings(choose, shift)
@@ -141,19 +178,7 @@ def convert(
     for text in merged.warnings:
         warn(text)
     source = " + ".join(merged.names)
-    full, used = completed(config, merged.nested_settings(), f"settings in {source}")
-    bare = full.model_copy(update={"columns": {}, "units": {}})
-    with collected_warnings() as texts:
-        beams = usable_beams(merged.tables[BEAMS], f"beams of {source}") if BEAMS in merged.tables else None
-    log = Log.from_rows(merged.rows, bare, source).with_beams(beams)
-    log = replace(
-        log,
-        config=full,
-        warnings=(*merged.warnings, *texts, *log.warnings),
-        settings=merged.nested_settings(),
-        notes=(*notes(merged), *_settings_told(merged, used)),
-    )
-    return Conversion(merged, log, bare, used)
+    return Conversion(merged, *completed(config, merged.nested_settings(), f"settings in {source}"))
 
 
 def _require_mappings(choose: Mapping[str, str], shift: Mapping[str, float]) -> None:

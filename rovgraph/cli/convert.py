@@ -32,7 +32,7 @@ def convert(
     settings = None if config is None else rg.load_config(config)
     with progress_bar() as progress:
         result = rg.convert(files, settings, pairs("choose", choose), seconds("shift", shift), progress)
-    written = result.save(out, config_out, force)
+        written = result.save(out, config_out, force, progress)
     shown = console(WIDE)
     for table in conversion_tables(result.report):
         shown.print(table)

@@ -76,13 +76,14 @@ def timing(channel: Channel) -> dict[str, Any]:
     """Count, rate and largest gap of a channel, by its own clock."""
     time = channel.columns["time"]
     periods = np.diff(time)
-    usual = float(np.median(periods)) if len(periods) else 0.0
+    gap = float(periods.max()) if len(periods) else None
+    usual = float(np.median(periods, overwrite_input=True)) if len(periods) else 0.0
     return {
         "count": len(time),
         "rate_hz": 1.0 / usual if usual > 0.0 else None,
         "first_s": float(time[0]),
         "last_s": float(time[-1]),
-        "gap_s": float(periods.max()) if len(periods) else None,
+        "gap_s": gap,
     }
 
 

@@ -40,7 +40,8 @@ class Line:
     at: float = 0.0
 
     def __call__(self, time: Array) -> Array:
-        return np.asarray(time + self.offset + self.drift * (time - self.at))
+        moved = time + self.offset
+        return moved + self.drift * (time - self.at) if self.drift else moved
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,8 @@ def join_clocks(
     stated, beside = _stated(axes, base, selected, recordings, shift)
     joined: list[tuple[_Axis, Line, float, float, str]] = [(base, Line(), 0.0, 0.0, "")]
     pool: list[_Joined] = []
-    if len(axes) > 1:
+    sought = any(axis is not base and id(axis) not in stated for axis in axes)  # by motion
+    if sought:
         pool.append(_known(base.channels(recordings[base.file]), motion_of))
     waiting = [axis for axis in axes if axis is not base]
     while waiting:
@@ -160,7 +162,8 @@ def join_clocks(
             line, sd, drift_sd, how, text = result  # sd: of the clock that is known best
             said += [f"{names[axis.file]}: {text}"] if text else []
             joined.append((axis, line, sd, drift_sd, how))
-            pool.append(_known([_moved(channel, line) for channel in channels], motion_of))
+            if sought:
+                pool.append(_known([_moved(channel, line) for channel in channels], motion_of))
             waiting.remove(axis)
         if len(waiting) == before:
             raise InputError(_not_joined(waiting[0], base, recordings, names))
@@ -181,19 +184,17 @@ def _axes(file: int, recording: Recording) -> tuple[list[_Axis], list[str]]:
     known: dict[str, Line] = {}
     sources: dict[str, tuple[str, float]] = {}
     said = []
-    stamps = {name: _stamps(recording, name) for name in recording.clocks}
+    typical = {name: _typical_stamp(recording, name) for name in recording.clocks}
     for name, clock in recording.clocks.items():
         if clock.unix_offset is None:
             continue
-        if len(stamps[name]) and np.median(stamps[name]) + clock.unix_offset < SINCE_2000:
-            said.append(
-                f"clock {name} reads {_date(float(np.median(stamps[name])) + clock.unix_offset)}: it was not set"
-            )
+        if typical[name] + clock.unix_offset < SINCE_2000:
+            said.append(f"clock {name} reads {_date(typical[name] + clock.unix_offset)}: it was not set")
             continue
         known[name] = Line(clock.unix_offset)
         sources[name] = clock.source or "Unix time", clock.offset_sd
     axes: list[_Axis] = []
-    alone = [name for name in stamps if name not in known]
+    alone = [name for name in recording.clocks if name not in known]
     for name in list(alone):
         channel = next((c for c in recording.channels if c.clock == name and c.received is not None), None)
         if channel is not None and channel.receiver in known:
@@ -317,11 +318,13 @@ def _not_joined(axis: _Axis, base: _Axis, recordings: Sequence[Recording], names
     )
 
 
-def _stamps(recording: Recording, clock: str) -> Array:
+def _typical_stamp(recording: Recording, clock: str) -> float:
+    """Median of a clock's stamps, of a thousand of each channel; NaN where it stamps nothing."""
     own = [channel.columns["time"] for channel in recording.channels if channel.clock == clock]
     own += [c.received for c in recording.channels if c.receiver == clock and c.received is not None]
-    stamps = np.concatenate(own) if own else np.empty(0)
-    return np.asarray(stamps[np.isfinite(stamps)])
+    stamps = np.concatenate([np.empty(0), *(times[:: max(len(times) // 1000, 1)] for times in own)])
+    stamps = stamps[np.isfinite(stamps)]
+    return float(np.median(stamps)) if len(stamps) else np.nan
 
 
 def _span(channels: Sequence[Channel]) -> tuple[float, float]:

@@ -77,7 +77,7 @@ class DataFlash:
         contents = read_messages(path, _WANTED, {"IMU": _imu_instance(options.choose)}, options.progress)
         findings = Findings()
         _count_other_imus(path, contents, findings)
-        messages = _one_boot(contents.messages, findings)
+        messages = _one_boot(contents, findings)
         parameters = _parameters(messages.pop("PARM", None), findings)
         clock = _clock(messages)
         firmware = _firmware(messages.pop("MSG", None))
@@ -124,21 +124,31 @@ def _count_other_imus(path: Path, contents: Contents, findings: Findings) -> Non
         findings.left["IMU", f"of another instance; choose one of: {known}"] = others
 
 
-def _one_boot(messages: dict[str, Messages], findings: Findings) -> dict[str, Messages]:
-    """The longest part of the log in which time goes on, by the messages that are most frequent."""
-    timed = [m for m in messages.values() if "TimeUS" in m]
+def _one_boot(contents: Contents, findings: Findings) -> dict[str, Messages]:
+    """The longest part of the log in which time goes on, by the messages that are most frequent.
+
+    Places are forgotten, which nothing else needs.
+    """
+    messages, places = contents.messages, dict(contents.places)
+    contents.places.clear()
+    timed = [name for name, m in messages.items() if "TimeUS" in m]
     if not timed:
         return messages
-    densest = max(timed, key=len)
-    order = np.argsort(densest.place, kind="stable")
-    time = densest.value("TimeUS")[order] * (1.0 if densest.units["TimeUS"] else 1e-6)
-    first, end, resets = longest_boot(densest.place[order], time)
+    densest = max(timed, key=lambda name: len(messages[name]))
+    place, time = places[densest], messages[densest].fields["TimeUS"]
+    if (place[1:] < place[:-1]).any():  # several types of messages of that name
+        order = np.argsort(place, kind="stable")
+        place, time = place[order], time[order]
+    if (time[1:] >= time[:-1]).all():
+        return messages
+    scale = messages[densest].multipliers["TimeUS"] if messages[densest].units["TimeUS"] else 1e-6
+    first, end, resets = longest_boot(place, time * scale)
     if not resets:
         return messages
     findings.warnings.append(f"the autopilot restarted {resets} times in the log; the longest run is read")
     kept = {"PARM": messages["PARM"]} if "PARM" in messages else {}
     for name, m in messages.items():
-        within = np.logical_and(m.place >= first, m.place < end)
+        within = np.logical_and(places[name] >= first, places[name] < end)
         if name not in kept and within.any():
             kept[name] = m.take(within)
     return kept
@@ -180,11 +190,14 @@ def _channels(
                 sources |= {s.label: (kind, s) for s in _sources(kind, messages, parameters, findings)}
         labels = _sea_first(sources, parameters, findings) if sensor == "depth" else list(sources)
         for place, label in enumerate(preferred_first(path, sensor, labels, choose)):
-            kind, source = sources.pop(label)
-            channel = kind.channel(source if place == 0 else source.quietly())
+            channel = _channel(*sources.pop(label), quietly=place > 0)
             if channel is not None and len(channel.columns["time"]):
                 made.append(channel)
     return made
+
+
+def _channel(kind: Kind, source: Source, quietly: bool) -> Channel | None:
+    return kind.channel(source.quietly() if quietly else source)
 
 
 def _sources(
@@ -198,13 +211,15 @@ def _sources(
         if lacking := [f for f in ("TimeUS", *kind.required) if f not in all_]:
             findings.left[name, f"its format has no field {', '.join(lacking)}"] = len(all_)
             continue
+        all_ = channels.in_seconds(name, all_, findings)
         field = next((f for f in INSTANCE if f in all_), None)
         if field is None:
             found.append(Source(name, all_, parameters, findings, name, number))
             continue
         numbers = all_.fields[field]
         for instance in np.unique(numbers).tolist():
-            part = all_.take(np.equal(numbers, instance))
+            own = np.equal(numbers, instance)
+            part = all_ if own.all() else all_.take(own)
             found.append(Source(name, part, parameters, findings, f"{name} {instance}", instance))
     return found
 

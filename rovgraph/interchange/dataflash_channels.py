@@ -88,7 +88,7 @@ class Source:
         return np.asarray(self.messages.fields[field_], dtype=float)
 
     def si(self, field_: str, documented: float = 1.0) -> Array:
-        """A field in SI, shape (n,).
+        """A field in SI, shape (n,), in single precision where what is stored has no more digits.
 
         Parameters
         ----------
@@ -97,19 +97,29 @@ class Source:
         factor = _SI.get(self.messages.units[field_])
         if factor is None:
             self.findings.undeclared.add(f"{self.name}.{field_}")
-        with np.errstate(over="ignore", invalid="ignore"):  # damaged values
-            values = self.messages.value(field_) * (documented if factor is None else factor)
-        return np.where(np.isfinite(values), values, np.nan)
+        values: Array = self.messages.fields[field_]
+        scale = self.messages.multipliers[field_] * (documented if factor is None else factor)
+        if values.dtype.kind != "f" or scale != 1.0:  # else as it is: a copy would be as large
+            with np.errstate(over="ignore", invalid="ignore"):  # damaged values
+                values = values.astype(np.result_type(values, np.float32))
+                values *= scale
+        sound = np.isfinite(values)
+        return values if sound.all() else np.where(sound, values, np.float32(np.nan))
 
     def time(self, own: str = "", documented: float = 1e-6) -> Array:
-        """Stamps [s], shape (n,): of a sample's own stamp, a counter of 32 bits, where there is one."""
-        time = self.si("TimeUS", 1e-6)
+        """Stamps [s] of messages `in_seconds`, shape (n,): a sample's own, a counter of 32 bits, where there is one."""
+        time: Array = self.messages.fields["TimeUS"]
         if own not in self.messages:
             return time
         stamp = self.si(own, documented)
-        tick = float(np.median(stamp / np.maximum(self.raw(own), 1.0)))
-        late = np.mod(time - stamp, 2.0**32 * tick) if tick > 0.0 else np.full(len(time), np.inf)
-        return time - np.where(late < LATE_S, late, 0.0)
+        some = slice(None, None, max(len(stamp) // 10_000, 1))
+        tick = float(np.median(stamp[some] / np.maximum(self.messages.fields[own][some], 1.0)))
+        if not tick > 0.0:
+            return time
+        late = time - stamp
+        np.mod(late, 2.0**32 * tick, out=late)
+        late[~(late < LATE_S)] = 0.0
+        return time - late
 
     def where(self, keep: NDArray[np.bool_], why: str) -> "Source":
         """Some of them; the others are counted."""
@@ -126,10 +136,20 @@ class Source:
         return Channel(sensor, columns, f"{self.label}: {fields}", frame, CLOCK)
 
 
+def in_seconds(name: str, messages: Messages, findings: Findings) -> Messages:
+    """Messages whose stamps are made seconds where they are, not copied."""
+    declared = messages.units["TimeUS"] == "s"
+    if not declared:
+        findings.undeclared.add(f"{name}.TimeUS")
+    messages.fields["TimeUS"] *= messages.multipliers["TimeUS"] * (1.0 if declared else 1e-6)
+    return messages
+
+
 def imu(source: Source) -> Channel | None:
     """IMU: specific force and rate, board orientation applied."""
     if "GH" in source and "AH" in source:
-        source = source.where((source.raw("GH") > 0) & (source.raw("AH") > 0), "the autopilot took the IMU for failed")
+        healthy = (source.messages.fields["GH"] > 0) & (source.messages.fields["AH"] > 0)
+        source = source.where(healthy, "the autopilot took the IMU for failed")
     columns = {"time": source.time()}
     for axis in _XYZ:
         columns[f"acc_{axis.lower()}"] = source.si(f"Acc{axis}")
@@ -141,26 +161,26 @@ def magnetometer(source: Source) -> Channel | None:
     """MAG: the field with the autopilot's offsets, or without them where these cannot be right."""
     if "Health" in source:
         source = source.where(source.raw("Health") > 0, "the autopilot took the compass for failed")
-    field_ = np.column_stack([source.si(f"Mag{axis}", 0.1) for axis in _XYZ])
-    offsets = np.zeros_like(field_)
-    for kind in ("Ofs", "MO"):
-        for column, axis in enumerate(_XYZ):
-            if f"{kind}{axis}" in source:
-                offsets[:, column] += source.si(f"{kind}{axis}", 0.1)
+    field_ = [source.si(f"Mag{axis}", 0.1) for axis in _XYZ]
+    kinds = [kind for kind in ("Ofs", "MO") if all(f"{kind}{axis}" in source for axis in _XYZ)]
+    offsets = [sum((source.si(f"{kind}{axis}", 0.1) for kind in kinds), np.zeros(1, np.float32)) for axis in _XYZ]
     low, high = EARTH_FIELD_UT
-    as_logged, raw = (_median(np.linalg.norm(v, axis=1)) for v in (field_, field_ - offsets))
+    as_logged = _magnitude(field_)
+    raw = _magnitude([values - offset for values, offset in zip(field_, offsets, strict=True)])
     said = f"{source.label}: magnitude {as_logged:.0f} uT with the autopilot's offsets, {raw:.0f} uT without"
     if not low <= as_logged <= high and low <= raw <= high:
-        field_ = field_ - offsets
+        field_ = [values - offset for values, offset in zip(field_, offsets, strict=True)]
         source.findings.warnings.append(f"{said}: the offsets are taken off, as no place on Earth has the first")
     elif not low <= as_logged <= high:
         source.findings.warnings.append(f"{said}: no place on Earth has either; calibrate the magnetometer")
-    columns = {"time": source.time("S"), **{f"mag_{axis.lower()}": field_[:, k] for k, axis in enumerate(_XYZ)}}
+    columns = {"time": source.time("S"), **{f"mag_{axis.lower()}": field_[k] for k, axis in enumerate(_XYZ)}}
     return source.channel("mag", columns, "MagX, MagY, MagZ", BODY)
 
 
-def _median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else 0.0
+def _magnitude(field_: list[Array]) -> float:
+    """Median of some thousands of vectors."""
+    some = np.column_stack([values[:: max(len(values) // 10_000, 1)] for values in field_])
+    return float(np.median(np.linalg.norm(some, axis=1))) if len(some) else 0.0
 
 
 def attitude(source: Source) -> Channel | None:
@@ -176,7 +196,8 @@ def attitude(source: Source) -> Channel | None:
 
 def barometer(source: Source) -> Channel | None:
     """BARO: depth from pressure."""
-    found, said, good = depth_of(source.instance, source.si("Press"), source.parameters, source.label)
+    pressure = np.asarray(source.si("Press"), dtype=float)
+    found, said, good = depth_of(source.instance, pressure, source.parameters, source.label)
     (source.findings.notes if good else source.findings.warnings).append(said)
     return source.channel("depth", {"time": source.time("SMS", 1e-3), "depth": found}, "Press")
 

@@ -4,7 +4,7 @@ A log is a row of messages: 0xA3 0x95, a type, and as many bytes as the type's f
 themselves (FMT); units and multipliers of their fields too (UNIT, MULT, FMTU). There are no checksums. Source:
 https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html and libraries/AP_Logger of ArduPilot.
 
-Only the headers are walked in Python; the rows of the messages that are wanted are copied out by NumPy.
+Headers are found by NumPy in all bytes of a block; Python walks only from one gap between messages to the next.
 """
 
 import struct
@@ -22,7 +22,6 @@ from rovgraph.geometry import Array
 
 HEAD = b"\xa3\x95"
 FMT = 128  # type of the message that defines all others, itself too
-ENDINGS = (HEAD, HEAD[:1], b"")  # what may follow a message: the next one, or the end of the file
 INSTANCE = ("I", "Instance")  # fields that say which of several sensors it is
 BLOCK = 1 << 22  # bytes walked at a time
 _PLACE = " place"  # no field has a blank in its name
@@ -79,19 +78,17 @@ class Messages:
 
     Attributes
     ----------
-    fields : field -> ndarray, shape (n,), as stored: without multipliers
-    place : ndarray of int, shape (n,), byte of the file where each begins
+    fields : field -> ndarray, shape (n,), as stored: without multipliers; integers of 64 bits as floats
     units : field -> its unit's label, such as "m/s/s"; "" where the file does not say
     multipliers : field -> factor that makes that unit of what is stored
     """
 
     fields: dict[str, NDArray[Any]]
-    place: NDArray[np.int64]
     units: dict[str, str] = field(default_factory=dict)
     multipliers: dict[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.place)
+        return len(next(iter(self.fields.values())))
 
     def __contains__(self, name: str) -> bool:
         return name in self.fields
@@ -102,7 +99,7 @@ class Messages:
 
     def take(self, index: NDArray[Any]) -> "Messages":
         """Some of them, by a mask."""
-        return Messages({k: v[index] for k, v in self.fields.items()}, self.place[index], self.units, self.multipliers)
+        return Messages({k: v[index] for k, v in self.fields.items()}, self.units, self.multipliers)
 
 
 @dataclass(frozen=True)
@@ -112,6 +109,7 @@ class Contents:
     Attributes
     ----------
     messages : name -> Messages, those that were wanted and are there
+    places : name -> ndarray of int, shape (n,), bytes of the file where they begin
     counts : name -> how many there are, of all
     instances : name -> instances that there are, of those of which one was wanted
     damaged : stretches of bytes that are no message
@@ -119,6 +117,7 @@ class Contents:
     """
 
     messages: dict[str, Messages]
+    places: dict[str, NDArray[np.integer[Any]]]
     counts: Counter[str]
     instances: Mapping[str, set[int]]
     damaged: int
@@ -140,8 +139,8 @@ def read_messages(
     only : name of a message -> the one instance that is wanted, None = the first; without it all are
     progress : called with the bytes read and those of the file
     """
-    walk = _Walk({**wanted, **_DEFINING}, only)
     total, rest, start = path.stat().st_size, b"", 0
+    walk = _Walk({**wanted, **_DEFINING}, only, np.dtype(np.uint32 if total < 2**32 else np.int64))
     with path.open("rb") as file:
         while block := file.read(BLOCK):
             data = rest + block
@@ -152,47 +151,61 @@ def read_messages(
     return walk.contents()
 
 
-class _Growing:
-    """Rows that come in blocks, in one piece of memory that grows where it is: a copy would be as large as they are."""
-
-    def __init__(self, dtype: np.dtype[Any]) -> None:
-        self._held = np.zeros(0, dtype)
-        self._count = 0
-
-    def more(self, count: int) -> NDArray[Any]:
-        """So many new rows, to be filled before more are asked for."""
-        first, self._count = self._count, self._count + count
-        if self._count > len(self._held):
-            self._held.resize(max(self._count, len(self._held) * 4 // 3), refcheck=False)
-        return self._held[first : self._count]
-
-    def whole(self) -> NDArray[Any]:
-        """All rows."""
-        self._held.resize(self._count, refcheck=False)
-        return self._held
-
-
-class _Walk:
-    """Goes from header to header, and keeps the rows that are wanted.
+class _Heads:
+    """Where messages may begin in a block of bytes.
 
     Attributes
     ----------
-    lengths : of the messages of each type; 0 = no format known
-    places : of those of each type, within the block
+    at : ndarray of int, shape (n,), of the bytes of a header
+    kind : ndarray of uint8, shape (n,), the type that follows each
+    after : ndarray of int, shape (n,), where the next message begins; a length of 0 is not known
+    sound : ndarray of bool, shape (n,), whether one begins there, or the file ends
     """
 
-    def __init__(self, wanted: Mapping[str, Collection[str]], only: Mapping[str, int | None]) -> None:
+    def __init__(self, data: bytes, lengths: NDArray[np.int64], last: bool) -> None:
+        raw = np.frombuffer(data, np.uint8)
+        end = len(raw)
+        begins = np.zeros(end + 2, bool)
+        begins[: max(end - 1, 0)] = (raw[:-1] == HEAD[0]) & (raw[1:] == HEAD[1])
+        self.at = np.flatnonzero(begins[: max(end - 2, 0)])
+        self.kind = raw[self.at + 2]
+        self.after = self.at + lengths[self.kind]
+        if last and end:
+            begins[end - 1] = raw[-1] == HEAD[0]
+            begins[end] = True
+        self.sound = (self.after > self.at) & begins[np.minimum(self.after, end + 1)]
+        self.end = end
+        followed = self.sound.copy()  # by the next head, without a gap
+        followed[:-1] &= self.at[1:] == self.after[:-1]
+        followed[-1:] = False
+        self._last = np.flatnonzero(~followed)  # of each stretch
+
+    def from_place(self, place: int) -> int:
+        """Index of the first head there or behind it."""
+        return int(np.searchsorted(self.at, place))
+
+    def stretch(self, index: int) -> int:
+        """Index of the last of the messages that follow each other from this one on; it may not be sound itself."""
+        return int(self._last[np.searchsorted(self._last, index)])
+
+
+class _Walk:
+    """Goes from message to message, and keeps the fields that are wanted."""
+
+    def __init__(
+        self, wanted: Mapping[str, Collection[str]], only: Mapping[str, int | None], place: np.dtype[Any]
+    ) -> None:
         self._wanted = wanted
         self._only = dict(only)
+        self._place = place
         self._instances: dict[str, set[int]] = {}
         self._formats: dict[int, MessageFormat] = {}
-        self._rows: dict[str, _Growing] = {}
+        self._columns: dict[str, dict[str, NDArray[Any]]] = {}
         self._counts: Counter[str] = Counter()
         self._damaged = self._damaged_bytes = 0
         self._sane = True
-        self._lengths = [0] * 256
+        self._lengths = np.zeros(256, np.int64)
         self._lengths[FMT] = len(HEAD) + 1 + _FMT.size
-        self._places: list[list[int]] = [[] for _ in range(256)]
 
     def walk(self, data: bytes, start: int, last: bool = False) -> int:
         """Walk the messages that are whole; returns how many bytes they are.
@@ -200,42 +213,44 @@ class _Walk:
         A message counts if the next one begins where it ends: one that lost bytes, or that only looks like one, does
         not.
         """
-        lengths, places = self._lengths, self._places
-        at, end = 0, len(data)
-        while at + 3 <= end:
-            kind = data[at + 2]
-            length = lengths[kind]
-            after = at + length
-            if after + 2 > end and length and not last:
-                break
-            if after > end and data[at : at + 2] == HEAD:
-                break  # cut off by the end of the file
-            if not length or data[at] != 0xA3 or data[at + 1] != 0x95 or data[after : after + 2] not in ENDINGS:
-                at = self._resume(data, at)
+        heads = _Heads(data, self._lengths, last)
+        defining = heads.at[(heads.kind == FMT) & heads.sound].tolist()
+        if any([self._define(data, at) for at in defining]):
+            heads = _Heads(data, self._lengths, last)
+        place, taken = 0, np.zeros(len(heads.at), bool)
+        while place + 3 <= heads.end:
+            index = heads.from_place(place)
+            if index == len(heads.at) or heads.at[index] != place:
+                place = self._skip(heads, index, place)
                 continue
-            if kind == FMT:
-                self._define(data, at)
-            places[kind].append(at)
-            self._sane = True
-            at = after
-        self._collect(data, start)
-        return at
+            final = heads.stretch(index)
+            taken[index:final] = True
+            self._sane |= final > index
+            place, after = int(heads.at[final]), int(heads.after[final])
+            if after > heads.end or (after > place and after + 2 > heads.end and not last):
+                break  # goes on in the next block, or is cut off by the end of the file
+            if heads.sound[final]:
+                taken[final] = self._sane = True
+                place = after
+            else:
+                place = self._skip(heads, final + 1, place)
+        self._collect(data, heads.at[taken], heads.kind[taken], start)
+        return place
 
-    def _resume(self, data: bytes, at: int) -> int:
-        """The next place where a message may begin; what is skipped counts as damaged."""
-        found = data.find(HEAD, at + 1)
-        after = found if found >= 0 else max(at + 1, len(data) - len(HEAD))  # a header may be cut in two
+    def _skip(self, heads: _Heads, index: int, place: int) -> int:
+        """The next place where a message may begin, that of a head; what is skipped counts as damaged."""
+        found = int(heads.at[index]) if index < len(heads.at) else max(place + 1, heads.end - len(HEAD))
         self._damaged += self._sane
         self._sane = False
-        self._damaged_bytes += after - at
-        return after
+        self._damaged_bytes += found - place
+        return found
 
-    def _define(self, data: bytes, at: int) -> None:
-        """Take a format; one whose fields do not fill its length keeps the length alone."""
+    def _define(self, data: bytes, at: int) -> bool:
+        """Take a format that is new; one whose fields do not fill its length keeps the length alone."""
         kind, length, *texts = _FMT.unpack_from(data, at + 3)
         name, characters, columns = (text.split(b"\0")[0].decode("ascii", "replace") for text in texts)
         if self._lengths[kind] or length < 3:  # repeated, or damaged
-            return
+            return False
         names = columns.split(",")
         whole = len(names) == len(characters) == len(set(names)) and all(c in _CHARACTERS for c in characters)
         packed = [(n, "<" + _CHARACTERS[c][0]) for n, c in zip(names, characters, strict=True)] if whole else []
@@ -245,28 +260,32 @@ class _Walk:
         multipliers = {n: _CHARACTERS[c][1] for (n, _), c in zip(packed, characters, strict=False)}
         self._formats[kind] = MessageFormat(name, length, dtype, multipliers)
         self._lengths[kind] = length
+        return True
 
-    def _collect(self, data: bytes, start: int) -> None:
-        """Copy the rows that are wanted out of the block, and forget their places."""
-        raw = np.frombuffer(data, dtype=np.uint8)
-        for kind, places in enumerate(self._places):
-            if not places:
+    def _collect(self, data: bytes, at: NDArray[np.int64], kinds: NDArray[np.uint8], start: int) -> None:
+        """Copy the fields that are wanted out of the block."""
+        for kind, count in enumerate(np.bincount(kinds, minlength=256).tolist()):
+            if not count:
                 continue
             form = self._formats.get(kind)
-            self._counts["FMT" if form is None else form.name] += len(places)
-            if form is not None and (names := self._fields(form)):
-                index = np.array(places)
-                rows = raw[index[:, None] + np.arange(3, form.length)].view(form.dtype)[:, 0]
-                if form.name in self._only and (numbers := instances(rows)) is not None:
-                    chosen = self._choose(form.name, numbers)
-                    rows, index = rows[chosen], index[chosen]
-                if form.name not in self._rows:
-                    self._rows[form.name] = _Growing(np.dtype([(_PLACE, "i8"), *((n, form.dtype[n]) for n in names)]))
-                kept = self._rows[form.name].more(len(rows))
-                kept[_PLACE] = index + start
-                for name in names:
-                    kept[name] = rows[name]
-            places.clear()
+            self._counts["FMT" if form is None else form.name] += count
+            if form is None or not (names := self._fields(form)):
+                continue
+            index, size = at[kinds == kind], form.dtype.itemsize
+            every = np.ndarray(len(data) - size + 1, f"V{size}", data, 0, (1,))  # what begins at each byte
+            rows = every[index + 3].view(form.dtype)
+            if form.name in self._only and (numbers := instances(rows)) is not None:
+                chosen = self._choose(form.name, numbers)
+                rows, index = rows[chosen], index[chosen]
+            columns = self._columns.setdefault(form.name, {})
+            if not columns:
+                columns |= {_PLACE: np.empty(0, self._place)} | {n: np.empty(0, _held(form.dtype[n])) for n in names}
+            if not columns.keys() - {_PLACE} <= set(names):  # another type of that name, with other fields
+                continue
+            for name, column in columns.items():
+                before = len(column)
+                column.resize(before + len(rows), refcheck=False)  # where it is: a copy would be as large as it
+                column[before:] = index + start if name == _PLACE else rows[name]
 
     def _choose(self, name: str, numbers: NDArray[Any]) -> NDArray[np.bool_]:
         """Which rows are of the instance that is wanted."""
@@ -280,13 +299,10 @@ class _Walk:
 
     def contents(self) -> Contents:
         """All that was walked."""
-        found = {}
-        for name, growing in self._rows.items():
-            rows = growing.whole()
-            fields = {n: rows[n] for n in rows.dtype.names or () if n != _PLACE}
-            found[name] = Messages(fields, rows[_PLACE])
+        places = {name: columns.pop(_PLACE) for name, columns in self._columns.items()}
+        found = {name: Messages(columns) for name, columns in self._columns.items()}
         self._give_units(found)
-        return Contents(found, self._counts, self._instances, self._damaged, self._damaged_bytes)
+        return Contents(found, places, self._counts, self._instances, self._damaged, self._damaged_bytes)
 
     def _give_units(self, found: dict[str, Messages]) -> None:
         """Units and multipliers by the log's own tables; a format character's multiplier goes before them."""
@@ -308,6 +324,11 @@ class _Walk:
                 known = scales.get(ord(scale), 0.0) if label and scale not in (b"", b"?") else 0.0
                 messages.units[name] = label
                 messages.multipliers[name] = implied if implied != 1.0 or not known else float(known)
+
+
+def _held(stored: np.dtype[Any]) -> np.dtype[Any]:
+    """How a field is kept: integers of 64 bits as floats, so that times become seconds where they are."""
+    return np.dtype(float) if stored == np.uint64 else stored
 
 
 def instances(rows: NDArray[Any]) -> NDArray[Any] | None:

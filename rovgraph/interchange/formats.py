@@ -146,6 +146,8 @@ def read_recording(path: Path | str, options: Options | None = None, format_: Fo
         except InputError as error:
             error.args = (str(error).replace(str(plain), str(path)),)
             raise
+        except MemoryError:
+            raise InputError(f"{path}: what it holds does not fit into the memory that is free; split it") from None
         except Exception as error:  # whatever a damaged file does to a reader
             raise InputError(f"{path}: cannot be read as a {format_.title} ({in_one_line(error)}); damaged?") from error
     said = tuple(text.replace(str(plain), str(path)) for text in recording.warnings)

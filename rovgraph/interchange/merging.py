@@ -1,7 +1,7 @@
 """Recordings of one dive become one log: sensors selected, clocks joined, rows in the order of time."""
 
 import warnings as python_warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,14 +11,14 @@ import pandas as pd
 from rovgraph.config.completion import leaves
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.interchange.clocks import JoinedClock, join_clocks
+from rovgraph.interchange.clocks import BASES, JoinedClock, join_clocks
 from rovgraph.interchange.motion import Motion
 from rovgraph.interchange.motion import motion_of as motion_of_log
 from rovgraph.interchange.recording import Channel, Recording
 from rovgraph.interchange.selection import Selected, Unused, file_names, select
 from rovgraph.interchange.stamps import put_in_order
 from rovgraph.log import Log
-from rovgraph.log.rows import STAMP_DIGITS, Rows, frame_of, in_order
+from rovgraph.log.rows import STAMP_DIGITS, Part, Rows, frame_of, in_order, whole
 
 OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
 UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
@@ -31,7 +31,7 @@ class Merged:
 
     Attributes
     ----------
-    rows : of the log, in SI, those of each channel that feeds it
+    parts : of the log, in SI, one for each channel that feeds it
     recordings : as read
     selected, unused : what feeds the log, and what does not
     clocks : how the stamps were put on the log's clock
@@ -42,7 +42,7 @@ class Merged:
         Those of file k have ``_k`` behind their names, but for the file that feeds the log's DVL
     """
 
-    rows: Sequence[Rows]
+    parts: Sequence[Part]
     recordings: Sequence[Recording]
     selected: Sequence[Selected]
     unused: Sequence[Unused]
@@ -56,6 +56,22 @@ class Merged:
     def frame(self) -> pd.DataFrame:
         """Columns of a log, in SI, one row per measurement, in the order of time."""
         return frame_of(self.rows)
+
+    @property
+    def first_fix(self) -> tuple[float, float] | None:
+        """Latitude and longitude [deg] of the first fix that is somewhere on Earth."""
+        for part in self.parts:
+            if "fix_lat" in part.columns and "fix_lon" in part.columns:
+                lat, lon = part.columns["fix_lat"], part.columns["fix_lon"]
+                known = np.flatnonzero(np.isfinite(lat) & np.isfinite(lon) & ((lat != 0.0) | (lon != 0.0)))
+                if known.size:
+                    return float(lat[known[0]]), float(lon[known[0]])
+        return None
+
+    @property
+    def rows(self) -> list[Rows]:
+        """Those of the log."""
+        return whole(self.parts)
 
     @property
     def names(self) -> list[str]:
@@ -92,15 +108,17 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
     selected, unused = select(recordings, choose)
     clocks, beside, unix, told = join_clocks(recordings, selected, shift, _motion)
     by_name = {(clock.file, clock.name): clock for clock in clocks}
-    stamped = []
+    parts = []
     for each in selected:
-        clock, columns = by_name[each.file, each.channel.clock], each.channel.columns
-        time = clock(np.asarray(columns["time"])) + beside.get(each.channel.sensor, 0.0)
-        stamped.append({**columns, "time": time})
-    rows = in_order(stamped)
+        clock, added = by_name[each.file, each.channel.clock], beside.get(each.channel.sensor, 0.0)
+        parts.append(Part(each.channel.columns, _stamps(clock, added)))
     settings = _settings(recordings, selected, clocks)
     tables = _tables(recordings, selected, by_name, beside.get("dvl", 0.0))
-    return Merged(rows, recordings, selected, unused, clocks, unix, settings, (*said, *told), tables)
+    return Merged(parts, recordings, selected, unused, clocks, unix, settings, (*said, *told), tables)
+
+
+def _stamps(clock: JoinedClock, added: float) -> Callable[[Array], Array]:
+    return lambda time: clock(time) + added
 
 
 def _tables(
@@ -154,14 +172,10 @@ def _motion(channels: Sequence[Channel]) -> Motion:
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore")  # the log that is made of them is read again
         try:
-            log = Log.from_arrays(*(_tabled(channel) for channel in first.values()))
+            log = Log.from_rows(in_order([channel.columns for channel in first.values()]))
         except InputError:
             return Motion((), None)
     return motion_of_log(log)
-
-
-def _tabled(channel: Channel) -> dict[str, Any]:
-    return {name: np.asarray(values) for name, values in channel.columns.items()}
 
 
 def _settings(
@@ -178,7 +192,7 @@ def _settings(
         each.channel.sensor: next(c for c in clocks if (c.file, c.name) == (each.file, each.channel.clock))
         for each in selected
     }
-    reference = next((stamps[sensor] for sensor in ("imu", "dvl") if sensor in stamps), None)
+    reference = next((stamps[sensor] for sensor in BASES if sensor in stamps), stamps[selected[0].channel.sensor])
     for each in selected:
         clock = stamps[each.channel.sensor]  # how late it is against the reference is all that an estimate knows of
         if each.channel.sensor in OFFSETS and clock is not reference and clock.sd > UNSURE_S:

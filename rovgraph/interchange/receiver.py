@@ -8,6 +8,7 @@ it was.
 import sys
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ def receiver_clock(place: NDArray[np.int64], received: Array, boot: Array) -> Re
     return ReceiverClock(np.array([p[0] for p in pieces]), np.array([p[1] for p in pieces]))
 
 
-def longest_boot(place: NDArray[np.int64], boot: Array) -> tuple[int, int, int]:
+def longest_boot(place: NDArray[np.integer[Any]], boot: Array) -> tuple[int, int, int]:
     """The messages of the longest run of an autopilot.
 
     Returns

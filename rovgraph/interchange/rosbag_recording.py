@@ -221,16 +221,18 @@ class _Made:
         """State mountings, and warn of what is missing or contradicts."""
         first = {channel.sensor: channel for channel in reversed(channels)}
         at = {sensor: topics[channel.source.partition(" (")[0]] for sensor, channel in first.items()}
-        names = ", ".join(each.name for each in self.left) or "none"
+        names = ", ".join(
+            dict.fromkeys([*(f"{t.name} ({t.type})" for t in topics.values()), *(x.name for x in self.left)])
+        )
         if "imu" in first:
             columns = first["imu"].columns
             self.settings["imu"] = self._imu_mounting(at["imu"], columns)
             self.warnings += too_slow(columns["time"], at["imu"].name, "record the IMU at 50 Hz or more")
         else:
-            self.warnings.append(f"no IMU (sensor_msgs/Imu) in the bag; other topics: {names}")
+            self.warnings.append(f"no IMU (sensor_msgs/Imu) in the bag; its topics: {names}")
         dvl = next((sensor for sensor in ("dvl", "dvl_water") if sensor in first), None)
         if dvl is None:
-            self.warnings.append(f"no DVL in the bag; other topics: {names}")
+            self.warnings.append(f"no DVL in the bag; its topics: {names}")
         else:
             self.settings["dvl"] = self._dvl_mounting(at[dvl], self._mountings[dvl])
         if "ahrs" in first and (declination := at["ahrs"].declination_deg):

@@ -1,6 +1,7 @@
 """Rows that fill few of a log's columns each: a large log without its empty cells."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,16 +17,64 @@ STAMP_DIGITS = 6  # of a second, as a log is written
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a log that fill the same columns.
+    """Rows of a log, or of a piece of it, that fill the same columns.
 
     Attributes
     ----------
-    place : ndarray of int, shape (n,), increasing: which rows of the log they are, 0 = the first
+    place : ndarray of int, shape (n,), increasing: which rows of it they are, 0 = the first
     columns : column -> ndarray, shape (n,); NaN = an empty cell; ``time`` among them [s]
     """
 
     place: NDArray[np.int64]
     columns: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Measurements of one sensor that are put into a log, stamped by a clock of their own.
+
+    Attributes
+    ----------
+    columns : column -> ndarray, shape (n,); ``time`` among them, in order, by that clock [s]
+    stamps : from its times to those of the log, which stay in order; both of shape (m,) [s]
+    """
+
+    columns: Mapping[str, Array]
+    stamps: Callable[[Array], Array]
+
+    def __len__(self) -> int:
+        return len(self.columns["time"])
+
+    def rows(self, begin: int, end: int) -> dict[str, Array]:
+        """Some rows, stamped as in the log."""
+        own = {name: np.asarray(values[begin:end]) for name, values in self.columns.items()}
+        return own | {"time": np.round(self.stamps(own["time"]), STAMP_DIGITS)}
+
+    def at(self, row: int) -> float:
+        """Time of a row in the log [s]."""
+        return float(self.rows(row, row + 1)["time"][0])
+
+
+def whole(parts: Sequence[Part]) -> list[Rows]:
+    """The rows of one log."""
+    return in_order([part.rows(0, len(part)) for part in parts])
+
+
+def pieces(parts: Sequence[Part], count: int) -> Iterator[list[Rows]]:
+    """The rows of one log in pieces that follow each other, so that a large one is never in memory twice.
+
+    Parameters
+    ----------
+    count : of rows of each part that a piece has; more only where their times are equal
+    """
+    begins = [0] * len(parts)
+    while left := [(part, begin) for part, begin in zip(parts, begins, strict=True) if begin < len(part)]:
+        until = min(part.at(min(begin + count, len(part)) - 1) for part, begin in left)
+        ends = [bisect_right(range(len(part)), until, begin, key=part.at)
+                for part, begin in zip(parts, begins, strict=True)]  # fmt: skip
+        spans = zip(parts, begins, ends, strict=True)
+        yield in_order([part.rows(begin, end) for part, begin, end in spans if begin < end])
+        begins = ends
 
 
 def in_order(parts: Sequence[Mapping[str, Array]]) -> list[Rows]:
@@ -53,9 +102,9 @@ def _increasing(rows: Rows) -> Rows:
     return Rows(rows.place[order], {name: values[order] for name, values in rows.columns.items()})
 
 
-def column_names(rows: Sequence[Rows]) -> list[str]:
+def column_names(parts: Sequence[Part | Rows]) -> list[str]:
     """Columns of the log, in the order in which it is written."""
-    held = {name for own in rows for name in own.columns}
+    held = {name for part in parts for name in part.columns}
     known = [name for name in all_columns() if name in held]
     return known + sorted(held.difference(known), key=_natural)
 

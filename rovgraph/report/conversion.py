@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
@@ -17,10 +18,11 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.fast_csv import write_csv, write_sparse_csv
 from rovgraph.geometry import Array
-from rovgraph.log import Log
-from rovgraph.log.rows import Rows, column_names, frame_of
+from rovgraph.log.rows import Part, column_names, frame_of, pieces, whole
 from rovgraph.log.table import SUFFIXES
+from rovgraph.progress import Progress, no_progress
 
+PIECE = 8192  # rows of a sensor that are written at a time
 DIGITS = 10  # significant, of a cell: latitudes to a centimetre
 DECIMALS = {"time": 6}
 MOUNTED = {"imu": "x forward, y starboard, z down", "dvl": "x forward, y starboard, z down"}
@@ -39,22 +41,38 @@ def check_suffix(path: Path) -> str:
     return path.name.removesuffix(suffix)
 
 
-def write_rows(rows: Sequence[Rows], path: Path) -> None:
+def write_parts(parts: Sequence[Part], path: Path, progress: Progress = no_progress) -> None:
     """Write a log as its suffix says.
+
+    Parameters
+    ----------
+    parts : of `rovgraph.interchange.merging.Merged`
+    progress : called with the current task and how much of it is done
 
     Raises
     ------
     InputError : Parquet, and pyarrow is not installed
     """
     if path.suffix != ".parquet":
-        write_sparse_csv(column_names(rows), [(own.place, own.columns) for own in rows], path, DIGITS, DECIMALS)
+        write_sparse_csv(column_names(parts), _told(parts, f"writing {path.name}", progress), path, DIGITS, DECIMALS)
         return
     try:
-        frame_of(rows).to_parquet(path, engine="pyarrow", index=False)
+        frame_of(whole(parts)).to_parquet(path, engine="pyarrow", index=False)
     except ImportError:
         raise InputError(
             f"{path.name}: writing Parquet needs pyarrow; install it with: pip install 'rovgraph[parquet]'"
         ) from None
+
+
+def _told(
+    parts: Sequence[Part], what: str, progress: Progress
+) -> Iterator[list[tuple[NDArray[np.int64], Mapping[str, Array]]]]:
+    """Pieces of a log, with how far they are."""
+    total, done = sum(len(part) for part in parts), 0
+    for piece in pieces(parts, PIECE):
+        yield [(rows.place, rows.columns) for rows in piece]
+        done += sum(len(rows.place) for rows in piece)
+        progress(what, done / total)
 
 
 def write_table(table: Mapping[str, Array], path: Path) -> None:
@@ -64,25 +82,28 @@ def write_table(table: Mapping[str, Array], path: Path) -> None:
     )
 
 
-def starter(config: Config, log: Log, sources: Mapping[str, str], name: str) -> str:
+def starter(
+    config: Config, counts: Mapping[str, int], origin: tuple[float, float] | None, sources: Mapping[str, str], name: str
+) -> str:
     """A configuration to begin with: what is known of the vehicle, each value with where it is from.
 
     Parameters
     ----------
     config : what is stated, and what files know
-    log : that it is for
+    counts : sensor -> number of measurements, of the log that it is for
+    origin : latitude and longitude of the first fix [deg], where there is one
     sources : dotted key -> file that it comes from
     name : of the log's file
     """
     settings: dict[str, Any] = config.model_dump(mode="json", exclude_unset=True)
     settings = {key: value for key, value in settings.items() if key not in ("columns", "units")}
     sources = dict(sources)
-    if log.origin is not None and not config.environment.origin:
+    if origin is not None and not config.environment.origin:
         section = settings.setdefault("environment", {})
-        section |= {"origin_lat_deg": log.origin[0], "origin_lon_deg": log.origin[1]}
+        section |= {"origin_lat_deg": origin[0], "origin_lon_deg": origin[1]}
         sources |= dict.fromkeys(("environment.origin_lat_deg", "environment.origin_lon_deg"), "the first fix")
     for sensor, axes in MOUNTED.items():
-        if sensor not in log:
+        if sensor not in counts:
             continue
         section = settings.setdefault(sensor, {})
         if "mount_rpy_deg" not in section:
@@ -91,8 +112,8 @@ def starter(config: Config, log: Log, sources: Mapping[str, str], name: str) -> 
         if "lever_arm_m" not in section:
             section["lever_arm_m"] = [0, 0, 0]
             sources[f"{sensor}.lever_arm_m"] = "not known; state it, forward, starboard, down from the vehicle's origin"
-    counts = ", ".join(f"{sensor} ({len(stream)})" for sensor, stream in log.streams.items())
-    head = f"# Configuration to begin with, for {' '.join(name.split())}\n# sensors: {counts}\n"
+    sensors = ", ".join(f"{sensor} ({count})" for sensor, count in counts.items())
+    head = f"# Configuration to begin with, for {' '.join(name.split())}\n# sensors: {sensors}\n"
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 4096
