@@ -1,8 +1,8 @@
 """A trajectory with its uncertainty, and its files.
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
-v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; ``lat, lon`` at the end where it is known where
-on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
+v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
+Unix time, and ``lat, lon`` if it is known where on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
 """
 
 import zlib
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError, warn
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
+from rovgraph.gps_time import is_unix
 
 FAR = 1000.0  # from the origin, in which seven digits are a tenth of a millimetre [m]
 TUM = ".ned.tum"  # end of the name of a TUM file, which says its frame
@@ -148,6 +149,8 @@ class Trajectory:
     def write_csv(self, path: Path | str, more: bool = False, origin: tuple[float, float] | None = None) -> None:
         """Write the columns of the contract that are known; time to the millisecond's tenth.
 
+        Where the time is Unix time, a column ``unix_time`` says so.
+
         Parameters
         ----------
         path : the file
@@ -160,6 +163,9 @@ class Trajectory:
             name for name in POSITION if name in frame and frame[name].abs().max() >= FAR and frame[name].notna().all()
         ]
         decimals |= dict.fromkeys(far, 4)  # seven digits of a grid's northing are a metre
+        if is_unix(self.time):
+            frame["unix_time"] = frame["time"]
+            decimals["unix_time"] = 4
         if origin is not None:
             frame["lat"], frame["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
@@ -236,7 +242,7 @@ def read_table(path: Path | str) -> pd.DataFrame:
     table.columns = table.columns.str.strip()
     twice = table.columns[table.columns.duplicated()]
     if len(twice):
-        raise InputError(f"{path}: column {twice[0]} stands there twice")
+        raise InputError(f"{path}: column {twice[0]} occurs twice")
     missing = [c for c in ("time", "north", "east") if c not in table]
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing, a trajectory has time, north, east")

@@ -114,7 +114,7 @@ def table_of_frame(frame: pd.DataFrame, source: str) -> Table:
 
     Raises
     ------
-    InputError : no data frame, no row in it, a name that stands there twice
+    InputError : no data frame, no row in it, a name that occurs twice
     """
     if not isinstance(frame, pd.DataFrame):
         raise InputError(

@@ -51,7 +51,7 @@ def open_sources(
 
     Raises
     ------
-    InputError : no URL, one of them is wrong, or stands there twice; logs that are not on one clock
+    InputError : no URL, one of them is wrong, or occurs twice; logs that are not on one clock
     """
     if not urls:
         raise InputError(f"expected at least one source, such as {', '.join(FORMS.values())}")
