@@ -79,8 +79,8 @@ look(units)
 # %% [markdown]
 # ## The mounting
 #
-# The DVL remains: no mounting is stated, so rovgraph assumes that its axes are the vehicle's. The dive is too calm for the
-# check to notice, but the estimate shows it. Read the verdict and its first line before you look at the track:
+# The DVL remains: no mounting is stated, so rovgraph assumes that its axes are the vehicle's. The dive is too calm for
+# the check to notice, but the estimate shows it. Read the verdict and its first line before you look at the track:
 
 # %%
 units += "calibration: {dvl_yaw: {estimate: true, sd_deg: 5}}\n"  # the yaw of a mounting is known to 5° or so
@@ -100,8 +100,8 @@ straight = smooth(units)
 
 # %% [markdown]
 # The first line is the cause, and the others follow from it. It says to turn the DVL over, by a roll of 180°. That is
-# half of the truth, because rovgraph chooses among quarter turns only. The note about the vehicle says "z up, x about 45° to port of
-# forward", so the mounting has a roll of 180° and a yaw of −45° ([mountings](mounting.md)).
+# half of the truth, because rovgraph chooses among quarter turns only. The note about the vehicle says "z up, x about
+# 45° to port of forward", so the mounting has a roll of 180° and a yaw of −45° ([mountings](mounting.md)).
 
 # %%
 mounted = smooth(units + "dvl: {mount_rpy_deg: [180, 0, -45], velocity_sd_mps: [0.01, 0.01, 0.005]}")

@@ -2,7 +2,8 @@
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
 v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
-Unix time, and ``lat, lon`` if it is known where on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
+Unix time, and ``lat, lon`` if it is known where on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for
+tools such as ``evo_ape``.
 """
 
 import zlib
@@ -13,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.errors import InputError, warn
+from rovgraph.errors import InputError, as_path, warn
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
 from rovgraph.gps_time import is_unix
@@ -169,14 +170,14 @@ class Trajectory:
         if origin is not None:
             frame["lat"], frame["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
-        write_csv(frame, Path(path), append=more, decimals=decimals)
+        write_csv(frame, as_path(path, "path"), append=more, decimals=decimals)
 
     def write_tum(self, path: Path | str) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line says so (its name should: `TUM`)."""
         rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
         line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
         poses = line * len(rows) % tuple(rows.ravel().tolist())
-        Path(path).write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
+        as_path(path, "path").write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
 
 
 def _sd(covariance: Array) -> Array:
@@ -227,9 +228,10 @@ def read_table(path: Path | str) -> pd.DataFrame:
     ------
     InputError : no such file, no CSV, a required column missing, something that is no number
     """
-    if Path(path).is_dir():
+    path = as_path(path, "trajectory")
+    if path.is_dir():
         likely = ("trajectory_s*.csv", "trajectory_*.csv", "truth.csv*", "reference.csv*")
-        inside = [found for pattern in likely for found in sorted(Path(path).glob(pattern))]
+        inside = [found for pattern in likely for found in sorted(path.glob(pattern))]
         such = f", such as {inside[0]}" if inside else ""
         raise InputError(f"{path}: is a directory, expected a CSV file; give one in it{such}")
     try:

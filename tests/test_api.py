@@ -668,3 +668,36 @@ def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
         rg.evaluate("trajectory.csv", "reference.csv")
     with pytest.raises(rg.InputError, match="reference: expected a Trajectory, as read_reference gives it"):
         rg.evaluate(rg.simulate("circle", choices=rg.Choices(duration=40.0)).truth, short)
+
+
+def test_what_is_no_path_is_refused_in_one_line(tmp_path, short, result):
+    dive, converted = rg.simulate("circle", choices=rg.Choices(duration=40.0)), rg.convert(SHIPPED / "log.csv.gz")
+    found = rg.check(rg.Log.from_frame(short))
+    uses = {
+        "load_config": rg.load_config,
+        "read_log": rg.read_log,
+        "convert": rg.convert,
+        "read_trajectory": rg.read_trajectory,
+        "read_reference": rg.read_reference,
+        "demo": rg.demo,
+        "Result.save": result.save,
+        "Result.report": result.report,
+        "SimulatedDive.save": dive.save,
+        "Conversion.save": converted.save,
+        "Trajectory.write_csv": dive.truth.write_csv,
+        "export": lambda given: rg.export(given, "kml"),
+        "export, out": lambda given: rg.export(result, "kml", out=given),
+        "tag": lambda given: rg.tag(given, result, tmp_path / "placed.csv"),
+        "report": rg.report,
+        "report_check": lambda given: rg.report_check(found, given),
+        "study_misalignment": lambda given: rg.study_misalignment(given, tmp_path / "study"),
+        "Online.run": lambda given: rg.Online().run(given),
+        "Online.run, out": lambda given: rg.Online().run("-", out=given),
+    }
+    for given in (None, 5, 2.5, b"log.csv", {"log": 1}, [3]):
+        for name, use in uses.items():
+            if given is None and name in ("load_config", "export, out", "Online.run, out"):
+                continue  # where it is the default
+            with pytest.raises(rg.InputError, match=r"expected (a path|an address|a results folder).*, found ") as said:
+                use(given)
+            assert "\n" not in str(said.value), (name, given)

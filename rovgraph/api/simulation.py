@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rovgraph.config import Config
+from rovgraph.errors import as_path
 from rovgraph.log import Log
 from rovgraph.simulate import Choices, Dive, simulated
 from rovgraph.simulate.files import figures, write_dive
@@ -55,7 +56,7 @@ class SimulatedDive:
         """
         from rovgraph.report.folder import STAMP, results_folder
 
-        with results_folder(Path(path), force) as folder:
+        with results_folder(as_path(path, "path"), force) as folder:
             told = {**STAMP, "scenario": self.scenario, "seed": self.seed, **self.choices.told()}
             write_dive(folder, self.dive, self.config, told)
 

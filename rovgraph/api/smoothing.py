@@ -8,7 +8,7 @@ from typing import Any
 
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config
-from rovgraph.errors import InputError, collected_warnings
+from rovgraph.errors import InputError, as_path, collected_warnings
 from rovgraph.estimators import dive as library
 from rovgraph.estimators.alarms import Alarm, Verdict
 from rovgraph.estimators.dive import Dive
@@ -138,7 +138,7 @@ class Result:
         from rovgraph.report.results import write_results
 
         began = time.perf_counter()
-        with results_folder(Path(path), force, [Path(self.log.source)]) as folder:
+        with results_folder(as_path(path, "path"), force, [Path(self.log.source)]) as folder:
             if figures:
                 from rovgraph.report.figures import draw_figures  # loads matplotlib
 
@@ -186,7 +186,7 @@ class Result:
 
         from rovgraph.api.reporting import free_page, report
 
-        page = free_page(Path(out), force, "out")
+        page = free_page(as_path(out, "out"), force, "out")
         with TemporaryDirectory() as temporary:
             folder = Path(temporary) / page.stem
             self.save(folder, figures=False, page=False)

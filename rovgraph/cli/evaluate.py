@@ -11,9 +11,7 @@ if TYPE_CHECKING:
 
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(help="CSV of an estimate", show_default=False)],
-    reference: Annotated[
-        Path, typer.Argument(help="CSV with time, north, east, and optionally attitude and velocity")
-    ],
+    reference: Annotated[Path, typer.Argument(help="CSV with time, north, east, and optionally attitude and velocity")],
     start: Annotated[float, typer.Option("--from", help="skip the first seconds of the trajectory")] = 0.0,
     end: Annotated[
         float | None, typer.Option("--to", help="skip everything after this many seconds", show_default=False)

@@ -192,7 +192,9 @@ def _attitude(
     tilt_sd = np.deg2rad(start.tilt_sd_deg)
     if moving and (start.roll_deg is None or start.pitch_deg is None):
         tilt_sd = max(tilt_sd, MOVING_TILT_SD)
-        assumptions.append("the log begins in motion: roll and pitch at the start are rough, and the estimate refines them")
+        assumptions.append(
+            "the log begins in motion: roll and pitch at the start are rough until the estimate refines them"
+        )
     yaw_sd = np.deg2rad(start.heading_sd_deg)
     if start.heading_deg is None:
         levelled = matrix_from_rpy([roll, pitch, 0.0])
