@@ -85,6 +85,21 @@ def as_paths(given: object, name: str) -> list[Path]:
     return [as_path(given, name)]
 
 
+def as_texts(given: object, name: str) -> list[str]:
+    """The texts that an argument gives, one or several.
+
+    Raises
+    ------
+    InputError : it gives none, or something else
+    """
+    texts = []
+    for text in [given] if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable) else given:
+        if not isinstance(text, str):
+            raise InputError(f"{name}: expected text, found {kind_of(text)}")
+        texts.append(text)
+    return texts
+
+
 def in_one_line(error: BaseException) -> str:
     """An error as a result of many; what is no bad input is named by its kind."""
     text = (str(error).splitlines() or [""])[0][:300]

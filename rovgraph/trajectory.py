@@ -28,7 +28,7 @@ VELOCITY = ["v_north", "v_east", "v_down"]
 COLUMNS = ["time", *POSITION, *ATTITUDE, *VELOCITY]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """Poses and velocities of the body's origin at n epochs.
 
@@ -51,6 +51,10 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        span = f", {self.time[0]:.1f} to {self.time[-1]:.1f} s" if len(self) else ""
+        return f"<Trajectory of {len(self)} epochs{span}>"
 
     @staticmethod
     def certain(time: Array, p_n: Array, R_nb: Array, v_n: Array) -> "Trajectory":

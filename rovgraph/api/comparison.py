@@ -10,7 +10,7 @@ import pandas as pd
 
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config
-from rovgraph.errors import InputError, as_path
+from rovgraph.errors import InputError, as_path, kind_of
 from rovgraph.evaluate import read_reference
 from rovgraph.log import Log
 from rovgraph.progress import Progress, no_progress
@@ -116,6 +116,8 @@ def compare(
         if isinstance(reference, Path | str):
             about["reference"] = str(reference)
             reference = read_reference(reference)
+        if not isinstance(reference, Trajectory):
+            raise InputError(f"reference: expected a path or a Trajectory, found {kind_of(reference)}")
         runs = [Recorded(title, Case(prepared(log, config), config, reference))]
     began = time.perf_counter()
     comparison = library.compare(runs, names, jobs, lambda done: progress("comparing", done))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from rovgraph.errors import InputError, as_path, kind_of
+from rovgraph.errors import InputError, as_path, as_texts, kind_of
 from rovgraph.export import Options, Tagged, Track, read_track, write_track
 from rovgraph.export import tag as tag_table
 from rovgraph.export.tagging import column_of, geotag
@@ -52,7 +52,7 @@ def export(
         if not isinstance(results, str | Path):
             raise InputError("out: expected a folder to write into, because these results have none")
         out = results
-    return write_track(track, [to] if isinstance(to, str) else to, as_path(out, "out"), Options(rate, crs), force)
+    return write_track(track, as_texts(to, "to"), as_path(out, "out"), Options(rate, crs), force)
 
 
 def tag(

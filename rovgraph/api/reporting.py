@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from rovgraph.check import Report
-from rovgraph.errors import InputError, as_path
+from rovgraph.errors import InputError, as_path, kind_of
 from rovgraph.pages.about import PAGE
 from rovgraph.pages.campaign import CAMPAIGN, campaign_page
 from rovgraph.pages.page import write
@@ -54,6 +54,8 @@ def report_check(found: Report, out: Path | str, force: bool = False) -> Path:
     ------
     InputError : the page exists, or cannot be written
     """
+    if not isinstance(found, Report):
+        raise InputError(f"found: expected what rg.check returns, found {kind_of(found)}")
     path = free_page(as_path(out, "out"), force, "--page")
     write(path, check_page(found.as_dict(), found.source))
     return path

@@ -15,7 +15,7 @@ from rovgraph.trajectory import Trajectory
 OWN = Choices()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SimulatedDive:
     """A simulated dive with its truth and the configuration for an estimator.
 
@@ -31,6 +31,9 @@ class SimulatedDive:
     choices: Choices
     dive: Dive
     config: Config
+
+    def __repr__(self) -> str:
+        return f"<SimulatedDive {self.scenario}, seed {self.seed}: {self.truth!r}>"
 
     @cached_property
     def log(self) -> Log:

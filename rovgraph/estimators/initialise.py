@@ -213,5 +213,7 @@ def _bias(config: Config, first: Level, assumptions: list[str]) -> tuple[Array, 
     if first.shows_bias:
         bias[3:] = first.rate_b
         sd[3:] = min(gyr_sd, float(np.hypot(config.imu.noise.gyr / np.sqrt(first.seconds), STILL_GYR_SD)))
-        assumptions.append(f"gyro bias from the first {first.seconds:.0f} s, in which the vehicle is assumed to be at rest")
+        assumptions.append(
+            f"gyro bias from the first {first.seconds:.0f} s, in which the vehicle is assumed to be at rest"
+        )
     return bias, sd

@@ -62,6 +62,8 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
     ------
     InputError : no such scenario, or a choice that it does not have
     """
+    if not isinstance(name, str):
+        raise InputError(f"scenario: expected its name, such as lawnmower, found {kind_of(name)}")
     require_known(name)
     if not (isinstance(seed, int) and seed >= 0):
         raise InputError(f"seed {seed!r}: an integer of 0 or more is expected")
