@@ -13,7 +13,7 @@
 # small. It is a notebook: open `docs/tutorial.py` in Jupyter (with [jupytext](https://jupytext.readthedocs.io)).
 #
 # The raw log is made here from a simulated dive, so that the truth is known at the end. The logger writes rates in
-# degrees per second, depths that count upwards, its own names, and times in milliseconds.
+# degrees per second, depths that count upwards, times in milliseconds, and its own column names.
 
 # %%
 import warnings
@@ -40,8 +40,8 @@ raw.head(3).dropna(axis="columns", how="all")
 # %% [markdown]
 # ## The names
 #
-# Without a configuration rovgraph does not find what it needs, and says which column it misses. Bad input is always
-# one line.
+# Without a configuration rovgraph does not find the columns that it needs, and names one that is missing. Bad input
+# is always one line.
 
 # %%
 try:
@@ -79,8 +79,8 @@ look(units)
 # %% [markdown]
 # ## The mounting
 #
-# The DVL remains: no mounting is stated, so rovgraph takes its axes for the vehicle's. The dive is too calm for the
-# check to notice, but the estimate shows it. Read the verdict and its first line before you look at the track:
+# The DVL remains: no mounting is stated, so rovgraph assumes that its axes are the vehicle's. The dive is too calm for
+# the check to notice, but the estimate shows it. Read the verdict and its first line before you look at the track:
 
 # %%
 units += "calibration: {dvl_yaw: {estimate: true, sd_deg: 5}}\n"  # the yaw of a mounting is known to 5° or so
@@ -99,9 +99,9 @@ def smooth(settings: str) -> rg.Result:
 straight = smooth(units)
 
 # %% [markdown]
-# The first line is the cause, and the others follow from it. It says to turn the DVL over, a roll of 180°, and that is
-# half of the truth: it chooses among quarter turns. The note about the vehicle says "z up, x about 45° to port of
-# forward", so the mounting has a roll of 180° and a yaw of −45° ([mountings](mounting.md)).
+# The first line is the cause, and the others follow from it. It says to turn the DVL over, by a roll of 180°. That is
+# half of the truth, because rovgraph chooses among quarter turns only. The note about the vehicle says "z up, x about
+# 45° to port of forward", so the mounting has a roll of 180° and a yaw of −45° ([mountings](mounting.md)).
 
 # %%
 mounted = smooth(units + "dvl: {mount_rpy_deg: [180, 0, -45], velocity_sd_mps: [0.01, 0.01, 0.005]}")
@@ -109,9 +109,9 @@ mounted = smooth(units + "dvl: {mount_rpy_deg: [180, 0, -45], velocity_sd_mps: [
 # %% [markdown]
 # ## The noise
 #
-# The next mistake: "accuracy 1 mm/s" in the data sheet, taken for the noise of a ping. Here `smooth` finds that the
-# residuals vary more than that, solves the dive again with the noise that it found, and says so among its
-# assumptions. Do not rely on it; [state the noise](noise.md).
+# The next mistake: "accuracy 1 mm/s" in the data sheet, stated as the noise of a ping. Here `smooth` finds that the
+# residuals vary more than that, solves the dive again with the noise that it found, and lists it among its
+# assumptions. Do not rely on this; [state the noise](noise.md).
 
 # %%
 precise = smooth(units + "dvl: {mount_rpy_deg: [180, 0, -45], velocity_sd_mps: [0.001, 0.001, 0.001]}")
@@ -128,10 +128,10 @@ residuals = mounted.smoothed.residuals.query("weight > 0")
 (residuals["normalised"] ** 2).groupby(residuals["sensor"]).mean().round(2)
 
 # %% [markdown]
-# ## What the dive could not tell
+# ## What the dive could not show
 #
-# `narrowing` is the sd after the dive over that before it. Near 1 means that the value is your prior repeated. The
-# compass offset is such a one: without position fixes nothing shows it, and the whole track may be turned by it.
+# `narrowing` is the sd after the dive divided by that before it. Near 1 means that the dive did not change your prior.
+# That is so for the compass offset: without position fixes nothing shows it, and it may rotate the whole track.
 
 # %%
 for label in ("dvl_yaw", "mag_offset", "dvl_compass_offset"):
@@ -141,8 +141,8 @@ for label in ("dvl_yaw", "mag_offset", "dvl_compass_offset"):
 # %% [markdown]
 # ## The track
 #
-# A dive of your own has no truth. Here it has, so compare: the error should be of the size of the sd. A normalised
-# error squared of 2 is the mean over many dives; a single one may well be 0.3 or 5.
+# For your own dives you do not know the truth. Here you do, so compare: the error should be about as large as the sd.
+# The normalised error squared is 2 on average over many dives; a single dive may well have 0.3 or 5.
 
 # %%
 metrics = rg.evaluate(mounted.smoothed.trajectory, dive.truth)
@@ -157,5 +157,5 @@ axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal")
 _ = axes.legend()
 
 # %% [markdown]
-# Go on with [your own log](own-log.md). If something looks odd, [troubleshooting](troubleshooting.md) is ordered by
-# what you see.
+# Continue with [your own log](own-log.md). If something looks odd, see [troubleshooting](troubleshooting.md), which is
+# ordered by symptom.

@@ -1,6 +1,6 @@
 """Simulate, plan and observe: which manoeuvre shows how the DVL is turned, and did the dive show it?
 
-Writes simulate_plan_observe.png. The work stands in a function because rg.plan starts processes, which import this
+Writes simulate_plan_observe.png. The work is in a function, because rg.plan starts processes, which import this
 file again.
 """
 

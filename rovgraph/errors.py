@@ -1,10 +1,12 @@
 """Errors and warnings for the user, one clear line each."""
 
+import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 
 _collecting: ContextVar[list[str] | None] = ContextVar("collecting", default=None)
 
@@ -42,6 +44,60 @@ def collected_warnings() -> Iterator[list[str]]:
         yield texts
     finally:
         _collecting.reset(token)
+
+
+def kind_of(value: object) -> str:
+    """What an argument is, for "expected …, found …".
+
+    >>> kind_of(None), kind_of(5), kind_of({})
+    ('None', 'an int', 'a dict')
+    """
+    name = type(value).__name__
+    return "None" if value is None else f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"
+
+
+def as_path(given: object, name: str) -> Path:
+    """The path that an argument gives.
+
+    Parameters
+    ----------
+    given : text or a path
+    name : of the argument, for the message
+
+    Raises
+    ------
+    InputError : it is neither
+    """
+    if not isinstance(given, str | os.PathLike):
+        raise InputError(f"{name}: expected a path, found {kind_of(given)}")
+    return Path(given)
+
+
+def as_paths(given: object, name: str) -> list[Path]:
+    """The paths that an argument gives, one or several.
+
+    Raises
+    ------
+    InputError : it gives none, or something else
+    """
+    if isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping | os.PathLike):
+        return [as_path(each, name) for each in given]
+    return [as_path(given, name)]
+
+
+def as_texts(given: object, name: str) -> list[str]:
+    """The texts that an argument gives, one or several.
+
+    Raises
+    ------
+    InputError : it gives none, or something else
+    """
+    texts = []
+    for text in [given] if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable) else given:
+        if not isinstance(text, str):
+            raise InputError(f"{name}: expected text, found {kind_of(text)}")
+        texts.append(text)
+    return texts
 
 
 def in_one_line(error: BaseException) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.errors import InputError, warn
+from rovgraph.errors import InputError, kind_of, warn
 from rovgraph.geometry import Array, exp_rotation, rotate, wrap_angle
 from rovgraph.trajectory import Trajectory, parse_trajectory, read_table
 
@@ -93,7 +93,7 @@ def evaluate(
     """
     for name, track in (("trajectory", trajectory), ("reference", reference)):
         if not isinstance(track, Trajectory):
-            raise InputError(f"{name}: expected a Trajectory, as read_{name} gives it, found a {type(track).__name__}")
+            raise InputError(f"{name}: expected a Trajectory, as read_{name} gives it, found {kind_of(track)}")
     if not start >= 0.0:
         raise InputError(f"comparing from {start:g} s on: expected 0 or more after the trajectory's first epoch")
     if (lasts := float(trajectory.time[-1] - trajectory.time[0])) < start:

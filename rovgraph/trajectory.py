@@ -1,8 +1,9 @@
 """A trajectory with its uncertainty, and its files.
 
 CSV columns are those of the log's contract: ``time, north, east, down, roll, pitch, yaw,
-v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; ``lat, lon`` at the end where it is known where
-on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for tools such as ``evo_ape``.
+v_north, v_east, v_down``, a ``_sd`` for each, and ``cov_north_east``; at the end ``unix_time`` if the log's clock is
+Unix time, and ``lat, lon`` if it is known where on Earth n is. TUM files hold ``time x y z qx qy qz qw`` in n, for
+tools such as ``evo_ape``.
 """
 
 import zlib
@@ -13,9 +14,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.errors import InputError, warn
+from rovgraph.errors import InputError, as_path, warn
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
+from rovgraph.gps_time import is_unix
 
 FAR = 1000.0  # from the origin, in which seven digits are a tenth of a millimetre [m]
 TUM = ".ned.tum"  # end of the name of a TUM file, which says its frame
@@ -26,7 +28,7 @@ VELOCITY = ["v_north", "v_east", "v_down"]
 COLUMNS = ["time", *POSITION, *ATTITUDE, *VELOCITY]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """Poses and velocities of the body's origin at n epochs.
 
@@ -49,6 +51,10 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        span = f", {self.time[0]:.1f} to {self.time[-1]:.1f} s" if len(self) else ""
+        return f"<Trajectory of {len(self)} epochs{span}>"
 
     @staticmethod
     def certain(time: Array, p_n: Array, R_nb: Array, v_n: Array) -> "Trajectory":
@@ -148,6 +154,8 @@ class Trajectory:
     def write_csv(self, path: Path | str, more: bool = False, origin: tuple[float, float] | None = None) -> None:
         """Write the columns of the contract that are known; time to the millisecond's tenth.
 
+        Where the time is Unix time, a column ``unix_time`` says so.
+
         Parameters
         ----------
         path : the file
@@ -160,17 +168,20 @@ class Trajectory:
             name for name in POSITION if name in frame and frame[name].abs().max() >= FAR and frame[name].notna().all()
         ]
         decimals |= dict.fromkeys(far, 4)  # seven digits of a grid's northing are a metre
+        if is_unix(self.time):
+            frame["unix_time"] = frame["time"]
+            decimals["unix_time"] = 4
         if origin is not None:
             frame["lat"], frame["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
-        write_csv(frame, Path(path), append=more, decimals=decimals)
+        write_csv(frame, as_path(path, "path"), append=more, decimals=decimals)
 
     def write_tum(self, path: Path | str) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line says so (its name should: `TUM`)."""
         rows = np.column_stack([self.time, self.p_n, quaternion_from_matrix(self.R_nb)])
         line = "%.4f" + " %.6f" * 3 + " %.9f" * 4 + "\n"
         poses = line * len(rows) % tuple(rows.ravel().tolist())
-        Path(path).write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
+        as_path(path, "path").write_text(f"# {TUM_FRAME}\n{poses}", encoding="utf-8", newline="")
 
 
 def _sd(covariance: Array) -> Array:
@@ -221,9 +232,10 @@ def read_table(path: Path | str) -> pd.DataFrame:
     ------
     InputError : no such file, no CSV, a required column missing, something that is no number
     """
-    if Path(path).is_dir():
+    path = as_path(path, "trajectory")
+    if path.is_dir():
         likely = ("trajectory_s*.csv", "trajectory_*.csv", "truth.csv*", "reference.csv*")
-        inside = [found for pattern in likely for found in sorted(Path(path).glob(pattern))]
+        inside = [found for pattern in likely for found in sorted(path.glob(pattern))]
         such = f", such as {inside[0]}" if inside else ""
         raise InputError(f"{path}: is a directory, expected a CSV file; give one in it{such}")
     try:
@@ -236,7 +248,7 @@ def read_table(path: Path | str) -> pd.DataFrame:
     table.columns = table.columns.str.strip()
     twice = table.columns[table.columns.duplicated()]
     if len(twice):
-        raise InputError(f"{path}: column {twice[0]} stands there twice")
+        raise InputError(f"{path}: column {twice[0]} occurs twice")
     missing = [c for c in ("time", "north", "east") if c not in table]
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing, a trajectory has time, north, east")

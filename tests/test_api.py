@@ -426,6 +426,13 @@ def test_a_result_has_track_calibration_and_covariance(result):
     assert result.config.name and result.dead_reckoning.kind == "dead_reckoning"
 
 
+def test_what_a_notebook_shows_of_a_dive_is_one_line(result):
+    dive = rg.simulate("circle", choices=rg.Choices(duration=40.0))
+    for shown in (result, result.smoothed, result.smoothed.trajectory, result.log, dive, dive.log):
+        assert len(repr(shown)) < 200 and repr(shown).startswith(f"<{type(shown).__name__}")
+    assert "dvl " in repr(result.log) and result.verdict in repr(result)
+
+
 def test_progress_is_told(short, config):
     told: list[tuple[str, float]] = []
     log = rg.Log.from_frame(short[short["time"] < short["time"].iloc[0] + 20.0], config)
@@ -614,7 +621,7 @@ def test_what_is_no_log_no_configuration_or_no_choice_is_one_line(short):
         rg.observe(log, estimate="dvl_yav,dvl_scale")
 
 
-def test_an_argument_of_the_wrong_kind_is_one_line(tmp_path, short):
+def test_an_argument_of_the_wrong_kind_is_one_line(tmp_path, short, result):
     log, path = rg.Log.from_frame(short), tmp_path / "log.csv"
     short.to_csv(path, index=False)
     for use, said in (
@@ -630,6 +637,11 @@ def test_an_argument_of_the_wrong_kind_is_one_line(tmp_path, short):
         (lambda: rg.plan(goals=3, estimate="dvl_yaw"), "goals: 3, expected a mapping"),
         (lambda: rg.Online().run(f"file:{path}", outputs="jsonl"), "output 'jsonl' is of an unknown form"),
         (lambda: rg.compare(log, reference="a.csv", estimators="graph-smoothd"), "nearest is graph-smoothed-"),
+        (lambda: rg.compare(log, reference=5), "reference: expected a path or a Trajectory, found an int"),
+        (lambda: rg.simulate(5), "scenario: expected its name, such as lawnmower, found an int"),
+        (lambda: rg.report_check(5, "check.html"), "found: expected what rg.check returns, found an int"),
+        (lambda: rg.export(result, None, out=tmp_path), "to: expected text, found None"),
+        (lambda: rg.Online().run(f"file:{path}", outputs=5), "outputs: expected text, found an int"),
     ):
         with pytest.raises(rg.InputError, match=said):
             use()
@@ -668,3 +680,36 @@ def test_what_is_no_configuration_no_file_or_no_trajectory_is_one_line(short):
         rg.evaluate("trajectory.csv", "reference.csv")
     with pytest.raises(rg.InputError, match="reference: expected a Trajectory, as read_reference gives it"):
         rg.evaluate(rg.simulate("circle", choices=rg.Choices(duration=40.0)).truth, short)
+
+
+def test_what_is_no_path_is_refused_in_one_line(tmp_path, short, result):
+    dive, converted = rg.simulate("circle", choices=rg.Choices(duration=40.0)), rg.convert(SHIPPED / "log.csv.gz")
+    found = rg.check(rg.Log.from_frame(short))
+    uses = {
+        "load_config": rg.load_config,
+        "read_log": rg.read_log,
+        "convert": rg.convert,
+        "read_trajectory": rg.read_trajectory,
+        "read_reference": rg.read_reference,
+        "demo": rg.demo,
+        "Result.save": result.save,
+        "Result.report": result.report,
+        "SimulatedDive.save": dive.save,
+        "Conversion.save": converted.save,
+        "Trajectory.write_csv": dive.truth.write_csv,
+        "export": lambda given: rg.export(given, "kml"),
+        "export, out": lambda given: rg.export(result, "kml", out=given),
+        "tag": lambda given: rg.tag(given, result, tmp_path / "placed.csv"),
+        "report": rg.report,
+        "report_check": lambda given: rg.report_check(found, given),
+        "study_misalignment": lambda given: rg.study_misalignment(given, tmp_path / "study"),
+        "Online.run": lambda given: rg.Online().run(given),
+        "Online.run, out": lambda given: rg.Online().run("-", out=given),
+    }
+    for given in (None, 5, 2.5, b"log.csv", {"log": 1}, [3]):
+        for name, use in uses.items():
+            if given is None and name in ("load_config", "export, out", "Online.run, out"):
+                continue  # where it is the default
+            with pytest.raises(rg.InputError, match=r"expected (a path|an address|a results folder).*, found ") as said:
+                use(given)
+            assert "\n" not in str(said.value), (name, given)

@@ -423,7 +423,7 @@ def test_a_steady_turn_that_dvl_or_compass_show_is_not_taken_for_standing_still(
     if shown_by == "dvl_heading":
         data[:, 0] += DEG * log["dvl_heading"].time
     _, b = start_of(altered(log, shown_by or "dvl", data))
-    assert any("taken as standing still" in line for line in b.assumptions) == (shown_by is None)
+    assert any("is assumed to be at rest" in line for line in b.assumptions) == (shown_by is None)
 
 
 def test_what_was_written_of_the_start_gives_the_same_start_again(lively):

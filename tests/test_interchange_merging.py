@@ -220,7 +220,7 @@ def test_few_stamps_of_another_epoch_are_left_out_and_counted():
 def test_rows_that_overlap_by_less_than_a_second_are_put_in_order_and_counted():
     kept, said = put_in_order(channel([0.0, 1.0, 0.5, 2.0]), "a.log")
     assert kept.columns["depth"].tolist() == [0.0, 2.0, 1.0, 3.0]
-    assert "1 rows behind the time" in said[0]
+    assert "1 rows are earlier than a row above them" in said[0]
 
 
 def test_one_wrong_stamp_costs_its_row_alone():

@@ -275,7 +275,7 @@ def test_rows_without_time_are_left_out(tmp_path):
 
 
 def test_a_small_step_back_is_put_in_order(tmp_path):
-    with pytest.warns(DataWarning, match="2 rows behind the time before them, put in order; first in line 4"):
+    with pytest.warns(DataWarning, match="2 rows are earlier than a row above them, sorted; first in line 4"):
         log = read_log(write(tmp_path, "time,depth\n1,1\n2,2\n1.5,3\n1.6,4\n2.6,5\n"))
     assert log["depth"]["depth"].tolist() == [1, 3, 4, 2, 5]
     assert log["depth"].row.tolist() == [2, 4, 5, 3, 6]

@@ -21,9 +21,10 @@ import rovgraph
 
 ROOT = Path(__file__).parents[1]
 BUILT_FROM = (
-    *("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE", "Makefile", "Dockerfile"),
-    *(".dockerignore", "rovgraph", "tests", "docs", "data", "configs", "benchmarks", "blueos"),
+    *("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE", "Makefile", "Dockerfile", "mkdocs.yml"),
+    *(".dockerignore", "rovgraph", "tests", "docs", "data", "configs", "benchmarks", "blueos", "examples"),
 )
+NOT_RELEASED = {".ci", ".gitignore"}
 LEFT_BEHIND = ("__pycache__", ".*_cache")
 LINUX = {"sys_platform": "linux", "platform_machine": "x86_64"}
 
@@ -91,6 +92,13 @@ def test_the_sdist_holds_the_whole_source(tree, built):
     made = {name for name in names if name in ("PKG-INFO", "setup.cfg") or ".egg-info/" in name}
     written = {name for name in files(tree) if ".egg-info/" in name}  # by the build
     assert names - made == files(tree) - written
+
+
+def test_what_the_repository_holds_is_released():
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("this is no checkout")
+    assert {name.partition("/")[0] for name in listed.stdout.splitlines()} - NOT_RELEASED == set(BUILT_FROM)
 
 
 def test_nothing_is_a_symbolic_link(tree):

@@ -46,11 +46,19 @@ def test_units_of_data_sheets_are_converted() -> None:
 def test_every_preset_reaches_the_configuration_with_a_source_for_each_number(preset: Preset) -> None:
     config = stated(f"{preset.kind}: {{preset: {preset.name}}}")
     keys = {key for key, *_ in describe()}
-    assert preset.facts
+    assert preset.facts or preset.notes[0].startswith("fills in nothing: ")
     for fact in preset.facts:
         assert fact.key in keys and fact.source.strip()
         assert leaf(config, fact.key) == fact.value
         assert isinstance(fact.value, tuple) == (fact.key in TRIPLES)
+
+
+def test_a_preset_without_numbers_says_so_and_changes_nothing() -> None:
+    assert presets()["waterlinked-a125"].facts == ()
+    config = parse_config("dvl: {preset: waterlinked-a125}")
+    assert config.changed(dvl={"preset": None}) == Config()
+    assert "| nothing | fills in nothing: " in preset_tables()
+    assert "70 mm above" in preset_tables()
 
 
 @pytest.mark.parametrize("preset", presets().values(), ids=presets().keys())

@@ -39,6 +39,20 @@ def test_a_place_on_earth_adds_latitude_and_longitude_at_the_end(trajectory, tmp
     assert read_trajectory(tmp_path / "placed.csv").p_n == pytest.approx(trajectory.p_n, rel=1e-6)
 
 
+def test_a_log_on_unix_time_says_so_in_a_column_of_the_track(trajectory, tmp_path):
+    trajectory.write_csv(tmp_path / "boot.csv")
+    dated = replace(trajectory, time=trajectory.time + 1.75e9)
+    dated.write_csv(tmp_path / "dated.csv", origin=(58.3, 14.5))
+    boot, found = (pd.read_csv(tmp_path / name) for name in ("boot.csv", "dated.csv"))
+    assert found.columns.tolist() == [*boot.columns, "unix_time", "lat", "lon"]
+    np.testing.assert_allclose(found["unix_time"], dated.time, rtol=0.0, atol=1e-4)
+    growing = TrackFile(tmp_path / "growing.csv")
+    growing.add(dated.take(np.arange(20)), (58.3, 14.5))
+    again = TrackFile(tmp_path / "growing.csv", until=float(dated.time[20]))
+    again.add(dated.take(np.arange(20, N)), (58.3, 14.5))
+    assert (tmp_path / "growing.csv").read_text() == (tmp_path / "dated.csv").read_text()
+
+
 def test_a_growing_track_keeps_the_columns_that_it_began_with(trajectory, tmp_path):
     halves = trajectory.take(np.arange(20)), trajectory.take(np.arange(20, N))
     late, early = TrackFile(tmp_path / "late.csv"), TrackFile(tmp_path / "early.csv")

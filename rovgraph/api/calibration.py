@@ -7,7 +7,7 @@ from rovgraph import calibrate as library
 from rovgraph.api.logs import given
 from rovgraph.calibrate import MagnetometerCalibration, NoiseReport
 from rovgraph.config import Config, completed, config_or_defaults
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, as_path
 from rovgraph.log import Log
 
 
@@ -35,7 +35,7 @@ class MagnetometerResult:
         from rovgraph.report.calibrations import write_magnetometer
         from rovgraph.report.folder import results_folder
 
-        with results_folder(Path(path), force, [Path(self.found.source)]) as folder:
+        with results_folder(as_path(path, "path"), force, [Path(self.found.source)]) as folder:
             write_magnetometer(folder, self.found, self.config)
             write_page(folder)
 
@@ -64,7 +64,7 @@ class NoiseResult:
         from rovgraph.report.calibrations import write_noise
         from rovgraph.report.folder import results_folder
 
-        with results_folder(Path(path), force, [Path(self.found.source)]) as folder:
+        with results_folder(as_path(path, "path"), force, [Path(self.found.source)]) as folder:
             write_noise(folder, self.found, self.config)
             write_page(folder)
 

@@ -10,7 +10,7 @@ import pandas as pd
 
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, as_path, kind_of
 from rovgraph.evaluate import read_reference
 from rovgraph.log import Log
 from rovgraph.progress import Progress, no_progress
@@ -60,7 +60,7 @@ class ComparisonResult:
         from rovgraph.report.figure_compare import draw_comparison
         from rovgraph.report.folder import results_folder
 
-        with results_folder(Path(path), force) as folder:
+        with results_folder(as_path(path, "path"), force) as folder:
             draw_comparison(folder, self.comparison, self.title, self.thesis)
             write_comparison(folder, self.comparison, self.about)
             write_page(folder)
@@ -116,6 +116,8 @@ def compare(
         if isinstance(reference, Path | str):
             about["reference"] = str(reference)
             reference = read_reference(reference)
+        if not isinstance(reference, Trajectory):
+            raise InputError(f"reference: expected a path or a Trajectory, found {kind_of(reference)}")
         runs = [Recorded(title, Case(prepared(log, config), config, reference))]
     began = time.perf_counter()
     comparison = library.compare(runs, names, jobs, lambda done: progress("comparing", done))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rovgraph.config import Config, completed, config_or_defaults
-from rovgraph.errors import InputError, collected_warnings, warn
+from rovgraph.errors import InputError, as_path, as_paths, collected_warnings, warn
 from rovgraph.interchange.account import account, notes
 from rovgraph.interchange.alternatives import SourceMissing
 from rovgraph.interchange.formats import Format, Options, formats, head_of, read_recording, recognise
@@ -110,11 +110,12 @@ class Conversion:
         from rovgraph.report.conversion import check_suffix, starter, write_parts, write_table
         from rovgraph.report.folder import results_files
 
-        path = Path(path)
+        path = as_path(path, "path")
         stem = check_suffix(path)
         inputs = {Path(recording.path).resolve() for recording in self.merged.recordings}
         tables = {table_beside(path, name): table for name, table in self.merged.tables.items()}
-        report, config_path = path.with_name(stem + REPORT), None if config_out is None else Path(config_out)
+        report = path.with_name(stem + REPORT)
+        config_path = None if config_out is None else as_path(config_out, "config_out")
         paths = [path, report, *tables, *([] if config_path is None else [config_path])]
         if clash := next((p for p in paths if p.resolve() in inputs), None):
             raise InputError(f"{clash} is one of the files that are read; choose another --out")
@@ -158,7 +159,7 @@ def convert(
     """
     config = config_or_defaults(config)
     _require_mappings(choose, shift)
-    files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    files = as_paths(paths, "paths")
     if not files:
         raise InputError("no file was given; expected native files or logs of one dive")
     found = [_format(path, config) for path in files]

@@ -8,6 +8,7 @@ from rovgraph.api.logs import read_log
 from rovgraph.api.simulation import SimulatedDive, simulate
 from rovgraph.api.smoothing import Result, smooth
 from rovgraph.config import load_config
+from rovgraph.errors import as_path
 from rovgraph.evaluate import Metrics, evaluate, read_reference
 from rovgraph.progress import Progress, no_progress
 from rovgraph.simulate import Choices
@@ -58,7 +59,7 @@ def demo(path: Path | str = "demo", force: bool = False, progress: Progress = no
     """
     from rovgraph.report.folder import check_writable
 
-    folder = Path(path)
+    folder = as_path(path, "path")
     check_writable(folder, force)
     progress("simulating the dive", 0.0)
     dive = simulate(SCENARIO, falcon(), SEED, CHOICES)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, as_path, as_texts, kind_of
 from rovgraph.export import Options, Tagged, Track, read_track, write_track
 from rovgraph.export import tag as tag_table
 from rovgraph.export.tagging import column_of, geotag
@@ -47,12 +47,12 @@ def export(
     InputError : an unknown format, a missing library, a missing origin or Unix time that a format needs, a file that
         exists
     """
+    track = track_of(results, estimate).shifted(unix_offset)
     if out is None:
         if not isinstance(results, str | Path):
             raise InputError("out: expected a folder to write into, because these results have none")
         out = results
-    track = track_of(results, estimate).shifted(unix_offset)
-    return write_track(track, [to] if isinstance(to, str) else to, Path(out), Options(rate, crs), force)
+    return write_track(track, as_texts(to, "to"), as_path(out, "out"), Options(rate, crs), force)
 
 
 def tag(
@@ -85,7 +85,7 @@ def tag(
     """
     from rovgraph.report.folder import results_files
 
-    table, out = Path(table), Path(out)
+    table, out = as_path(table, "table"), as_path(out, "out")
     photos = out.with_name(f"{out.stem}_photos")
     if exif is not None and photos.exists() and not force:
         raise InputError(f"{photos} exists; choose another --out or give --force")
@@ -139,4 +139,8 @@ def track_of(results: "Result | Path | str", estimate: str | None = None) -> Tra
     ------
     InputError : not that estimate, no results folder
     """
-    return read_track(results, estimate) if isinstance(results, str | Path) else results.track(estimate)
+    if isinstance(results, str | Path):
+        return read_track(results, estimate)
+    if not hasattr(results, "track"):
+        raise InputError(f"results: expected a results folder or what rg.smooth returns, found {kind_of(results)}")
+    return results.track(estimate)

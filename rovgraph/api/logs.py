@@ -11,7 +11,7 @@ from rovgraph.api.conversion import NOTHING, Paths, convert, is_plain_log
 from rovgraph.check import Finding, Report, bridge_jumps, examine
 from rovgraph.check import warn as warn_of_findings
 from rovgraph.config import Config, completed, config_or_defaults
-from rovgraph.errors import InputError, warn
+from rovgraph.errors import InputError, as_paths, kind_of, warn
 from rovgraph.estimators.initialise import refusal
 from rovgraph.log import Log
 from rovgraph.progress import Progress, no_progress
@@ -46,7 +46,7 @@ def read_log(
     """
     if isinstance(path, pd.DataFrame):
         raise InputError("log: is a DataFrame, expected a file's name; use Log.from_frame")
-    files = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
+    files = as_paths(path, "log")
     if config is None:
         warn_of_unused(*files)
     alone = len(files) == 1 and not choose and not shift
@@ -113,7 +113,7 @@ def given(log: Log, config: Config | None) -> Config:
     InputError : these are not a log and a configuration, or the log was read with another one's columns
     """
     if not isinstance(log, Log):
-        raise InputError(f"log: expected a Log, as read_log or Log.from_frame gives it, found a {type(log).__name__}")
+        raise InputError(f"log: expected a Log, as read_log or Log.from_frame gives it, found {kind_of(log)}")
     config = config_or_defaults(config)
     config, _ = completed(config, log.settings, f"settings in {log.source}")
     log.require_read_with(config)

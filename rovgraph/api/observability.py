@@ -7,7 +7,7 @@ from typing import Any
 
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config, config_or_defaults
-from rovgraph.errors import collected_warnings
+from rovgraph.errors import as_path, collected_warnings
 from rovgraph.log import Log
 from rovgraph.progress import Progress, no_progress
 from rovgraph.studies import observability as library
@@ -56,7 +56,7 @@ class ObservabilityResult:
         from rovgraph.report.folder import results_folder
         from rovgraph.report.observability import write_observability
 
-        with results_folder(Path(path), force) as folder:
+        with results_folder(as_path(path, "path"), force) as folder:
             draw_observability(folder, self.observability)
             write_observability(folder, self.observability, self.config, self.about)
             write_page(folder)
@@ -89,7 +89,7 @@ class PlanResult:
         from rovgraph.report.folder import results_folder
         from rovgraph.report.observability import write_plan
 
-        with results_folder(Path(path), force) as folder:
+        with results_folder(as_path(path, "path"), force) as folder:
             draw_plan(folder, self.plan)
             write_plan(folder, self.plan, self.config, self.about)
             write_page(folder)
@@ -159,7 +159,7 @@ def plan(
         seen, source = known.observability, known.about["log"]
         before = Known(seen.labels, seen.covariance, seen.prior_sd)
     else:
-        before, source = (None, None) if known is None else (read_known(Path(known)), str(known))
+        before, source = (None, None) if known is None else (read_known(as_path(known, "known")), str(known))
     result = ranked(config, candidates, duration, before, wanted, sensors, lambda done: progress("manoeuvres", done))
     about = {"duration_s": duration, "known": source, "fix_interval_s": sensors.fix_interval}
     return PlanResult(result, config, about)

@@ -11,7 +11,7 @@ from rovgraph.api.live_folder import prepare, settings_of, summarise
 from rovgraph.api.live_page import live_page
 from rovgraph.api.logs import given, warn_of_unused
 from rovgraph.config import Config, config_or_defaults
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, as_path, as_texts
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.feed import Feed
 from rovgraph.live.files import Files
@@ -174,11 +174,13 @@ class Online:
         -----
         DataWarning : a configuration lies beside a log and was not given
         """
-        folder = None if out is None else Path(out)
+        folder = None if out is None else as_path(out, "out")
         if resume and folder is None:
             raise InputError("--resume needs the folder of the run, --out")
         if self.config is None and not resume:
-            warn_of_unused(*(url.removeprefix("file:").partition("?")[0] for url in sources if url.startswith("file:")))
+            warn_of_unused(
+                *(url.removeprefix("file:").partition("?")[0] for url in map(str, sources) if url.startswith("file:"))
+            )
         config = self.config or (settings_of(folder) if resume and folder is not None else Config())
         warnings = Warnings(on_warning)
         opened = open_sources(sources, warnings, config, speed)
@@ -190,7 +192,7 @@ class Online:
         )  # may refuse, before anything is written
         with ExitStack() as opened_outputs:  # they have threads, which a refused folder must not leave behind
             receivers: list[Output] = []
-            for url in [outputs] if isinstance(outputs, str) else outputs:
+            for url in as_texts(outputs, "outputs"):
                 receivers.append(open_output(url, warnings, patient=feed.recorded))
                 opened_outputs.callback(receivers[-1].close)
             marks, watched = Marks(folder, warnings, resume), None

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from rovgraph.check import Report
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, as_path, kind_of
 from rovgraph.pages.about import PAGE
 from rovgraph.pages.campaign import CAMPAIGN, campaign_page
 from rovgraph.pages.page import write
@@ -29,13 +29,13 @@ def report(*results: Path | str, out: Path | str | None = None, force: bool = Fa
     ------
     InputError : no results folder, unreadable files, or a page that exists or cannot be written
     """
-    folders = [Path(folder) for folder in results]
+    folders = [as_path(folder, "results") for folder in results]
     if not folders:
         raise InputError("report: give at least one results folder")
     if out is None:
         path = folders[0] / PAGE if len(folders) == 1 else Path(CAMPAIGN)
     else:
-        path = free_page(Path(out), force, "--out")
+        path = free_page(as_path(out, "out"), force, "--out")
     html = page_of(folders[0]) if len(folders) == 1 else campaign_page(folders)
     write(path, html)
     return path
@@ -54,7 +54,9 @@ def report_check(found: Report, out: Path | str, force: bool = False) -> Path:
     ------
     InputError : the page exists, or cannot be written
     """
-    path = free_page(Path(out), force, "--page")
+    if not isinstance(found, Report):
+        raise InputError(f"found: expected what rg.check returns, found {kind_of(found)}")
+    path = free_page(as_path(out, "out"), force, "--page")
     write(path, check_page(found.as_dict(), found.source))
     return path
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rovgraph.config import Config
+from rovgraph.errors import as_path
 from rovgraph.log import Log
 from rovgraph.simulate import Choices, Dive, simulated
 from rovgraph.simulate.files import figures, write_dive
@@ -14,7 +15,7 @@ from rovgraph.trajectory import Trajectory
 OWN = Choices()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SimulatedDive:
     """A simulated dive with its truth and the configuration for an estimator.
 
@@ -30,6 +31,9 @@ class SimulatedDive:
     choices: Choices
     dive: Dive
     config: Config
+
+    def __repr__(self) -> str:
+        return f"<SimulatedDive {self.scenario}, seed {self.seed}: {self.truth!r}>"
 
     @cached_property
     def log(self) -> Log:
@@ -55,7 +59,7 @@ class SimulatedDive:
         """
         from rovgraph.report.folder import STAMP, results_folder
 
-        with results_folder(Path(path), force) as folder:
+        with results_folder(as_path(path, "path"), force) as folder:
             told = {**STAMP, "scenario": self.scenario, "seed": self.seed, **self.choices.told()}
             write_dive(folder, self.dive, self.config, told)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config
-from rovgraph.errors import InputError, collected_warnings
+from rovgraph.errors import InputError, as_path, as_texts, collected_warnings
 from rovgraph.estimators import dive as library
 from rovgraph.estimators.alarms import Alarm, Verdict
 from rovgraph.estimators.dive import Dive
@@ -22,7 +22,7 @@ ENGINES = ("batch", "isam2")
 ESTIMATES = ("smoothed", "filtered", "both")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """The estimates of a dive with verdict and alarms.
 
@@ -38,6 +38,9 @@ class Result:
     log: Log
     warnings: tuple[str, ...]
     seconds: dict[str, float]
+
+    def __repr__(self) -> str:
+        return f"<Result of {self.log.source}: {self.verdict}, {len(self.alarms)} alarms>"
 
     @property
     def smoothed(self) -> Estimate:
@@ -138,13 +141,13 @@ class Result:
         from rovgraph.report.results import write_results
 
         began = time.perf_counter()
-        with results_folder(Path(path), force, [Path(self.log.source)]) as folder:
+        with results_folder(as_path(path, "path"), force, [Path(self.log.source)]) as folder:
             if figures:
                 from rovgraph.report.figures import draw_figures  # loads matplotlib
 
                 draw_figures(folder, self.dive.estimates, self.log, self.config)
             if export:
-                write_track(self.track(), [export] if isinstance(export, str) else export, folder, Options())
+                write_track(self.track(), as_texts(export, "export"), folder, Options())
             seconds = {**self.seconds, "total": sum(self.seconds.values()) + time.perf_counter() - began}
             summary = write_results(
                 folder,
@@ -186,7 +189,7 @@ class Result:
 
         from rovgraph.api.reporting import free_page, report
 
-        page = free_page(Path(out), force, "out")
+        page = free_page(as_path(out, "out"), force, "out")
         with TemporaryDirectory() as temporary:
             folder = Path(temporary) / page.stem
             self.save(folder, figures=False, page=False)

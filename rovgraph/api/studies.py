@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, as_path
 from rovgraph.progress import Progress, no_progress
 from rovgraph.studies import engines
 from rovgraph.studies.misalignment import Tables, chosen, open_results, read_study
@@ -45,12 +45,12 @@ def study_misalignment(
     from rovgraph.report.figure_study import draw_study
     from rovgraph.report.study import write_study
 
-    plan = read_study(Path(study))
+    plan = read_study(as_path(study, "study"))
     cells = chosen(plan, only)
     if scheduler is not None and jobs is not None:
         raise InputError("--jobs cannot be combined with --scheduler; the cluster decides the number of workers")
     engine = engines.Local(jobs) if scheduler is None else engines.Cluster(scheduler)
-    folder = Path(out)
+    folder = as_path(out, "out")
     results = open_results(folder, plan, resume)
     began = time.perf_counter()
     tables = library(plan, results, cells, engine, lambda done: progress("making dives", done))

@@ -89,7 +89,7 @@ def preset_tables() -> str:
             "|---|---|---|---|",
         ]
         for preset in (p for p in known().values() if p.kind == kind):
-            filled = "<br>".join(f"`{f.key}`: {f.stated}" for f in preset.facts)
+            filled = "<br>".join(f"`{f.key}`: {f.stated}" for f in preset.facts) or "nothing"
             said = "<br>".join([*dict.fromkeys(f.source for f in preset.facts), *preset.notes])
             lines.append(f"| `{preset.name}` | {preset.instrument} | {filled} | {said} |")
         lines.append("")

@@ -7,8 +7,8 @@ import typer
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to create.")] = Path("demo"),
-    force: Annotated[bool, typer.Option("--force", help="Replace an older folder.")] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="folder to create")] = Path("demo"),
+    force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
 ) -> None:
     """Write a demonstration dive, estimate its track and compare it with the truth.
 

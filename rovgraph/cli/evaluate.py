@@ -10,18 +10,16 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    trajectory: Annotated[Path, typer.Argument(help="CSV of an estimate.", show_default=False)],
-    reference: Annotated[
-        Path, typer.Argument(help="CSV with time, north, east, and optionally attitude and velocity.")
-    ],
-    start: Annotated[float, typer.Option("--from", help="Skip the first seconds of the trajectory.")] = 0.0,
+    trajectory: Annotated[Path, typer.Argument(help="CSV of an estimate", show_default=False)],
+    reference: Annotated[Path, typer.Argument(help="CSV with time, north, east, and optionally attitude and velocity")],
+    start: Annotated[float, typer.Option("--from", help="skip the first seconds of the trajectory")] = 0.0,
     end: Annotated[
-        float | None, typer.Option("--to", help="Skip everything after this many seconds.", show_default=False)
+        float | None, typer.Option("--to", help="skip everything after this many seconds", show_default=False)
     ] = None,
     align: Annotated[
-        bool, typer.Option("--align", help="First rotate and shift the trajectory onto the reference.")
+        bool, typer.Option("--align", help="first rotate and shift the trajectory onto the reference")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON instead of a table")] = False,
 ) -> None:
     """Compare a trajectory with a reference.
 

@@ -13,49 +13,49 @@ def simulate(
     scenario: Annotated[
         str,
         typer.Argument(
-            help="Driven by thrusters: vattern, docking, excited, tank, stationary. "
-            "Prescribed motions: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral.",
+            help="driven by thrusters: vattern, docking, excited, tank, stationary; "
+            "prescribed motions: falcon, lawnmower, square, circle, figure8, straight, accelerate-and-stop, spiral",
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder to create.", show_default=False)],
-    seed: Annotated[int, typer.Option(min=0, help="Seed: the same one gives the same dive.")] = 1,
-    duration: Annotated[float | None, typer.Option(help="Duration in seconds; default: the scenario's.")] = None,
-    speed: Annotated[float | None, typer.Option(help="Speed in m/s; default: the scenario's.")] = None,
+    out: Annotated[Path, typer.Option(help="folder to create", show_default=False)],
+    seed: Annotated[int, typer.Option(min=0, help="seed: the same one gives the same dive")] = 1,
+    duration: Annotated[float | None, typer.Option(help="duration in seconds; default: the scenario's")] = None,
+    speed: Annotated[float | None, typer.Option(help="speed in m/s; default: the scenario's")] = None,
     variant: Annotated[
         str | None,
         typer.Option(
-            help="vattern: run 1, 2 or 3, default by the seed; tank: raw or calibrated; stationary: land or water."
+            help="vattern: run 1, 2 or 3, default by the seed; tank: raw or calibrated; stationary: land or water"
         ),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help="Configuration (YAML); default: the thesis's Falcon if driven by thrusters, else defaults."),
+        typer.Option(help="configuration (YAML); default: the thesis's Falcon if driven by thrusters, else defaults"),
     ] = None,
     current: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Current, north and east in m/s; default: drawn.", metavar="NORTH EAST", show_default=False),
+        typer.Option(help="current, north and east in m/s; default: drawn", metavar="NORTH EAST", show_default=False),
     ] = None,
     disturbances: Annotated[
         bool | None,
         typer.Option(
-            "--disturbances/--no-disturbances", help="Iron on the seabed; default: in a lake.", show_default=False
+            "--disturbances/--no-disturbances", help="iron on the seabed; default: in a lake", show_default=False
         ),
     ] = None,
-    outliers: Annotated[float, typer.Option(help="Share of DVL pings that are wrong, 0 to 1.")] = 0.0,
+    outliers: Annotated[float, typer.Option(help="share of DVL pings that are wrong, 0 to 1")] = 0.0,
     dropout: Annotated[
         list[str] | None,
-        typer.Option(help="Seconds without bottom lock, such as 100:130; may be repeated.", metavar="FROM:TO"),
+        typer.Option(help="seconds without bottom lock, such as 100:130; may be repeated", metavar="FROM:TO"),
     ] = None,
     place: Annotated[
         list[str] | None,
         typer.Option(
-            help="A place that a camera recognises, in m, such as 10:-5; may be repeated.", metavar="NORTH:EAST"
+            help="a place that a camera recognises, in m, such as 10:-5; may be repeated", metavar="NORTH:EAST"
         ),
     ] = None,
-    false_places: Annotated[float, typer.Option(help="Share of the camera's matches that are false, below 1.")] = 0.0,
-    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Noise, biases and drawn calibration.")] = True,
-    force: Annotated[bool, typer.Option("--force", help="Replace an older folder.")] = False,
+    false_places: Annotated[float, typer.Option(help="share of the camera's matches that are false, below 1")] = 0.0,
+    noise: Annotated[bool, typer.Option("--noise/--no-noise", help="noise, biases and drawn calibration")] = True,
+    force: Annotated[bool, typer.Option("--force", help="replace an older folder")] = False,
 ) -> None:
     """Simulate a dive: log.csv, the truth, and the configuration for an estimator.
 

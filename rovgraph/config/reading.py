@@ -38,7 +38,7 @@ from rovgraph.config.sections import (
     Triple,
     Vehicle,
 )
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, as_path, kind_of
 from rovgraph.gauss_markov import stationary_walk
 from rovgraph.geometry import Array, matrix_from_rpy
 
@@ -191,7 +191,7 @@ def load_config(path: Path | str | None = None) -> Config:
     InputError : no such file, no YAML, an unknown key (with the nearest known one), a
         value of the wrong kind
     """
-    return Config() if path is None else _parse_config(read_yaml(Path(path)), str(path))
+    return Config() if path is None else _parse_config(read_yaml(as_path(path, "configuration")), str(path))
 
 
 def config_or_defaults(config: Config | None) -> Config:
@@ -204,7 +204,7 @@ def config_or_defaults(config: Config | None) -> Config:
     if config is None:
         return Config()
     if not isinstance(config, Config):
-        raise InputError(f"config: expected a Config, as load_config gives it, found a {type(config).__name__}")
+        raise InputError(f"config: expected a Config, as load_config gives it, found {kind_of(config)}")
     return config
 
 
@@ -216,7 +216,7 @@ def parse_config(text: str, source: str = "configuration") -> Config:
     InputError : no text, no valid YAML, or a key or value that a configuration does not have
     """
     if not isinstance(text, str):
-        raise InputError(f"{source}: expected YAML text, found a {type(text).__name__}")
+        raise InputError(f"{source}: expected YAML text, found {kind_of(text)}")
     return _parse_config(_parse_yaml(text, source), source)
 
 
@@ -265,7 +265,7 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise InputError(f"{source}: expected keys and values at the top, found a {type(data).__name__}")
+        raise InputError(f"{source}: expected keys and values at the top, found {kind_of(data)}")
     return data
 
 

@@ -55,7 +55,7 @@ class CalibrationEstimate:
     verdict: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Estimate:
     """A trajectory, the calibration and the residuals of the measurements.
 
@@ -77,3 +77,6 @@ class Estimate:
     history: dict[str, History]
     residuals: pd.DataFrame
     summary: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"<Estimate, {self.kind}: {self.trajectory!r}>"

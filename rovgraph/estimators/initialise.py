@@ -192,7 +192,9 @@ def _attitude(
     tilt_sd = np.deg2rad(start.tilt_sd_deg)
     if moving and (start.roll_deg is None or start.pitch_deg is None):
         tilt_sd = max(tilt_sd, MOVING_TILT_SD)
-        assumptions.append("the log begins in motion: levelled roughly, roll and pitch settle in the graph")
+        assumptions.append(
+            "the log begins in motion: roll and pitch at the start are rough until the estimate refines them"
+        )
     yaw_sd = np.deg2rad(start.heading_sd_deg)
     if start.heading_deg is None:
         levelled = matrix_from_rpy([roll, pitch, 0.0])
@@ -211,5 +213,7 @@ def _bias(config: Config, first: Level, assumptions: list[str]) -> tuple[Array, 
     if first.shows_bias:
         bias[3:] = first.rate_b
         sd[3:] = min(gyr_sd, float(np.hypot(config.imu.noise.gyr / np.sqrt(first.seconds), STILL_GYR_SD)))
-        assumptions.append(f"gyro bias from the first {first.seconds:.0f} s, taken as standing still")
+        assumptions.append(
+            f"gyro bias from the first {first.seconds:.0f} s, in which the vehicle is assumed to be at rest"
+        )
     return bias, sd

@@ -132,7 +132,9 @@ def _lasting(error: LastingError, config: Config) -> UnstatedNoise:
     sd, seconds = factor * error.sd, float(error.time_constant)
     key = f"calibration.{error.variable}"
     if np.isinf(seconds):
-        text = f"{error.sensor}: {variable.about}: the dive tells it better than its sd, so it is estimated ({key})"
+        text = (
+            f"{error.sensor}: {variable.about}: the dive determines it better than its sd, so it is estimated ({key})"
+        )
         return UnstatedNoise(error.sensor, key, {"estimate": True, "sd_deg" if variable.angular else "sd": sd}, text)
     values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd, "time_constant_s": seconds}
     size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.gps_time import is_unix
 from rovgraph.trajectory import Trajectory, read_trajectory
 
-LATEST_UNIX = 4_102_444_800.0  # 2100: stamps beyond are in other units [s]
-EARLIEST_UNIX = 315_532_800.0  # 1980: no clock of a vehicle that counts from its start gets that far [s]
 CHI2_95 = 5.991  # of two degrees of freedom
 ESTIMATES = ("smoothed", "filtered", "dead_reckoning")
 
@@ -79,7 +78,7 @@ class Track:
     @property
     def has_utc(self) -> bool:
         """Whether time counts from 1970."""
-        return all(map(is_utc, self.trajectory.time[[0, -1]].tolist()))
+        return is_unix(self.trajectory.time[[0, -1]])
 
     @property
     def utc(self) -> pd.DatetimeIndex:
@@ -141,11 +140,6 @@ def require_place(name: str, origin: tuple[float, float] | None) -> tuple[float,
     return origin
 
 
-def is_utc(time: float) -> bool:
-    """Whether a time [s] counts from 1970."""
-    return EARLIEST_UNIX <= time < LATEST_UNIX
-
-
 def require_utc(name: str, start: float) -> None:
     """See that time is Unix time.
 
@@ -157,7 +151,7 @@ def require_utc(name: str, start: float) -> None:
     ------
     InputError : it counts from something else
     """
-    if not is_utc(start):
+    if not is_unix(start):
         raise InputError(
             f"{name}: its time begins at {start:g} s, which is not Unix time, and this format needs one; "
             "add the Unix time of 0 s to the log's times (or give it as --unix-offset)"

@@ -81,7 +81,7 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
         said.append(f"{where}: {told}; left out")
     late = int(np.count_nonzero(time[kept] < np.maximum.accumulate(time[kept])))
     if late:
-        said.append(f"{where}: {late} rows behind the time before them, put in order")
+        said.append(f"{where}: {late} rows are earlier than a row above them, sorted")
     order = kept[np.argsort(time[kept], kind="stable")]
     if len(order) == len(time) and not late:
         return channel, said

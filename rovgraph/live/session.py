@@ -90,11 +90,11 @@ class Session:
         elif state is not None:
             self.navigator.restore(state)
         if self.files.received is None:
-            self.navigator.say("start", "resumed", "nothing had been received before; starts again")
+            self.navigator.say("start", "resumed", "nothing was received before: starts anew")
             return
         self.navigator.replay(self.files.received)
         self._resumed = self.navigator.time
-        self.navigator.say("start", "resumed", f"goes on from what was received up to {self._resumed:.1f} s")
+        self.navigator.say("start", "resumed", f"continues from the data received up to {self._resumed:.1f} s")
 
     def run(self, feed: Iterable[Message | Command | None]) -> None:
         """Work off what the sources say."""

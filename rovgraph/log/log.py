@@ -18,7 +18,7 @@ from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_prec
 from rovgraph.log.table import Table, read_table, table_of_arrays, table_of_frame
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Log:
     """A dive as recorded.
 
@@ -94,6 +94,10 @@ class Log:
         InputError : as `from_frame`
         """
         return _log(tables_of(rows, source), config, source)
+
+    def __repr__(self) -> str:
+        sensors = ", ".join(f"{name} {len(stream)}" for name, stream in self.streams.items())
+        return f"<Log {self.source}: {sensors}>"
 
     def __contains__(self, sensor: str) -> bool:
         return sensor in self.streams

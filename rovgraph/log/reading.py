@@ -58,7 +58,7 @@ def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[
 
     Warns
     -----
-    DataWarning : what was left out or put in order
+    DataWarning : what was left out or sorted
     """
     origin = config.environment.origin
     found: dict[str, Stream] = {}
@@ -178,7 +178,7 @@ def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: boo
             f"expected steps back of at most {limit:g} s; was the clock set, or are two dives in one file? Split it"
         )
     if not by_arrival:
-        warn(f"{source}: {late.size} rows behind the time before them, put in order; first in line {line[late[0]]}")
+        warn(f"{source}: {late.size} rows are earlier than a row above them, sorted; first in line {line[late[0]]}")
     order = np.argsort(time, kind="stable")
     return {name: values[order] for name, values in cells.items()}, line[order]
 
@@ -283,7 +283,7 @@ def _known_sd(column: str, sd: Array, line: Lines, source: str) -> None:
     if unknown.any():
         warn(
             f"{source}: {column}: {unknown.sum()} times 0 or less, taken as unknown; "
-            f"the configuration's sd holds there; first in line {line[np.argmax(unknown)]}"
+            f"the configuration's sd is used; first in line {line[np.argmax(unknown)]}"
         )
         sd[unknown] = np.nan
 

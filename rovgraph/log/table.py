@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from rovgraph.errors import InputError, warn
+from rovgraph.errors import InputError, kind_of, warn
 from rovgraph.geometry import Array
 from rovgraph.log.streams import label_number
 
@@ -114,12 +114,10 @@ def table_of_frame(frame: pd.DataFrame, source: str) -> Table:
 
     Raises
     ------
-    InputError : no data frame, no row in it, a name that stands there twice
+    InputError : no data frame, no row in it, a name that occurs twice
     """
     if not isinstance(frame, pd.DataFrame):
-        raise InputError(
-            f"{source}: is a {type(frame).__name__}, expected a pandas DataFrame with the columns of a log"
-        )
+        raise InputError(f"{source}: is {kind_of(frame)}, expected a pandas DataFrame with the columns of a log")
     names = [str(name).strip() for name in frame.columns]
     _check_names(names, source)
     _check_rows(frame, source)
@@ -141,7 +139,7 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
     frames = []
     for number, table in enumerate(tables, 1):
         if not isinstance(table, Mapping):
-            what = f"table {number} is a {type(table).__name__}, expected a mapping of column names to arrays"
+            what = f"table {number} is {kind_of(table)}, expected a mapping of column names to arrays"
             raise InputError(f"{source}: {what}; a configuration is given as config=...")
         arrays = {name: _array(name, values, source) for name, values in table.items()}
         for name, values in arrays.items():

@@ -7,7 +7,7 @@ from importlib.resources import files
 import numpy as np
 
 from rovgraph.config import Config, config_or_defaults, parse_config
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, kind_of
 from rovgraph.simulate.choices import Choices
 from rovgraph.simulate.dive import Dive, simulate
 from rovgraph.simulate.driven_scenarios import DRIVEN
@@ -62,11 +62,13 @@ def simulated(name: str, seed: int, config: Config | None = None, choices: Choic
     ------
     InputError : no such scenario, or a choice that it does not have
     """
+    if not isinstance(name, str):
+        raise InputError(f"scenario: expected its name, such as lawnmower, found {kind_of(name)}")
     require_known(name)
     if not (isinstance(seed, int) and seed >= 0):
         raise InputError(f"seed {seed!r}: an integer of 0 or more is expected")
     if not isinstance(choices, Choices):
-        raise InputError(f"choices: expected Choices(duration=60), for example, found a {type(choices).__name__}")
+        raise InputError(f"choices: expected Choices(duration=60), for example, found {kind_of(choices)}")
     if name in DRIVEN:
         driven = DRIVEN[name]
         choices.require(name, driven.choices, driven.variants)

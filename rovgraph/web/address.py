@@ -49,6 +49,7 @@ def parse_address(text: str) -> Address:
     ------
     InputError : none of both
     """
+    text = str(text)
     try:
         parts = urlsplit(f"//{text}" if ":" in text else f"//127.0.0.1:{text}")
         host, port = parts.hostname, parts.port

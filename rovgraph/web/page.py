@@ -8,6 +8,7 @@ from typing import Self
 
 import uvicorn
 
+from rovgraph.errors import as_path, as_paths
 from rovgraph.live.marks import Marks
 from rovgraph.live.solution import Solution
 from rovgraph.live.warnings import Warnings
@@ -64,8 +65,8 @@ class LivePage:
     ) -> None:
         wanted, origins = parse_address(address), [parse_origin(origin) for origin in origins]
         self._warnings = warnings or Warnings()
-        shown = read_charts([Path(path) for path in charts])
-        self.token = None if wanted.loopback else token_of(None if token is None else Path(token))
+        shown = read_charts(as_paths(charts, "charts"))
+        self.token = None if wanted.loopback else token_of(None if token is None else as_path(token, "token"))
         self._socket = listening(wanted)
         self.address = Address(wanted.host, self._socket.getsockname()[1])
         self.broadcast = Broadcast(View(marks or Marks(), limits or Limits()))

@@ -60,7 +60,7 @@ class Preset:
     name : as the configuration writes it
     kind : section of the configuration, "imu" or "dvl"
     instrument : maker and model
-    facts : what it fills in
+    facts : what it fills in; none where no source has a number
     notes : what its sources state besides, and what they do not state
     """
 

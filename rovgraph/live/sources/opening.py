@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from rovgraph.config import Config
-from rovgraph.errors import InputError
+from rovgraph.errors import InputError, kind_of
 from rovgraph.interchange.mavlink import IMUS
 from rovgraph.live.sources import waterlinked
 from rovgraph.live.sources.address import LOOPBACK, Address, one_of, parse_address, positive, whole
@@ -51,11 +51,13 @@ def open_sources(
 
     Raises
     ------
-    InputError : no URL, one of them is wrong, or stands there twice; logs that are not on one clock
+    InputError : no URL, one of them is wrong, or occurs twice; logs that are not on one clock
     """
     if not urls:
         raise InputError(f"expected at least one source, such as {', '.join(FORMS.values())}")
     for url in urls:
+        if not isinstance(url, str):
+            raise InputError(f"source: expected an address as text, such as file:log.csv, found {kind_of(url)}")
         if urls.count(url) > 1:
             raise InputError(f"{url}: given twice; each source can be read once")
     warnings = warnings or Warnings()
