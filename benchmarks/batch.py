@@ -54,7 +54,7 @@ def make_graph(seconds: float, config: Config) -> tuple[Problem, gtsam.Values]:
     for measurement in log.measurements():
         smoother.add(measurement)
     smoother.finish()
-    b = smoother.beginning
+    b = smoother.initial
     # gates are open: Levenberg-Marquardt has none
     sensors = {name: replace(instrument, gate_sd=None) for name, instrument in b.instruments.items()}
     problem = make_problem(smoother.intervals, b.prior, b.config, beliefs(b.config), sensors)

@@ -171,7 +171,7 @@ def smoothed(log: Log, config: Config) -> Estimate:
     return batch(log, config).solve()
 
 
-def beginning(log: Log, config: Config) -> InitialConditions:
+def initial_conditions(log: Log, config: Config) -> InitialConditions:
     return initialise(log, config)
 
 

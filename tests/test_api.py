@@ -331,7 +331,7 @@ def test_compare_writes_what_the_command_writes(monkeypatch, tmp_path, short, co
 
 
 def test_plan_writes_what_the_command_writes(monkeypatch, tmp_path):
-    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything anew
+    monkeypatch.setattr("rovgraph.studies.plan.cores", lambda: 1)  # each process imports everything again
     options = ["--manoeuvres", "straight", "--duration", 60, "--imu-rate", 20, "--dvl-rate", 2]
     assert command(monkeypatch, "plan", *options, "--estimate", "dvl_yaw", "-o", tmp_path / "command") == 0
     sensors = Sensors(20.0, 2.0, None)

@@ -44,7 +44,7 @@ HELD = {name: {"estimate": False} for name in TABLE}
 def problem_of(log, config) -> tuple[Problem, gtsam.Values]:
     """The graph of a log, and dead reckoning to begin with."""
     smoother = batch(log, config)
-    b = smoother.beginning
+    b = smoother.initial
     problem = make_problem(smoother.intervals, b.prior, b.config, beliefs(b.config), b.instruments)
     return problem, make_values(problem, dead_reckon(smoother.intervals, b, problem.unknowns.fixed))
 

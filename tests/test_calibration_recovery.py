@@ -93,11 +93,11 @@ def test_batch_finds_any_time_offset_and_the_track_is_as_good_as_without(offset)
 def isam2(log: Log, config: Config) -> IncrementalEstimator:
     """As `smooth` has it: a second time, with the pings where the first has found them to belong."""
     first = incremental(log, config)
-    anew = batch(log, config).placed_again(first.latest().calibration)
-    if anew is None:
+    moved = batch(log, config).placed_again(first.latest().calibration)
+    if moved is None:
         return first
-    again = IncrementalEstimator(anew.beginning)
-    for interval in anew.intervals:
+    again = IncrementalEstimator(moved.initial)
+    for interval in moved.intervals:
         again.step(interval)
     return again
 

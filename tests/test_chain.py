@@ -97,7 +97,7 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
         dive = batch(*SCENARIOS[request.param]())
-        b = dive.beginning
+        b = dive.initial
         states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
         both = smooth_chain(dive.intervals, b, states), smooth_graph(dive.intervals, b, states)
     assert IS_SO[request.param](both[0]), "the scenario is not what it is called"

@@ -45,7 +45,7 @@ def case() -> Simulated:
 def optimum(case: Simulated, config: Config) -> ChainOptimum:
     dive = batch(case.log, config)
     means = {name: belief.mean for name, belief in beliefs(config).items()}
-    return smooth_chain(dive.intervals, dive.beginning, dead_reckon(dive.intervals, dive.beginning, means))
+    return smooth_chain(dive.intervals, dive.initial, dead_reckon(dive.intervals, dive.initial, means))
 
 
 def plain_filter(case: Simulated, config: Config) -> ErrorStateFilter:

@@ -62,6 +62,6 @@ def test_a_filter_that_goes_on_from_isam2_has_what_is_considered_in_its_sd(case)
 
 def test_after_a_sensor_has_joined_no_way_leads_back_to_keyframes_without_it(case):
     nav = flown(case, lambda m: m.sensor != "dvl_water" or m.time > END_S - 1.0)
-    assert nav.engine is not None and "dvl_water" in nav.engine.beginning.instruments
+    assert nav.engine is not None and "dvl_water" in nav.engine.initial.instruments
     size = nav.engine.filter.layout.size
     assert all(len(mark.known.P) == size for mark in [*nav.engine.marks, *nav._incoherence._recent])

@@ -142,7 +142,7 @@ BIAS = np.array([0.002, -0.001, 0.003])
 def test_without_a_heading_the_bias_of_the_heading_gyro_stays_as_it_was():
     config = Config.model_validate({"start": {"heading_deg": 0.0}})
     smoother = batch(turning_gyro(120.0, BIAS), config)
-    states = dead_reckon(smoother.intervals, smoother.beginning, means(config))
+    states = dead_reckon(smoother.intervals, smoother.initial, means(config))
     np.testing.assert_allclose(states.bias[-1, 3:5], BIAS[:2], atol=2e-4)  # the others are found
     assert np.abs(states.bias[:, 5]).max() < 0.01 * BIAS[2]
 
@@ -151,7 +151,7 @@ def test_with_a_heading_the_bias_of_the_heading_gyro_is_found():
     time = np.arange(0.05, 120.0, 0.1)
     log = turning_gyro(120.0, BIAS, ahrs=(time, np.tile([0.5, np.nan, np.nan], (len(time), 1))))
     smoother = batch(log, Config())
-    states = dead_reckon(smoother.intervals, smoother.beginning, means(smoother.beginning.config))
+    states = dead_reckon(smoother.intervals, smoother.initial, means(smoother.initial.config))
     np.testing.assert_allclose(states.bias[-1, 3:], BIAS, atol=3e-4)
 
 
@@ -178,8 +178,8 @@ def test_a_gyro_at_rest_shows_its_bias_beside_the_earths_rate():
     style = Style(rest=30.0, waves=CALM.waves)
     case = simulated(falcon(**sections), 300.0, noise=False, style=style)
     smoother = batch(case.log, started(case))
-    assert any("gyro bias" in line for line in smoother.beginning.assumptions)
-    assert np.abs(smoother.beginning.prior.state.bias[0, 3:]).max() < 1e-6
+    assert any("gyro bias" in line for line in smoother.initial.assumptions)
+    assert np.abs(smoother.initial.prior.state.bias[0, 3:]).max() < 1e-6
     track = smoother.dead_reckoning().trajectory
     assert np.rad2deg(np.abs(attitude_errors(track, case))).max() < 0.01
 

@@ -304,10 +304,10 @@ def test_intervals_in_a_row_come_out_as_one_by_one(case):
     data = case.log["dvl"].data.copy()
     data[20::17, 0] += 1.0  # some that the gate leaves out
     dive = batch(altered(case.log, "dvl", data), case.config)
-    alone = ErrorStateFilter(dive.beginning, (10.0,))
+    alone = ErrorStateFilter(dive.initial, (10.0,))
     for interval in dive.intervals:
         alone.step(interval)
-    together = replay(dive.intervals, dive.beginning, (10.0,))
+    together = replay(dive.intervals, dive.initial, (10.0,))
     np.testing.assert_array_equal(together.known.P, alone.known.P)
     np.testing.assert_array_equal(together.states().p_n, alone.states().p_n)
     assert together.gates == alone.gates
@@ -320,7 +320,7 @@ def test_intervals_in_a_row_come_out_as_one_by_one(case):
 @pytest.mark.parametrize("where", ["between", "here"])
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_correction_is_a_textbooks_kalman_update_moved_along_the_coordinates(estimator, where, loss):
-    initial = estimator.beginning
+    initial = estimator.initial
     lossy = {sensor: replace(instrument, loss=loss) for sensor, instrument in initial.instruments.items()}
     engine = FilterEngine(replace(initial, instruments=lossy))
     interval = max(estimator.intervals[60:], key=lambda i: len(getattr(i, where)))
@@ -545,7 +545,7 @@ def left_out(estimator: RecordingFilter, off: float, since: float) -> tuple[Gaus
 
 
 def test_a_measurement_beyond_its_gate_changes_nothing_and_is_remembered(estimator):
-    gate = estimator.beginning.instruments["dvl"].gate_sd
+    gate = estimator.initial.instruments["dvl"].gate_sd
     known, after, let_in, gates = left_out(estimator, 1.01 * gate, 0.0)
     assert not let_in and list(gates) == ["dvl"]
     np.testing.assert_array_equal(after.x, known.x)
@@ -555,7 +555,7 @@ def test_a_measurement_beyond_its_gate_changes_nothing_and_is_remembered(estimat
 
 
 def test_a_sensor_that_was_left_out_for_long_returns_within_three_sd(estimator):
-    long = 1.01 * estimator.beginning.instruments["dvl"].readmit_s
+    long = 1.01 * estimator.initial.instruments["dvl"].readmit_s
     assert not left_out(estimator, 1.01 * RETURN_SD, long)[2]
     *_, let_in, gates = left_out(estimator, 0.99 * RETURN_SD, long)
     assert let_in and not gates
@@ -566,7 +566,7 @@ def test_a_sensor_that_was_left_out_for_long_inflates_what_it_sees_and_what_foll
 
     Moments of the way t v, t even between 0 and T: T/2 v in the mean, T^2/3 v^2.
     """
-    engine, long = estimator.engine, 1.01 * estimator.beginning.instruments["dvl"].readmit_s
+    engine, long = estimator.engine, 1.01 * estimator.initial.instruments["dvl"].readmit_s
     known, after, let_in, gates = left_out(estimator, 50.0, long)
     assert not let_in and list(gates) == ["dvl"]
     np.testing.assert_array_equal(after.x, known.x)

@@ -26,7 +26,7 @@ def case() -> Simulated:
 
 
 @pytest.fixture(scope="module")
-def beginning(case) -> InitialConditions:
+def initial(case) -> InitialConditions:
     return initialise(case.log, case.config)
 
 
@@ -36,16 +36,16 @@ def measurements(case) -> list[Measurement]:
 
 
 @pytest.fixture(scope="module")
-def reference(case, beginning) -> RecordingFilter:
-    return fed(RecordingFilter(beginning), case.log)
+def reference(case, initial) -> RecordingFilter:
+    return fed(RecordingFilter(initial), case.log)
 
 
 def live(
-    beginning: InitialConditions, measurements: list[Measurement], hold: float = HOLD
+    initial: InitialConditions, measurements: list[Measurement], hold: float = HOLD
 ) -> tuple[FixedLag, list[Gaussian]]:
     """The filter after all measurements, and its estimate of every keyframe."""
     known: list[Gaussian] = []
-    engine = FixedLag(beginning, LAG, hold, passed=lambda mark: known.append(mark.known))
+    engine = FixedLag(initial, LAG, hold, passed=lambda mark: known.append(mark.known))
     for measurement in measurements:
         engine.add(measurement)
     engine.finish()
@@ -66,31 +66,31 @@ def shuffled(measurements: list[Measurement], within: float, seed: int = 3) -> l
     return [measurements[k] for k in np.argsort(arrival)]
 
 
-def test_in_order_it_is_the_filter_of_a_recorded_dive(beginning, measurements, reference):
-    same(live(beginning, measurements)[1], reference.filtered, 1e-12)
+def test_in_order_it_is_the_filter_of_a_recorded_dive(initial, measurements, reference):
+    same(live(initial, measurements)[1], reference.filtered, 1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hold", [HOLD, 0.0])
-def test_the_order_of_arrival_within_300_ms_changes_nothing(beginning, measurements, reference, hold):
+def test_the_order_of_arrival_within_300_ms_changes_nothing(initial, measurements, reference, hold):
     first, rest = measurements[:50], measurements[50:]
-    same(live(beginning, first + shuffled(rest, 0.3), hold)[1], reference.filtered, 1e-9)
+    same(live(initial, first + shuffled(rest, 0.3), hold)[1], reference.filtered, 1e-9)
 
 
 @pytest.mark.slow
 def test_pings_about_as_far_apart_as_keyframes_may_be_make_the_same_keyframes_in_any_order():
     case = simulated(falcon(), 40.0, seed=6, dvl_rate=1.0, dvl_jitter=0.4)
-    measurements, beginning = list(case.log.measurements()), initialise(case.log, case.config)
-    reference = fed(RecordingFilter(beginning), case.log)
+    measurements, initial = list(case.log.measurements()), initialise(case.log, case.config)
+    reference = fed(RecordingFilter(initial), case.log)
     first, rest = measurements[:50], measurements[50:]
-    same(live(beginning, first + shuffled(rest, 2.0), 0.1)[1], reference.filtered, 1e-9)
+    same(live(initial, first + shuffled(rest, 2.0), 0.1)[1], reference.filtered, 1e-9)
 
 
-def test_a_ping_three_seconds_late_is_used_at_its_own_time(beginning, measurements, reference):
+def test_a_ping_three_seconds_late_is_used_at_its_own_time(initial, measurements, reference):
     k = next(k for k, m in enumerate(measurements) if m.sensor == "dvl" and m.time > 20.0)
     late = next(j for j, m in enumerate(measurements) if m.time > measurements[k].time + 3.0)
     order = measurements[:k] + measurements[k + 1 : late] + [measurements[k]] + measurements[late:]
-    same(live(beginning, order)[1], reference.filtered, 1e-9)
+    same(live(initial, order)[1], reference.filtered, 1e-9)
 
 
 def test_pings_that_are_found_to_be_late_are_put_where_they_belong_from_then_on():
@@ -98,16 +98,16 @@ def test_pings_that_are_found_to_be_late_are_put_where_they_belong_from_then_on(
     offset = {"dvl_time_offset": np.array([0.1])}
     config = falcon(calibration={"dvl_time_offset": {"estimate": True, "sd": 0.1}})
     case = simulated(config, 40.0, seed=6, dvl_rate=3.0, calibration=offset)
-    beginning = initialise(case.log, case.config)
-    engine, known = live(beginning, list(case.log.measurements()))
-    recorded = fed(RecordingFilter(beginning), case.log)
+    initial = initialise(case.log, case.config)
+    engine, known = live(initial, list(case.log.measurements()))
+    recorded = fed(RecordingFilter(initial), case.log)
     same(known, recorded.filtered, 1e-12)
     assert engine._assembler.time_offsets.off(known[-1].state.calibration) < 0.02
     assert abs(known[-1].state.calibration["dvl_time_offset"][0] - 0.1) < 0.02
 
 
-def test_what_is_later_than_the_lag_or_repeated_is_left_out_and_said(beginning, measurements):
-    engine = FixedLag(beginning, LAG, HOLD)
+def test_what_is_later_than_the_lag_or_repeated_is_left_out_and_said(initial, measurements):
+    engine = FixedLag(initial, LAG, HOLD)
     cut = next(k for k, m in enumerate(measurements) if m.time > 15.0)
     assert {engine.add(m) for m in measurements[:cut]} == {InsertResult.IN}
     ping = next(m for m in measurements if m.sensor == "dvl" and m.time > 5.0)
@@ -116,22 +116,22 @@ def test_what_is_later_than_the_lag_or_repeated_is_left_out_and_said(beginning, 
     assert engine.add(recent) == InsertResult.AGAIN
 
 
-def test_retracted_pings_leave_no_trace(case, beginning, measurements):
+def test_retracted_pings_leave_no_trace(case, initial, measurements):
     gone = [m for m in measurements if m.sensor == "dvl" and 28.0 < m.time < 30.0]
-    engine = FixedLag(beginning, LAG, HOLD)
+    engine = FixedLag(initial, LAG, HOLD)
     cut = next(k for k, m in enumerate(measurements) if m.time > 30.0)
     for m in measurements[:cut]:
         engine.add(m)
     engine.retract("dvl", 28.0)
-    never = FixedLag(beginning, LAG, HOLD)
+    never = FixedLag(initial, LAG, HOLD)
     for m in measurements[:cut]:
         if not any(m is g for g in gone):
             never.add(m)
     same([engine.marks[-1].known], [never.marks[-1].known], 1e-9)
 
 
-def test_prediction_ahead_grows_uncertain_and_beyond_the_imu_more_so(beginning, measurements):
-    engine = FixedLag(beginning, LAG, HOLD)
+def test_prediction_ahead_grows_uncertain_and_beyond_the_imu_more_so(initial, measurements):
+    engine = FixedLag(initial, LAG, HOLD)
     for m in measurements[:2500]:
         engine.add(m)
     mark = engine.marks[-1]
@@ -140,14 +140,14 @@ def test_prediction_ahead_grows_uncertain_and_beyond_the_imu_more_so(beginning, 
     assert sd[0] < sd[1] < 0.1 * sd[2]
 
 
-def test_restored_from_its_state_it_goes_on_as_if_nothing_had_happened(tmp_path, beginning, measurements, reference):
+def test_restored_from_its_state_it_goes_on_as_if_nothing_had_happened(tmp_path, initial, measurements, reference):
     cut = 2500
-    before = FixedLag(beginning, LAG, HOLD)
+    before = FixedLag(initial, LAG, HOLD)
     for m in measurements[:cut]:
         before.add(m)
     write_checkpoint(tmp_path / "state", before.state())
     known: list[Gaussian] = []
-    after = FixedLag(beginning, LAG, HOLD, passed=lambda mark: known.append(mark.known))
+    after = FixedLag(initial, LAG, HOLD, passed=lambda mark: known.append(mark.known))
     after.restore(read_checkpoint(tmp_path / "state"))
     for t in (before.marks[-1].interval.time, measurements[cut - 1].time):
         np.testing.assert_allclose(after.ahead(t)[1].P, before.ahead(t)[1].P, rtol=1e-9, atol=1e-12)
@@ -158,8 +158,8 @@ def test_restored_from_its_state_it_goes_on_as_if_nothing_had_happened(tmp_path,
     same(known[-20:], reference.filtered[-20:], 1e-9)
 
 
-def test_memory_does_not_grow(beginning, measurements):
-    engine, sizes = FixedLag(beginning, LAG, HOLD), []
+def test_memory_does_not_grow(initial, measurements):
+    engine, sizes = FixedLag(initial, LAG, HOLD), []
     for k, m in enumerate(measurements):
         engine.add(m)
         if k in (len(measurements) // 2, len(measurements) - 1):
@@ -177,7 +177,7 @@ def once(monkeypatch) -> None:
 
 
 def reinitialised(
-    beginning: InitialConditions,
+    initial: InitialConditions,
     measurements: list[Measurement],
     thread: Reinitialisations,
     lag: float = LAG,
@@ -190,7 +190,7 @@ def reinitialised(
         known.append(mark.known)
         thread.take(mark)
 
-    engine, newest = FixedLag(beginning, lag, HOLD, passed=passed), -1
+    engine, newest = FixedLag(initial, lag, HOLD, passed=passed), -1
     for measurement in measurements:
         engine.add(measurement)
         if engine.marks and engine.marks[-1].interval.index > newest:
@@ -203,19 +203,19 @@ def reinitialised(
 
 
 @pytest.mark.parametrize("lag", [LAG, 20.0])
-def test_a_reinitialisation_in_the_thread_makes_it_the_reinitialised_filter(once, case, beginning, measurements, lag):
+def test_a_reinitialisation_in_the_thread_makes_it_the_reinitialised_filter(once, case, initial, measurements, lag):
     """From the keyframe at which it was due, with those since taken again."""
-    recorded = fed(RecordingFilter(beginning, (DUE,)), case.log)
+    recorded = fed(RecordingFilter(initial, (DUE,)), case.log)
     thread = Reinitialisations(patient=True)
-    known = reinitialised(beginning, measurements, thread, lag)
+    known = reinitialised(initial, measurements, thread, lag)
     assert not thread.news
     same(known[-20:], recorded.filtered[-20:], 1e-5, rtol=1e-2)  # of two optima, each within its tolerance
 
 
 def test_a_reinitialisation_that_takes_longer_than_the_lag_makes_it_the_same(
-    once, monkeypatch, case, beginning, measurements
+    once, monkeypatch, case, initial, measurements
 ):
-    recorded = fed(RecordingFilter(beginning, (DUE,)), case.log)
+    recorded = fed(RecordingFilter(initial, (DUE,)), case.log)
     thread, smooth, released = Reinitialisations(patient=False), reinitialisations._smoothed, threading.Event()
 
     def slow(*arguments):
@@ -228,19 +228,19 @@ def test_a_reinitialisation_that_takes_longer_than_the_lag_makes_it_the_same(
             thread.patient = True
 
     monkeypatch.setattr(reinitialisations, "_smoothed", slow)
-    known = reinitialised(beginning, measurements, thread, at=release)
+    known = reinitialised(initial, measurements, thread, at=release)
     assert not thread.news
     same(known[-20:], recorded.filtered[-20:], 1e-5, rtol=1e-2)
 
 
 def test_a_reinitialisation_that_fails_is_said_once_and_leaves_the_filter_as_it_is(
-    once, monkeypatch, beginning, measurements, reference
+    once, monkeypatch, initial, measurements, reference
 ):
     def fails(*arguments):
         raise InputError("the data do not determine pose of keyframe 3")
 
     monkeypatch.setattr(reinitialisations, "_smoothed", fails)
     thread = Reinitialisations(patient=True)
-    same(reinitialised(beginning, measurements, thread), reference.filtered, 1e-12)
+    same(reinitialised(initial, measurements, thread), reference.filtered, 1e-12)
     [text] = thread.news
     assert "pose of keyframe 3" in text

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from dives import altered, as_log, batch, beginning, changed, kept, rms, same, without
+from dives import altered, as_log, batch, changed, initial_conditions, kept, rms, same, without
 
 from rovgraph.config import Config
 from rovgraph.engine.aiding import OLDEST_SIGNAL_S, PIECE_S
@@ -169,13 +169,13 @@ def test_drag_current_and_track_are_recovered_without_noise(still, graph, smooth
     current = [c.value for c in smoothed.calibration if c.label.startswith("current")]
     np.testing.assert_allclose(current, CURRENT, atol=2e-3)
     assert still.errors(smoothed).max() < 0.05
-    filtered = replay(graph.intervals, graph.beginning, REINITIALISE_AT_S).solve()
+    filtered = replay(graph.intervals, graph.initial, REINITIALISE_AT_S).solve()
     np.testing.assert_allclose(coefficients(filtered)[0], TRUE_DRAG - 1.0, atol=0.1)
 
 
 def test_graph_and_rts_smoother_agree(graph, smoothed):
     """To half an sd of the track and 10 percent of drag: one pass linearises with drag a quarter off."""
-    rts = replay(graph.intervals, graph.beginning).smoothed()
+    rts = replay(graph.intervals, graph.initial).smoothed()
     far = np.linalg.norm(rts.trajectory.p_n - smoothed.trajectory.p_n, axis=1)
     sd = np.sqrt(np.trace(smoothed.trajectory.cov_p, axis1=1, axis2=2))
     assert np.all(far < 0.5 * sd)
@@ -206,7 +206,7 @@ def test_signals_that_stop_or_start_late_are_left_out_and_counted(still):
 
 
 def test_signals_of_a_whole_log_are_taken_as_those_that_come_one_by_one(still):
-    one, whole = batch(still.log, still.config), BatchSmoother(beginning(still.log, still.config))
+    one, whole = batch(still.log, still.config), BatchSmoother(initial_conditions(still.log, still.config))
     same(one.intervals, whole.take(still.log))
     assert whole.assembler.left_out == one.assembler.left_out
 
@@ -214,7 +214,7 @@ def test_signals_of_a_whole_log_are_taken_as_those_that_come_one_by_one(still):
 def test_without_hydrodynamics_signals_change_nothing(still):
     config = with_thrusters(still.config, on=False)
     noisy = altered(still.log, "thruster", 0.0 * still.log["thruster"].data + 50.0)
-    start = beginning(still.log, config)
+    start = initial_conditions(still.log, config)
     assert "thruster" not in start.instruments
     for a, b in zip(batch(still.log, config).intervals, batch(noisy, config).intervals, strict=True):
         assert a.time == b.time and len(a.measurements) == len(b.measurements)

@@ -46,7 +46,7 @@ def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows():
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))
     chain = smoother.optimum()
-    graph = smooth_graph(smoother.intervals, smoother.beginning, chain.state)
+    graph = smooth_graph(smoother.intervals, smoother.initial, chain.state)
     assert chain.solution.cost == pytest.approx(graph.solution.cost, rel=1e-6)
     for name in SCALES:
         np.testing.assert_allclose(chain.covariances(name)[-1], graph.covariances(name)[-1], rtol=1e-3, atol=1e-12)
@@ -65,7 +65,7 @@ def interval_and_states() -> tuple[KeyframeInterval, Unknowns, State, State]:
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))
     interval = smoother.intervals[60]
-    wanted = unknowns(beliefs(smoother.beginning.config), smoother.beginning.instruments).of(SCALES)
+    wanted = unknowns(beliefs(smoother.initial.config), smoother.initial.instruments).of(SCALES)
     at = true_at(case, np.array([smoother.intervals[59].time]))
     means = {**wanted.fixed, **{name: np.array(value) for name, value in SCALES.items()}}
     before = State(at.R_nb, at.p_n, at.v_n, 0.01 * np.ones((1, 6)), means)
@@ -98,7 +98,7 @@ def test_factor_of_a_motion_with_scales_is_linearised_as_its_error_moves():
 def test_transition_of_the_filter_holds_the_derivative_by_the_scales():
     interval, _, before, _ = interval_and_states()
     case = scaled(noise=True, seconds=40.0)
-    engine = FilterEngine(batch(case.log, started(case)).beginning)
+    engine = FilterEngine(batch(case.log, started(case)).initial)
     before = replace(before, calibration={**engine.unknowns.fixed, **before.calibration})
     transition = engine.predict(interval, Gaussian.of(before, engine.start().P))
     d = 1e-5

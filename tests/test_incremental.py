@@ -81,7 +81,7 @@ def test_filter_ends_where_the_batch_does(case, filtered):
 
 
 def test_the_filter_is_as_good_as_isam2_at_its_newest_keyframe(case, filtered):
-    isam2 = IncrementalEstimator(filtered.beginning)
+    isam2 = IncrementalEstimator(filtered.initial)
     newest: dict[int, Array] = {}
     for interval in filtered.intervals:
         isam2.step(interval)
@@ -115,7 +115,7 @@ def test_feeding_measurements_and_replaying_intervals_are_the_same(case, filtere
 def test_the_future_does_not_change_what_was_filtered(case, filtered):
     half = Log(case.log.source, {s: _until(stream, 40.0) for s, stream in case.log.streams.items()})
     # the start resolves the log's own noise and field, so both are told the same
-    estimator = fed(ErrorStateFilter(filtered.beginning, REINITIALISE_AT_S), half)
+    estimator = fed(ErrorStateFilter(filtered.initial, REINITIALISE_AT_S), half)
     short, full = estimator.solve().trajectory, filtered.solve().trajectory
     n = int(np.searchsorted(full.time, 39.0))
     np.testing.assert_allclose(short.p_n[:n], full.p_n[:n], atol=1e-9)
@@ -169,7 +169,7 @@ def test_an_open_gate_lets_everything_in(case):
 
 
 def test_a_variable_that_nothing_determines_is_named_in_one_line(filtered):
-    engine = IncrementalEstimator(filtered.beginning).engine
+    engine = IncrementalEstimator(filtered.initial).engine
     between = gtsam.JacobianFactor(key(POSE, 0), np.eye(6), key(POSE, 1), -np.eye(6), np.zeros(6), UNIT)
     engine._graph.push_back(gtsam.LinearContainerFactor(between))
     for index in range(2):
@@ -201,7 +201,7 @@ def test_what_isam2_knows_of_its_newest_keyframe_is_what_the_dive_so_far_shows(c
     filtered, off = whole.history.states, []
     for end in range(30, len(dive.intervals), 30):
         states = filtered.at(np.arange(end + 1))
-        best = smooth_chain(dive.intervals[: end + 1], dive.beginning, states)
+        best = smooth_chain(dive.intervals[: end + 1], dive.initial, states)
         sd = np.sqrt(np.diag(best.newest_covariance()))
         newest = best.state.at([end])
         turn = log_rotation(transpose(newest.R_nb) @ filtered.R_nb[end : end + 1])[0]
@@ -220,7 +220,7 @@ def test_isam2_and_the_filter_agree_on_every_keyframe_but_the_first_seconds(case
 def test_isam2s_filtered_estimate_is_of_the_pass_itself(case, whole):
     """What came later does not change it, and its residuals are innovations."""
     half = Log(case.log.source, {s: _until(stream, 40.0) for s, stream in case.log.streams.items()})
-    short, full = fed(IncrementalEstimator(whole.beginning), half).filtered().trajectory, whole.filtered().trajectory
+    short, full = fed(IncrementalEstimator(whole.initial), half).filtered().trajectory, whole.filtered().trajectory
     n = int(np.searchsorted(full.time, 39.0))
     np.testing.assert_allclose(short.p_n[:n], full.p_n[:n], atol=1e-9)
     nis = whole.filtered().summary["nis"]["dvl"]
@@ -245,7 +245,7 @@ def test_the_rows_of_an_interval_are_gtsams_factors_of_it(whole):
     states = whole.history.states.at([interval.index - 1, interval.index])
     x = np.concatenate([states.R_nb.reshape(2, 9), states.p_n + 0.01, states.v_n - 0.02, states.bias], axis=1)
     c = calibration_vector({name: value[-1] for name, value in states.calibration.items()})
-    (rows,) = Linearization(engine, whole.beginning.prior).linearize(
+    (rows,) = Linearization(engine, whole.initial.prior).linearize(
         [IntervalTerms(engine, interval, interval.measurements)], x, c[None]
     )
     values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
@@ -272,7 +272,7 @@ def test_the_rows_of_an_interval_are_gtsams_factors_of_it(whole):
 
 
 def test_what_isam2_tells_of_its_newest_keyframe_is_its_joint_marginal(whole):
-    """The root of the tree has it, also after iSAM2 has been put up anew."""
+    """The root of the tree has it, also after iSAM2 has been put up again."""
     engine, last = whole.engine, whole.intervals[-1]
     keys = [key(POSE, last.index), key(CALIBRATION, last.segment)]
     x, _, P, _ = engine.newest()
@@ -286,8 +286,8 @@ def test_isam2_claims_no_more_of_the_heading_than_the_dive_so_far_shows(case, wh
     heading = whole.filtered().trajectory.rpy_sd[:, 2]
     for seconds in range(6, 40, 2):
         end = int(np.searchsorted([i.time for i in dive.intervals], dive.intervals[0].time + seconds))
-        best = smooth_chain(dive.intervals[: end + 1], dive.beginning, whole.history.states.at(np.arange(end + 1)))
-        so_far = smoothed_results(best, dive.beginning).trajectory.rpy_sd[-1, 2]
+        best = smooth_chain(dive.intervals[: end + 1], dive.initial, whole.history.states.at(np.arange(end + 1)))
+        so_far = smoothed_results(best, dive.initial).trajectory.rpy_sd[-1, 2]
         ratio.append(heading[end] / so_far)
     assert min(ratio) > 0.8
     assert np.mean(ratio) > 0.95

@@ -46,7 +46,7 @@ def still(rpy_deg, heading_deg=30.0, noise=0.0, seconds=10.0, gyr=(0.0, 0.0, 0.0
 
 
 def start_of(log, config=None):
-    """Roll, pitch, yaw of the start [deg] and the whole beginning."""
+    """Roll, pitch, yaw of the start [deg] and the whole initial."""
     b = initialise(log, config or Config())
     return np.rad2deg(rpy_from_matrix(b.prior.state.R_nb[0])), b
 
@@ -91,7 +91,7 @@ def test_a_start_in_motion_settles_in_the_graph():
     trajectory = smoother.solve().trajectory
     tilt = np.linalg.norm(attitude_errors(trajectory, case)[:, :2], axis=1)
     assert tilt.max() < 0.5 * DEG
-    started = rpy_from_matrix(smoother.beginning.prior.state.R_nb[0])
+    started = rpy_from_matrix(smoother.initial.prior.state.R_nb[0])
     true = case.dive.path.motion([trajectory.time[0]])
     assert np.abs(started - rpy_from_matrix(true.R_nb[0]))[:2].max() < 15.0 * DEG
 

@@ -63,7 +63,7 @@ def test_prediction_is_the_process_and_its_mean():
     case = simulated(config, 32.0, water_track=True, **SLOW)
     dive = BatchSmoother(initialise(case.log, case.config))
     dive.take(case.log)
-    engine = FilterEngine(dive.beginning)
+    engine = FilterEngine(dive.initial)
     before, interval = engine.start(), dive.intervals[5]
     own, seconds = engine.layout.columns["current"], interval.time - dive.intervals[4].time
     before.c[LAYOUT["current"]] = 1.3, 0.8

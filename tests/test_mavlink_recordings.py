@@ -130,7 +130,7 @@ def test_a_link_that_stalls_is_no_clock_that_jumps(tmp_path):
     assert recording.clocks[first(recording, "ahrs").clock].unix_offset == pytest.approx(UNIX, abs=1e-3)
 
 
-def test_an_autopilot_that_starts_anew_leaves_its_longest_run(tmp_path):
+def test_an_autopilot_that_restarts_leaves_its_longest_run(tmp_path):
     times = iter(np.arange(1000) / 20.0)  # of the receiver, which goes on
     sent = [(next(times), message, sender) for _, message, sender in attitudes(60, 500.0) + attitudes(150, 1.0)]
     recording = read(written(sent), tmp_path)

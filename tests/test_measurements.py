@@ -247,7 +247,7 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
             by_sensor.setdefault(a.sensor, []).append(a)
     assert set(by_sensor) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
     for sensor, attached in by_sensor.items():
-        instrument = smoother.beginning.instruments[sensor]
+        instrument = smoother.initial.instruments[sensor]
         block = make_block(attached, instrument, config.environment.gravity_mps2, Unknowns(truth.calibration, {}))
         r = block.normalised(truth.at(block.keyframe))
         # motion from the keyframe is integrated from noisy samples, which adds little

@@ -158,7 +158,7 @@ def test_damaged_rows_and_names_that_come_again_are_counted(tmp_path):
     }  # fmt: skip
 
 
-ANEW = connect(by_reference(5)) + connect(by_reference(5), [f"{name} [deg/s]" if "Gyro" in name else name for name in CONNECT])  # fmt: skip  # noqa: E501
+RENAMED = connect(by_reference(5)) + connect(by_reference(5), [f"{name} [deg/s]" if "Gyro" in name else name for name in CONNECT])  # fmt: skip  # noqa: E501
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ ANEW = connect(by_reference(5)) + connect(by_reference(5), [f"{name} [deg/s]" if
             connect(by_reference(), [f"{name} [furlong]" if "Mag" in name else name for name in CONNECT]),
             "unknown unit 'furlong'; expected one of: uT",
         ),
-        (ANEW, "row 6 names the columns anew, and otherwise than before"),
+        (RENAMED, "row 6 names the columns again, in another way"),
         (connect(by_reference()).replace(b"Gyro", b"Temp"), "no row with a time and acceleration"),
     ],
 )

@@ -155,8 +155,8 @@ def test_a_log_without_imu_is_smoothed_and_no_bias_is_reported(dive):
 
 def test_measurements_one_by_one_and_a_whole_log_give_the_same_keyframes(dive):
     case, config = dive
-    beginning = initialise(case.log, config)
-    whole = BatchSmoother(beginning)
+    initial = initialise(case.log, config)
+    whole = BatchSmoother(initial)
     whole.take(case.log)
     one_by_one = batch(case.log, config)
     assert len(whole.intervals) > SECONDS
@@ -355,7 +355,7 @@ def test_gtsam_finds_the_same_optimum(dive):
 
     case, config = dive
     smoother = batch(case.log, config)
-    problem = smoother.intervals, smoother.beginning, smoother.optimum().state
+    problem = smoother.intervals, smoother.initial, smoother.optimum().state
     chain, graph = smooth_chain(*problem), smooth_graph(*problem)
     np.testing.assert_allclose(graph.state.p_n, chain.state.p_n, atol=1e-5)
 

@@ -81,7 +81,7 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
         log = kept(log, sensor, (log[sensor].time > 18.0) & (log[sensor].time < 24.0))
     smoother = batch(log, ONE_COMPASS)
     dive = smoother.optimum()
-    problem, values = as_graph(dive, smoother.beginning)
+    problem, values = as_graph(dive, smoother.initial)
     ends = [7, 12, problem.count - 1]
     seen = dive.knowledge(ends)
     linear = problem.linearize(values, dive.solution.gates)

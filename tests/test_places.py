@@ -305,15 +305,15 @@ def test_a_renewed_filter_knows_the_places_as_the_graph_does(lost):
 
 
 def test_late_and_restored_it_remembers_the_same_places(lost, tmp_path):
-    beginning = initialise(lost.log, lost.config)
+    initial = initialise(lost.log, lost.config)
     reference = filtered(lost.log, lost.config, renew=False).known
     measurements = list(lost.log.measurements())
     late = sorted(measurements, key=lambda m: m.time + (1.5 if m.sensor == "place" else 0.0))
-    engine = FixedLag(beginning, 5.0, 0.3)
+    engine = FixedLag(initial, 5.0, 0.3)
     for m in late[: len(late) // 2]:
         engine.add(m)
     write_checkpoint(tmp_path / "state", engine.state())
-    after = FixedLag(beginning, 5.0, 0.3)
+    after = FixedLag(initial, 5.0, 0.3)
     after.restore(read_checkpoint(tmp_path / "state"))
     for m in late[len(late) // 2 :]:
         after.add(m)
@@ -340,13 +340,13 @@ def test_information_about_the_calibration_is_the_graphs_with_places_in_it(lost)
 
 
 def test_a_place_that_stays_in_view_counts_once(lost):
-    beginning = initialise(lost.log, changed(lost.config, place={"every_s": 5.0}))
+    initial = initialise(lost.log, changed(lost.config, place={"every_s": 5.0}))
     often = lost.log["place"]
     time = np.arange(50.0, 58.0, 0.5)
     data = np.column_stack([np.ones(len(time)), np.full(len(time), 0.3)])
     stream = replace(often, time=time, data=data, row=np.arange(len(time)))
     log = Log("dive.csv", {**lost.log.streams, "place": stream})
-    assembler = Assembler(beginning.config, beginning.instruments, beginning.prior.state.bias[0])
+    assembler = Assembler(initial.config, initial.instruments, initial.prior.state.bias[0])
     intervals = [i for m in log.measurements() for i in assembler.add(m)]
     seen = [a for i in intervals for a in i.measurements if a.sensor == "place"]
     assert [a.time for a in seen] == [50.0, 55.0] and [a.landmark.number for a in seen] == [1, 2]

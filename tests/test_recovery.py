@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dives import Simulated, altered, beginning, falcon, interrupted, renewed, simulated, true_at
+from dives import Simulated, altered, falcon, initial_conditions, interrupted, renewed, simulated, true_at
 
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
@@ -79,10 +79,10 @@ def test_a_correction_of_a_wide_prediction_is_at_the_optimum_of_its_cost(case, s
 def about_to_return(case: Simulated, rng: np.random.Generator) -> tuple[FilterEngine, Gaussian, KeyframeMeasurement]:
     """A prediction after a long silence, off by an error of its covariance, and the first ping."""
     config = falcon(dvl={"loss": "none"})
-    batch = assemble(interrupted(case.log, SILENT_FROM, 160.0, "dvl"), beginning(case.log, config))
+    batch = assemble(interrupted(case.log, SILENT_FROM, 160.0, "dvl"), initial_conditions(case.log, config))
     back = next(k for k, i in enumerate(batch.intervals) if i.time > SILENT_FROM + 159.9)
     interval = batch.intervals[back]
-    estimator = replay(batch.intervals[:back], batch.beginning, REINITIALISE_AT_S)
+    estimator = replay(batch.intervals[:back], batch.initial, REINITIALISE_AT_S)
     engine = estimator.engine
     before = engine.correct(estimator.known, interval.between, {}, [])
     known = engine.predict(interval, before).predicted

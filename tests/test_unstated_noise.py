@@ -69,7 +69,7 @@ def test_fixes_whose_errors_last_are_found_and_believed_so(correlated, found):
     (one,) = found.estimates[0].summary["noise_found"]
     assert one["key"] == "calibration.fix_error" and one["values"]["estimate"]
     assert 0.7 < one["values"]["sd"] < 3.0 and 8.0 < one["values"]["time_constant_s"] < 50.0
-    assert found.beginning.config.calibration.fix_error.time_constant_s == one["values"]["time_constant_s"]
+    assert found.initial.config.calibration.fix_error.time_constant_s == one["values"]["time_constant_s"]
     assert "fix: its errors are correlated over" in found.assumptions[0]
     for kind in ("smoothed", "filtered"):
         assert nees(correlated[0], found, kind) < 2.0, kind
@@ -135,7 +135,7 @@ def test_noise_three_times_what_is_stated_is_found_and_believed():
     dive = smooth(case.log, stated, "smoothed")
     (one,) = dive.estimates[0].summary["noise_found"]
     assert one["key"] == "fix.sd_m" and one["values"] == pytest.approx(0.3, rel=0.2)
-    assert dive.beginning.config.fix.sd_m == one["values"]
+    assert dive.initial.config.fix.sd_m == one["values"]
     assert dive.assumptions[0].startswith("fix: its noise is ")
 
 

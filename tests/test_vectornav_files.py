@@ -176,7 +176,10 @@ GYROS = {f"UncompGyro{axis}": f"UncompGyro{axis} [deg/s]" for axis in "XYZ"}
         (sentence("GPE", 1.0, 2.0) * 9, "no message with inertial values or attitude .* it has: VNGPE"),
         (csv(9, ["GpsTag" if "Time" in name and name != "TimeStatus" else name for name in CSV], TimeGps=0), "no time"),
         (csv(9).replace(b"UncompGyroZ", b"UncompGyroZ [deg/s]"), "in different units: UncompGyroX in no stated unit"),
-        (csv(9) + csv(9, [GYROS.get(name, name) for name in CSV]), "names the columns anew, and otherwise than before"),
+        (
+            csv(9) + csv(9, [GYROS.get(name, name) for name in CSV]),
+            "names the columns again, in another way",
+        ),
         (csv(9, [GYROS.get(n, n).replace("deg/s", "rpm") for n in CSV]), "unknown unit 'rpm'; expected one of: rad/s"),
     ],
 )

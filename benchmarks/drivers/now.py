@@ -30,16 +30,16 @@ def filtered(*files: str) -> float:
     log, config = read(*files)
     batch = assemble(log, initialise(log, config))
     began = processor()
-    replay_filter(batch.intervals, batch.beginning, REINITIALISE_AT_S).solve()
+    replay_filter(batch.intervals, batch.initial, REINITIALISE_AT_S).solve()
     return processor() - began
 
 
 def smoothed(*files: str) -> float:
     """Processor time of assembling, the optimum and its marginal covariances [s]."""
     log, config = read(*files)
-    beginning = initialise(log, config)
+    initial = initialise(log, config)
     began = processor()
-    assemble(log, beginning).solve()
+    assemble(log, initial).solve()
     return processor() - began
 
 

@@ -203,7 +203,7 @@ class Online:
             if folder is not None:
                 if not resume:
                     prepare(folder, force, sources)
-                files = Files(folder, config, warnings, resume, anew=self.engine == "isam2")
+                files = Files(folder, config, warnings, resume, replayed=self.engine == "isam2")
             opened_outputs.pop_all()
         told: list[Callable[[Solution], None]] = [each.send for each in receivers]
         if watched is not None:

@@ -60,8 +60,8 @@ class SimulatedDive:
         from rovgraph.report.folder import STAMP, results_folder
 
         with results_folder(as_path(path, "path"), force) as folder:
-            told = {**STAMP, "scenario": self.scenario, "seed": self.seed, **self.choices.told()}
-            write_dive(folder, self.dive, self.config, told)
+            settings = {**STAMP, "scenario": self.scenario, "seed": self.seed, **self.choices.summary()}
+            write_dive(folder, self.dive, self.config, settings)
 
 
 def simulate(scenario: str, config: Config | None = None, seed: int = 1, choices: Choices = OWN) -> SimulatedDive:

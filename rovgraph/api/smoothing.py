@@ -95,7 +95,7 @@ class Result:
     @property
     def config(self) -> Config:
         """The effective configuration."""
-        return self.dive.beginning.config
+        return self.dive.initial.config
 
     def track(self, estimate: str | None = None) -> Track:
         """An estimate with its origin on Earth and its fixes, ready to be exported; None = the best available.

@@ -16,7 +16,7 @@ from rovgraph.geometry import Array, log_rotation
 from rovgraph.log import Log
 from rovgraph.sensors.dvl import axes_remedy
 
-ALIKE = 1.1  # times the least error, that tells two orientations apart no more
+SIMILAR = 1.1  # times the least error, that tells two orientations apart no more
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 LAG_WARNING = 0.05  # [s]
 APART = 0.15  # that search and fit may be apart [s]
@@ -54,7 +54,7 @@ def dvl_and_imu(log: Log, config: Config) -> Iterator[Finding]:
 def _explanation(found: Search) -> tuple[int, int]:
     """Orientation and lag, by their indices: as configured unless another is far better, and one of the two if it does.
 
-    A dive's legs are alike, so shifted or turned they may agree almost as well as when they are right.
+    A dive's legs are similar, so shifted or turned they may agree almost as well as when they are right.
     """
     both = np.unravel_index(int(np.argmin(found.error)), found.error.shape)
     axes, lag = int(np.argmin(found.error[:, found.now])), int(np.argmin(found.error[0]))
@@ -70,18 +70,18 @@ def _explanation(found: Search) -> tuple[int, int]:
 
 
 def _upright(log: Log, config: Config, found: Search, m: int) -> int:
-    """Of orientations that agree alike, as the two senses of the vertical do on a level dive, the one to believe.
+    """The one to believe of orientations that agree equally well, as both senses of the vertical do on a level dive.
 
     Depth decides; where it shows nothing, an instrument is rather mounted in another way than left-handed.
     """
     error = found.error[:, m]
-    alike = np.flatnonzero(error < ALIKE * error.min())
+    similar = np.flatnonzero(error < SIMILAR * error.min())
     R_bs = mount_matrix(config.dvl.mount_rpy_deg)
-    by_depth = [dives_with_depth(log, config, R_bs @ ORIENTATIONS[k]) for k in alike]
+    by_depth = [dives_with_depth(log, config, R_bs @ ORIENTATIONS[k]) for k in similar]
     if max(by_depth) > FOLLOWS:
-        return int(alike[int(np.argmax(by_depth))])
-    handed = np.linalg.det(ORIENTATIONS[alike]) > 0.0
-    chosen = alike[handed] if handed.any() else alike
+        return int(similar[int(np.argmax(by_depth))])
+    handed = np.linalg.det(ORIENTATIONS[similar]) > 0.0
+    chosen = similar[handed] if handed.any() else similar
     return int(chosen[int(np.argmin(error[chosen]))])
 
 

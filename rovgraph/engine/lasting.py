@@ -166,8 +166,10 @@ def unity(block: Block, state: State, H: Array, gate: NDArray[np.bool_]) -> floa
     score, information = np.einsum("nij,ni->nj", H, r), np.einsum("nij,nij->nj", H, H) * gate[:, None]
     window = ((block.time - block.time[0]) // WINDOW_S).astype(np.int64)
     sums = np.array([[np.bincount(window, column) for column in part.T] for part in (score, information)])
-    told = sums[:, sums[1] > 0.0]  # windows without measurements that are let in say nothing
-    return float(np.mean(told[0] ** 2 / np.maximum(told[1], 0.1 * np.median(told[1])))) if told.size else 1.0
+    windows = sums[:, sums[1] > 0.0]  # windows without measurements that are let in say nothing
+    if not windows.size:
+        return 1.0
+    return float(np.mean(windows[0] ** 2 / np.maximum(windows[1], 0.1 * np.median(windows[1]))))
 
 
 def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseline]:

@@ -87,30 +87,30 @@ class _Pings:
 
 
 def dead_reckon(
-    intervals: Sequence[KeyframeInterval], beginning: InitialConditions, calibration: Mapping[str, Array]
+    intervals: Sequence[KeyframeInterval], initial: InitialConditions, calibration: Mapping[str, Array]
 ) -> State:
     """The state at every keyframe, at the IMU.
 
     Parameters
     ----------
     intervals : of `rovgraph.engine.assembly.Assembler`, the first without motion
-    beginning : the resolved start
+    initial : the resolved start
     calibration : all calibration variables, at their means
 
     Returns
     -------
     State of ``len(intervals)`` epochs
     """
-    sources: list[str] = [s for s in HEADING_STREAMS if s in beginning.instruments]
-    compass = next(iter(trusted_first(beginning.config, sources)), None)
+    sources: list[str] = [s for s in HEADING_STREAMS if s in initial.instruments]
+    compass = next(iter(trusted_first(initial.config, sources)), None)
     epochs = _gather(intervals, {"dvl", "dvl_water", compass})
-    bottom, water = (_pings(epochs, sensor, beginning, calibration) for sensor in ("dvl", "dvl_water"))
-    R_nb, bias = _attitudes(epochs, bottom, compass, beginning, calibration)
+    bottom, water = (_pings(epochs, sensor, initial, calibration) for sensor in ("dvl", "dvl_water"))
+    R_nb, bias = _attitudes(epochs, bottom, compass, initial, calibration)
     v_n = _velocities(epochs, R_nb, bias, bottom, water, calibration["current"])
     step = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(epochs.time)[:, None]
     k = epochs.keyframe
-    p_n = (beginning.prior.state.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)]))[k]
-    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb[k], beginning, calibration)
+    p_n = (initial.prior.state.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)]))[k]
+    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb[k], initial, calibration)
     return State(R_nb[k], p_n, v_n[k], bias[k], dict(calibration))
 
 
@@ -150,8 +150,8 @@ def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | Non
             motion.bias,
         )
     begin, begin_R, begin_v = np.roll(dt, 1), np.roll(dR, 1, axis=0), np.roll(dv, 1, axis=0)
-    anew = (keyframe + 1) % m
-    begin[anew], begin_R[anew], begin_v[anew] = 0.0, identity(3), 0.0
+    first = (keyframe + 1) % m
+    begin[first], begin_R[first], begin_v[first] = 0.0, identity(3), 0.0
     return _Epochs(
         time,
         dt - begin,
@@ -165,13 +165,13 @@ def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | Non
     )
 
 
-def _pings(epochs: _Epochs, sensor: str, beginning: InitialConditions, calibration: Mapping[str, Array]) -> _Pings:
+def _pings(epochs: _Epochs, sensor: str, initial: InitialConditions, calibration: Mapping[str, Array]) -> _Pings:
     k, pings = epochs.of(sensor)
     if not pings:
         return _Pings(k, np.zeros((0, 3)), np.zeros(0), np.zeros(3))
     still = np.zeros((1, 3))
     R_bs = dvl_mounting(State(np.eye(3)[None], still, still, np.zeros((1, 6)), calibration))[0]
-    model: Any = beginning.instruments[sensor].model
+    model: Any = initial.instruments[sensor].model
     arm = model.lever_arm_b + calibration["dvl_lever_arm"]
     z, sd, rate_b = (np.array([getattr(a, name) for a in pings]) for name in ("z", "sd", "rate_b"))
     velocity_b = z @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(rate_b, arm)
@@ -180,13 +180,13 @@ def _pings(epochs: _Epochs, sensor: str, beginning: InitialConditions, calibrati
 
 
 def _attitudes(
-    epochs: _Epochs, bottom: _Pings, compass: str | None, beginning: InitialConditions, calibration: Mapping[str, Array]
+    epochs: _Epochs, bottom: _Pings, compass: str | None, initial: InitialConditions, calibration: Mapping[str, Array]
 ) -> tuple[Array, Array]:
     """Attitude and bias at all epochs, shapes (m, 3, 3), (m, 6).
 
     Tilt hardly depends on heading: it is found first, and with it what the compass says of heading.
     """
-    start, config, m = beginning.prior, beginning.config, len(epochs.time)
+    start, config, m = initial.prior, initial.config, len(epochs.time)
     bias, gyr_sd, env = start.state.bias[0], start.bias_sd[3:].max(), config.environment
     dvl, turns = np.tile([0.0, 0.0, 0.0, math.inf], (m, 1)), np.tile([0.0, math.inf, 0.0], (m, 1))
     dvl[bottom.epoch] = np.column_stack([bottom.velocity_b, bottom.variance])
@@ -203,7 +203,7 @@ def _attitudes(
     reckon_attitude(*arguments)
     k, headings = epochs.of(compass)
     if headings:
-        instrument, z = beginning.instruments[headings[0].sensor], np.array([a.z for a in headings])
+        instrument, z = initial.instruments[headings[0].sensor], np.array([a.z for a in headings])
         turn = solve_turn(instrument, z, R_nb[k], calibration)
         noise = turn_noise(instrument, R_nb[k], turn, calibration, beliefs(config))
         turns[k], reference[:] = np.column_stack([turn, noise.variance, noise.by_tilt]), R_nb
@@ -268,7 +268,7 @@ def _depths(
     intervals: Sequence[KeyframeInterval],
     integrated: Array,
     R_nb: Array,
-    beginning: InitialConditions,
+    initial: InitialConditions,
     calibration: Mapping[str, Array],
 ) -> Array:
     """Depth of the IMU from the pressure sensor, where there is one."""
@@ -276,7 +276,7 @@ def _depths(
     if not found:
         return integrated
     time, depth = np.array(found).T
-    arm = beginning.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
+    arm = initial.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
     own = np.interp([i.time for i in intervals], time, depth) - calibration["depth_offset"]
     own /= 1.0 + calibration["depth_scale"]
     return np.asarray(own - rotate(R_nb, arm)[:, 2])

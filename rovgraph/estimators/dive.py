@@ -39,14 +39,14 @@ class Dive:
     Attributes
     ----------
     estimates : "smoothed" and "filtered" as requested, and "dead_reckoning"
-    beginning : effective configuration, start and assumptions
+    initial : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
     frozen : intervals in which a sensor repeated its values; ignored too
     statistics : numbers that healthy dives keep small
     """
 
     estimates: list[Estimate]
-    beginning: InitialConditions
+    initial: InitialConditions
     left_out: dict[tuple[str, str], int]
     frozen: list[FrozenStretch]
     statistics: list[Statistic]
@@ -71,7 +71,7 @@ class Dive:
         """Assumptions and counts of ignored measurements, a line each."""
         counts = sorted(self.left_out.items())
         left_out = [f"left out {n} of {sensor}: {why}" for (sensor, why), n in counts]
-        return self.beginning.assumptions + _taken_as_exact(self.beginning) + left_out
+        return self.initial.assumptions + _taken_as_exact(self.initial) + left_out
 
 
 def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress = no_progress) -> Dive:
@@ -92,7 +92,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     found: list[UnstatedNoise] = []
     dive, best = _solve(log, config, frozen, gaps, estimate, progress)
     for _ in range(MAX_NOISES if config.graph.find_noise else 0):
-        more = find_noise(best, dive.beginning.config, dive.alarms) if isinstance(best, ChainOptimum) else []
+        more = find_noise(best, dive.initial.config, dive.alarms) if isinstance(best, ChainOptimum) else []
         if not more:
             break
         found, config = found + more, with_noise(config, more)
@@ -128,12 +128,12 @@ def _solve(
     progress: Progress,
 ) -> tuple[Dive, Optimum | None]:
     """The dive as configured, and the optimum of its smoothed estimate where a batch solver found it."""
-    beginning = initialise(log, config)
-    batch = assemble(log, beginning)
+    initial = initialise(log, config)
+    batch = assemble(log, initial)
     if config.graph.solver == "isam2":
         solver = _isam2(batch, progress)
         best = solver.optimum() if estimate != "filtered" else None
-        estimates = [] if best is None else [smoothed(best, solver.beginning)]
+        estimates = [] if best is None else [smoothed(best, solver.initial)]
         if estimate != "smoothed":
             estimates.append(solver.filtered())
     else:
@@ -146,23 +146,23 @@ def _solve(
         if estimate != "filtered":
             progress("smoothing", 0.5)
             best = batch.optimum(states)
-            estimates.insert(0, smoothed(best, beginning))
+            estimates.insert(0, smoothed(best, initial))
             best.forget_covariances()  # of a long dive they are large
     intervals = batch.intervals if best is None else best.intervals
-    numbers = statistics(Evidence(beginning, estimates, intervals, best, frozen, gaps))
+    numbers = statistics(Evidence(initial, estimates, intervals, best, frozen, gaps))
     left_out = _left_out(batch, frozen, gaps)
-    return Dive([*estimates, batch.dead_reckoning()], beginning, left_out, frozen, numbers), best
+    return Dive([*estimates, batch.dead_reckoning()], initial, left_out, frozen, numbers), best
 
 
 def _saying(dive: Dive, found: list[UnstatedNoise]) -> Dive:
     """A dive that says what noise was found in it."""
-    beginning = replace(dive.beginning, assumptions=[*(one.text for one in found), *dive.beginning.assumptions])
-    return replace(_with_main(dive, noise_found=[asdict(one) for one in found]), beginning=beginning)
+    initial = replace(dive.initial, assumptions=[*(one.text for one in found), *dive.initial.assumptions])
+    return replace(_with_main(dive, noise_found=[asdict(one) for one in found]), initial=initial)
 
 
-def assemble(log: Log, beginning: InitialConditions) -> BatchSmoother:
+def assemble(log: Log, initial: InitialConditions) -> BatchSmoother:
     """All keyframes of a log and what lies between them."""
-    batch = BatchSmoother(beginning)
+    batch = BatchSmoother(initial)
     batch.take(log)
     return batch
 
@@ -180,10 +180,10 @@ def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch], gaps: list[Atti
     return counts
 
 
-def _taken_as_exact(beginning: InitialConditions) -> list[str]:
+def _taken_as_exact(initial: InitialConditions) -> list[str]:
     """What iSAM2's filtered estimate does not doubt although the configuration does, in a line."""
-    config = beginning.config
-    names = unknowns(beliefs(config), beginning.instruments).considered if config.graph.solver == "isam2" else ()
+    config = initial.config
+    names = unknowns(beliefs(config), initial.instruments).considered if config.graph.solver == "isam2" else ()
     return (
         [f"the filtered estimate of iSAM2 takes these considered variables as exact: {', '.join(names)}"]
         if names
@@ -195,8 +195,8 @@ def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
     filtering = partial(progress, "filtering")
     measurements = batch.measurements
     if not measurements:
-        return replay(batch.intervals, batch.beginning, REINITIALISE_AT_S, filtering, batch.rows)
-    estimator = ErrorStateFilter(batch.beginning, REINITIALISE_AT_S)  # learns how late they are while they come
+        return replay(batch.intervals, batch.initial, REINITIALISE_AT_S, filtering, batch.rows)
+    estimator = ErrorStateFilter(batch.initial, REINITIALISE_AT_S)  # learns how late they are while they come
     for k, measurement in enumerate(measurements):
         if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:
             filtering(k / len(measurements))
@@ -210,8 +210,8 @@ def _isam2(batch: BatchSmoother, progress: Progress) -> "IncrementalEstimator":
 
     progress("incremental smoothing", 0.0)
     report = partial(progress, "incremental smoothing")
-    solver = run_isam2(batch.intervals, batch.beginning, report)
+    solver = run_isam2(batch.intervals, batch.initial, report)
     again = batch.placed_again(solver.latest().calibration)
     if again is not None:
-        solver = run_isam2(again.intervals, again.beginning, report)
+        solver = run_isam2(again.intervals, again.initial, report)
     return solver

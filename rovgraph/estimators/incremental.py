@@ -54,18 +54,18 @@ class IncrementalEstimator:
 
     Attributes
     ----------
-    beginning : of `rovgraph.estimators.initialise.initialise`
+    initial : of `rovgraph.estimators.initialise.initialise`
     update_s : of the dive, between updates of iSAM2; in between, the filter goes on from it [s]
     intervals : the dive, as far as it has been taken, landmarks given to their places
     known : Gaussian of the newest keyframe
     history : the filtered estimate of every keyframe
     """
 
-    beginning: InitialConditions
+    initial: InitialConditions
     update_s: float = 0.0
 
     def __post_init__(self) -> None:
-        b = self.beginning
+        b = self.initial
         self.filter = FilterEngine(b, considers=False)
         self.known = self.filter.start()
         self.history = FilterHistory(self.filter)
@@ -179,7 +179,7 @@ class IncrementalEstimator:
 
     def solve(self) -> Estimate:
         """The smoothed trajectory with its uncertainty."""
-        return smoothed(self.optimum(), self.beginning)
+        return smoothed(self.optimum(), self.initial)
 
     def optimum(self) -> Optimum:
         """The optimum of all that was taken, which is where the smoothed trajectory comes from."""
@@ -189,7 +189,7 @@ class IncrementalEstimator:
     def _optimum(self) -> Optimum:
         """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
         states = self.states()
-        given = self.beginning, states, newest_calibration(states.calibration)
+        given = self.initial, states, newest_calibration(states.calibration)
         if not self._own_places:
             return optimum(self.intervals, *given)
         best = associated_optimum(resolved_associations(self.intervals), *given)
@@ -207,12 +207,12 @@ class IncrementalEstimator:
 
 def run_isam2(
     intervals: Sequence[KeyframeInterval],
-    beginning: InitialConditions,
+    initial: InitialConditions,
     progress: Callable[[float], None] = lambda done: None,
     update_s: float = 0.0,
 ) -> IncrementalEstimator:
     """iSAM2 that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
-    estimator = IncrementalEstimator(beginning, update_s)
+    estimator = IncrementalEstimator(initial, update_s)
     for interval in intervals:
         estimator.step(interval)
         if interval.index % 50 == 0:

@@ -42,16 +42,16 @@ class BatchSmoother:
 
     Attributes
     ----------
-    beginning : of `rovgraph.estimators.initialise.initialise`
+    initial : of `rovgraph.estimators.initialise.initialise`
     time_offsets : how late they are; None = as the configuration believes
     intervals : the dive, as far as it has been taken
     """
 
-    beginning: InitialConditions
+    initial: InitialConditions
     time_offsets: TimeOffsets | None = None
 
     def __post_init__(self) -> None:
-        b = self.beginning
+        b = self.initial
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], assumed=self.time_offsets)
         self.intervals: list[KeyframeInterval] = []
         self._log: Log | None = None
@@ -61,7 +61,7 @@ class BatchSmoother:
     def take(self, log: Log) -> list[KeyframeInterval]:
         """Take a whole log, before anything else: what `add` of each of its measurements and `finish` give."""
         self._log = log
-        b, assembler = self.beginning, self.assembler
+        b, assembler = self.initial, self.assembler
         if has_constant_velocity(b.config):  # every measurement may make a keyframe, and no samples lie between
             for measurement in log.measurements():
                 self.intervals += assembler.add(measurement)
@@ -82,7 +82,7 @@ class BatchSmoother:
     def rows(self) -> DiveRows:
         """The dive as arrays, as far as it has been taken."""
         if self._rows is None or len(self._rows) != len(self.intervals):
-            self._rows = DiveRows.of(self.intervals, [*self.beginning.instruments])
+            self._rows = DiveRows.of(self.intervals, [*self.initial.instruments])
         return self._rows
 
     def add(self, measurement: Measurement) -> list[KeyframeInterval]:
@@ -101,7 +101,7 @@ class BatchSmoother:
 
     def solve(self, states: State | None = None) -> Estimate:
         """The smoothed trajectory with its uncertainty; ``states`` as `optimum` takes them."""
-        return smoothed(self.optimum(states), self.beginning)
+        return smoothed(self.optimum(states), self.initial)
 
     def optimum(self, states: State | None = None) -> Optimum:
         """The dive and its optimum.
@@ -110,7 +110,7 @@ class BatchSmoother:
         ----------
         states : State of its keyframes to begin with, calibration at the end of the dive; None = dead reckoning
         """
-        b = self.beginning
+        b = self.initial
         dive, priors = self, beliefs(b.config)
         calibration = None if states is None else newest_calibration(states.calibration)
         for _ in range(MAX_PLACINGS):
@@ -118,10 +118,10 @@ class BatchSmoother:
                 states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
             best = optimum(dive.intervals, b, states, calibration, dive.rows)
             found = best.state.calibration
-            anew = dive.placed_again(found)
-            if anew is None:
+            again = dive.placed_again(found)
+            if again is None:
                 break
-            dive, states, calibration = anew, None, newest_calibration(found)
+            dive, states, calibration = again, None, newest_calibration(found)
         return best
 
     def placed_again(self, calibration: Mapping[str, Array]) -> "BatchSmoother | None":
@@ -133,18 +133,18 @@ class BatchSmoother:
         """
         if self.assembler.time_offsets.off(calibration) < PLACED_WITHIN_S:
             return None
-        anew = BatchSmoother(self.beginning, self.assembler.time_offsets.centred(calibration, CENTRED_REACH_S))
+        again = BatchSmoother(self.initial, self.assembler.time_offsets.centred(calibration, CENTRED_REACH_S))
         if self._log is not None:
-            anew.take(self._log)
-            return anew
+            again.take(self._log)
+            return again
         for measurement in self._measurements:
-            anew.add(measurement)
-        anew.finish()
-        return anew
+            again.add(measurement)
+        again.finish()
+        return again
 
     def dead_reckoning(self) -> Estimate:
         """Dead reckoning over the same intervals: the baseline."""
-        b = self.beginning
+        b = self.initial
         means = {name: belief.mean for name, belief in beliefs(b.config).items()}
         states = dead_reckon(self.intervals, b, means)
         trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)

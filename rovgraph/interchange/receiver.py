@@ -80,7 +80,7 @@ def longest_boot(place: NDArray[np.integer[Any]], boot: Array) -> tuple[int, int
 
     Returns
     -------
-    number of the first message and of the one behind the last, and how often the autopilot was started anew
+    number of the first message and of the one behind the last, and how often the autopilot was restarted
     """
     back = np.flatnonzero(np.diff(boot) < -RESET_S) + 1
     bounds = [0, *back.tolist(), len(boot)]

@@ -103,7 +103,7 @@ def read_table(
 
     Raises
     ------
-    InputError : the columns are named anew within the file, and otherwise than before
+    InputError : the columns are named again within the file, in another way
     """
     places: dict[str, tuple[int, str, str]] = {}  # plain name -> place in a row, name as written, unit
     for k, written in enumerate(layout.names):
@@ -128,7 +128,7 @@ def read_table(
             if why and sum(naming(cell)[0] in known for cell in cells) >= min(FEW, len(known)):
                 if tuple(cells) != layout.names:
                     raise InputError(
-                        f"{path}: row {number} names the columns anew, and otherwise than before "
+                        f"{path}: row {number} names the columns again, in another way "
                         f"({', '.join(cells)[:80]}...); split the file there"
                     )
                 why = AGAIN

@@ -26,7 +26,7 @@ from rovgraph.log.beams import BEAMS, MOST_BEAMS
 DVL, RECORDER, ELAPSED = "DVL", "recorder", "DVL's time between reports"
 SET = 1e9  # [s] since 1970: a clock that shows less has never been set
 SET_SD_S = 0.05  # how well a network sets a clock, a choice
-RESET_S = 1.0  # a clock that goes back further was set, or started anew
+RESET_S = 1.0  # a clock that goes back further was set, or restarted
 LONGEST = 1 << 16  # bytes of a line
 FRAME = "the DVL's: x forward, y starboard, z down, turned by its own mounting_rotation_offset"
 _CSV = {"vx", "vy", "vz", "velocity_valid"}
@@ -213,7 +213,7 @@ class _Reports:
         raise InputError(f"{path}: has reports without a time; record time_of_validity as the DVL sends it")
 
     def _by_dvl(self, stamped: Array, validity: Array, since: Array) -> tuple[Array, Array, Clock]:
-        """Stamps of a clock that may have been set meanwhile, or have started anew."""
+        """Stamps of a clock that may have been set meanwhile, or have restarted."""
         index = np.flatnonzero(stamped)
         time = validity[index].copy()
         set_at = np.flatnonzero((time[:-1] < SET) & (time[1:] >= SET)) + 1

@@ -1,7 +1,7 @@
 """Compiles kernels with numba, once per machine, into a cache folder that can be written.
 
 The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_CACHE_DIR``, this package's
-``__pycache__`` and the user's cache directory; where there is none, kernels are compiled anew in each process.
+``__pycache__`` and the user's cache directory; where there is none, kernels are compiled in each process.
 Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
 calls another one in a changed module is compiled again, which numba's own cache does not notice.
 

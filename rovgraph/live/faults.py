@@ -53,13 +53,13 @@ class Watch:
     ----------
     state : "ok", "silent", "frozen", "no lock"
     entered : when it came into that state [s]
-    told : the state that an event has told of, if it is not "ok"
+    reported : the state that an event has reported, if it is not "ok"
     time, heard : of its newest measurement, and what time it was when it came [s]
     """
 
     state: str = "ok"
     entered: float = 0.0
-    told: str = ""
+    reported: str = ""
     time: float = -np.inf
     heard: float = -np.inf
     period: float = 0.0
@@ -125,7 +125,7 @@ class Faults:
             quiet = time - watch.heard  # what comes late all the time is not silent
             longest = max(SILENT_S, SILENT_PERIODS * watch.period) if watch.period else SILENT_AT_FIRST_S
             if watch.state != "silent" and quiet > longest:
-                watch.state = watch.told = "silent"
+                watch.state = watch.reported = "silent"
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))
 
     def _ping(self, m: Measurement, watch: Watch) -> Verdict:
@@ -147,11 +147,11 @@ class Faults:
         if before != state:
             watch.entered = m.time
         if state == "ok":
-            if watch.told:
+            if watch.reported:
                 self.events.append(Event(m.time, m.sensor, "back", f"{m.sensor}: measures again"))
-            watch.told = ""
+            watch.reported = ""
             return _GOOD
-        if watch.told != state and (state == "frozen" or m.time - watch.entered >= TELL_S):
-            watch.told = state
+        if watch.reported != state and (state == "frozen" or m.time - watch.entered >= TELL_S):
+            watch.reported = state
             self.events.append(Event(m.time, m.sensor, state, f"{m.sensor}: {text}; left out"))
         return Verdict(False, watch.since if state == "frozen" and before != state else None)

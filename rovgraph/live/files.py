@@ -31,7 +31,9 @@ CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  
 SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
-ANEW_S = REINITIALISE_AT_S[-1]  # a recording that is shorter is estimated anew: the filter is still to be renewed
+REPLAYED_S = REINITIALISE_AT_S[
+    -1
+]  # a recording that is shorter is replayed from its start: the filter is still to be re-initialised
 LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
 
 
@@ -45,7 +47,7 @@ class Files:
     config : as the user gave it
     warnings : where trouble with the disk goes
     resume : go on with what is there
-    anew : from the recording alone, not from the checkpoint
+    replayed : from the recording alone, not from the checkpoint
 
     Attributes
     ----------
@@ -61,7 +63,7 @@ class Files:
     config: Config
     warnings: Warnings
     resume: bool = False
-    anew: bool = False
+    replayed: bool = False
 
     def __post_init__(self) -> None:
         if self.resume and not self.folder.is_dir():
@@ -71,10 +73,10 @@ class Files:
         until = -np.inf
         if self.resume and not (self.folder / RECORDING).exists():
             raise InputError(f"{self.folder}: nothing to resume, there is no {RECORDING}; leave out --resume")
-        self.anew = self.anew or (self.resume and self._seconds() < ANEW_S)
+        self.replayed = self.replayed or (self.resume and self._seconds() < REPLAYED_S)
         if self.resume and checkpoint.exists():
             self.state = read_checkpoint(checkpoint)
-            until = -np.inf if self.anew else float(self.state["engine"]["keyframe"][1])
+            until = -np.inf if self.replayed else float(self.state["engine"]["keyframe"][1])
         self.recorder = Recorder(self.folder / RECORDING, self.warnings)
         self.received = self._received() if self.resume else None  # before the track is touched: it may not be readable
         self.track = TrackFile(self.folder / TRACK, until)
@@ -106,7 +108,7 @@ class Files:
             file.readline()
             if not file.readline():  # the header alone
                 return None
-        if self.anew or self.state is None:
+        if self.replayed or self.state is None:
             # recorded under rovgraph's own names, in SI
             return replace(read_log(path, Config(environment=self.config.environment)), config=None)
         return Log.from_frame(_last_rows(path, self.state["origin"]), source=str(path))

@@ -185,8 +185,8 @@ class Navigator:
         """No more measurements: take what is held back."""
         for sensor, text in self._lags.finish():
             self.say(sensor, "clock", text)
-        if self.engine is None and (beginning := self._startup.begin(self.origin)) is not None:
-            self._begin(beginning)
+        if self.engine is None and (initial := self._startup.begin(self.origin)) is not None:
+            self._begin(initial)
         if self.engine is not None:
             self.engine.finish()
             self.engine.marks.extend(self.passed[-1:])  # for a last solution
@@ -233,7 +233,7 @@ class Navigator:
         if self.engine is None or not self.engine.marks:
             return None
         return {
-            "beginning": self.engine.beginning.dump(),
+            "beginning": self.engine.initial.dump(),
             "engine": self.engine.state(),
             "clocks": self.clocks.state(),
             "origin": self.origin,
@@ -276,23 +276,23 @@ class Navigator:
         if self._incoherence.keeps_out(m.sensor, m.time):
             self.left_out[m.sensor, "incoherent"] += 1
         elif self.engine is None:
-            if (beginning := self._startup.add(m, self.origin)) is not None:
-                self._begin(beginning)
+            if (initial := self._startup.add(m, self.origin)) is not None:
+                self._begin(initial)
         else:
             self._feed(self.engine, m)
 
-    def _begin(self, beginning: InitialConditions, state: Mapping[str, Any] | None = None) -> None:
+    def _begin(self, initial: InitialConditions, state: Mapping[str, Any] | None = None) -> None:
         """The first seconds are over, or an estimate goes on from its state."""
-        config = beginning.config
+        config = initial.config
         if self.smooth:
             from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
 
-            self.isam2 = IncrementalEstimator(beginning, UPDATE_S)
-        self.engine = FixedLag(beginning, config.graph.lag_s, config.online.hold_s, self._pass, learn_noise=True)
+            self.isam2 = IncrementalEstimator(initial, UPDATE_S)
+        self.engine = FixedLag(initial, config.graph.lag_s, config.online.hold_s, self._pass, learn_noise=True)
         if state is not None:
             self.engine.restore(state)
             return
-        for text in beginning.assumptions:
+        for text in initial.assumptions:
             self.say("start", "assumed", text)
         for text in self._startup.doubts:
             self.say("start", "warning", text)

@@ -85,12 +85,12 @@ class Session:
         """Go on from the last checkpoint and what was recorded after it."""
         assert self.files is not None
         state = self.files.state
-        if state is not None and self.files.anew:
+        if state is not None and self.files.replayed:
             self.navigator.clocks.restore(state["clocks"])
         elif state is not None:
             self.navigator.restore(state)
         if self.files.received is None:
-            self.navigator.say("start", "resumed", "nothing was received before: starts anew")
+            self.navigator.say("start", "resumed", "nothing was received before: starts again")
             return
         self.navigator.replay(self.files.received)
         self._resumed = self.navigator.time

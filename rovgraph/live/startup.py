@@ -80,10 +80,10 @@ class Startup:
         expected = {s.name for s in later if s.heading_source is None or named}
         log = gathered(self.measurements, "so far", origin)
         try:
-            beginning = initialise(log, self.config, expected)
+            initial = initialise(log, self.config, expected)
         except InputError as error:
             self.waits_for = str(error)
             return None
         findings = [finding for check in (gravity, turn_rates, angles) for finding in check(log, self.config)]
         self.doubts = [f"{finding.sensor}: {finding.text}" for finding in findings if finding.level != "ok"]
-        return beginning
+        return initial

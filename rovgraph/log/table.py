@@ -80,9 +80,9 @@ class Table:
     def labels(self, name: str) -> Array:
         """A column of names as the numbers that stand for them, shape (n,); NaN = empty cell."""
         cells = self.frame[name]
-        told = cells.notna() & (cells.astype(str).str.strip() != "")
+        filled = cells.notna() & (cells.astype(str).str.strip() != "")
         out = np.full(len(cells), np.nan)
-        out[told] = [label_number(str(cell)) for cell in cells[told]]
+        out[filled] = [label_number(str(cell)) for cell in cells[filled]]
         return out
 
 
@@ -147,8 +147,8 @@ def table_of_arrays(tables: Sequence[Mapping[str, ArrayLike]], time: str, source
                 raise InputError(f"{source}: column {name} has shape {values.shape}, expected one number per row")
         lengths = {len(values) for values in arrays.values()}
         if len(lengths) > 1:
-            told = ", ".join(f"{name} {len(values)}" for name, values in arrays.items())
-            raise InputError(f"{source}: columns of different length ({_shortened(told, 200)}), expected one")
+            found = ", ".join(f"{name} {len(values)}" for name, values in arrays.items())
+            raise InputError(f"{source}: columns of different length ({_shortened(found, 200)}), expected one")
         frames.append(table_of_frame(pd.DataFrame(arrays), source).frame)
     merged = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
     if len(frames) > 1 and all(time in frame for frame in frames):
@@ -301,9 +301,9 @@ def _filled(content: bytes, width: int, source: str) -> NDArray[np.bool_]:
     """Which lines below the header are not blank; every one of them has as many cells as the header."""
     filled = bytearray()
     for number, line in enumerate(_lines(content), 1):
-        told = bool(line.strip())
-        filled.append(told)
-        if line.count(b",") + 1 != width and told and b'"' not in line:
+        has_cells = bool(line.strip())
+        filled.append(has_cells)
+        if line.count(b",") + 1 != width and has_cells and b'"' not in line:
             raise InputError(
                 f"{source}: line {number} has {line.count(b',') + 1} cells, expected {width} as in the header; "
                 "repair or delete that line"

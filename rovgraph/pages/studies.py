@@ -113,9 +113,9 @@ def plan_page(source: Source) -> str:
     factors = {label: shown(unit_of(label))[0] for label in labels}
     names = [f"{p['manoeuvre']} at {p['speed_mps']:g} m/s" for p in ranking]
     head = ("manoeuvre", "bits", *(f"{label_with_unit(label, unit_of(label))}, sd" for label in labels))
-    told = [("as known before", "", summary.get("sd_before") or {})]
-    told += [(name, f"{p['bits']:.1f}", p["sd"] or {}) for name, p in zip(names, ranking, strict=True)]
-    rows = [(name, bits, *(_scaled(factors[label], sd.get(label)) for label in labels)) for name, bits, sd in told]
+    sentences = [("as known before", "", summary.get("sd_before") or {})]
+    sentences += [(name, f"{p['bits']:.1f}", p["sd"] or {}) for name, p in zip(names, ranking, strict=True)]
+    rows = [(name, bits, *(_scaled(factors[label], sd.get(label)) for label in labels)) for name, bits, sd in sentences]
     place = np.arange(1, len(ranking) + 1)
     drawn = [bars("bits", [p["bits"] for p in ranking], place, "#8FBBD9", 0.7, orientation="h", showlegend=False)]
     items: list[Item] = [
@@ -157,15 +157,16 @@ def noise_page(source: Source) -> str:
         )
     items.append(piece(source, "noise.yaml"))
     remarks = {"Remarks": source.summary.get("remarks") or []}
-    told = [f"Noise of {len(channels)} channels over {source.summary.get('duration_s') or 0.0:.0f} s at rest."]
+    sentences = [f"Noise of {len(channels)} channels over {source.summary.get('duration_s') or 0.0:.0f} s at rest."]
     found = source.summary.get("lines") or []
     if found:
-        told.append("Regular motion or vibration, which the noise is stated without: " + _lines_told(found) + ".")
-    sections = [Section("noise", "Noise", told, items, {k: v for k, v in remarks.items() if v})]
+        lines = _describe_lines(found)
+        sentences.append(f"Regular motion or vibration, which the noise is stated without: {lines}.")
+    sections = [Section("noise", "Noise", sentences, items, {k: v for k, v in remarks.items() if v})]
     return rendered(source, "Noise of the instruments", sections)
 
 
-def _lines_told(found: Sequence[Mapping[str, Any]]) -> str:
+def _describe_lines(found: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(
         f"{cell(one.get('frequency_hz'))} Hz of the {one.get('sensor')} ({one.get('kind')})" for one in found
     )
@@ -202,26 +203,26 @@ def magnetometer_page(source: Source) -> str:
             head = [name.removesuffix("_s") + " [s]" if name.endswith("_s") else name for name in entries[0]]
             items.append(Table(key.capitalize(), head, [tuple(map(cell, e.values())) for e in entries]))
     items += [*images(source), piece(source, "magnetometer.yaml")]
-    return rendered(source, "Magnetometer", [Section("magnetometer", "Magnetometer", _field_told(summary), items)])
+    return rendered(source, "Magnetometer", [Section("magnetometer", "Magnetometer", _describe_field(summary), items)])
 
 
-def _field_told(summary: Mapping[str, Any]) -> list[str]:
+def _describe_field(summary: Mapping[str, Any]) -> list[str]:
     """How much the calibration improves, in sentences."""
     before, after = (summary.get(f"length_rms_{when}") for when in ("before", "after"))
     if before is None or after is None:
         return []
-    told = [
+    sentences = [
         f"The length of the measured field scatters by {100 * before:.3g} % as recorded and by {100 * after:.3g} % "
         f"with the calibration ({summary.get('samples_used')} of {summary.get('samples')} samples were used)."
     ]
     if summary.get("dip_deg") is not None:
         sideways = float(np.rad2deg(after / max(np.cos(np.deg2rad(summary["dip_deg"])), 0.01)))
-        told.append(f"So much error across the field turns a level heading by {sideways:.2g}° (rms).")
+        sentences.append(f"So much error across the field turns a level heading by {sideways:.2g}° (rms).")
     if after > WORSE * before:
-        told.append("The calibration hardly improves the field: do not use it; turn the vehicle anew, far from steel.")
+        sentences.append("The calibration hardly improves the field: do not use it. Turn the vehicle far from steel.")
     if summary.get("disturbances"):
-        told.append("The field changed with something on the vehicle, at the times below, which are left out.")
-    return told
+        sentences.append("The field changed with something on the vehicle, at the times below, which are left out.")
+    return sentences
 
 
 def check_page(report: dict[str, Any], title: str) -> str:

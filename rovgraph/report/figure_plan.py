@@ -24,11 +24,11 @@ def draw_plan(folder: Path, plan: Plan) -> list[Path]:
 
 def draw_ranking(plan: Plan) -> Figure:
     """sd after each manoeuvre, a panel per component that matters, with what is known before and the goal."""
-    told = plan.told
-    figure = new_figure(1.1 + 0.19 * len(plan.ranked), max(4.5, 1.6 + 1.5 * len(told)))
-    panels: list[Axes] = list(figure.subplots(1, len(told), sharey=True, squeeze=False).flat)
+    selected = plan.selected
+    figure = new_figure(1.1 + 0.19 * len(plan.ranked), max(4.5, 1.6 + 1.5 * len(selected)))
+    panels: list[Axes] = list(figure.subplots(1, len(selected), sharey=True, squeeze=False).flat)
     place = np.arange(len(plan.ranked))
-    for axes, i in zip(panels, told, strict=True):
+    for axes, i in zip(panels, selected, strict=True):
         factor, unit = shown(plan.units[i])
         axes.barh(place, [factor * p.sd[i] for p in plan.ranked], color=[BEST, *[OTHERS] * (len(place) - 1)])
         axes.axvline(factor * plan.before[i], color="black", lw=0.8, ls=(0, (4, 2)))

@@ -69,8 +69,8 @@ def draw_error(tables: Tables) -> Figure | None:
 
 
 def _say_the_rest(figure: Figure, tables: Tables) -> None:
-    if told := unless_said(tables):
-        figure.suptitle(fill(told, 130), x=0.01, ha="left", fontsize=7)
+    if remark := unless_said(tables):
+        figure.suptitle(fill(remark, 130), x=0.01, ha="left", fontsize=7)
 
 
 def _error_panel(axes: Axes, rows: pd.DataFrame) -> None:

@@ -91,12 +91,12 @@ def observability_table(seen: Observability, title: str) -> Table:
     for heading in ("variable", "prior sd", "sd", "bits", "verdict", "needs"):
         numbers = heading in ("prior sd", "sd", "bits")
         table.add_column(heading, justify="right" if numbers else "left", no_wrap=heading != "needs")
-    for i, (label, variable, told) in enumerate(zip(seen.labels, seen.variables, seen.verdicts, strict=True)):
+    for i, (label, variable, verdict) in enumerate(zip(seen.labels, seen.variables, seen.verdicts, strict=True)):
         factor = shown(variable.unit)[0]
         name = label_with_unit(label, variable.unit)
         cells = (f"{factor * seen.prior_sd[i]:.3g}", f"{factor * seen.sd[i]:.3g}", f"{seen.bits[i]:.2f}")
-        missing = "" if told == OBSERVABLE else variable.excited_by
-        table.add_row(escape(name), *cells, told, escape(missing), style="" if told == OBSERVABLE else "bold")
+        missing = "" if verdict == OBSERVABLE else variable.excited_by
+        table.add_row(escape(name), *cells, verdict, escape(missing), style="" if verdict == OBSERVABLE else "bold")
     pairs = ", ".join(f"{a} with {b} {rho:+.2f}" for a, b, rho in seen.correlated()[:TOLD])
     table.caption = f"{seen.joint_bits:.1f} bits in all. Correlations beyond 0.5: {pairs or 'none'}"
     return table
@@ -126,7 +126,7 @@ def plan_table(plan: Plan, title: str) -> Table:
     table = Table(title=escape(title), title_justify="left", caption_justify="left", box=SIMPLE_HEAD)
     table.add_column("manoeuvre")
     table.add_column("bits", justify="right")
-    columns = plan.told
+    columns = plan.selected
     for i in columns:
         unit = shown(plan.units[i])[1]
         table.add_column(escape(plan.labels[i] + (f"\n[{unit}]" if unit != "1" else "")), justify="right")

@@ -106,7 +106,7 @@ def study_table(tables: Tables) -> Table:
         "coverage: share of runs whose 95 % interval holds the truth, with the 95 % interval of that share. bias, sd: "
         "of the error. predicted: sd that the estimator states, median. NEES: 1 if consistent, ↑↓ outside its 95 % band"
         + (f"; {beyond} more cells are in cells.csv" if beyond > 0 else "")
-        + (f"; {escape(told)}" if (told := unless_said(tables)) else "")
+        + (f"; {escape(remark)}" if (remark := unless_said(tables)) else "")
     )
     return table
 

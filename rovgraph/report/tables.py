@@ -63,11 +63,11 @@ def calibration_table(estimates: Sequence[Estimate]) -> Table:
     for heading in ("variable", "value ± sd", "prior ± sd", "left", "verdict"):  # 80 columns hold the longest of each
         table.add_column(heading, justify="left" if heading in ("variable", "verdict") else "right", no_wrap=True)
     silent = [e for e in main.calibration if not e.estimated and e.value == 0.0 and e.sd == 0.0]
-    told = [e for e in main.calibration if e not in silent]
-    for entry in sorted(told, key=lambda e: not e.estimated):
+    shown = [e for e in main.calibration if e not in silent]
+    for entry in sorted(shown, key=lambda e: not e.estimated):
         name = label_with_unit(entry.label, entry.unit)
         table.add_row(escape(name), *_calibration_cells(entry), style="" if entry.estimated else "dim")
-    notes = ["left: sd in percent of the prior's"] if any(e.estimated for e in told) else []
+    notes = ["left: sd in percent of the prior's"] if any(e.estimated for e in shown) else []
     notes += [f"held at 0: {', '.join(e.label for e in silent)}"] if silent else []
     if any(e.verdict == UNOBSERVABLE for e in main.calibration):
         notes.append("unobservable: this dive says little about it, the value is mostly the prior (rovgraph observe)")

@@ -71,7 +71,7 @@ class Choices:
             if not (isinstance(pairs, tuple | list) and all(map(_is_pair, pairs))):
                 raise InputError(f"{name} {pairs!r}: pairs of numbers are expected, as {example}")
 
-    def told(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """What ``summary.json`` says: the common ones always, the others where something was chosen."""
         common = {"speed_mps": self.speed, "outlier_share": self.outliers, "noise": self.noise}
         others = {name: getattr(self, name) for name in ("variant", "current", "disturbances")}

@@ -2,7 +2,7 @@
 
 On one machine a pool of processes is all that is needed; it is at hand without another
 library, starts in a second and uses no ports. What a pool lacks is done here: when one of its
-processes is killed, it breaks as a whole and is made anew. A cluster's scheduler does that by
+processes is killed, it breaks as a whole and is made again. A cluster's scheduler does that by
 itself, so for more than one machine there is Dask, and nothing of it is repeated here.
 """
 

@@ -1,7 +1,7 @@
 """What of the calibration a dive can show: what ``rovgraph observe`` does.
 
 From the graph's own information matrix: states are marginalised exactly, by QR, and what
-noise in the estimate pretends is taken off (`rovgraph.estimators.observability`).
+noise in the estimate feigns, the spurious information, is removed (`rovgraph.estimators.observability`).
 """
 
 import difflib
@@ -27,7 +27,7 @@ from rovgraph.log import Log
 from rovgraph.log.frozen import without_frozen
 from rovgraph.progress import Progress, no_progress
 
-TIMES = 30  # at which the sd is told
+TIMES = 30  # at which the sd is calculated
 FEWEST_KEYFRAMES = 20
 OTHER_LABELS = (
     "acc_bias_x", "acc_bias_y", "acc_bias_z", "gyr_bias_x", "gyr_bias_y", "gyr_bias_z",
@@ -187,7 +187,7 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
     Parameters
     ----------
     dive, config : of `solved`
-    noisy : take off what noise in the estimate pretends
+    noisy : remove spurious information
     progress : called now and then
     """
     progress("information", 0.6)

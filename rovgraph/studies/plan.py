@@ -122,7 +122,7 @@ class Plan:
     duration: float
 
     @property
-    def told(self) -> list[int]:
+    def selected(self) -> list[int]:
         """Components worth a column: those of the goals, else those that the best manoeuvre shows most of."""
         if self.goals:
             return [self.labels.index(name) for name in self.goals]

@@ -53,7 +53,7 @@ class Connection(H11Protocol):
         super().handle_websocket_upgrade(event)
 
     def _expect(self, seconds: float | None) -> None:
-        """Set the deadline anew; None = there is none."""
+        """Set the deadline again; None = there is none."""
         if self._deadline is not None:
             self._deadline.cancel()
         self._deadline = None if seconds is None else self.loop.call_later(seconds, self.transport.abort)

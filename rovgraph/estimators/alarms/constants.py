@@ -45,7 +45,7 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
     for c in evidence.main.calibration:
         if c.estimated:
             yield from moved_constant(c, evidence.start, evidence.end)
-    prior = evidence.beginning.prior
+    prior = evidence.initial.prior
     for name, part, key in BIASES:
         history = evidence.main.history.get(name)
         if history is None or evidence.main.kind != "smoothed":
@@ -100,7 +100,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
     """Constants that are held, released one by one: the score test of `rovgraph.engine.released`."""
     if evidence.optimum is None:
         return
-    best = as_chain(evidence.optimum, evidence.beginning)
+    best = as_chain(evidence.optimum, evidence.initial)
     v, v_sd = evidence.main.trajectory.v_n, evidence.main.trajectory.v_sd
     moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
     for r in release(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
@@ -120,7 +120,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
             FAR_MOVED if belief.considered else HELD_FAR_OFF,  # the prior's sd is all that the track's sd has of it
             f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements shift it "
             f"by {factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)}",
-            _remedy_of_held(r, evidence.beginning.config),
+            _remedy_of_held(r, evidence.initial.config),
         )
 
 
@@ -130,7 +130,7 @@ def earth_rate(evidence: Evidence) -> Iterator[Statistic]:
     It is a bias that turns with the vehicle. A gyro whose bias is known ten times better than that feels it.
     """
     history = evidence.main.history.get("gyr_bias")
-    if history is None or evidence.beginning.config.environment.earth_rotation:
+    if history is None or evidence.initial.config.environment.earth_rotation:
         return
     yield earth_rate_of(float(history.sd.min()), evidence.start, evidence.end)
 

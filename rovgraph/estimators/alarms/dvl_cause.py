@@ -37,7 +37,7 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
     compared = _Compared.of(best, best.blocks["dvl"])
     if compared is None:
         return
-    R_bs = mount_matrix(evidence.beginning.config.dvl.mount_rpy_deg)
+    R_bs = mount_matrix(evidence.initial.config.dvl.mount_rpy_deg)
     as_configured = compared.error(np.eye(3), R_bs, 0.0)
     orientations = signed_permutations()
     turned = [compared.error(H, R_bs, 0.0) for H in orientations]

@@ -43,7 +43,7 @@ class Evidence:
 
     Attributes
     ----------
-    beginning : configuration, instruments and prior
+    initial : configuration, instruments and prior
     estimates : smoothed, filtered or both
     intervals : of the estimates' keyframes
     optimum : of the smoothed estimate, where a batch solver found it
@@ -51,7 +51,7 @@ class Evidence:
     attitude_gaps : times without heading or tilt, of a dive without an IMU
     """
 
-    beginning: InitialConditions
+    initial: InitialConditions
     estimates: Sequence[Estimate]
     intervals: Sequence[KeyframeInterval]
     optimum: Optimum | None

@@ -144,7 +144,7 @@ def too_large_in(
 def too_small(evidence: Evidence) -> Iterator[Statistic]:
     """Mean of the filter's normalised innovations squared, per dimension, that is far below 1."""
     filtered = evidence.estimate("filtered")
-    if has_constant_velocity(evidence.beginning.config):  # innovations are the motion's rather than the sensors'
+    if has_constant_velocity(evidence.initial.config):  # innovations are the motion's rather than the sensors'
         return
     for sensor, nis in ({} if filtered is None else filtered.summary.get("nis", {})).items():
         if nis["mean"] is None or nis["count"] < ENOUGH:

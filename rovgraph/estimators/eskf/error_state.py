@@ -35,7 +35,7 @@ class ErrorStateFilter:
 
     Attributes
     ----------
-    beginning : of `rovgraph.estimators.initialise.initialise`
+    initial : of `rovgraph.estimators.initialise.initialise`
     reinitialise_at : times since the start at which the dive so far is smoothed, and the filter goes on from there [s]
     learn_noise : of the IMU, from its newest samples
     known : Gaussian of the newest keyframe, or what is believed before the first
@@ -45,12 +45,12 @@ class ErrorStateFilter:
     gates : sensors that are left out
     """
 
-    beginning: InitialConditions
+    initial: InitialConditions
     reinitialise_at: tuple[float, ...] = ()
     learn_noise: bool = False
 
     def __post_init__(self) -> None:
-        b = self.beginning
+        b = self.initial
         self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise)
         self.engine = FilterEngine(b)
         self.known = self.engine.start()
@@ -115,7 +115,7 @@ class ErrorStateFilter:
         progress : is told 0 to 1 now and then
         rows : the dive as arrays, where they are at hand
         """
-        sensors = [*self.beginning.instruments]
+        sensors = [*self.initial.instruments]
         self._rows = rows = rows or DiveRows.of(intervals, sensors)
         compiled = all(self.engine.knows(sensor) or sensor == PLACE for sensor in sensors)
         while (k := len(self.intervals)) < len(intervals):
@@ -192,12 +192,12 @@ def _back(engine: FilterEngine, departed: Gaussian, transition: Transition, foll
 
 def replay(
     intervals: Sequence[KeyframeInterval],
-    beginning: InitialConditions,
+    initial: InitialConditions,
     reinitialise_at: tuple[float, ...] = (),
     progress: Callable[[float], None] = lambda done: None,
     rows: DiveRows | None = None,
 ) -> ErrorStateFilter:
     """A filter that has taken the intervals of a dive; ``progress`` and ``rows`` as of `ErrorStateFilter.run`."""
-    estimator = ErrorStateFilter(beginning, reinitialise_at)
+    estimator = ErrorStateFilter(initial, reinitialise_at)
     estimator.run(intervals, progress, rows)
     return estimator

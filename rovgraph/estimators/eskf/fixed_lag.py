@@ -71,14 +71,14 @@ class FixedLag:
 
     Attributes
     ----------
-    beginning : of `rovgraph.estimators.initialise.initialise`
+    initial : of `rovgraph.estimators.initialise.initialise`
     lag_s : how late a measurement may be against the newest of the IMU [s]
     hold_s : how long measurements are held back before they are taken; later ones cost more [s]
     passed : called with each `FilterSnapshot` that the lag has passed, for good
     learn_noise : of the IMU, from its newest samples
     """
 
-    beginning: InitialConditions
+    initial: InitialConditions
     lag_s: float
     hold_s: float
     passed: Callable[[FilterSnapshot], None] = lambda mark: None
@@ -86,7 +86,7 @@ class FixedLag:
     marks: deque[FilterSnapshot] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
-        self.filter = FilterEngine(self.beginning)
+        self.filter = FilterEngine(self.initial)
         self._assembler = self._fresh()
         self._gates: Gates = {}
         self._record: list[Measurement] = []  # in order; the first `_taken` have been taken
@@ -155,18 +155,18 @@ class FixedLag:
             self.marks[k] = replace(mark, known=known, gates=dict(self._gates), processed=done.processed)
         self._assembler.time_offsets.assume(known.state.calibration)
 
-    def continued(self, beginning: InitialConditions, position_sd: float = 0.0) -> "FixedLag":
+    def continued(self, initial: InitialConditions, position_sd: float = 0.0) -> "FixedLag":
         """A filter that knows more sensors, or less of where it is, and goes on from here.
 
         Parameters
         ----------
-        beginning : this filter's with more instruments, or another prior
+        initial : this filter's with more instruments, or another prior
         position_sd : that is added to north and east [m]
         """
         oldest = self.oldest()
         while self.marks[0] is not oldest:
             self.passed(self.marks.popleft())
-        other = FixedLag(beginning, self.lag_s, self.hold_s, self.passed, self.learn_noise)
+        other = FixedLag(initial, self.lag_s, self.hold_s, self.passed, self.learn_noise)
         known, assembler = _taken_over(self.filter, other.filter, oldest.known), other._fresh()
         here, R_nb = other.filter.layout.columns[POSE], known.state.R_nb[0]
         known.P[here, here][3:, 3:] += R_nb.T @ np.diag([position_sd**2, position_sd**2, 0.0]) @ R_nb
@@ -249,7 +249,7 @@ class FixedLag:
         ----------
         intervals, known : the keyframes and what is known of them, n each
         """
-        columns, arm = self.filter.layout.columns, self.beginning.config.imu.lever_arm_m
+        columns, arm = self.filter.layout.columns, self.initial.config.imu.lever_arm_m
         pose, velocity = (np.array([k.covariance[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
         return body_trajectory(intervals, stack_states(known), arm, pose, velocity)
 
@@ -289,7 +289,7 @@ class FixedLag:
             self._assembler, self._gates, self._taken = self._fresh(), {}, 0
 
     def _fresh(self) -> Assembler:
-        b = self.beginning
+        b = self.initial
         return Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise)
 
 

@@ -125,7 +125,7 @@ def update(x: Array, P: Array, residual: Array, H: Array, R: Array) -> tuple[Arr
 def iterated_update(
     x: Array, P: Array, innovate: Innovate, R: Array, iterations: int = 1
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """A measurement linearised anew at each iterate (Bell and Cathey 1993).
+    """A measurement linearised again at each iterate (Bell and Cathey 1993).
 
     Parameters
     ----------

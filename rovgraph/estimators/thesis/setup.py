@@ -85,18 +85,18 @@ def prepare(variant: Filter, log: Log, config: Config) -> Setup:
     InputError : the log lacks what the filter needs
     """
     _demand(variant, log, config)
-    beginning = initialise(log, _with_sources(variant, log, config))
-    config, priors = beginning.config, beliefs(beginning.config)
+    initial = initialise(log, _with_sources(variant, log, config))
+    config, priors = initial.config, beliefs(initial.config)
     known = None
     if variant.attitude_given:
-        known = known_motion(log, config, priors, beginning.prior.state.bias[0, 3:])
+        known = known_motion(log, config, priors, initial.prior.state.bias[0, 3:])
     process = _process(variant, log, config, known)
     sensors = instruments(config)
     field_length = float(np.linalg.norm(log["mag"].data, axis=1).mean()) if variant.magnetometer else 1.0
     samples = _samples(variant, log, field_length)
     used = samples.shape[1]
-    x, P = _start(process.layout, variant.numbers, beginning, priors)
-    assumptions = beginning.assumptions + ([f"attitude: {known.source}"] if known else [])
+    x, P = _start(process.layout, variant.numbers, initial, priors)
+    assumptions = initial.assumptions + ([f"attitude: {known.source}"] if known else [])
     body = variant.motion != "earth"
     return Setup(
         variant=variant,
@@ -197,10 +197,10 @@ def _samples(variant: Filter, log: Log, field_length: float) -> Array:
 
 
 def _start(
-    places: Layout, numbers: Numbers, beginning: InitialConditions, priors: dict[str, Belief]
+    places: Layout, numbers: Numbers, initial: InitialConditions, priors: dict[str, Belief]
 ) -> tuple[Array, Array]:
     """State and covariance at the first epoch; biases begin as (3.15)."""
-    start, where = beginning.prior, beginning.config.start
+    start, where = initial.prior, initial.config.start
     R_nb, iron = start.state.R_nb[0], priors["hard_iron"]
     q = from_matrix(R_nb)
     by_angle = 0.5 * rate_matrix(q)
@@ -216,7 +216,7 @@ def _start(
         "p": start.p_sd**2,
         "w": numbers.rate_sd**2,
         "acc_bias": start.bias_sd[:3] ** 2,
-        "gyr_bias": np.deg2rad(beginning.config.imu.gyr_bias_sd_dps) ** 2,
+        "gyr_bias": np.deg2rad(initial.config.imu.gyr_bias_sd_dps) ** 2,
         "mag_bias": iron.sd**2,
         "mount": [priors[name].sd ** 2 for name in MOUNT],
     }

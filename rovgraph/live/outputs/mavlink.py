@@ -103,7 +103,7 @@ class MavlinkOutput(Output):
         self._mav.heartbeat_send(m.MAV_TYPE_ONBOARD_CONTROLLER, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE)
 
     def _give_up(self, error: Exception) -> None:
-        """Let the link go; the next solution tries anew."""
+        """Let the link go; the next solution tries again."""
         link, self._link = self._link, None
         self._drop(1, "connection", f"cannot be sent ({str(error) or type(error).__name__}), still trying")
         if link is not None:

@@ -93,9 +93,9 @@ class Study(Section):
 
     def all_cells(self) -> list[Cell]:
         """Every cell once: those of the grid, then the others."""
-        return list({cell.id: cell for cell in self._told()}.values())
+        return list({cell.id: cell for cell in self._selected()}.values())
 
-    def _told(self) -> Iterator[Cell]:
+    def _selected(self) -> Iterator[Cell]:
         common, lists = self.common.model_dump(exclude_unset=True), self.grid.model_dump(exclude_unset=True)
         if lists:
             for values in product(*lists.values()):
