@@ -55,7 +55,7 @@ EXAMPLES = {  # what each of them has to say
     "mountings": r"stated 45 .*: trusted\nstated -45 .* found 4\d.*: wrong",
     "monte_carlo": r"NEES (1\.\d|2\.\d|3\.[0-4]) over 10 dives",
     "simulate_plan_observe": r"square@0\.5: dvl_yaw known to 1\.\d°(.*\n)*after the square@0\.5: dvl_yaw is weak",
-    "own_sensor": r"without ranges: 0\.97 m rms.*\nwith ranges: 0\.17 m rms",
+    "own_sensor": r"without ranges: 0\.98 m rms.*\nwith ranges: 0\.17 m rms",
     "live": r"start: heading from mag, dvl_heading\n(.*\n)*6\d solutions, the last at \[6\.",
     "export": r"xarray.Dataset",
     "native_files": r"dvl.csv: .* by acceleration .*\ntrusted, .* m rms\nmaps",
