@@ -82,7 +82,7 @@ def test_a_start_in_motion_is_less_sure_of_its_level():
     b = initialise(log, falcon())
     assert (b.prior.rpy_sd[:2] > 2.0 * falcon().start.tilt_sd_deg * DEG).all()
     assert any("begins in motion" in line for line in b.assumptions)
-    assert not any("standing still" in line for line in b.assumptions)
+    assert not any("assumed to be at rest" in line for line in b.assumptions)
 
 
 def test_a_start_in_motion_settles_in_the_graph():

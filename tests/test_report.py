@@ -408,7 +408,7 @@ def test_summary_and_trajectories_have_a_place_on_earth_where_the_log_has(dive, 
     summary = write_results(tmp_path, estimates, replace(log, origin=(58.3, 14.5)), config, [], {})
     assert summary["origin"] == {"lat_deg": 58.3, "lon_deg": 14.5} and written[1]["origin"] is None
     header = (tmp_path / "trajectory_smoothed.csv").read_text().partition("\n")[0]
-    assert header.endswith(",cov_north_east,lat,lon")
+    assert header.endswith(",cov_north_east,unix_time,lat,lon")  # the dive counts from 1970
     assert "lat" not in (written[0] / "trajectory_smoothed.csv").read_text().partition("\n")[0]
 
 
