@@ -145,7 +145,8 @@ class FilterEngine:
         tables: Any = self._sensors, self.layout.column, self._walk, *self.layout.coordinates
         order: Any = np.append(0, some.taken), some.first[:k]
         limits: Any = since, self._gravity, POORLY_KNOWN
-        taken = filter_intervals(*known, *order, *tables, *limits, *out)
+        kernels: Any = correct, predict_filter
+        taken = filter_intervals(*known, *order, *tables, *limits, *out, *kernels)
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
         return FilterRun(Gaussian(x, c, P, (), B, before.L), *(a[:taken] for a in out[:-2]), *(a[:m] for a in out[-2:]))

@@ -32,15 +32,14 @@ try:
     from numba import njit
     from numba.extending import register_jitable
 
-    from rovgraph.kernels.linked_helpers import HelperCompiler
+    from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler
 except ImportError as error:
     raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61'") from None
 
 F = TypeVar("F", bound=Callable[..., Any])
 config: Any = numba.config
-KERNEL: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}  # nothing in C calls them
-# only kernels call them; numba compiles a helper once more for each set of options that its callers have
-HELPER: Any = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # which makes none either
+KERNEL: Any = {"error_model": "numpy", "nogil": True}
+HELPER: Any = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # False: as kernels
 HELPS = "ROVGRAPH_HELPS_COMPILE"  # in the environment of a process that compiles for another one
 logger = logging.getLogger("rovgraph")
 
@@ -65,25 +64,29 @@ def given(ndim: int) -> str:
     return f"Array(f8, {ndim}, 'A', True)"
 
 
-def kernel(signature: str) -> Callable[[F], F]:
+def kernel(signature: str, by_address: bool = False) -> Callable[[F], F]:
     """An entry point, compiled for one signature when its module is imported, or loaded from the cache.
 
     Parameters
     ----------
     signature : numba's, such as ``"void(f8[:, ::1], f8[::1])"``
+    by_address : can be an argument of other kernels, of type ``FunctionType(signature)``: what calls it so need not
+        be optimised with it once more
 
     Raises
     ------
     InputError : numba cannot compile it
     """
 
+    options = KERNEL if by_address else {**KERNEL, "pipeline_class": KernelCompiler}
+
     def decorate(function: F) -> F:
         folder = cache_folder(function.__module__)
         try:
             with _cache_in(folder):
-                compiled = njit(signature, cache=folder is not None, **KERNEL)(function)
+                compiled = njit(signature, cache=folder is not None, **options)(function)
         except OSError:  # the folder went away, or the disk is full
-            compiled = njit(signature, **KERNEL)(function)
+            compiled = njit(signature, **options)(function)
         except numba.core.errors.NumbaError as error:
             raise InputError(
                 f"numba {numba.__version__} cannot compile {function.__name__} ({_first_line(error)}): "
@@ -102,7 +105,7 @@ def cache_folder(module: str) -> Path | None:
     folder = _folder_in(parent, module)
     if not folder.exists():
         if HELPS not in os.environ:
-            _say_once("compiling rovgraph's kernels, once: this takes some minutes")
+            _say_once("compiling rovgraph's kernels, once: this takes about a minute")
             if module.rpartition(".")[0] == __package__:
                 _compile_missing(parent)
         folder.mkdir(parents=True, exist_ok=True)
@@ -125,9 +128,10 @@ def _compile_missing(parent: Path) -> None:
     order.prepare()
     with contextlib.ExitStack() as stack:
         idle: SimpleQueue[subprocess.Popen[str]] = SimpleQueue()
-        for _ in range(min(cores, len(missing))):
+        workers = min(cores, len(missing))
+        for _ in range(workers):
             idle.put(stack.enter_context(_worker(parent)))
-        pool = stack.enter_context(ThreadPoolExecutor(idle.qsize()))
+        pool = stack.enter_context(ThreadPoolExecutor(workers))
 
         def compile_one(module: str) -> str:
             worker = idle.get()
@@ -137,17 +141,19 @@ def _compile_missing(parent: Path) -> None:
             idle.put(worker)
             return module
 
+        ready: list[str] = []
         running: set[Future[str]] = set()
         while order.is_active():
-            ready = sorted(order.get_ready(), key=lambda module: -len(_importing(module, missing)))
-            running |= {pool.submit(compile_one, module) for module in ready}
+            ready = sorted([*ready, *order.get_ready()], key=lambda module: _awaited(module, missing))
+            while ready and len(running) < workers:
+                running.add(pool.submit(compile_one, ready.pop()))
             done, running = wait(running, return_when=FIRST_COMPLETED)
             order.done(*(each.result() for each in done))
 
 
-def _importing(module: str, among: set[str]) -> set[str]:
-    """Those that wait for a module: the more there are, the sooner it should be compiled."""
-    return {other for other in among if module in _imported_kernels(other)}
+def _awaited(module: str, among: set[str]) -> int:
+    """Of how many modules the largest one is made that a module is a part of: its parts should come first."""
+    return max(len(_imported_kernels(whole)) for whole in among if module in _imported_kernels(whole))
 
 
 @contextlib.contextmanager

@@ -33,6 +33,12 @@ from rovgraph.kernels.velocity_coordinates import coordinates_of_velocity
 
 Index = NDArray[np.int64]
 
+CORRECT = (
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], "
+    "f8[:, :, ::1], f8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], "
+    "f8[::1], f8[::1])"
+)  # signature of `correct`
+
 WIDE = 30.0  # sd of a prediction, in those of its measurement, from which it is corrected by iterations
 MAX_RELINEARIZATIONS = 5
 STANDS = 0.1  # a correction within as many sd needs no other point to linearise at
@@ -156,11 +162,7 @@ def relinearize(
                 leave_out(r, H, H_y, HP, S, first[j], first[j + 1])
 
 
-@kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], "
-    "f8[:, :, ::1], f8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], "
-    "f8[::1], f8[::1])"
-)
+@kernel(CORRECT, by_address=True)
 def correct(
     x: Array,
     c: Array,

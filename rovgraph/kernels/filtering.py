@@ -5,15 +5,17 @@ stops before an interval with a measurement that is `GIVEN`, and where the attit
 be found before it is linearised at (`rovgraph.engine.alignment`).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import given, helper, kernel, view_helper
-from rovgraph.kernels.correction import correct
+from rovgraph.kernels.correction import CORRECT
 from rovgraph.kernels.layout import VELOCITY
 from rovgraph.kernels.measurement_row import GIVEN, KIND
-from rovgraph.kernels.prediction import predict_filter
+from rovgraph.kernels.prediction import PREDICT_FILTER
 
 Index = NDArray[np.int64]
 
@@ -66,7 +68,7 @@ def _covariance(P: Array, B: Array, first: int, P_out: Array) -> None:
     "i8(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], "
     "f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], "
     "f8[::1], f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], "
-    "f8[:, ::1], f8[::1], f8[::1])"
+    f"f8[:, ::1], f8[::1], f8[::1], FunctionType({CORRECT}), FunctionType({PREDICT_FILTER}))"
 )
 def filter_intervals(
     x: Array,
@@ -100,6 +102,8 @@ def filter_intervals(
     sd_out: Array,
     nis_out: Array,
     weight_out: Array,
+    correct: Callable[..., None],
+    predict_filter: Callable[..., None],
 ) -> int:
     """Take up to k intervals.
 
@@ -118,6 +122,7 @@ def filter_intervals(
     predicted_x_out, predicted_c_out : the same before what was measured at them
     pose_out, velocity_out, sd_out : shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
     nis_out, weight_out : shape (m,), of the measurements
+    correct, predict_filter : of `rovgraph.kernels.correction` and `rovgraph.kernels.prediction`
 
     Returns
     -------

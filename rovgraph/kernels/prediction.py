@@ -20,6 +20,11 @@ from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion import predict_with_transition
 from rovgraph.kernels.motion_row import DURATION
 
+PREDICT_FILTER = (
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8, "
+    "f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])"
+)  # signature of `predict_filter`
+
 MOVED = 9  # components that the motion mixes: rotation, position, velocity; biases and calibration stay
 
 
@@ -70,10 +75,7 @@ def carry_considered(B: Array, F: Array, moved: Array, own: Array) -> None:
             B[i, k] *= F[i, i]
 
 
-@kernel(
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8, "
-    "f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])"
-)
+@kernel(PREDICT_FILTER, by_address=True)
 def predict_filter(
     x: Array,
     c: Array,

@@ -1,13 +1,17 @@
-"""Compiler of helpers: lowered and linked into the kernels that call them, which alone are optimised and assembled.
+"""What numba's compiler is asked for, of kernels and of the helpers that only they call.
 
 numba would optimise and assemble each helper by itself, and again within every caller, although nothing but kernels
-calls it. Here a helper stops at LLVM's unoptimised code, which halves the time that all kernels take to compile.
+calls it. Here a helper stops at LLVM's unoptimised code and is linked into its kernels, which alone are optimised and
+assembled: that halves the time that all kernels take to compile.
+
+Wrappers are decided here and not by numba's options, because numba compiles a helper once more for each set of options
+that its callers have.
 """
 
 from typing import Any, cast
 
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
 
 
 class _NoEnvironment:
@@ -35,12 +39,21 @@ class LinkedLibrary(JITCodeLibrary):
 
 
 class HelperCompiler(CompilerBase):
-    """numba's compiler with such a library."""
+    """numba's compiler with such a library, and without wrappers."""
 
     def define_pipelines(self) -> list[Any]:
-        """As numba's, without a wrapper for Python."""
-        self.state.flags.no_cpython_wrapper = True
+        """As numba's."""
         library: Any = LinkedLibrary  # numba's classes have no types
         builder: Any = DefaultPassBuilder
+        self.state.flags.no_cpython_wrapper = self.state.flags.no_cfunc_wrapper = True
         self.state.library = library(self.state.targetctx.codegen(), "helper")
         return [builder.define_nopython_pipeline(self.state)]
+
+
+class KernelCompiler(Compiler):
+    """numba's compiler without a wrapper for C, which only a kernel that is called by its address needs."""
+
+    def define_pipelines(self) -> Any:
+        """As numba's."""
+        self.state.flags.no_cfunc_wrapper = True
+        return cast(Any, super()).define_pipelines()
