@@ -21,7 +21,7 @@ print(twice(1.5), cache_folder(__name__))
 
 
 def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    given = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    given = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_DISABLE_JIT": "0", **environment}
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=given, timeout=120)
 
 
@@ -63,7 +63,12 @@ def test_where_no_folder_can_be_written_kernels_are_compiled_all_the_same(tmp_pa
 
 def test_processes_that_compile_at_once_do_not_disturb_each_other(tmp_path):
     (tmp_path / "own_kernel.py").write_text(MODULE)
-    given = {**os.environ, "PYTHONPATH": str(ROOT), "ROVGRAPH_CACHE_DIR": str(tmp_path / "kept")}
+    given = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "NUMBA_DISABLE_JIT": "0",
+        "ROVGRAPH_CACHE_DIR": str(tmp_path / "kept"),
+    }
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import own_kernel"
     children = [
         subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=given) for _ in range(3)
