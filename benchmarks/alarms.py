@@ -43,6 +43,8 @@ def healthy(seeds: int) -> Iterator[tuple[str, Log, Config]]:
                 path = ("falcon", "lawnmower", "figure8")[(k + seed) % 3]
                 data = falcon().model_dump(exclude_unset=True)
                 data["imu"] = {**data.get("imu", {}), **imu}
+                if grade != "mti":  # such a gyro feels the Earth turn
+                    data["environment"] = {**data.get("environment", {}), "earth_rotation": True}
                 if sensors == "ahrs":
                     data["heading"] = {"sources": ["ahrs", "dvl"]}
                 config = Config.model_validate(data)
