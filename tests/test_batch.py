@@ -105,7 +105,8 @@ TRUE_CALIBRATION = {
 def calibrated():
     """A perfect log of a vehicle whose calibration is far from its prior means, with precise fixes."""
     config = falcon(
-        calibration={name: {"estimate": True} for name in TRUE_CALIBRATION},
+        calibration={name: {"estimate": True} for name in TRUE_CALIBRATION}
+        | {"dvl_scale": {"estimate": True, "sd": 0.01}},
         fix={"sd_m": 0.02},
         heading={"sources": ["mag", "dvl", "ahrs"]},
         start={"position_sd_m": 0.01},
@@ -142,7 +143,7 @@ def test_without_fixes_on_a_straight_line_the_misalignment_keeps_its_prior():
     case = simulated(falcon_still, 120.0, path=scenario("straight", 120.0, 0.02, Style(waves=CALM)), seed=2)
     found = {c.label: c for c in smoothed(case.log, case.config).calibration}["dvl_yaw"]
     assert found.prior_sd == pytest.approx(5 * DEG)
-    # noise in the estimated velocity passes for motion; what it pretends to show is not taken for known
+    # noise in the estimated velocity passes for motion; this spurious information is removed
     assert found.verdict == "unobservable"
     assert (found.value, found.sd) == (found.prior_mean, pytest.approx(found.prior_sd))
 

@@ -373,7 +373,7 @@ def test_a_recording_that_cannot_be_read_is_said_and_the_track_before_stands(cas
     assert (tmp_path / "trajectory_filtered.csv").read_bytes() == track
 
 
-def test_resuming_what_received_nothing_begins_anew_and_writes_what_is_json(case, tmp_path):
+def test_resuming_what_received_nothing_begins_again_and_writes_what_is_json(case, tmp_path):
     recorded(tmp_path, case, 0.0)
     nav = Navigator(case.config, reinitialise=False, clocks=Clocks(trust=True))
     files = Files(tmp_path, case.config, Warnings(), resume=True)
@@ -382,7 +382,7 @@ def test_resuming_what_received_nothing_begins_anew_and_writes_what_is_json(case
     session.run(message(m) for m in case.log.measurements() if m.time < 20.0)
     files.close()
     first = json.loads((tmp_path / "events.jsonl").read_text().splitlines()[0], parse_constant=lambda name: 1 / 0)
-    assert first["time"] is None and "starts anew" in first["text"]
+    assert first["time"] is None and "starts again" in first["text"]
 
 
 def test_a_summary_that_cannot_be_written_is_one_line_and_leaves_no_rest(capsys, dive, tmp_path, monkeypatch):
