@@ -68,7 +68,8 @@ class Guess:
 
         reasons = {f"columns.{each.field}": f"{each.sureness}: {each.why}" for each in self.proposed}
         sections: dict[str, Any] = {"columns": self.mapping, "units": self.units, **self.settings}
-        text = commented_yaml({name: section for name, section in sections.items() if section}, reasons)
+        stated = {name: section for name, section in sections.items() if section}
+        text = commented_yaml(stated, reasons) if stated else ""
         unsure = [each for each in self.columns if each.sureness == "unsure"]
         lines = [f"# unsure: {each.field}: {_one_line(each.column)}  ({each.why})" for each in unsure]
         return text + "".join(f"{line}\n" for line in lines)
@@ -118,4 +119,5 @@ def guess_columns(path: Path | str) -> Guess:
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    """A text as it may stand in a comment."""
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))

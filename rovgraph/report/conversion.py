@@ -195,7 +195,12 @@ def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str]) -> Tabl
     """What each column of a table may be."""
     table = _table("columns of the file", "column", "field", "unit", "why", "how sure")
     for each in columns:
-        table.add_row(escape(each.column), each.field, each.unit, escape(each.why), each.sureness)
+        table.add_row(_printable(each.column), each.field, each.unit, _printable(each.why), each.sureness)
     for column, why in left.items():
-        table.add_row(escape(column), "", "", escape(why), "left")
+        table.add_row(_printable(column), "", "", _printable(why), "left")
     return table
+
+
+def _printable(text: str) -> str:
+    """A name from a file, without what a terminal would obey."""
+    return escape("".join(letter if letter.isprintable() else "?" for letter in text))

@@ -176,7 +176,11 @@ def propose(out: Guesses, group: Group, unit: UnitGuess) -> None:
     """Add columns of a group, none surer than its choice."""
     known = quantities()
     for name, each in group.columns.items():
-        choice: Sureness = "likely" if group.likely else "sure"
+        if name not in known:  # a flag
+            out.columns.append(ColumnGuess(each.column, name, "", each.meaning.why, unit.sureness))
+            continue
+        doubts = [text for text in (group.likely, each.meaning.assumed) if text]
+        choice: Sureness = "likely" if doubts else "sure"
+        why = "; ".join([each.meaning.why, unit.why, *doubts])
         sureness = max(unit.sureness, choice, key=_ORDER.index)
-        why = "; ".join(text for text in (each.meaning.why, unit.why, group.likely) if text)
-        out.columns.append(ColumnGuess(each.column, name, unit.unit if name in known else "", why, sureness))
+        out.columns.append(ColumnGuess(each.column, name, unit.unit, why, sureness))

@@ -6,7 +6,7 @@ A name is read as words: split at signs, blanks and capitals, and where an axis 
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rovgraph.log.streams import is_column
 from rovgraph.log.units import known_unit, name_and_bracket, quantities
@@ -26,12 +26,21 @@ _SINGLE = {"g": "gyro", "m": "mag"}
 _ANGLES = {"roll": "roll", "pitch": "pitch"} | dict.fromkeys(("yaw", "heading", "hdg", "hdt", "hdm", "azimuth"), "yaw")
 _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 _RATES = {"rate", "speed"}
+_SCALARS = {
+    "depth": {"depth"},
+    "dvl_altitude": {"altitude", "altimeter", "alt", "range"},
+    "fix_lat": {"lat", "latitude"},
+    "fix_lon": {"lon", "lng", "longitude"},
+    "fix_north": {"north", "northing"},
+    "fix_east": {"east", "easting"},
+}
 _TIME = {"time", "timestamp", "stamp", "t", "utc", "clock", "epoch"}
 _IMU = {"imu", "ahrs", "ins", "xsens", "vn", "vectornav", "microstrain", "mti"}
 _DVL = {"dvl", "bt", "btm", "bottom"}
 _WATER = {"water", "wt"}
 _FIX = {"fix", "usbl", "gps", "gnss", "position", "pos", "horizontal"}
 _SD = {"sd", "std", "sigma", "fom", "accuracy"}
+_VALID = {"valid", "lock"}
 _NOT_DVL = {"gps", "gnss", "local", "ned", "enu", "global", "north", "east", "wind", "ground", "sound", "air"}
 _DERIVED = {
     **dict.fromkeys(("bias", "offset", "scale", "noise", "temperature", "temp", "cov", "covariance", "variance", "var"),
@@ -55,12 +64,14 @@ class Meaning:
     source : the other words, which tell instruments apart
     unit : that the name states, a key of `UNITS`; "" = none
     why : what the field follows from, or why there is none
+    assumed : what the name leaves open, "" = nothing
     """
 
     field: str
     source: str
     unit: str
     why: str
+    assumed: str = ""
 
 
 def meaning(written: str) -> Meaning:
@@ -83,7 +94,7 @@ def meaning(written: str) -> Meaning:
     field, words, unit = whole
     if not field:
         return Meaning("", "", "", _refusal(words))
-    return _with_unit(field, _source(words), unit, "name")
+    return replace(_with_unit(field, _source(words), unit, "name"), assumed=_assumption(field, set(words)))
 
 
 def _with_unit(field: str, source: str, unit: str, why: str) -> Meaning:
@@ -102,6 +113,19 @@ def _unit_of_words(field: str, words: Sequence[str]) -> str:
     if quantity is None:
         return ""
     return next((unit for sign in ("", "/") if (unit := known_unit(quantity, sign.join(words)))), "")
+
+
+def _assumption(field: str, words: set[str]) -> str:
+    """What is assumed of a column beside its name, "" = nothing."""
+    if field.startswith("dvl_v") and not words & _DVL:
+        return "taken for a DVL's, along its own axes"
+    if field == "dvl_altitude" and not words & _DVL:
+        return "taken for the height above the bottom"
+    if field in ("fix_north", "fix_east") and not words & _FIX:
+        return "taken for a position fix"
+    if field in ("heading", "ahrs_yaw", "dvl_heading") and words & {"true", "hdt"}:
+        return "relative to true north by its name: set environment.declination_deg to 0"
+    return ""
 
 
 def _words(name: str) -> list[str]:
@@ -126,7 +150,7 @@ def _field(words: Collection[str]) -> str:
         return "dvl_sd" if has(_DVL) else "fix_sd" if has(_FIX) else ""
     if has(_DERIVED) or has(_SD):
         return ""
-    if has({"valid", "lock"}):
+    if has(_VALID):
         return "dvl_valid" if has(_DVL | _VELOCITY) else ""
     if has(_TIME):
         return "time"
@@ -136,7 +160,7 @@ def _field(words: Collection[str]) -> str:
         return f"gyr_{_ABOUT[angle]}"
     if angle:
         return _attitude(angle, set(words))
-    return _vector(axis, set(words)) if axis else _scalar(set(words))
+    return (_vector(axis, set(words)) if axis else "") or _scalar(set(words))
 
 
 def _attitude(angle: str, words: set[str]) -> str:
@@ -161,20 +185,13 @@ def _vector(axis: str, words: set[str]) -> str:
 def _scalar(words: set[str]) -> str:
     if words & _VELOCITY or words & _ACC:
         return ""
-    plain = {
-        "depth": {"depth"},
-        "dvl_altitude": {"altitude", "altimeter", "alt", "range"},
-        "fix_lat": {"lat", "latitude"},
-        "fix_lon": {"lon", "lng", "longitude"},
-        "fix_north": {"north", "northing"},
-        "fix_east": {"east", "easting"},
-    }
-    return next((field for field, known in plain.items() if words & known), "")
+    return next((field for field, known in _SCALARS.items() if words & known), "")
 
 
 def _source(words: Collection[str]) -> str:
     """What a name says beside quantity and axis."""
-    spoken = {*_AXES, *_ACC, *_GYR, *_MAG, *_VELOCITY, *_ANGLES, *_RATES, "angular", "linear", "field", "g", "m"}
+    spoken = {*_AXES, *_ACC, *_GYR, *_MAG, *_VELOCITY, *_ANGLES, *_RATES, *_SD, *_VALID, "angular", "linear", "field"}
+    spoken = spoken.union({"g", "m"}, *_SCALARS.values())
     return " ".join(word for word in words if word not in spoken)
 
 
