@@ -164,6 +164,12 @@ def test_a_dvl_and_a_depth_that_change_alike_give_each_others_unit(speed, length
     assert {each.sureness for each in guess.columns if each.field in (*DVL, "depth")} == {"sure"}
 
 
+def test_large_numbers_of_a_depth_without_a_unit_are_no_metres_for_sure(frame, tmp_path):
+    table = renamed(frame, {n: n for n in ("time", *ACC, *GYR, *DVL, "depth")}, {"depth": 100.0})
+    (depth,) = [each for each in rg.guess_columns(written(table, tmp_path)).columns if each.field == "depth"]
+    assert depth.sureness == "unsure" and "state it" in depth.why
+
+
 def test_names_that_say_nothing_are_never_proposed(frame, tmp_path):
     table = frame.set_axis([f"column {k}" for k in range(frame.shape[1])], axis="columns")
     guess = rg.guess_columns(written(table, tmp_path))
