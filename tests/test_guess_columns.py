@@ -193,6 +193,33 @@ def test_a_stated_unit_that_the_heading_contradicts_is_unsure(frame, tmp_path):
     assert {each.sureness for each in guess.columns if each.field in GYR} == {"unsure"}
 
 
+def test_angles_of_one_source_share_a_unit_and_those_of_two_do_not(frame, tmp_path):
+    small = frame["dvl_heading"] * 0.0 + np.sin(frame["time"])
+    table = frame[["time", *ACC, *GYR]].assign(
+        **{"imu.roll": 2.0 * small, "imu.pitch": small, "imu.yaw": frame["dvl_heading"] * DEG},
+        **{"ATTITUDE.roll": 0.6 * small, "ATTITUDE.pitch": 0.1 * small, "VFR_HUD.heading": frame["dvl_heading"] * DEG},
+    )
+    guess = rg.guess_columns(written(table, tmp_path))
+    assert (guess.mapping["ahrs_yaw"], guess.mapping["ahrs_roll"]) == ("imu.yaw", "imu.roll")
+    assert (guess.mapping["heading"], guess.mapping["roll"]) == ("VFR_HUD.heading", "ATTITUDE.roll")
+    assert guess.units["ahrs"] == "deg"
+    assert (guess.units["heading"], guess.units["roll"], guess.units["pitch"]) == ("deg", "rad", "rad")
+
+
+def test_axes_of_one_vector_in_several_units_are_left(frame, tmp_path):
+    names = {n: n for n in ("time", *ACC)} | triple(GYR, "gyr_x_deg_s", "gyr_y_deg_s", "gyr_z_rad_s")
+    guess = rg.guess_columns(written(renamed(frame, names, {}), tmp_path))
+    assert {name for name, why in guess.left.items() if "deg/s and rad/s" in why} == {names[n] for n in GYR}
+
+
+def test_a_depth_that_contradicts_the_dvl_is_unsure(tmp_path):
+    names = {n: n for n in ("time", *ACC, *GYR)} | triple(DVL, "dvl_vx_m_s", "dvl_vy_m_s", "dvl_vz_m_s")
+    dive = pd.read_csv(SHIPPED / "log.csv.gz").head(40_000)
+    table = renamed(dive, {**names, "depth": "depth [cm]"}, {})
+    guess = rg.guess_columns(written(table, tmp_path))
+    assert {each.sureness for each in guess.columns if each.field in (*DVL, "depth")} == {"unsure"}
+
+
 def test_a_heading_that_counts_anticlockwise_is_left(frame, tmp_path):
     names = {n: n for n in ("time", *ACC, *GYR)} | {"dvl_heading": "odometer yaw"}
     guess = rg.guess_columns(written(renamed(frame, names, {"dvl_heading": -1.0}), tmp_path))
@@ -322,7 +349,7 @@ def test_the_command_proposes_what_the_library_does_and_writes_only_what_is_aske
     guess = rg.guess_columns(path)
     assert command(monkeypatch, "convert", path, "--guess") == 0
     said = capsys.readouterr().out
-    assert guess.to_yaml() in said and "a proposal" in said
+    assert guess.to_yaml() in said and "this is a proposal" in said
     assert all(each.column in said for each in guess.columns)
     assert sorted(tmp_path.iterdir()) == [path]
     out = tmp_path / "vehicle.yaml"

@@ -9,6 +9,7 @@ from rovgraph.config import Config, parse_config
 from rovgraph.errors import InputError, as_path
 from rovgraph.interchange.formats import head_of, recognise
 from rovgraph.interchange.guessing.groups import ColumnGuess
+from rovgraph.interchange.guessing.imu import POINTS_UP
 from rovgraph.interchange.guessing.table import guess_table
 from rovgraph.interchange.own_log import FORMAT as OWN_LOG
 from rovgraph.interchange.unknown import purpose
@@ -67,6 +68,7 @@ class Guess:
         from rovgraph.report.conversion import commented_yaml
 
         reasons = {f"columns.{each.field}": f"{each.sureness}: {each.why}" for each in self.proposed}
+        reasons |= {f"{section}.{key}": POINTS_UP for section, keys in self.settings.items() for key in keys}
         sections: dict[str, Any] = {"columns": self.mapping, "units": self.units, **self.settings}
         stated = {name: section for name, section in sections.items() if section}
         text = commented_yaml(stated, reasons) if stated else ""

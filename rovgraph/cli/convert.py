@@ -74,4 +74,5 @@ def propose(files: Sequence[Path], config_out: Path | None, force: bool) -> None
     for note in guess.notes:
         say(shown, f"note: {note}")
     where = "these lines" if saved is None else str(saved)
-    say(shown, f"a proposal: confirm {where}, then run rovgraph check {files[0]} --config {saved or 'vehicle.yaml'}")
+    check = f"rovgraph check {files[0]} --config {saved or 'vehicle.yaml'}"
+    say(shown, f"this is a proposal: confirm {where}, then run {check}")

@@ -10,68 +10,68 @@ from rovgraph.interchange.guessing import physics
 from rovgraph.interchange.guessing.groups import VECTORS, Group, Guesses, propose
 from rovgraph.interchange.guessing.physics import Signal, UnitGuess
 
+NOTHING = Signal(np.empty(0), np.empty((0, 3)))
+
 
 def guess_doppler(groups: Mapping[str, Group], time: Array, out: Guesses) -> None:
     """Velocity and depth, by what both say of the descent."""
-    lengths = speeds = None
-    depth = groups.get("depth")
-    sunk = None if depth is None else depth.signal(time, ("depth",))
-    if depth is not None and sunk is not None:
-        lengths = physics.depths_by_size(sunk.values, depth.stated) if len(sunk.time) else ["m"]
-    moving = groups.get("dvl")
-    way = None if moving is None else moving.signal(time, VECTORS["dvl"][:3])
-    if moving is not None and way is not None:
-        speeds = physics.speeds_by_size(way.values, moving.stated) if len(way.time) else []
-    agrees = False
-    if sunk is not None and way is not None and lengths and speeds:
-        slope, correlation = physics.ratio(sunk, Signal(way.time, way.values[:, 2:]).integrated())
-        if abs(correlation) > physics.ALIKE:
-            pairs = physics.agreeing(slope, ("length", lengths), ("speed", speeds))
-            agrees = bool(pairs)
-            lengths, speeds = (
-                list(dict.fromkeys(p[k] for p in pairs)) or full for k, full in ((0, lengths), (1, speeds))
-            )
-    if depth is not None and sunk is not None:
-        _propose_depth(depth, sunk, lengths or ["m"], agrees, out)
+    depth, moving = groups.get("depth"), groups.get("dvl")
+    sunk = NOTHING if depth is None else depth.signal(time, ("depth",))
+    way = NOTHING if moving is None else moving.signal(time, VECTORS["dvl"][:3])
+    lengths = physics.depths_by_size(sunk.values, "" if depth is None else depth.stated)
+    speeds = physics.speeds_by_size(way.values, "" if moving is None else moving.stated)
+    pairs = _descending(sunk, way, lengths, speeds)
+    agree = None if pairs is None else bool(pairs)
+    if pairs:
+        lengths, speeds = (list(dict.fromkeys(units)) for units in zip(*pairs, strict=True))
+    if depth is not None:
+        propose(out, depth, _depth(depth.stated, sunk, lengths, agree))
     if moving is not None:
-        propose(out, moving, _speed(moving.stated, speeds or [], agrees))
-    if "dvl_water" in groups:
-        group = groups["dvl_water"]
-        own = group.signal(time, VECTORS["dvl_water"])
-        propose(
-            out,
-            group,
-            _speed(group.stated, physics.speeds_by_size(own.values, group.stated) if len(own.time) else [], False),
-        )
+        propose(out, moving, _speed(moving.stated, speeds, agree))
+    if (water := groups.get("dvl_water")) is not None:
+        values = water.signal(time, VECTORS["dvl_water"]).values
+        propose(out, water, _speed(water.stated, physics.speeds_by_size(values, water.stated), None))
 
 
-def _speed(stated: str, units: Sequence[str], agrees: bool) -> UnitGuess:
+def _descending(
+    sunk: Signal, way: Signal, lengths: Sequence[str], speeds: Sequence[str]
+) -> list[tuple[str, str]] | None:
+    """Units in which depth and DVL descend alike; None where nothing tells."""
+    down = Signal(way.time, way.values[:, -1:])
+    slope, correlation = physics.ratio(sunk, down.integrated())
+    if abs(correlation) < physics.ALIKE:
+        return None
+    return physics.agreeing(slope, ("length", lengths), ("speed", speeds))
+
+
+def _speed(stated: str, units: Sequence[str], agrees: bool | None) -> UnitGuess:
+    if agrees is False:
+        return UnitGuess(stated or "m/s", "does not descend as the depth does: state its unit", "unsure")
+    if agrees and len(units) == 1:
+        return UnitGuess(units[0], "descends as the depth does", "sure")
     if stated:
         return UnitGuess(stated, "stated", "sure")
-    if len(units) != 1:
-        text = f"may be in {' or '.join(units)}: state it" if units else "is no vehicle's speed in any unit"
-        return UnitGuess(units[0] if units else "m/s", text, "unsure")
-    return UnitGuess(
-        units[0], "descends as the depth does" if agrees else "by its size", "sure" if agrees else "likely"
-    )
+    if len(units) == 1:
+        return UnitGuess(units[0], "by its size", "likely")
+    text = f"may be in {' or '.join(units)}: state it" if units else "is no vehicle's speed in any unit"
+    return UnitGuess(units[0] if units else "m/s", text, "unsure")
 
 
-def _propose_depth(group: Group, sunk: Signal, units: Sequence[str], agrees: bool, out: Guesses) -> None:
+def _depth(stated: str, sunk: Signal, units: Sequence[str], agrees: bool | None) -> UnitGuess:
     if not len(sunk.time):
-        propose(out, group, UnitGuess("m", "no row with a time", "unsure"))
-        return
+        return UnitGuess(stated or "m", "no row with a time", "unsure")
     middle = float(np.median(sunk.values))
-    if group.stated:
-        unit = UnitGuess(group.stated, "stated", "sure")
-    elif len(units) == 1:
-        unit = UnitGuess(units[0], "sinks as the DVL does" if agrees else "by its size", "sure" if agrees else "likely")
-    elif abs(middle) <= physics.SHALLOW:
+    if agrees is False:
+        unit = UnitGuess(stated or "m", "does not sink as the DVL does: state its unit", "unsure")
+    elif agrees and len(units) == 1:
+        unit = UnitGuess(units[0], "sinks as the DVL does", "sure")
+    elif stated:
+        unit = UnitGuess(stated, "stated", "sure")
+    elif "m" in units and abs(middle) <= physics.SHALLOW:
         unit = UnitGuess("m", "metres are assumed", "likely")
     else:
-        unit = UnitGuess(units[0], f"may be in {' or '.join(units)}: state it", "unsure")
-    if middle < 0.0:
-        unit = replace(unit, unit=f"-{unit.unit}", why=f"{unit.why}, negative below the surface")
-    propose(out, group, unit)
+        unit = UnitGuess(next(iter(units), "m"), f"may be in {' or '.join(units) or 'no unit'}: state it", "unsure")
+    return replace(unit, unit=f"-{unit.unit}", why=f"{unit.why}, negative below the surface") if middle < 0.0 else unit
 
 
 def guess_others(groups: Mapping[str, Group], time: Array, out: Guesses) -> None:
@@ -82,8 +82,9 @@ def guess_others(groups: Mapping[str, Group], time: Array, out: Guesses) -> None
             if name == "dvl_altitude" and np.nanmedian(values) < 0.0:
                 out.left |= {c.column: "negative, as no altitude above the bottom is" for c in group.columns.values()}
                 continue
-            unit = UnitGuess(group.stated or "m", "stated" if group.stated else "metres are assumed",
-                             "sure" if group.stated else "likely")  # fmt: skip
+            unit = UnitGuess(group.stated, "stated", "sure")
+            if not group.stated:
+                unit = UnitGuess("m", "metres are assumed", "likely")
             propose(out, group, unit)
     for group in _present(groups, "latitude"):
         fixes = group.signal(time, VECTORS["latitude"])

@@ -138,7 +138,7 @@ def groups_of(candidates: Sequence[Candidate], out: Guesses) -> dict[str, Group]
                     out.left[each.column] = f"{each.meaning.field}, too; {twin[each.meaning.field].column} is taken"
                 else:
                     twin[each.meaning.field] = each
-        sources = _with_shared(sources)
+        sources = _of_one_unit(_with_shared(sources), out)
         needed = [f for f in fields if not is_optional(f)]
         whole = {s: c for s, c in sources.items() if name == PARTIAL or all(f in c for f in needed)}
         for source in sources.keys() - whole.keys():
@@ -168,6 +168,20 @@ def _with_shared(sources: dict[str, dict[str, Candidate]]) -> dict[str, dict[str
     return {others[0]: shared | sources[others[0]]}
 
 
+def _of_one_unit(sources: Mapping[str, dict[str, Candidate]], out: Guesses) -> dict[str, dict[str, Candidate]]:
+    """Sources whose columns do not state several units; optional columns in another one are left."""
+    kept = {}
+    for source, columns in sources.items():
+        units = {c.meaning.unit for f, c in columns.items() if c.meaning.unit and not is_optional(f)}
+        if len(units) > 1:
+            out.left |= {c.column: f"one of several in {' and '.join(sorted(units))}" for c in columns.values()}
+            continue
+        other = {f: c for f, c in columns.items() if units and c.meaning.unit and c.meaning.unit not in units}
+        out.left |= {c.column: f"in {c.meaning.unit}, others in {next(iter(units))}" for c in other.values()}
+        kept[source] = {f: c for f, c in columns.items() if f not in other}
+    return kept
+
+
 def _rows(columns: Mapping[str, Candidate]) -> int:
     return int(np.isfinite(np.column_stack([each.values for each in columns.values()])).sum())
 
@@ -179,7 +193,8 @@ def propose(out: Guesses, group: Group, unit: UnitGuess) -> None:
         if name not in known:  # a flag
             out.columns.append(ColumnGuess(each.column, name, "", each.meaning.why, unit.sureness))
             continue
-        doubts = [text for text in (group.likely, each.meaning.assumed) if text]
+        shared = "its unit as the others state it" if group.stated and not each.meaning.unit else ""
+        doubts = [text for text in (group.likely, each.meaning.assumed, shared) if text]
         choice: Sureness = "likely" if doubts else "sure"
         why = "; ".join([each.meaning.why, unit.why, *doubts])
         sureness = max(unit.sureness, choice, key=_ORDER.index)

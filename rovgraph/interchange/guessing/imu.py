@@ -14,6 +14,7 @@ from rovgraph.log.units import UNITS
 HEADINGS = {"ahrs": "ahrs_yaw", PARTIAL: "heading", OTHER: "heading", "dvl_heading": "dvl_heading"}
 ANTICLOCKWISE = "counts anticlockwise by the gyro, as ENU does: convert it, heading = 90 deg - yaw"
 UP = (180.0, 0.0, 0.0)  # mounting of an IMU whose z axis points up [deg]
+POINTS_UP = "the IMU's z axis points up by gravity: x forward and y to port are assumed"
 LEVEL = 0.7  # of gravity, that lies along an axis that is called vertical
 
 
@@ -46,7 +47,7 @@ def _mounting(force: Signal, out: Guesses) -> None:
         out.notes.append(f"gravity lies along the IMU's {axis} axis: state imu.mount_rpy_deg (docs/mounting.md)")
     elif f[2] > 0.0:
         out.settings["imu"] = {"mount_rpy_deg": list(UP)}
-        out.notes.append("the IMU's z axis points up by gravity: x forward and y to port are assumed")
+        out.notes.append(POINTS_UP)
 
 
 def _turning(groups: Mapping[str, Group], time: Array, force: Signal | None, out: Guesses) -> None:

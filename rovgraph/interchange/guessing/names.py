@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from rovgraph.log.streams import is_column
 from rovgraph.log.units import known_unit, name_and_bracket, quantities
 
+OWN_NAME = "rovgraph's own name"
 _PIECES = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _AXES = {
     **{"x": "x", "forward": "x", "fwd": "x", "surge": "x"},
@@ -82,7 +83,7 @@ def meaning(written: str) -> Meaning:
     """
     plain, bracket = name_and_bracket(written)
     if is_column(plain):
-        return _with_unit(plain, "", bracket, "rovgraph's own name")
+        return _with_unit(plain, "", bracket, OWN_NAME)
     words = _words(plain)
     whole = (_field(words), words, bracket)
     for count in (3, 2, 1) if not bracket else ():  # a unit that ends the name: acc_x_m_s2
@@ -94,7 +95,7 @@ def meaning(written: str) -> Meaning:
     field, words, unit = whole
     if not field:
         return Meaning("", "", "", _refusal(words))
-    return replace(_with_unit(field, _source(words), unit, "name"), assumed=_assumption(field, set(words)))
+    return replace(_with_unit(field, _source(words), unit, "by name"), assumed=_assumption(field, set(words)))
 
 
 def _with_unit(field: str, source: str, unit: str, why: str) -> Meaning:

@@ -160,6 +160,8 @@ def speeds_by_size(velocity: Array, stated: str) -> list[str]:
     """Units in which a velocity, shape (n, 3), is one that a vehicle has."""
     if stated:
         return [stated]
+    if not len(velocity):
+        return []
     speed = float(np.percentile(np.linalg.norm(velocity, axis=1), 90.0))
     return [unit for unit, factor in UNITS["speed"].items() if SPEED[0] <= speed * factor <= SPEED[1]]
 
@@ -168,7 +170,7 @@ def depths_by_size(depth: Array, stated: str) -> list[str]:
     """Units in which a depth, shape (n,), is one of the sea."""
     if stated:
         return [stated]
-    most = float(np.abs(depth).max())
+    most = float(np.abs(depth).max(initial=0.0))
     return [unit for unit, factor in UNITS["length"].items() if most * factor <= DEEPEST]
 
 

@@ -23,7 +23,7 @@ from rovgraph.interchange.guessing.groups import (
     propose,
 )
 from rovgraph.interchange.guessing.imu import guess_imu
-from rovgraph.interchange.guessing.names import Meaning
+from rovgraph.interchange.guessing.names import OWN_NAME, Meaning
 from rovgraph.interchange.guessing.physics import UnitGuess
 from rovgraph.log.table import Table
 from rovgraph.log.units import UNITS
@@ -81,7 +81,7 @@ def _time(table: Table, candidates: Mapping[str, Candidate], unnamed: Mapping[st
     found = {name: each for name, each in named.items() if _goes_on(each.values)}
     out.left |= {name: "a time that does not go on, or stands in few rows" for name in named.keys() - found.keys()}
     if found:
-        best = max(found, key=lambda name: (found[name].meaning.why != "name", _distinct(found[name].values)))
+        best = max(found, key=lambda name: (found[name].meaning.why == OWN_NAME, _distinct(found[name].values)))
         out.left |= {name: f"a time, too; {best} is taken" for name in found if name != best}
         return found[best]
     rising = {name: v for name, v in unnamed.items() if _goes_on(v) and _distinct(v) > max(1, len(v) // 10)}
