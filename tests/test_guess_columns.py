@@ -262,6 +262,7 @@ def test_positions_are_in_the_unit_of_their_range(scale, unit, sureness, tmp_pat
         ("LOCAL_POSITION_NED.vx", "", ""),
         ("ekf.vel.x", "", ""),
         ("depth_m", "depth", "m"),
+        ("Depth (meters)", "depth", "m"),
         ("depth [ft]", "", ""),
         ("pressure [Pa]", "", ""),
         ("gps.lat", "fix_lat", ""),

@@ -37,6 +37,7 @@ _SPELLINGS = {  # as other programs write units, in small letters
     "rad/sec": "rad/s", "radians/s": "rad/s", "rads": "rad/s", "rps": "rad/s", "dps": "deg/s", "°/s": "deg/s",
     "deg/sec": "deg/s", "degrees/s": "deg/s", "degs": "deg/s", "radians": "rad", "degrees": "deg", "°": "deg",
     "e7": "dege7", "µt": "ut", "μt": "ut", "microtesla": "ut", "mgauss": "mg",
+    "meters": "m", "metres": "m", "meter": "m", "metre": "m",
     "sec": "s", "secs": "s", "seconds": "s", "msec": "ms", "usec": "us", "µs": "us", "μs": "us", "nsec": "ns",
 }  # fmt: skip
 _STATED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
