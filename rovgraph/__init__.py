@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from rovgraph.api.demo import demo as demo
     from rovgraph.api.exporting import export as export
     from rovgraph.api.exporting import tag as tag
+    from rovgraph.api.guessing import Guess as Guess
+    from rovgraph.api.guessing import guess_columns as guess_columns
     from rovgraph.api.live_page import live_page as live_page
     from rovgraph.api.logs import check as check
     from rovgraph.api.logs import read_log as read_log
@@ -97,6 +99,7 @@ _HOMES = {
     "Conversion": "api.conversion",
     "DataWarning": "errors",
     "Demo": "api.demo",
+    "Guess": "api.guessing",
     "InputError": "errors",
     "Log": "log",
     "MagnetometerResult": "api.calibration",
@@ -116,6 +119,7 @@ _HOMES = {
     "demo": "api.demo",
     "evaluate": "evaluate",
     "export": "api.exporting",
+    "guess_columns": "api.guessing",
     "live_page": "api.live_page",
     "load_config": "config",
     "observe": "api.observability",

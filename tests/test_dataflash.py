@@ -305,6 +305,14 @@ def test_damage_costs_what_is_damaged_and_is_counted(written, tmp_path):
         assert any("are no messages" in warning for warning in recording.warnings)
 
 
+def test_an_end_that_was_cut_off_is_said(written, tmp_path):
+    said = "the recording was cut off"
+    assert not any(said in warning for warning in read(written, tmp_path).warnings)
+    for cut in (1, 7):
+        (warning,) = [text for text in read(written[:-cut], tmp_path).warnings if said in text]
+        assert "within a message" in warning
+
+
 def test_the_beginning_of_a_log_may_be_damaged(written, tmp_path):
     assert len(read(b"\x00" * 100 + written, tmp_path).channels) > 4
 

@@ -1,5 +1,6 @@
 """``rovgraph convert``: native files as one log."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -12,18 +13,31 @@ WIDE = 150  # columns of a file or a pipe, which has no width of its own
 
 def convert(
     files: Files,
-    out: Annotated[Path, typer.Option("--out", "-o", help="log to write: .csv, .csv.gz or .parquet")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="log to write: .csv, .csv.gz or .parquet")] = None,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="configuration (YAML)")] = None,
     config_out: Annotated[Path | None, typer.Option(help="also write a configuration to begin with (YAML)")] = None,
     choose: Choose = None,
     shift: Shift = None,
     force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
+    guess: Annotated[
+        bool, typer.Option("--guess", help="propose columns and units of one table instead; writes no log")
+    ] = False,
 ) -> None:
     """Convert native files of instruments, autopilots and robots into one log.
 
     Example: rovgraph convert dive.BIN dvl.jsonl --out log.csv --config-out vehicle.yaml
+    A table of your own: rovgraph convert table.csv --guess --config-out vehicle.yaml
     """
     import rovgraph as rg
+    from rovgraph.errors import InputError
+
+    if guess:
+        if out is not None or config is not None or choose or shift:
+            raise InputError("--guess: writes no log; give one table, and --config-out or nothing")
+        propose(files, config_out, force)
+        return
+    if out is None:
+        raise InputError("expected --out with the log to write, or --guess for a table of other columns")
     from rovgraph.cli.console import console, say
     from rovgraph.cli.progress import progress_bar
     from rovgraph.report.conversion import check_suffix, conversion_tables
@@ -40,3 +54,25 @@ def convert(
     for note in result.notes:
         say(shown, f"assumed: {note}")
     say(shown, f"log in {written[0]}, with {', '.join(path.name for path in written[1:])}")
+
+
+def propose(files: Sequence[Path], config_out: Path | None, force: bool) -> None:
+    """Print a mapping of the columns of a table."""
+    import rovgraph as rg
+    from rovgraph.cli.console import console, say
+    from rovgraph.errors import InputError
+    from rovgraph.report.conversion import guess_table
+
+    if len(files) != 1:
+        raise InputError(f"--guess: expected one table, found {len(files)} files")
+    guess = rg.guess_columns(files[0])
+    saved = None if config_out is None else guess.save(config_out, force)
+    shown = console(WIDE)
+    shown.print(guess_table(guess.columns, guess.left))
+    shown.print()
+    typer.echo(guess.to_yaml())
+    for note in guess.notes:
+        say(shown, f"note: {note}")
+    where = "these lines" if saved is None else str(saved)
+    check = f"rovgraph check {files[0]} --config {saved or 'vehicle.yaml'}"
+    say(shown, f"this is a proposal: confirm {where}, then run {check}")

@@ -253,6 +253,9 @@ def _describe(contents: Contents, made: list[Channel], findings: Findings) -> No
         findings.warnings.append(
             f"{contents.damaged_bytes} bytes in {contents.damaged} places are no messages and are skipped"
         )
+    if contents.cut_off:
+        text = f"the file ends within a message, of which it has {contents.cut_off} bytes"
+        findings.warnings.append(f"{text}: the recording was cut off")
     if findings.undeclared:
         fields = ", ".join(sorted(findings.undeclared))
         findings.notes.append(f"the log declares no unit of {fields}; those of ArduPilot's documentation are taken")

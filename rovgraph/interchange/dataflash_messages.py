@@ -114,6 +114,7 @@ class Contents:
     instances : name -> instances that there are, of those of which one was wanted
     damaged : stretches of bytes that are no message
     damaged_bytes : bytes in them, without a message that the end of the file cuts off
+    cut_off : bytes of that message
     """
 
     messages: dict[str, Messages]
@@ -122,6 +123,7 @@ class Contents:
     instances: Mapping[str, set[int]]
     damaged: int
     damaged_bytes: int
+    cut_off: int
 
 
 def read_messages(
@@ -147,8 +149,8 @@ def read_messages(
             used = walk.walk(data, start)
             rest, start = data[used:], start + used
             progress(start, total)
-    walk.walk(rest, start, last=True)
-    return walk.contents()
+    cut_off = len(rest) - walk.walk(rest, start, last=True)
+    return walk.contents(cut_off)
 
 
 class _Heads:
@@ -297,12 +299,12 @@ class _Walk:
     def _fields(self, form: MessageFormat) -> list[str]:
         return [n for n in self._wanted.get(form.name, ()) if n in form.multipliers]
 
-    def contents(self) -> Contents:
+    def contents(self, cut_off: int) -> Contents:
         """All that was walked."""
         places = {name: columns.pop(_PLACE) for name, columns in self._columns.items()}
         found = {name: Messages(columns) for name, columns in self._columns.items()}
         self._give_units(found)
-        return Contents(found, places, self._counts, self._instances, self._damaged, self._damaged_bytes)
+        return Contents(found, places, self._counts, self._instances, self._damaged, self._damaged_bytes, cut_off)
 
     def _give_units(self, found: dict[str, Messages]) -> None:
         """Units and multipliers by the log's own tables; a format character's multiplier goes before them."""

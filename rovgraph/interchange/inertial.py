@@ -22,7 +22,7 @@ from rovgraph.interchange.formats import Options
 from rovgraph.interchange.rates import too_slow
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.text_table import Table
-from rovgraph.log.units import UNITS
+from rovgraph.log.units import UNITS, known_unit, name_and_bracket
 
 WORLDS = {  # to NED, of the coordinate systems that instruments have
     "ENU": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
@@ -40,12 +40,6 @@ SINCE_START = "the instrument's time since its start"
 GRAVITY = 7.0, 13.0  # medians of a vehicle's acceleration [m/s^2]
 MOST = {"rate": 40.0, "angle": 2.0 * np.pi + 0.01}  # no instrument gives more [rad/s], [rad]
 OTHERS = {"acceleration": ("m/s2", "g", "mg"), "rate": ("deg/s",), "angle": ("deg",)}  # than the documented unit
-_SPELLINGS = {
-    "m/s²": "m/s2", "m/s/s": "m/s2", "m/sec^2": "m/s2", "m/sec2": "m/s2", "m/sec/sec": "m/s2", "m/s^2": "m/s2",
-    "rad/sec": "rad/s", "radians/s": "rad/s", "dps": "deg/s", "°/s": "deg/s", "deg/sec": "deg/s", "degrees/s": "deg/s",
-    "radians": "rad", "degrees": "deg", "°": "deg", "µt": "ut", "μt": "ut", "microtesla": "ut", "mgauss": "mg",
-}  # fmt: skip
-_STATED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
 
 
 @dataclass(frozen=True)
@@ -147,9 +141,8 @@ def flags_of(values: Array) -> NDArray[np.int64]:
 
 def name_and_unit(written: str) -> tuple[str, str]:
     """A column's name in small letters without blanks, and the unit that it states in brackets, "" = none."""
-    stated = _STATED.match(written)
-    name, unit = (stated[1], stated[2]) if stated else (written, "")
-    return re.sub(r"[\s_]", "", name).lower(), unit.strip()
+    name, unit = name_and_bracket(written)
+    return re.sub(r"[\s_]", "", name).lower(), unit
 
 
 def measured_of(
@@ -196,12 +189,10 @@ def _usual_step(time: Array, values: Array) -> float:
 
 
 def _factor(path: Path, shown: str, quantity: str, unit: str) -> float:
-    known = {name.lower(): factor for name, factor in UNITS[quantity].items()}
-    plain = unit.lower()
-    plain = plain if plain in known else _SPELLINGS.get(plain, "gauss" if plain == "g" else plain)
-    if plain not in known:
+    known = known_unit(quantity, unit)
+    if known is None:
         raise InputError(f"{path}: {shown}: unknown unit {unit!r}; expected one of: {', '.join(UNITS[quantity])}")
-    return known[plain]
+    return UNITS[quantity][known]
 
 
 def _documented(values: Array, vector: Vector, shown: str, account: Account) -> float:

@@ -5,6 +5,7 @@ A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns
 """
 
 import difflib
+import re
 from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
@@ -29,6 +30,39 @@ UNITS: dict[str, dict[str, float]] = {
     "length": _LENGTH,
     "latitude": {"deg": 1.0, "degE7": 1e-7, "rad": 1.0 / _DEG},
 }
+
+_SPELLINGS = {  # as other programs write units, in small letters
+    "m/s²": "m/s2", "m/s/s": "m/s2", "m/sec^2": "m/s2", "m/sec2": "m/s2", "m/sec/sec": "m/s2", "mps2": "m/s2",
+    "ms2": "m/s2", "m/s/2": "m/s2", "mps": "m/s", "m/sec": "m/s",
+    "rad/sec": "rad/s", "radians/s": "rad/s", "rads": "rad/s", "rps": "rad/s", "dps": "deg/s", "°/s": "deg/s",
+    "deg/sec": "deg/s", "degrees/s": "deg/s", "degs": "deg/s", "radians": "rad", "degrees": "deg", "°": "deg",
+    "e7": "dege7", "µt": "ut", "μt": "ut", "microtesla": "ut", "mgauss": "mg",
+    "meters": "m", "metres": "m", "meter": "m", "metre": "m",
+    "sec": "s", "secs": "s", "seconds": "s", "msec": "ms", "usec": "us", "µs": "us", "μs": "us", "nsec": "ns",
+}  # fmt: skip
+_STATED = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
+
+
+def name_and_bracket(written: str) -> tuple[str, str]:
+    """A column's name, and the unit that it states in brackets, "" = none.
+
+    >>> name_and_bracket("Gyro X [deg/s]"), name_and_bracket("depth")
+    (('Gyro X', 'deg/s'), ('depth', ''))
+    """
+    stated = _STATED.match(written)
+    return (stated[1], stated[2].strip()) if stated else (written, "")
+
+
+def known_unit(quantity: str, written: str) -> str | None:
+    """The unit of a quantity, both keys of `UNITS`, that a text means; None = none that is known.
+
+    >>> known_unit("rate", "dps"), known_unit("field", "G"), known_unit("speed", "kn")
+    ('deg/s', 'gauss', None)
+    """
+    known = {name.lower(): name for name in UNITS[quantity]}
+    plain = written.lower()
+    plain = plain if plain in known else _SPELLINGS.get(plain, "gauss" if plain == "g" else plain)
+    return known.get(plain)
 
 
 def groups() -> dict[str, tuple[str, ...]]:

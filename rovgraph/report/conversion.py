@@ -1,7 +1,7 @@
 """A converted log as files, the configuration to begin with, and the tables that a command prints."""
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.fast_csv import write_csv, write_sparse_csv
 from rovgraph.geometry import Array
+from rovgraph.interchange.guessing.groups import ColumnGuess
 from rovgraph.log.rows import Part, column_names, frame_of, pieces, whole
 from rovgraph.log.table import SUFFIXES
 from rovgraph.progress import Progress, no_progress
@@ -114,11 +115,16 @@ def starter(
             sources[f"{sensor}.lever_arm_m"] = "not known; state it, forward, starboard, down from the vehicle's origin"
     sensors = ", ".join(f"{sensor} ({count})" for sensor, count in counts.items())
     head = f"# Configuration to begin with, for {' '.join(name.split())}\n# sensors: {sensors}\n"
+    return head + commented_yaml(settings, sources)
+
+
+def commented_yaml(settings: Mapping[str, Any], comments: Mapping[str, str]) -> str:
+    """Settings as YAML, with comments by dotted key."""
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 4096
-    yaml.dump(_commented(settings, sources), stream)
-    return head + stream.getvalue()
+    yaml.dump(_commented(settings, comments), stream)
+    return stream.getvalue()
 
 
 def _commented(settings: Mapping[str, Any], sources: Mapping[str, str], above: str = "") -> CommentedMap:
@@ -183,3 +189,18 @@ def _left(report: Mapping[str, Any]) -> Iterator[Table]:
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
+
+
+def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str]) -> Table:
+    """What each column of a table may be."""
+    table = _table("columns of the file", "column", "field", "unit", "why", "how sure")
+    for each in columns:
+        table.add_row(_printable(each.column), each.field, each.unit, _printable(each.why), each.sureness)
+    for column, why in left.items():
+        table.add_row(_printable(column), "", "", _printable(why), "left")
+    return table
+
+
+def _printable(text: str) -> str:
+    """A name from a file, without what a terminal would obey."""
+    return escape("".join(letter if letter.isprintable() else "?" for letter in text))
