@@ -96,7 +96,7 @@ def _alike(
         return
     patterns, which = np.unique(np.column_stack([*holey.values()]), axis=0, return_inverse=True)
     for k, empty in enumerate(patterns):
-        rows, without = which == k, {name for name, gone in zip(holey, empty, strict=True) if gone}
+        rows, without = which.ravel() == k, {name for name, gone in zip(holey, empty, strict=True) if gone}
         yield place[rows], {name: values[rows] for name, values in columns.items() if name not in without}
 
 

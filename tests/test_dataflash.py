@@ -89,6 +89,16 @@ def test_units_are_those_that_the_log_declares(tmp_path):
     np.testing.assert_allclose(columns["acc_z"], -9.8)
 
 
+@pytest.mark.parametrize("stored", ["q", "I", "d"])
+def test_stamps_of_any_type_become_seconds(stored, tmp_path):
+    kind, form, *rest = FORMATS["IMU"]
+    writer = DataFlashWriter(formats=FORMATS | {"IMU": (kind, stored + form[1:], *rest)})
+    for k in range(20):
+        writer.add("IMU", 40_000 * k, 0, 0.1, 0.2, 0.3, 0.0, 0.0, -9.8, 1, 1)
+    columns = first(read(writer.bytes(), tmp_path), "imu").columns
+    np.testing.assert_allclose(columns["time"], 0.04 * np.arange(20))
+
+
 def test_a_log_that_declares_no_units_has_those_of_the_documentation_and_says_so(dive, tmp_path):
     data = dataflash_of(short_dive(DECLINATION_DEG), 0.0, SURFACE, units=False)
     recording = read(data, tmp_path)

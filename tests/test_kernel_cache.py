@@ -1,8 +1,10 @@
 """Compiled kernels: where they are kept, and what is said where they cannot be."""
 
+import contextlib
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -82,7 +84,7 @@ def test_the_folder_changes_with_the_version_and_with_what_a_kernel_imports(monk
     from rovgraph.kernels import compile as compiling
 
     before = compiling._state_of("rovgraph.kernels.correction")
-    assert "rotations" in compiling._imported_kernels("correction")
+    assert {"rotations", "compile", "compilers"} < compiling._imported_kernels("correction")
     compiling._state_of.cache_clear()
     monkeypatch.setattr(rovgraph, "__version__", "another")
     assert compiling._state_of("rovgraph.kernels.correction") != before
@@ -115,6 +117,58 @@ def test_missing_modules_are_compiled_by_processes_of_their_own_and_nothing_else
     kept = sorted(folder.name.split("-")[1] for folder in tmp_path.iterdir())
     assert kept == ["chain", "linear_chain"]
     assert all(any(folder.rglob("*.nbc")) for folder in tmp_path.iterdir())
+
+
+RECORDING = "import sys; [(print(x, end='', file=open(sys.argv[1], 'a')), print(flush=True)) for x in sys.stdin]"
+
+
+@pytest.mark.parametrize("alive", [0, 1])
+def test_where_a_worker_has_died_the_others_compile_the_rest(alive, tmp_path, monkeypatch):
+    from rovgraph.kernels import compile as compiling
+
+    given, codes = tmp_path / "given", iter(["", *[RECORDING] * alive, ""])
+
+    @contextlib.contextmanager
+    def worker(parent: Path) -> Iterator[subprocess.Popen[str]]:
+        command = [sys.executable, "-c", next(codes), str(given)]
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        yield process
+        with contextlib.suppress(OSError):
+            process.communicate(timeout=60)
+
+    given.touch()
+    monkeypatch.setattr(compiling, "_worker", worker)
+    monkeypatch.setattr(compiling.os, "sched_getaffinity", lambda pid: {0, 1}, raising=False)
+    compiling._compile_missing(tmp_path / "kept")
+    assert len(given.read_text().split()) >= alive * (len(compiling._modules()) - 1)
+
+
+def test_an_error_ends_a_worker_at_once(tmp_path):
+    from rovgraph.kernels.compile import _worker
+
+    with pytest.raises(KeyboardInterrupt), _worker(tmp_path) as worker:
+        raise KeyboardInterrupt
+    assert worker.returncode not in (0, None)
+
+
+def test_a_worker_imports_no_file_of_the_current_folder(tmp_path, monkeypatch):
+    from rovgraph.kernels.compile import _import_in, _worker
+
+    (tmp_path / "random.py").write_text("open('imported', 'w')")
+    monkeypatch.chdir(tmp_path)
+    with _worker(tmp_path) as worker:
+        assert _import_in(worker, "random")
+    assert not (tmp_path / "imported").exists()
+
+
+def test_where_the_disk_is_full_there_is_no_cache(tmp_path, monkeypatch):
+    from rovgraph.kernels import compile as compiling
+
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(compiling.HELPS, "1")
+    monkeypatch.setattr(compiling, "_writable_parent", lambda: tmp_path)
+    monkeypatch.setattr(compiling, "_folder_in", lambda parent, module: parent / "file" / "below")
+    assert compiling.cache_folder("rovgraph.kernels.chain") is None
 
 
 def test_modules_with_kernels_are_those_that_decorate_one():

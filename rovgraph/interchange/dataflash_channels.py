@@ -137,11 +137,13 @@ class Source:
 
 
 def in_seconds(name: str, messages: Messages, findings: Findings) -> Messages:
-    """Messages whose stamps are made seconds where they are, not copied."""
+    """Messages whose stamps are made seconds where they are, not copied unless they are stored as integers."""
     declared = messages.units["TimeUS"] == "s"
     if not declared:
         findings.undeclared.add(f"{name}.TimeUS")
-    messages.fields["TimeUS"] *= messages.multipliers["TimeUS"] * (1.0 if declared else 1e-6)
+    time = messages.fields["TimeUS"].astype(float, copy=False)
+    time *= messages.multipliers["TimeUS"] * (1.0 if declared else 1e-6)
+    messages.fields["TimeUS"] = time
     return messages
 
 

@@ -21,7 +21,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
-from queue import SimpleQueue
 from typing import IO, Any, TypeVar, cast
 
 import rovgraph
@@ -107,8 +106,12 @@ def cache_folder(module: str) -> Path | None:
         if HELPS not in os.environ:
             _say_once("compiling rovgraph's kernels, once: this takes about a minute")
             if module.rpartition(".")[0] == __package__:
-                _compile_missing(parent)
-        folder.mkdir(parents=True, exist_ok=True)
+                with contextlib.suppress(OSError):  # no process can be started
+                    _compile_missing(parent)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:  # the disk is full
+            return None
     return folder
 
 
@@ -126,29 +129,32 @@ def _compile_missing(parent: Path) -> None:
     # a module comes after those that it imports: their kernels are then loaded, not compiled once more
     order = TopologicalSorter({module: (_imported_kernels(module) - {module}) & missing for module in missing})
     order.prepare()
-    with contextlib.ExitStack() as stack:
-        idle: SimpleQueue[subprocess.Popen[str]] = SimpleQueue()
-        workers = min(cores, len(missing))
-        for _ in range(workers):
-            idle.put(stack.enter_context(_worker(parent)))
-        pool = stack.enter_context(ThreadPoolExecutor(workers))
-
-        def compile_one(module: str) -> str:
-            worker = idle.get()
-            with contextlib.suppress(OSError):  # it has died
-                print(f"{__package__}.{module}", file=worker.stdin, flush=True)
-                cast(IO[str], worker.stdout).readline()
-            idle.put(worker)
-            return module
-
+    count = min(cores, len(missing))
+    with ThreadPoolExecutor(count) as pool, contextlib.ExitStack() as stack:
+        idle = [stack.enter_context(_worker(parent)) for _ in range(count)]
         ready: list[str] = []
-        running: set[Future[str]] = set()
+        running: dict[Future[bool], tuple[str, subprocess.Popen[str]]] = {}
         while order.is_active():
             ready = sorted([*ready, *order.get_ready()], key=lambda module: _awaited(module, missing))
-            while ready and len(running) < workers:
-                running.add(pool.submit(compile_one, ready.pop()))
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            order.done(*(each.result() for each in done))
+            while ready and idle:
+                module, worker = ready.pop(), idle.pop()
+                running[pool.submit(_import_in, worker, f"{__package__}.{module}")] = module, worker
+            if not running:  # all workers have died
+                return
+            for each in wait(running, return_when=FIRST_COMPLETED).done:
+                module, worker = running.pop(each)
+                order.done(module)
+                if each.result():
+                    idle.append(worker)
+
+
+def _import_in(worker: subprocess.Popen[str], module: str) -> bool:
+    """Have a `_worker` import a module; False = it has died, such as for want of memory."""
+    try:
+        print(module, file=worker.stdin, flush=True)
+        return bool(cast(IO[str], worker.stdout).readline())
+    except OSError:
+        return False
 
 
 def _awaited(module: str, among: set[str]) -> int:
@@ -158,7 +164,7 @@ def _awaited(module: str, among: set[str]) -> int:
 
 @contextlib.contextmanager
 def _worker(parent: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that imports each module whose name it is given, and answers when it has."""
+    """A process that imports each module whose name it is given, and answers when it has; an error ends it at once."""
     root = str(Path(rovgraph.__file__).parents[1])
     code = (
         "import contextlib, importlib, sys; sys.path.insert(0, sys.argv[1])\n"
@@ -167,7 +173,7 @@ def _worker(parent: Path) -> Iterator[subprocess.Popen[str]]:
         "    print(flush=True)"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", code, root],
+        [sys.executable, "-P", "-c", code, root],  # -P: files of the current folder are not imported
         env={**os.environ, HELPS: "1", "ROVGRAPH_CACHE_DIR": str(parent)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -176,6 +182,9 @@ def _worker(parent: Path) -> Iterator[subprocess.Popen[str]]:
     )
     try:
         yield process
+    except BaseException:
+        process.kill()
+        raise
     finally:
         with contextlib.suppress(OSError):
             process.communicate()
@@ -241,7 +250,7 @@ def _imported_kernels(name: str) -> frozenset[str]:
     path = Path(__file__).parent / f"{name}.py"
     if not path.exists():  # a kernel of somebody else's
         return frozenset()
-    own = set(re.findall(r"^from rovgraph\.kernels\.(\w+) import", path.read_text(encoding="utf-8"), re.MULTILINE))
+    own = set(re.findall(r"^ *from rovgraph\.kernels\.(\w+) import", path.read_text(encoding="utf-8"), re.MULTILINE))
     return frozenset({name}).union(*(_imported_kernels(other) for other in own))
 
 
