@@ -151,16 +151,21 @@ class Trajectory:
         lat, lon, _ = ned2geodetic(self.p_n[:, 0], self.p_n[:, 1], 0.0, *origin, 0.0)
         return lat, lon
 
-    def write_csv(self, path: Path | str, more: bool = False, origin: tuple[float, float] | None = None) -> None:
+    def write_csv(
+        self,
+        path: Path | str,
+        more: bool = False,
+        origin: tuple[float, float] | None = None,
+        unix: bool | None = None,
+    ) -> None:
         """Write the columns of the contract that are known; time to the millisecond's tenth.
-
-        Where the time is Unix time, a column ``unix_time`` says so.
 
         Parameters
         ----------
         path : the file
         more : rows for the end of a file that has the same columns
         origin : latitude and longitude [deg] of north = east = 0, for columns ``lat`` and ``lon``; None = without
+        unix : whether there is a column ``unix_time``, empty for other times; None = if the time is Unix time
         """
         frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
         decimals = {"time": 4}
@@ -168,9 +173,10 @@ class Trajectory:
             name for name in POSITION if name in frame and frame[name].abs().max() >= FAR and frame[name].notna().all()
         ]
         decimals |= dict.fromkeys(far, 4)  # seven digits of a grid's northing are a metre
-        if is_unix(self.time):
-            frame["unix_time"] = frame["time"]
-            decimals["unix_time"] = 4
+        dated = is_unix(self.time)
+        if unix or (unix is None and dated):
+            frame["unix_time"] = frame["time"] if dated else np.nan
+            decimals |= {"unix_time": 4} if dated else {}
         if origin is not None:
             frame["lat"], frame["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre

@@ -66,6 +66,23 @@ def test_a_growing_track_keeps_the_columns_that_it_began_with(trajectory, tmp_pa
     assert (tmp_path / "early.csv").read_text() == (tmp_path / "whole.csv").read_text()
 
 
+def test_a_growing_file_keeps_its_columns_when_its_clock_becomes_unix_time(tmp_path):
+    """Also where it was begun by a release that wrote no ``unix_time``."""
+    early, late = (
+        Trajectory.certain(time, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
+        for time in (np.array([5.0, 6.0]), 1.7e9 + np.array([5.0, 6.0]))
+    )
+    path = tmp_path / "track.csv"
+    TrackFile(path).add(early, (54.0, 10.0))
+    TrackFile(path, until=10.0).add(late, (54.0, 10.0))
+    assert len({line.count(",") for line in path.read_text().splitlines()}) == 1
+    TrackFile(path).add(late)
+    TrackFile(path, until=2e9).add(early)
+    table = pd.read_csv(path)
+    assert table["time"].tolist() == [*late.time, *early.time]
+    np.testing.assert_array_equal(table["unix_time"], [*late.time, np.nan, np.nan])
+
+
 def test_csv_round_trip_keeps_values_and_sds(trajectory, tmp_path):
     trajectory.write_csv(tmp_path / "t.csv")
     back = read_trajectory(tmp_path / "t.csv")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.errors import InputError
+from rovgraph.gps_time import is_unix
 from rovgraph.trajectory import Trajectory
 
 
@@ -37,6 +38,7 @@ class TrackFile:
             partial.replace(path)
         self._begun = bool(kept)
         self._on_earth = bool(kept) and kept[0].rstrip().endswith(",lat,lon")
+        self._unix = bool(kept) and ",unix_time" in kept[0]
 
     def add(self, trajectory: Trajectory, origin: tuple[float, float] | None = None) -> None:
         """Add epochs, later than those before: all of them, or where the disk is full none.
@@ -47,11 +49,11 @@ class TrackFile:
         origin : of `Trajectory.write_csv`; a file that was begun without one goes on without
         """
         if not self._begun:
-            self._on_earth = origin is not None
+            self._on_earth, self._unix = origin is not None, is_unix(trajectory.time)
         with _one_line(self.path):
             size = self.path.stat().st_size
             try:
-                trajectory.write_csv(self.path, self._begun, origin if self._on_earth else None)
+                trajectory.write_csv(self.path, self._begun, origin if self._on_earth else None, self._unix)
             except OSError:
                 os.truncate(self.path, size)
                 raise
