@@ -68,7 +68,7 @@ def write_sparse_csv(
     with _opened(path) as file:
         file.write(",".join(names) + "\n")
         for parts in pieces:
-            file.write(_text(form, [rows for place, columns in parts for rows in _alike(place, columns)]))
+            file.write(_text(form, [rows for place, columns in parts for rows in _with_same_columns(place, columns)]))
 
 
 @contextmanager
@@ -85,7 +85,7 @@ def _opened(path: Path) -> Iterator[TextIO]:
         yield file
 
 
-def _alike(
+def _with_same_columns(
     place: NDArray[np.int64], columns: Mapping[str, NDArray[np.floating[Any]]]
 ) -> Iterator[tuple[NDArray[np.int64], Mapping[str, NDArray[np.floating[Any]]]]]:
     """Rows of a part in sets that fill the same columns, of which no cell is empty."""
@@ -108,7 +108,7 @@ def _text(
     Parameters
     ----------
     form : column -> how a number is formatted
-    sets : of `_alike`
+    sets : of `_with_same_columns`
     """
     lines, count = [], sum(len(place) for place, _ in sets)
     which, width = np.empty(count, np.int64), np.empty(count, np.int64)

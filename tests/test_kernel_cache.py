@@ -176,3 +176,14 @@ def test_modules_with_kernels_are_those_that_decorate_one():
 
     names = set(_modules())
     assert {"chain", "weighting", "filtering"} < names and not {"compile", "rotations"} & names
+
+
+def test_a_folder_that_an_interrupt_left_empty_is_compiled_again_and_said_to_be(tmp_path):
+    kept = tmp_path / "kept"
+    first = own_kernel(tmp_path, ROVGRAPH_CACHE_DIR=str(kept))
+    for file in [*kept.rglob("*.nbi"), *kept.rglob("*.nbc")]:
+        file.unlink()
+    again = own_kernel(tmp_path, ROVGRAPH_CACHE_DIR=str(kept))
+    assert again.stdout == first.stdout
+    assert again.stderr.count("compiling rovgraph's kernels, once") == 1
+    assert list(kept.rglob("*.nbi"))

@@ -69,14 +69,14 @@ class Conversion:
             config=self.completed,
             warnings=(*merged.warnings, *texts, *log.warnings),
             settings=merged.nested_settings(),
-            notes=(*notes(merged), *_settings_told(merged, self.used)),
+            notes=(*notes(merged), *_describe_settings(merged, self.used)),
         )
 
     @property
     def notes(self) -> list[str]:
         """Assumptions, and settings that come from the files, a sentence each."""
-        told = [text for recording in self.merged.recordings for text in recording.notes]
-        return [*told, *_settings_told(self.merged, self.used)]
+        notes = [text for recording in self.merged.recordings for text in recording.notes]
+        return [*notes, *_describe_settings(self.merged, self.used)]
 
     @property
     def report(self) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def _read(path: Path, options: Options, format_: Format | None, alone: bool) -> 
         return _read(path, replace(options, choose=others), format_, alone)
 
 
-def _settings_told(merged: Merged, used: Mapping[str, Any]) -> list[str]:
+def _describe_settings(merged: Merged, used: Mapping[str, Any]) -> list[str]:
     return [f"{key}: {value} ({merged.settings[key][1]})" for key, value in used.items()]
 
 

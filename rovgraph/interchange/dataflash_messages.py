@@ -281,7 +281,9 @@ class _Walk:
                 rows, index = rows[chosen], index[chosen]
             columns = self._columns.setdefault(form.name, {})
             if not columns:
-                columns |= {_PLACE: np.empty(0, self._place)} | {n: np.empty(0, _held(form.dtype[n])) for n in names}
+                columns |= {_PLACE: np.empty(0, self._place)} | {
+                    n: np.empty(0, _dtype_in_memory(form.dtype[n])) for n in names
+                }
             if not columns.keys() - {_PLACE} <= set(names):  # another type of that name, with other fields
                 continue
             for name, column in columns.items():
@@ -328,7 +330,7 @@ class _Walk:
                 messages.multipliers[name] = implied if implied != 1.0 or not known else float(known)
 
 
-def _held(stored: np.dtype[Any]) -> np.dtype[Any]:
+def _dtype_in_memory(stored: np.dtype[Any]) -> np.dtype[Any]:
     """How a field is kept: integers of 64 bits as floats, so that times become seconds where they are."""
     return np.dtype(float) if stored == np.uint64 else stored
 

@@ -106,7 +106,7 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
     if not any(recording.channels for recording in recordings):
         raise InputError(f"{', '.join(file_names(recordings))}: no measurement of any sensor in it")
     selected, unused = select(recordings, choose)
-    clocks, beside, unix, told = join_clocks(recordings, selected, shift, _motion)
+    clocks, beside, unix, notes = join_clocks(recordings, selected, shift, _motion)
     by_name = {(clock.file, clock.name): clock for clock in clocks}
     parts = []
     for each in selected:
@@ -114,7 +114,7 @@ def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Map
         parts.append(Part(each.channel.columns, _stamps(clock, added)))
     settings = _settings(recordings, selected, clocks)
     tables = _tables(recordings, selected, by_name, beside.get("dvl", 0.0))
-    return Merged(parts, recordings, selected, unused, clocks, unix, settings, (*said, *told), tables)
+    return Merged(parts, recordings, selected, unused, clocks, unix, settings, (*said, *notes), tables)
 
 
 def _stamps(clock: JoinedClock, added: float) -> Callable[[Array], Array]:

@@ -64,7 +64,7 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     InputError : no row with a time, or many whose stamps are of another epoch
     """
     where, time = f"{file}: {channel.source}", np.asarray(channel.columns["time"], dtype=float)
-    if _go_on(time):
+    if _increase(time):
         return channel, []
     stamped = np.isfinite(time)
     if not stamped.any():
@@ -90,7 +90,7 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     return replace(channel, columns=columns, received=received), said
 
 
-def _go_on(time: NDArray[np.float64]) -> bool:
+def _increase(time: NDArray[np.float64]) -> bool:
     """Whether all stamps are known and in order, as most are: a large channel is not copied to find out."""
     known = len(time) > 0 and np.isfinite(time[[0, -1]]).all() and (time[1:] >= time[:-1]).all()
     return bool(known and (time[-1] - time[0] <= JUMP or (np.diff(time) <= JUMP).all()))

@@ -102,9 +102,9 @@ def cache_folder(module: str) -> Path | None:
     if parent is None:
         return None
     folder = _folder_in(parent, module)
-    if not folder.exists():
+    if not _is_compiled(folder):
         if HELPS not in os.environ:
-            _say_once("compiling rovgraph's kernels, once: this takes about a minute")
+            _say_once("compiling rovgraph's kernels, once: this takes half a minute or more")
             if module.rpartition(".")[0] == __package__:
                 with contextlib.suppress(OSError):  # no process can be started
                     _compile_missing(parent)
@@ -115,6 +115,11 @@ def cache_folder(module: str) -> Path | None:
     return folder
 
 
+def _is_compiled(folder: Path) -> bool:
+    """Whether a folder holds kernels; what interrupts compiling leaves it empty."""
+    return next(folder.rglob("*.nbi"), None) is not None
+
+
 def _folder_in(parent: Path, module: str) -> Path:
     return parent / f"rovgraph-{module.rpartition('.')[2]}-{_state_of(module)}"
 
@@ -123,7 +128,7 @@ def _folder_in(parent: Path, module: str) -> Path:
 def _compile_missing(parent: Path) -> None:
     """Have other processes compile what is missing; what they leave, this one compiles when it imports it."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    missing = {module for module in _modules() if not _folder_in(parent, f"{__package__}.{module}").exists()}
+    missing = {module for module in _modules() if not _is_compiled(_folder_in(parent, f"{__package__}.{module}"))}
     if cores < 2 or len(missing) < 2:
         return
     # a module comes after those that it imports: their kernels are then loaded, not compiled once more
@@ -158,7 +163,7 @@ def _import_in(worker: subprocess.Popen[str], module: str) -> bool:
 
 
 def _awaited(module: str, among: set[str]) -> int:
-    """Of how many modules the largest one is made that a module is a part of: its parts should come first."""
+    """Size of the largest module that imports this one: the parts of the largest come first."""
     return max(len(_imported_kernels(whole)) for whole in among if module in _imported_kernels(whole))
 
 

@@ -18,7 +18,7 @@ class _NoEnvironment:
     """In place of a code generator, for a function that has no address and hence no environment to set."""
 
     def set_env(self, name: str, environment: object) -> None:
-        """Nothing."""
+        """Do nothing: the function has no environment."""
 
 
 class LinkedLibrary(JITCodeLibrary):

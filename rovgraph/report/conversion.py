@@ -55,7 +55,9 @@ def write_parts(parts: Sequence[Part], path: Path, progress: Progress = no_progr
     InputError : Parquet, and pyarrow is not installed
     """
     if path.suffix != ".parquet":
-        write_sparse_csv(column_names(parts), _told(parts, f"writing {path.name}", progress), path, DIGITS, DECIMALS)
+        write_sparse_csv(
+            column_names(parts), _with_progress(parts, f"writing {path.name}", progress), path, DIGITS, DECIMALS
+        )
         return
     try:
         frame_of(whole(parts)).to_parquet(path, engine="pyarrow", index=False)
@@ -65,7 +67,7 @@ def write_parts(parts: Sequence[Part], path: Path, progress: Progress = no_progr
         ) from None
 
 
-def _told(
+def _with_progress(
     parts: Sequence[Part], what: str, progress: Progress
 ) -> Iterator[list[tuple[NDArray[np.int64], Mapping[str, Array]]]]:
     """Pieces of a log, with how far they are."""
