@@ -75,8 +75,8 @@ class Conversion:
     @property
     def notes(self) -> list[str]:
         """Assumptions, and settings that come from the files, a sentence each."""
-        notes = [text for recording in self.merged.recordings for text in recording.notes]
-        return [*notes, *_describe_settings(self.merged, self.used)]
+        of_files = [text for recording in self.merged.recordings for text in recording.notes]
+        return [*of_files, *_describe_settings(self.merged, self.used)]
 
     @property
     def report(self) -> dict[str, Any]:

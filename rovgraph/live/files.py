@@ -31,9 +31,8 @@ CONFIG, SETTINGS, EVENTS = "config.yaml", "config_online.yaml", "events.jsonl"  
 SMOOTHED = "trajectory_smoothed.csv"
 KEEP_S = 0.5  # of the host's time between checkpoints
 UNWRITTEN = 10_000  # keyframes that wait for a disk that is full; then the oldest are lost
-REPLAYED_S = REINITIALISE_AT_S[
-    -1
-]  # a recording that is shorter is replayed from its start: the filter is still to be re-initialised
+# a recording that is shorter is replayed from its start, since the filter is still to be re-initialised
+REPLAYED_S = REINITIALISE_AT_S[-1]
 LAST_BYTES = 1 << 22  # of a recording, that a resumed run reads again: minutes
 
 
