@@ -1,5 +1,6 @@
 """ArduPilot's DataFlash logs: what is read of them, and that damage costs only what is damaged."""
 
+import struct
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -265,6 +266,21 @@ def test_of_several_imus_one_is_read_and_the_others_are_counted(tmp_path):
     np.testing.assert_allclose(chosen["acc_z"], -11.8, rtol=1e-6)
     with pytest.raises(InputError, match="choose one of: IMU 0, IMU 1, IMU 2"):
         read(data, tmp_path, imu="3")
+
+
+@pytest.mark.parametrize("form", ["QBfffffBB", "QBffffffB", "QBdddfffBB"])
+def test_messages_of_another_format_of_a_name_are_left_and_counted_as_such(form, tmp_path):
+    """Of other fields, and of fields that are stored otherwise."""
+    columns = ["TimeUS", "I", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "GH", "AH"][: len(form)]
+    writer = imus(30).raw(DataFlashWriter.format(200, 3 + struct.calcsize(f"<{form}"), "IMU", form, ",".join(columns)))
+    for k in range(5):
+        values = [0.0 if letter in "fd" else 0 for letter in form[1:]]
+        writer.raw(b"\xa3\x95\xc8" + struct.pack(f"<{form}", 40_000 * k, *values))
+    recording = read(writer.bytes(), tmp_path)
+    assert len(first(recording, "imu").columns["time"]) == 30
+    assert [(left.count, left.reason) for left in recording.left if left.name == "IMU"] == [
+        (5, "of another format of that name")
+    ]
 
 
 def test_an_imu_that_is_too_slow_or_missing_is_warned_of(tmp_path):

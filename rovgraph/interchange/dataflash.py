@@ -77,6 +77,7 @@ class DataFlash:
         contents = read_messages(path, _WANTED, {"IMU": _imu_instance(options.choose)}, options.progress)
         findings = Findings()
         _count_other_imus(path, contents, findings)
+        findings.left |= {(name, "of another format of that name"): n for name, n in contents.unlike.items()}
         messages = _one_boot(contents, findings)
         parameters = _parameters(messages.pop("PARM", None), findings)
         clock = _clock(messages)
@@ -120,7 +121,7 @@ def _count_other_imus(path: Path, contents: Contents, findings: Findings) -> Non
     kept = len(contents.messages.get("IMU", ()))
     if known and not kept:
         raise SourceMissing(f"{path}: the imu that was chosen is not there; choose one of: {known}", "imu")
-    if others := contents.counts["IMU"] - kept:
+    if others := contents.counts["IMU"] - kept - contents.unlike["IMU"]:
         findings.left["IMU", f"of another instance; choose one of: {known}"] = others
 
 

@@ -71,6 +71,15 @@ class MessageFormat:
     dtype: np.dtype[Any]
     multipliers: Mapping[str, float]
 
+    def stores(self, names: Collection[str], other: "MessageFormat") -> bool:
+        """Whether it has these fields, stored as another format of the same name stores them."""
+        return all(
+            name in self.multipliers
+            and self.dtype[name] == other.dtype[name]
+            and self.multipliers[name] == other.multipliers[name]
+            for name in names
+        )
+
 
 @dataclass
 class Messages:
@@ -112,6 +121,7 @@ class Contents:
     places : name -> ndarray of int, shape (n,), bytes of the file where they begin
     counts : name -> how many there are, of all
     instances : name -> instances that there are, of those of which one was wanted
+    unlike : name -> how many were wanted, but have other fields or types of them than the first of that name
     damaged : stretches of bytes that are no message
     damaged_bytes : bytes in them, without a message that the end of the file cuts off
     cut_off : bytes of that message
@@ -121,6 +131,7 @@ class Contents:
     places: dict[str, NDArray[np.integer[Any]]]
     counts: Counter[str]
     instances: Mapping[str, set[int]]
+    unlike: Counter[str]
     damaged: int
     damaged_bytes: int
     cut_off: int
@@ -204,6 +215,8 @@ class _Walk:
         self._formats: dict[int, MessageFormat] = {}
         self._columns: dict[str, dict[str, NDArray[Any]]] = {}
         self._counts: Counter[str] = Counter()
+        self._unlike: Counter[str] = Counter()
+        self._first: dict[str, MessageFormat] = {}  # of those of a name that are kept
         self._damaged = self._damaged_bytes = 0
         self._sane = True
         self._lengths = np.zeros(256, np.int64)
@@ -284,7 +297,8 @@ class _Walk:
                 columns |= {_PLACE: np.empty(0, self._place)} | {
                     n: np.empty(0, _dtype_in_memory(form.dtype[n])) for n in names
                 }
-            if not columns.keys() - {_PLACE} <= set(names):  # another type of that name, with other fields
+            if not form.stores(columns.keys() - {_PLACE}, self._first.setdefault(form.name, form)):
+                self._unlike[form.name] += len(rows)
                 continue
             for name, column in columns.items():
                 before = len(column)
@@ -306,7 +320,8 @@ class _Walk:
         places = {name: columns.pop(_PLACE) for name, columns in self._columns.items()}
         found = {name: Messages(columns) for name, columns in self._columns.items()}
         self._give_units(found)
-        return Contents(found, places, self._counts, self._instances, self._damaged, self._damaged_bytes, cut_off)
+        damaged = self._damaged, self._damaged_bytes
+        return Contents(found, places, self._counts, self._instances, self._unlike, *damaged, cut_off)
 
     def _give_units(self, found: dict[str, Messages]) -> None:
         """Units and multipliers by the log's own tables; a format character's multiplier goes before them."""
