@@ -141,6 +141,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for copy in copies:
             shutil.copy(folder / "made" / name, folder / copy)
     write_recordings(folder)
+    table = pd.read_csv(folder / "log.csv").rename(columns={"time": "timestamp", "gyr_x": "gyro x", "gyr_y": "gyro y"})
+    table.rename(columns={"gyr_z": "gyro z"}).to_csv(folder / "table.csv", index=False)
     pd.DataFrame({"time": [5.0, 20.0], "taken": [5.0, 20.0], "photo": ["a.jpg", "b.jpg"]}).to_csv(folder / "photos.csv")
     rg.simulate("stationary", choices=rg.Choices(variant="water")).save(folder / "still")
     for calibration in ("still.csv", "standing.csv"):
@@ -296,7 +298,7 @@ def test_the_tutorial_goes_from_a_wrong_track_to_one_that_is_right(drawing, caps
         told = runpy.run_path(str(DOCS / "tutorial.py"))
     said = capsys.readouterr().out
     assert [told[name].verdict for name in ("straight", "mounted")] == ["wrong", "trusted"]
-    assert "units: {gyr: deg/s}" in said and "sign is reversed" in said and "mount_rpy_deg: [180.0, 0.0, 0.0]" in said
+    assert "units: {gyr: deg/s}" in said and "sign is reversed" in said and "mount_rpy_deg: [180.0, 0.0, -90.0]" in said
     assert "its noise is" in said  # of the ping that was stated too precise
     assert told["metrics"].rms_m < 1.0
     assert rg.evaluate(told["straight"].smoothed.trajectory, told["dive"].truth).rms_m > 5.0
