@@ -46,7 +46,7 @@ def still(rpy_deg, heading_deg=30.0, noise=0.0, seconds=10.0, gyr=(0.0, 0.0, 0.0
 
 
 def start_of(log, config=None):
-    """Roll, pitch, yaw of the start [deg] and the whole initial."""
+    """Roll, pitch, yaw of the start [deg] and the whole initial conditions."""
     b = initialise(log, config or Config())
     return np.rad2deg(rpy_from_matrix(b.prior.state.R_nb[0])), b
 

@@ -17,7 +17,7 @@ from rovgraph.instruments import Instrument
 from rovgraph.log import Log, Stream
 
 WINDOW_S = 5.0  # over which a log is levelled, and a sensor's first value taken
-WITHIN_S = 30.0  # of the log's initial: first headings and fixes
+WITHIN_S = 30.0  # from the log's start: first headings and fixes
 QUIET_ACC, QUIET_GYR = 0.15, 0.03  # scatter above the sensor's own noise that counts as quiet [SI]
 STILL_SPEED = 0.1  # of a vehicle that stands still, by its DVL [m/s]
 STILL_TURN = np.deg2rad(3.0)  # its heading at the window's ends, at most [rad]

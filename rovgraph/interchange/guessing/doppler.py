@@ -39,7 +39,7 @@ def _descending(
     """Units in which depth and DVL descend alike; None where nothing tells."""
     down = Signal(way.time, way.values[:, -1:])
     slope, correlation = physics.ratio(sunk, down.integrated())
-    if abs(correlation) < physics.ALIKE:
+    if abs(correlation) < physics.CORRELATION:
         return None
     return physics.agreeing(slope, ("length", lengths), ("speed", speeds))
 

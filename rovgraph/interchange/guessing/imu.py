@@ -130,7 +130,7 @@ def _angles(group: Group, yaw: str, time: Array, gyro: _Gyro, out: Guesses) -> _
         turn = 2.0 * np.pi / UNITS["angle"][units[0]]
         unwrapped = replace(heading, values=np.unwrap(heading.values, axis=0, period=turn))
         slope, correlation = physics.ratio(unwrapped, gyro.turned)
-    if abs(correlation) < physics.ALIKE:
+    if abs(correlation) < physics.CORRELATION:
         propose(out, group, unit)
         return gyro
     pairs = physics.agreeing(slope, ("angle", units), ("rate", gyro.units))

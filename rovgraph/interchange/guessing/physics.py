@@ -28,9 +28,9 @@ SHALLOW = 100.0  # numbers of a depth up to this are taken for metres where noth
 WINDOW = 1.0  # [s]
 PERIODS = 3.0
 ENOUGH = 20  # changes that are compared
-ALIKE = 0.7  # correlation of two sensors that show the same
+CORRELATION = 0.7  # correlation of two sensors that show the same
 TOLERANCE = 1.5  # factor between the changes of two sensors that show the same
-TILT_ALIKE, TILT_TOLERANCE = 0.4, 3.0  # of gravity's direction, beside which a vehicle accelerates
+TILT_CORRELATION, TILT_TOLERANCE = 0.4, 3.0  # of gravity's direction, beside which a vehicle accelerates
 TURNING = 0.02, 3.0  # rates that a vehicle has at most, of which no two units have both [rad/s]
 WIDE = 1.0  # spread of an angle that no degrees below a turn have [rad]
 
@@ -136,7 +136,7 @@ def rates_that_tilt(force: Signal, rate: Signal, units: Sequence[str]) -> list[s
     f = np.column_stack([np.interp(rate.time, force.time, column) for column in force.values.T])
     turned = Signal(rate.time, -cross(rate.values, f)).integrated()
     slope, correlation = ratio(force, turned, regressed=True)
-    if correlation < TILT_ALIKE:
+    if correlation < TILT_CORRELATION:
         return list(units)
     found = [unit for unit in units if _within(slope / UNITS["rate"][unit], TILT_TOLERANCE)]
     return found or list(units)
