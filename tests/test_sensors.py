@@ -233,6 +233,15 @@ def test_gain_of_the_rate_is_the_derivative_through_the_nominal_mounting():
     assert not SENSORS["depth"].rate_gain.any()
 
 
+def test_noise_of_the_rate_has_no_direction_where_the_yaw_of_the_dvl_is_unknown():
+    vague = CONFIG.calibration.dvl_yaw.model_copy(update={"estimate": True, "sd_deg": 45.0})
+    config = CONFIG.model_copy(update={"calibration": CONFIG.calibration.model_copy(update={"dvl_yaw": vague})})
+    known, unknown = (instruments(c, c.imu.lever_arm_m)["dvl"].rate_gain for c in (CONFIG, config))
+    variance, spread = known @ known.T, unknown @ unknown.T
+    assert abs(variance[0, 1]) > 0.01 * variance[0, 0]
+    np.testing.assert_allclose(spread, np.diag([np.mean(np.diag(variance)[:2])] * 2 + [variance[2, 2]]), atol=1e-12)
+
+
 def test_a_rotated_world_rotates_the_dvl_not():
     """What a DVL measures does not depend on where north is."""
     state, rate = random_state(), np.zeros((N, 3))

@@ -17,6 +17,7 @@ from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
 VELOCITIES = ("dvl_vx", "dvl_vy", "dvl_vz")
 TIME_OFFSET = "dvl_time_offset"  # of the stamps of all that a ping measures
+KNOWN_YAW_SD_DEG = 10.0  # sd of the yaw's prior up to which the mounting says where the rate's noise goes
 
 
 def axes_remedy(H: Array, R_bs: Array) -> tuple[str, str]:
@@ -104,7 +105,20 @@ def _instrument(sensor: str, sd: tuple[float, float, float], config: Config, ori
     dvl = config.dvl
     model = DvlVelocity(np.array(dvl.lever_arm_m) - origin_b, sensor)
     gain = mount_matrix(dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
+    yaw = config.calibration.dvl_yaw
+    if yaw.estimate is True and yaw.sd_deg > KNOWN_YAW_SD_DEG:
+        gain = _evenly(gain)
     return instrument(dvl, model, sd, ("x", "y", "z"), gain, TIME_OFFSET)
+
+
+def _evenly(gain: Array) -> Array:
+    """A gain that spreads the rate's noise evenly over x and y, for a DVL whose yaw is unknown.
+
+    Noise that is larger along one axis draws the estimated yaw towards the one for which it was calculated.
+    """
+    variance = np.diag(gain @ gain.T)
+    level = 0.5 * (variance[0] + variance[1])
+    return np.diag(np.sqrt([level, level, variance[2]]))
 
 
 def _refused(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bool_]]]:
