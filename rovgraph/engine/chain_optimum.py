@@ -24,6 +24,8 @@ from rovgraph.engine.widened_chain import widened
 from rovgraph.geometry import Array
 from rovgraph.state import State
 
+SHORT = 6000  # keyframes whose conditionals take 40 MB
+
 
 @dataclass(frozen=True)
 class ChainOptimum:
@@ -78,8 +80,14 @@ class ChainOptimum:
 
     @cached_property
     def _end(self) -> SquareRoot:
-        """All factors linearised at the optimum and eliminated: the newest keyframe and the border."""
-        return self._wide.eliminate(self.state, self.solution.gates, kept=1)
+        """All factors linearised at the optimum and eliminated: the newest keyframe and the border, and of a short
+        dive all the others."""
+        return self._wide.eliminate(self.state, self.solution.gates, kept=None if self._short else 1)
+
+    @property
+    def _short(self) -> bool:
+        """Whether all conditionals may stay in memory."""
+        return len(self.intervals) <= SHORT
 
     @cached_property
     def _marginals(self) -> tuple[Array, Array, float, float]:
@@ -87,7 +95,8 @@ class ChainOptimum:
 
         What they come of would be the larger part of a long dive.
         """
-        root, held = self._wide.eliminate(self.state, self.solution.gates), len(self._believed)
+        root = self._end if self._short else self._wide.eliminate(self.state, self.solution.gates)
+        held = len(self._believed)
         P_y = root.border_covariance(self._believed)
         return root.covariances(P_y), P_y, root.log_determinant(held), root.least(held)
 

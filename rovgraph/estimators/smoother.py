@@ -14,7 +14,7 @@ from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.log_assembly import assemble_log
-from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
+from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd, residual_states
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
@@ -214,10 +214,11 @@ def _joint_calibration(best: Optimum) -> dict[str, Any] | None:
     names = best.unknowns.estimated
     if not names:
         return None
-    end = len(best.intervals) - 1
-    prior = joint_prior_sd(best, end)
+    prior = joint_prior_sd(best, len(best.intervals) - 1)
+    sd = np.concatenate([prior[name] for name in names])
+    own = slice(NEWEST, NEWEST + len(sd))
     return {
         "labels": [label for name in names for label in best.beliefs[name].variable.labels],
-        "prior_sd": np.concatenate([prior[name] for name in names]).tolist(),
-        "covariance": best.knowledge([end]).calibration[0].tolist(),
+        "prior_sd": sd.tolist(),
+        "covariance": best.newest_covariance()[own, own].tolist(),
     }
