@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.interchange.recording import Channel
+from rovgraph.spilling import steps, taken
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 JUMP = 86400.0  # ahead, after which a stamp is of another epoch [s]
@@ -85,15 +86,15 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     order = kept[np.argsort(time[kept], kind="stable")]
     if len(order) == len(time) and not late:
         return channel, said
-    received = None if channel.received is None else channel.received[order]
-    columns = {name: np.asarray(values)[order] for name, values in channel.columns.items()}
+    received = None if channel.received is None else taken(channel.received, order)
+    columns = {name: taken(np.asarray(values), order) for name, values in channel.columns.items()}
     return replace(channel, columns=columns, received=received), said
 
 
 def _increase(time: NDArray[np.float64]) -> bool:
     """Whether all stamps are known and in order, as most are: a large channel is not copied to find out."""
-    known = len(time) > 0 and np.isfinite(time[[0, -1]]).all() and (time[1:] >= time[:-1]).all()
-    return bool(known and (time[-1] - time[0] <= JUMP or (np.diff(time) <= JUMP).all()))
+    known = len(time) > 0 and bool(np.isfinite(time[[0, -1]]).all())
+    return known and not len(steps(time, lambda step: ~((step >= 0.0) & (step <= JUMP))))
 
 
 def _of_one_epoch(time: NDArray[np.float64]) -> NDArray[np.int64]:
