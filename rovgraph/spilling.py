@@ -5,6 +5,7 @@ the process ends. It is mapped into memory for reading; what was read is release
 reads it again where it is needed again.
 """
 
+import errno
 import mmap
 import sys
 import tempfile
@@ -40,6 +41,7 @@ class Column:
         Raises
         ------
         InputError : no space for a temporary file
+        MemoryError : as for any array
         """
         self._held.append(np.array(values, self._dtype))
         self._bytes += self._held[-1].nbytes
@@ -47,11 +49,11 @@ class Column:
             return
         try:
             if self._file is None:
-                self._file = tempfile.TemporaryFile()
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115 - `array` closes it
             for each in self._held:
                 self._file.write(each.data)
         except OSError as error:
-            raise _no_space(error) from None
+            raise _refused(error) from None
         self._held.clear()
 
     def array(self) -> NDArray[Any]:
@@ -63,7 +65,7 @@ class Column:
                 self._file.flush()
                 held = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
         except OSError as error:
-            raise _no_space(error) from None
+            raise _refused(error) from None
         return np.ndarray(len(self), self._dtype, held)
 
 
@@ -113,8 +115,9 @@ def release(*columns: NDArray[Any] | mmap.mmap) -> None:
     """Give back the memory that files are mapped into, those of columns or others."""
     if sys.platform == "win32":
         return
-    for held in {_file_of(values) for values in columns} - {None}:
-        held.madvise(mmap.MADV_DONTNEED)
+    for held in {_file_of(values) for values in columns}:
+        if held is not None:
+            held.madvise(mmap.MADV_DONTNEED)
 
 
 def _file_of(values: NDArray[Any] | mmap.mmap) -> mmap.mmap | None:
@@ -212,7 +215,11 @@ def _ranked(values: NDArray[np.float64], rank: int) -> float:
     return float(np.array(known, np.uint64).view(np.float64))
 
 
-def _no_space(error: OSError) -> InputError:
-    where = tempfile.gettempdir() if tempfile.tempdir is not None else "any temporary folder"
+def _refused(error: OSError) -> Exception:
     reason = error.strerror or str(error)
-    return InputError(f"no temporary file can be written in {where} ({reason}); set TMPDIR to a folder with more space")
+    if error.errno == errno.ENOMEM:
+        return MemoryError(reason)
+    folder = tempfile.tempdir or "any temporary folder"
+    return InputError(
+        f"no temporary file can be written in {folder} ({reason}); set TMPDIR to a folder with more space"
+    )

@@ -17,7 +17,7 @@ from rovgraph.interchange.formats import Options
 from rovgraph.interchange.rates import too_slow
 from rovgraph.interchange.receiver import longest_boot
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording, in_files
-from rovgraph.spilling import computed, steps
+from rovgraph.spilling import computed, in_pieces, steps
 
 RTC_SD_S = {0: 0.2, 1: 1.0, 2: 2.0}  # by where the clock was set from: GPS, a ground station, a battery
 GPS_SD_S = 0.2  # a fix reaches the autopilot so late
@@ -219,7 +219,7 @@ def _sources(
             found.append(Source(name, all_, parameters, findings, name, number))
             continue
         numbers = all_.fields[field]
-        for instance in np.unique(numbers).tolist():
+        for instance in sorted({each for (piece,) in in_pieces(numbers) for each in np.unique(piece).tolist()}):
             own = computed(lambda each, instance=instance: each == instance, numbers)
             part = all_ if own.all() else all_.take(own)
             found.append(Source(name, part, parameters, findings, f"{name} {instance}", instance))

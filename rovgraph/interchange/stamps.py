@@ -67,23 +67,14 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     where, time = f"{file}: {channel.source}", np.asarray(channel.columns["time"], dtype=float)
     if _increase(time):
         return channel, []
-    stamped = np.isfinite(time)
-    if not stamped.any():
-        raise InputError(f"{where}: no row has a time")
-    said = [f"{where}: {np.count_nonzero(~stamped)} rows without time left out"] if not stamped.all() else []
-    rows = np.flatnonzero(stamped)
-    kept = rows[_of_one_epoch(time[rows])]
-    if lost := len(rows) - len(kept):
-        odd = np.setdiff1d(rows, kept)[0]
-        apart = f"{time[odd]:.1f} s, others from {time[kept[0]]:.1f} s"
-        told = f"{lost} of {len(rows)} rows have stamps of another time ({apart})"
-        if lost > LOST * len(rows):
-            raise InputError(f"{where}: {told}; was the clock set, or are two dives in one file? Split it")
-        said.append(f"{where}: {told}; left out")
-    late = int(np.count_nonzero(time[kept] < np.maximum.accumulate(time[kept])))
+    said: list[str] = []
+    kept = None if _of_one_clock(time) else _usable(time, where, said)
+    stamps = time if kept is None else time[kept]
+    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps)))
     if late:
         said.append(f"{where}: {late} rows are earlier than a row above them, sorted")
-    order = kept[np.argsort(time[kept], kind="stable")]
+    order = np.argsort(stamps, kind="stable")
+    order = order if kept is None else kept[order]
     if len(order) == len(time) and not late:
         return channel, said
     received = None if channel.received is None else taken(channel.received, order)
@@ -95,6 +86,30 @@ def _increase(time: NDArray[np.float64]) -> bool:
     """Whether all stamps are known and in order, as most are: a large channel is not copied to find out."""
     known = len(time) > 0 and bool(np.isfinite(time[[0, -1]]).all())
     return known and not len(steps(time, lambda step: ~((step >= 0.0) & (step <= JUMP))))
+
+
+def _of_one_clock(time: NDArray[np.float64]) -> bool:
+    """Whether all stamps are known and nearly in order: then all rows are of one epoch, found without a copy."""
+    return len(time) > 1 and not len(steps(time, lambda step: ~((step > -0.5 * STEP_BACK) & (step <= JUMP))))
+
+
+def _usable(time: NDArray[np.float64], where: str, said: list[str]) -> NDArray[np.int64]:
+    """Indices of the rows whose stamps can be used; what is left out is said."""
+    stamped = np.isfinite(time)
+    if not stamped.any():
+        raise InputError(f"{where}: no row has a time")
+    if not stamped.all():
+        said.append(f"{where}: {np.count_nonzero(~stamped)} rows without time left out")
+    rows = np.flatnonzero(stamped)
+    kept = rows[_of_one_epoch(time[rows])]
+    if lost := len(rows) - len(kept):
+        odd = np.setdiff1d(rows, kept)[0]
+        apart = f"{time[odd]:.1f} s, others from {time[kept[0]]:.1f} s"
+        told = f"{lost} of {len(rows)} rows have stamps of another time ({apart})"
+        if lost > LOST * len(rows):
+            raise InputError(f"{where}: {told}; was the clock set, or are two dives in one file? Split it")
+        said.append(f"{where}: {told}; left out")
+    return kept
 
 
 def _of_one_epoch(time: NDArray[np.float64]) -> NDArray[np.int64]:
