@@ -107,8 +107,10 @@ class Gatherer:
             return
         stamp = 1e-6 * usec(message) or np.nan
         for said in READERS[name](message):
-            row = (self._taken, received, stamp, *said.values)
-            self._flat.setdefault((sender, name, said.sensor), FlatTable(len(row))).append(row)
+            row, key = (self._taken, received, stamp, *said.values), (sender, name, said.sensor)
+            if (rows := self._flat.get(key)) is None:
+                rows = self._flat[key] = FlatTable(len(row))
+            rows.append(row)
 
     def rows(self) -> dict[tuple[Sender, str, str], Rows]:
         """All that was taken: sender, name of the message and sensor -> Rows."""

@@ -154,7 +154,9 @@ def _take(topic: Topic, message: Any, received: int) -> None:
     for sensor, values in ALL_READERS[topic.type](message):
         row = (stamp, 1e-9 * received, *values)
         assert len(row) == 2 + len(COLUMNS[sensor])
-        topic.rows.setdefault(sensor, FlatTable(len(row))).append(row)
+        if (rows := topic.rows.get(sensor)) is None:
+            rows = topic.rows[sensor] = FlatTable(len(row))
+        rows.append(row)
 
 
 def _decoder(connection: Any, ros1: bool) -> Any:
