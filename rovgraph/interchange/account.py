@@ -7,6 +7,7 @@ import numpy as np
 from rovgraph.interchange.clocks import JoinedClock
 from rovgraph.interchange.merging import Merged
 from rovgraph.interchange.recording import Channel
+from rovgraph.spilling import in_pieces, median_step
 
 
 def account(merged: Merged) -> dict[str, Any]:
@@ -75,15 +76,14 @@ def columns(merged: Merged) -> dict[str, str]:
 def timing(channel: Channel) -> dict[str, Any]:
     """Count, rate and largest gap of a channel, by its own clock."""
     time = channel.columns["time"]
-    periods = np.diff(time)
-    gap = float(periods.max()) if len(periods) else None
-    usual = float(np.median(periods, overwrite_input=True)) if len(periods) else 0.0
+    gaps = [float(np.diff(piece).max(initial=0.0)) for (piece,) in in_pieces(time, beyond=1)]
+    usual = median_step(time) if len(time) > 1 else 0.0
     return {
         "count": len(time),
         "rate_hz": 1.0 / usual if usual > 0.0 else None,
         "first_s": float(time[0]),
         "last_s": float(time[-1]),
-        "gap_s": gap,
+        "gap_s": max(gaps) if len(time) > 1 else None,
     }
 
 

@@ -18,6 +18,7 @@ from rovgraph.interchange.motion import Motion
 from rovgraph.interchange.recording import Channel, Recording
 from rovgraph.interchange.selection import Selected, file_names
 from rovgraph.interchange.synchronise import Offset, find_offset
+from rovgraph.spilling import every
 
 UNKNOWN_ZONE_S = 1800.0  # sd of a clock that may show local time
 AGREE_S = 0.5  # stamps that motion contradicts by less stay: a sensor may be late by as much
@@ -322,7 +323,7 @@ def _typical_stamp(recording: Recording, clock: str) -> float:
     """Median of a clock's stamps, of a thousand of each channel; NaN where it stamps nothing."""
     own = [channel.columns["time"] for channel in recording.channels if channel.clock == clock]
     own += [c.received for c in recording.channels if c.receiver == clock and c.received is not None]
-    stamps = np.concatenate([np.empty(0), *(times[:: max(len(times) // 1000, 1)] for times in own)])
+    stamps = np.concatenate([np.empty(0), *(every(times, max(len(times) // 1000, 1)) for times in own)])
     stamps = stamps[np.isfinite(stamps)]
     return float(np.median(stamps)) if len(stamps) else np.nan
 

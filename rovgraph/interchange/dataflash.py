@@ -16,7 +16,8 @@ from rovgraph.interchange.dataflash_messages import FMT, HEAD, INSTANCE, Content
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.rates import too_slow
 from rovgraph.interchange.receiver import longest_boot
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording, in_files
+from rovgraph.spilling import computed, in_pieces, steps
 
 RTC_SD_S = {0: 0.2, 1: 1.0, 2: 2.0}  # by where the clock was set from: GPS, a ground station, a battery
 GPS_SD_S = 0.2  # a fix reaches the autopilot so late
@@ -137,10 +138,10 @@ def _one_boot(contents: Contents, findings: Findings) -> dict[str, Messages]:
         return messages
     densest = max(timed, key=lambda name: len(messages[name]))
     place, time = places[densest], messages[densest].fields["TimeUS"]
-    if (place[1:] < place[:-1]).any():  # several types of messages of that name
+    if len(steps(place, lambda step: step < 0)):  # several types of messages of that name
         order = np.argsort(place, kind="stable")
         place, time = place[order], time[order]
-    if (time[1:] >= time[:-1]).all():
+    if not len(steps(time, lambda step: ~(step >= 0.0))):
         return messages
     scale = messages[densest].multipliers["TimeUS"] if messages[densest].units["TimeUS"] else 1e-6
     first, end, resets = longest_boot(place, time * scale)
@@ -149,7 +150,7 @@ def _one_boot(contents: Contents, findings: Findings) -> dict[str, Messages]:
     findings.warnings.append(f"the autopilot restarted {resets} times in the log; the longest run is read")
     kept = {"PARM": messages["PARM"]} if "PARM" in messages else {}
     for name, m in messages.items():
-        within = np.logical_and(places[name] >= first, places[name] < end)
+        within = computed(lambda place: (place >= first) & (place < end), places[name])
         if name not in kept and within.any():
             kept[name] = m.take(within)
     return kept
@@ -193,7 +194,7 @@ def _channels(
         for place, label in enumerate(preferred_first(path, sensor, labels, choose)):
             channel = _channel(*sources.pop(label), quietly=place > 0)
             if channel is not None and len(channel.columns["time"]):
-                made.append(channel)
+                made.append(in_files(channel))
     return made
 
 
@@ -218,8 +219,8 @@ def _sources(
             found.append(Source(name, all_, parameters, findings, name, number))
             continue
         numbers = all_.fields[field]
-        for instance in np.unique(numbers).tolist():
-            own = np.equal(numbers, instance)
+        for instance in sorted({each for (piece,) in in_pieces(numbers) for each in np.unique(piece).tolist()}):
+            own = computed(lambda each, instance=instance: each == instance, numbers)
             part = all_ if own.all() else all_.take(own)
             found.append(Source(name, part, parameters, findings, f"{name} {instance}", instance))
     return found

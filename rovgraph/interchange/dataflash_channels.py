@@ -16,10 +16,12 @@ from rovgraph.interchange.ardupilot import BODY, CLOCK, EARTH_FIELD_UT, MAGNETIC
 from rovgraph.interchange.dataflash_messages import Messages
 from rovgraph.interchange.fixes import ONE_POINT, RANGE_SD_M, new_fixes, one_point
 from rovgraph.interchange.recording import Channel
+from rovgraph.spilling import computed, every, holds
 
 DOWN, GOOD = 25, 4  # a rangefinder's orientation and status
 FIX_3D = 3
 LATE_S = 1.0  # a sample's own stamp is at most so much before its message
+SOME = 10_000  # values that something is told by
 
 # unit's label -> factor to SI and radians; a field in microtesla, latitude and longitude in degrees
 _SI = {
@@ -97,14 +99,11 @@ class Source:
         factor = _SI.get(self.messages.units[field_])
         if factor is None:
             self.findings.undeclared.add(f"{self.name}.{field_}")
-        values: Array = self.messages.fields[field_]
+        stored = self.messages.fields[field_]
         scale = self.messages.multipliers[field_] * (documented if factor is None else factor)
-        if values.dtype.kind != "f" or scale != 1.0:  # else as it is: a copy would be as large
-            with np.errstate(over="ignore", invalid="ignore"):  # damaged values
-                values = values.astype(np.result_type(values, np.float32))
-                values *= scale
-        sound = np.isfinite(values)
-        return values if sound.all() else np.where(sound, values, np.float32(np.nan))
+        if stored.dtype.kind == "f" and scale == 1.0 and holds(np.isfinite, stored):
+            return stored  # as it is: a copy would be as large
+        return computed(lambda values: _scaled(values, scale), stored)
 
     def time(self, own: str = "", documented: float = 1e-6) -> Array:
         """Stamps [s] of messages `in_seconds`, shape (n,): a sample's own, a counter of 32 bits, where there is one."""
@@ -112,14 +111,18 @@ class Source:
         if own not in self.messages:
             return time
         stamp = self.si(own, documented)
-        some = slice(None, None, max(len(stamp) // 10_000, 1))
-        tick = float(np.median(stamp[some] / np.maximum(self.messages.fields[own][some], 1.0)))
+        some = max(len(stamp) // SOME, 1)
+        tick = float(np.median(every(stamp, some) / np.maximum(every(self.messages.fields[own], some), 1.0)))
         if not tick > 0.0:
             return time
-        late = time - stamp
-        np.mod(late, 2.0**32 * tick, out=late)
-        late[~(late < LATE_S)] = 0.0
-        return time - late
+
+        def sampled(time: Array, stamp: Array) -> Array:
+            late = time - stamp
+            np.mod(late, 2.0**32 * tick, out=late)
+            late[~(late < LATE_S)] = 0.0
+            return time - late
+
+        return computed(sampled, time, stamp)
 
     def where(self, keep: NDArray[np.bool_], why: str) -> "Source":
         """Some of them; the others are counted."""
@@ -137,20 +140,28 @@ class Source:
 
 
 def in_seconds(name: str, messages: Messages, findings: Findings) -> Messages:
-    """Messages whose stamps are made seconds where they are, not copied unless they are stored as integers."""
+    """Messages whose stamps are made seconds."""
     declared = messages.units["TimeUS"] == "s"
     if not declared:
         findings.undeclared.add(f"{name}.TimeUS")
-    time = messages.fields["TimeUS"].astype(float, copy=False)
-    time *= messages.multipliers["TimeUS"] * (1.0 if declared else 1e-6)
-    messages.fields["TimeUS"] = time
+    scale = messages.multipliers["TimeUS"] * (1.0 if declared else 1e-6)
+    messages.fields["TimeUS"] = computed(lambda time: time.astype(float) * scale, messages.fields["TimeUS"])
     return messages
+
+
+def _scaled(values: Array, scale: float) -> Array:
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged values
+        values = values.astype(np.result_type(values, np.float32))
+        values *= scale
+    values[~np.isfinite(values)] = np.nan
+    return values
 
 
 def imu(source: Source) -> Channel | None:
     """IMU: specific force and rate, board orientation applied."""
     if "GH" in source and "AH" in source:
-        healthy = (source.messages.fields["GH"] > 0) & (source.messages.fields["AH"] > 0)
+        health = source.messages.fields["GH"], source.messages.fields["AH"]
+        healthy = computed(lambda gyr, acc: (gyr > 0) & (acc > 0), *health)
         source = source.where(healthy, "the autopilot took the IMU for failed")
     columns = {"time": source.time()}
     for axis in _XYZ:
@@ -162,16 +173,21 @@ def imu(source: Source) -> Channel | None:
 def magnetometer(source: Source) -> Channel | None:
     """MAG: the field with the autopilot's offsets, or without them where these cannot be right."""
     if "Health" in source:
-        source = source.where(source.raw("Health") > 0, "the autopilot took the compass for failed")
+        healthy = computed(lambda health: health > 0, source.messages.fields["Health"])
+        source = source.where(healthy, "the autopilot took the compass for failed")
     field_ = [source.si(f"Mag{axis}", 0.1) for axis in _XYZ]
     kinds = [kind for kind in ("Ofs", "MO") if all(f"{kind}{axis}" in source for axis in _XYZ)]
-    offsets = [sum((source.si(f"{kind}{axis}", 0.1) for kind in kinds), np.zeros(1, np.float32)) for axis in _XYZ]
+    offsets = [[source.si(f"{kind}{axis}", 0.1) for kind in kinds] for axis in _XYZ]
+    some = max(len(source.messages) // SOME, 1)
     low, high = EARTH_FIELD_UT
-    as_logged = _magnitude(field_)
-    raw = _magnitude([values - offset for values, offset in zip(field_, offsets, strict=True)])
+    sampled = [every(values, some) for values in field_]
+    as_logged = _magnitude(sampled)
+    raw = _magnitude([
+        _less(values, *(every(offset, some) for offset in own)) for values, own in zip(sampled, offsets, strict=True)
+    ])  # fmt: skip
     said = f"{source.label}: magnitude {as_logged:.0f} uT with the autopilot's offsets, {raw:.0f} uT without"
     if not low <= as_logged <= high and low <= raw <= high:
-        field_ = [values - offset for values, offset in zip(field_, offsets, strict=True)]
+        field_ = [computed(_less, values, *own) for values, own in zip(field_, offsets, strict=True)]
         source.findings.warnings.append(f"{said}: the offsets are taken off, as no place on Earth has the first")
     elif not low <= as_logged <= high:
         source.findings.warnings.append(f"{said}: no place on Earth has either; calibrate the magnetometer")
@@ -180,9 +196,12 @@ def magnetometer(source: Source) -> Channel | None:
 
 
 def _magnitude(field_: list[Array]) -> float:
-    """Median of some thousands of vectors."""
-    some = np.column_stack([values[:: max(len(values) // 10_000, 1)] for values in field_])
-    return float(np.median(np.linalg.norm(some, axis=1))) if len(some) else 0.0
+    """Median of vectors."""
+    return float(np.median(np.linalg.norm(np.column_stack(field_), axis=1))) if len(field_[0]) else 0.0
+
+
+def _less(values: Array, *offsets: Array) -> Array:
+    return values - sum(offsets, np.zeros(1, np.float32))
 
 
 def attitude(source: Source) -> Channel | None:
@@ -191,7 +210,9 @@ def attitude(source: Source) -> Channel | None:
         "time": source.time(),
         "ahrs_roll": source.si("Roll", np.pi / 180.0),
         "ahrs_pitch": source.si("Pitch", np.pi / 180.0),
-        "ahrs_yaw": wrap_angle(source.si("Yaw", np.pi / 180.0) - declination(source.parameters)),
+        "ahrs_yaw": computed(
+            lambda yaw: wrap_angle(yaw - declination(source.parameters)), source.si("Yaw", np.pi / 180.0)
+        ),
     }
     return source.channel("ahrs", columns, "Roll, Pitch, Yaw", MAGNETIC)
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.spilling import Column, taken
 
 HEAD = b"\xa3\x95"
 FMT = 128  # type of the message that defines all others, itself too
@@ -87,7 +88,8 @@ class Messages:
 
     Attributes
     ----------
-    fields : field -> ndarray, shape (n,), as stored: without multipliers; integers of 64 bits as floats
+    fields : field -> ndarray, shape (n,), as stored: without multipliers; integers of 64 bits as floats. Not to be
+        changed: long ones are in temporary files (`rovgraph.spilling`)
     units : field -> its unit's label, such as "m/s/s"; "" where the file does not say
     multipliers : field -> factor that makes that unit of what is stored
     """
@@ -108,7 +110,7 @@ class Messages:
 
     def take(self, index: NDArray[Any]) -> "Messages":
         """Some of them, by a mask."""
-        return Messages({k: v[index] for k, v in self.fields.items()}, self.units, self.multipliers)
+        return Messages({k: taken(v, index) for k, v in self.fields.items()}, self.units, self.multipliers)
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,7 @@ class _Walk:
         self._place = place
         self._instances: dict[str, set[int]] = {}
         self._formats: dict[int, MessageFormat] = {}
-        self._columns: dict[str, dict[str, NDArray[Any]]] = {}
+        self._columns: dict[str, dict[str, Column]] = {}
         self._counts: Counter[str] = Counter()
         self._unlike: Counter[str] = Counter()
         self._first: dict[str, MessageFormat] = {}  # of those of a name that are kept
@@ -294,16 +296,12 @@ class _Walk:
                 rows, index = rows[chosen], index[chosen]
             columns = self._columns.setdefault(form.name, {})
             if not columns:
-                columns |= {_PLACE: np.empty(0, self._place)} | {
-                    n: np.empty(0, _dtype_in_memory(form.dtype[n])) for n in names
-                }
+                columns |= {_PLACE: Column(self._place)} | {n: Column(_dtype_in_memory(form.dtype[n])) for n in names}
             if not form.stores(columns.keys() - {_PLACE}, self._first.setdefault(form.name, form)):
                 self._unlike[form.name] += len(rows)
                 continue
             for name, column in columns.items():
-                before = len(column)
-                column.resize(before + len(rows), refcheck=False)  # where it is: a copy would be as large as it
-                column[before:] = index + start if name == _PLACE else rows[name]
+                column.extend(index + start if name == _PLACE else rows[name])
 
     def _choose(self, name: str, numbers: NDArray[Any]) -> NDArray[np.bool_]:
         """Which rows are of the instance that is wanted."""
@@ -317,8 +315,8 @@ class _Walk:
 
     def contents(self, cut_off: int) -> Contents:
         """All that was walked."""
-        places = {name: columns.pop(_PLACE) for name, columns in self._columns.items()}
-        found = {name: Messages(columns) for name, columns in self._columns.items()}
+        places = {name: columns.pop(_PLACE).array() for name, columns in self._columns.items()}
+        found = {name: Messages({n: column.array() for n, column in c.items()}) for name, c in self._columns.items()}
         self._give_units(found)
         damaged = self._damaged, self._damaged_bytes
         return Contents(found, places, self._counts, self._instances, self._unlike, *damaged, cut_off)

@@ -26,7 +26,8 @@ from rovgraph.interchange.mavlink import PRESSURES, UNIX_USEC
 from rovgraph.interchange.mavlink_rows import OF_PARAMETERS, Gatherer, Rows, Sender
 from rovgraph.interchange.rates import SLOWEST_HZ, rate_hz, too_slow
 from rovgraph.interchange.receiver import ReceiverClock, longest_boot, receiver_clock
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording, in_files
+from rovgraph.spilling import computed, holds, taken
 
 AUTOPILOT = 1  # component
 UNIX = "autopilot's Unix time"
@@ -81,7 +82,8 @@ def _imu_warnings(imu: Channel | None) -> list[str]:
     remedy = "raise the stream rate of RAW_IMU (SRn_RAW_SENS), or use the autopilot's own log (.BIN)"
     if imu is None:
         return ["no IMU in the file; record RAW_IMU, or use the autopilot's own log (.BIN)"]
-    return too_slow(imu.columns["time"][np.isfinite(imu.columns["acc_x"])], imu.source.partition(":")[0], remedy)
+    measured = computed(np.isfinite, imu.columns["acc_x"])
+    return too_slow(taken(imu.columns["time"], measured), imu.source.partition(":")[0], remedy)
 
 
 class _Vehicle:
@@ -104,7 +106,7 @@ class _Vehicle:
     def _boots(self) -> ReceiverClock | None:
         """Keep the longest run of the autopilot, and see how the receiver's clock went meanwhile."""
         own = [r for (sender, name, _), r in self._rows.items() if sender == self.sender and name not in LATE]
-        booted = [r for r in own if len(r) and np.isfinite(r.stamp).all() and r.stamp[-1] < 1e-6 * UNIX_USEC]
+        booted = [r for r in own if len(r) and holds(np.isfinite, r.stamp) and r.stamp[-1] < 1e-6 * UNIX_USEC]
         if not booted:
             return None
         dense = max(booted, key=len)
@@ -191,7 +193,7 @@ class _Vehicle:
 
     def _timed(self, rows: Rows) -> tuple[Array, str]:
         """Stamps of rows [s], and the name of their clock; of others than the autopilot: when they were received."""
-        stamped = len(rows) and rows.sender == self.sender and np.isfinite(rows.stamp).all()
+        stamped = len(rows) and rows.sender == self.sender and holds(np.isfinite, rows.stamp)
         if stamped and rows.stamp[-1] >= 1e-6 * UNIX_USEC:
             return rows.stamp, UNIX
         if stamped and self._clock is not None:
@@ -199,20 +201,13 @@ class _Vehicle:
         return self._received(rows), self._receiver
 
     def _received(self, rows: Rows) -> Array:
-        return rows.received if self._clock is None else self._clock.corrected(rows.place, rows.received)
+        return rows.received if self._clock is None else computed(self._clock.corrected, rows.place, rows.received)
 
     def _channel(self, sensor: str, rows: Rows, columns: Mapping[str, Array], frame: str) -> Channel:
         time, clock = self._timed(rows)
         fields = ", ".join(columns)
-        return Channel(
-            sensor,
-            {"time": time, **columns},
-            f"{rows.name}: {fields}",
-            frame,
-            clock,
-            self._received(rows),
-            self._receiver,
-        )
+        source, received = f"{rows.name}: {fields}", self._received(rows)
+        return in_files(Channel(sensor, {"time": time, **columns}, source, frame, clock, received, self._receiver))
 
     def _plain(self, sensor: str, rows: Rows) -> Iterator[Channel]:
         yield self._channel(sensor, rows, rows.columns, "" if sensor == "dvl_altitude" else BODY)
@@ -228,7 +223,7 @@ class _Vehicle:
 
     def _attitude(self, sensor: str, rows: Rows) -> Iterator[Channel]:
         """The autopilot's heading is true, a log's is magnetic."""
-        magnetic = wrap_angle(rows.columns["ahrs_yaw"] - declination(self.parameters))
+        magnetic = computed(lambda yaw: wrap_angle(yaw - declination(self.parameters)), rows.columns["ahrs_yaw"])
         yield self._channel(sensor, rows, {**rows.columns, "ahrs_yaw": magnetic}, MAGNETIC)
 
     def _depth(self, sensor: str, rows: Rows) -> Iterator[Channel]:

@@ -1,7 +1,6 @@
 """What recorded MAVLink messages said, as arrays."""
 
 import math
-from array import array
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.interchange.mavlink import COLUMNS, READERS, usec
+from rovgraph.spilling import FlatTable, computed, taken
 
 OF_PARAMETERS = "PARAM_VALUE", "SENSOR_OFFSETS"
 WANTED = {*READERS, *OF_PARAMETERS}
@@ -44,14 +44,13 @@ class Rows:
 
     def take(self, keep: NDArray[np.bool_]) -> "Rows":
         """Some of them, by a mask."""
-        columns = {name: values[keep] for name, values in self.columns.items()}
-        return replace(
-            self, place=self.place[keep], received=self.received[keep], stamp=self.stamp[keep], columns=columns
-        )
+        columns = {name: taken(values, keep) for name, values in self.columns.items()}
+        place, received, stamp = (taken(values, keep) for values in (self.place, self.received, self.stamp))
+        return replace(self, place=place, received=received, stamp=stamp, columns=columns)
 
     def within(self, first: int, end: int) -> "Rows":
         """Those of the messages first, ..., end - 1."""
-        return self.take(np.logical_and(self.place >= first, self.place < end))
+        return self.take(computed(lambda place: (place >= first) & (place < end), self.place))
 
     def interleaved(self, names: Sequence[str], other: "Rows") -> "Rows":
         """Columns of one, and all of the other, in the order of messages; what a row does not say is NaN."""
@@ -66,10 +65,11 @@ class Rows:
         return Rows(self.sender, f"{self.name} with {other.name}", place, received, stamp, columns)
 
 
-def _rows(sender: Sender, name: str, sensor: str, flat: "array[float]") -> Rows:
-    table = np.frombuffer(flat).reshape(-1, 3 + len(COLUMNS[sensor]))
+def _rows(sender: Sender, name: str, sensor: str, flat: FlatTable) -> Rows:
+    table = flat.table()
     columns = dict(zip(COLUMNS[sensor], table[:, 3:].T, strict=True))
-    return Rows(sender, name, table[:, 0].astype(np.int64), table[:, 1], table[:, 2], columns)
+    place = computed(lambda numbers: numbers.astype(np.int64), table[:, 0])
+    return Rows(sender, name, place, table[:, 1], table[:, 2], columns)
 
 
 class Gatherer:
@@ -86,7 +86,7 @@ class Gatherer:
         self.counts: Counter[tuple[Sender, str]] = Counter()
         self.unreadable: Counter[str] = Counter()
         self.parameters: dict[Sender, dict[str, float]] = {}
-        self._flat: dict[tuple[Sender, str, str], array[float]] = {}
+        self._flat: dict[tuple[Sender, str, str], FlatTable] = {}
         self._taken = 0
 
     def take(self, sender: Sender, name: str, message: Any, received: float) -> None:
@@ -107,8 +107,10 @@ class Gatherer:
             return
         stamp = 1e-6 * usec(message) or np.nan
         for said in READERS[name](message):
-            rows = self._flat.setdefault((sender, name, said.sensor), array("d"))
-            rows.extend((self._taken, received, stamp, *said.values))
+            row, key = (self._taken, received, stamp, *said.values), (sender, name, said.sensor)
+            if (rows := self._flat.get(key)) is None:
+                rows = self._flat[key] = FlatTable(len(row))
+            rows.append(row)
 
     def rows(self) -> dict[tuple[Sender, str, str], Rows]:
         """All that was taken: sender, name of the message and sensor -> Rows."""

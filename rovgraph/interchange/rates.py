@@ -3,6 +3,7 @@
 import numpy as np
 
 from rovgraph.geometry import Array
+from rovgraph.spilling import every
 
 SOME = 10_000  # stamps that a rate is taken from
 SLOWEST_HZ = 8.0  # of an inertial unit; in between, the vehicle moves as it likes
@@ -10,8 +11,8 @@ SLOWEST_HZ = 8.0  # of an inertial unit; in between, the vehicle moves as it lik
 
 def rate_hz(time: Array) -> float:
     """The usual rate of stamps that increase, of some thousands of them; 0 where none do."""
-    first = np.arange(0, len(time) - 1, max(len(time) // SOME, 1))
-    step = time[first + 1] - time[first]
+    some = max(len(time) // SOME, 1)
+    step = every(time[1:], some) - every(time[:-1], some)
     return float(1.0 / np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
 
 

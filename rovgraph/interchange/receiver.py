@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.spilling import computed, steps
 
 RESET_S = 1.0  # boot time that goes back further is another boot
 STEP_S = 1.0  # delays of successive messages that differ by more: a stall, or a clock that was set
@@ -59,8 +60,8 @@ def receiver_clock(place: NDArray[np.int64], received: Array, boot: Array) -> Re
     place : ndarray of int, shape (n,), increasing numbers of messages, n > 0
     received, boot : ndarray, shape (n,), when each was received, and its stamp [s]
     """
-    delay = received - boot
-    bounds = [0, *(np.flatnonzero(np.abs(np.diff(delay)) > STEP_S) + 1).tolist(), len(delay)]
+    delay = computed(np.subtract, received, boot)
+    bounds = [0, *steps(delay, lambda step: np.abs(step) > STEP_S).tolist(), len(delay)]
     pieces: list[tuple[int, float, int]] = []  # first message, least delay, messages
     for first, end in pairwise(bounds):
         least = float(delay[first:end].min())
@@ -82,7 +83,7 @@ def longest_boot(place: NDArray[np.integer[Any]], boot: Array) -> tuple[int, int
     -------
     number of the first message and of the one behind the last, and how often the autopilot was restarted
     """
-    back = np.flatnonzero(np.diff(boot) < -RESET_S) + 1
+    back = steps(boot, lambda step: step < -RESET_S)
     bounds = [0, *back.tolist(), len(boot)]
     longest = int(np.argmax(np.diff(bounds)))
     first = 0 if longest == 0 else int(place[bounds[longest]])

@@ -6,10 +6,11 @@ clocks, units become SI and radians, vectors stay in the instrument's axes: what
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from rovgraph.geometry import Array
+from rovgraph.spilling import spilled
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class Channel:
     Attributes
     ----------
     sensor : name of its stream in a log ("imu", "dvl", "depth", ...)
-    columns : column -> ndarray, shape (n,), SI and radians, ``time`` [s] among them; NaN = not valid
+    columns : column -> ndarray, shape (n,), SI and radians, ``time`` [s] among them; NaN = not valid. Not to be
+        changed: long ones are in temporary files (`rovgraph.spilling`)
     source : where in the file it comes from, such as "IMU instance 0: AccX, AccY, AccZ, GyrX, GyrY, GyrZ"
     frame : the axes of its values, in words; "" for scalars
     clock : name of the `Clock` that stamps it
@@ -52,6 +54,12 @@ class Channel:
     clock: str = ""
     received: Array | None = None
     receiver: str = ""
+
+
+def in_files(channel: Channel) -> Channel:
+    """The same, its long columns in temporary files."""
+    columns = {name: spilled(values) for name, values in channel.columns.items()}
+    return replace(channel, columns=columns, received=None if channel.received is None else spilled(channel.received))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ A message is decoded by the definition that its bag carries, else by that of ros
 """
 
 import struct
-from array import array
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -19,6 +18,7 @@ from rovgraph.interchange.recording import Left, Recording
 from rovgraph.interchange.rosbag_frames import Frames
 from rovgraph.interchange.rosbag_messages import COLUMNS, DEFINITIONS, LATER, READERS, Unusable, latency
 from rovgraph.interchange.rosbag_recording import Topic, recording
+from rovgraph.spilling import FlatTable
 
 TF = "tf2_msgs/msg/TFMessage"
 ROS1 = b"#ROSBAG V2.0"
@@ -152,10 +152,11 @@ def _take(topic: Topic, message: Any, received: int) -> None:
         stamp -= took
         topic.latencies += took > 0.0
     for sensor, values in ALL_READERS[topic.type](message):
-        rows = topic.rows.setdefault(sensor, array("d"))
         row = (stamp, 1e-9 * received, *values)
         assert len(row) == 2 + len(COLUMNS[sensor])
-        rows.extend(row)
+        if (rows := topic.rows.get(sensor)) is None:
+            rows = topic.rows[sensor] = FlatTable(len(row))
+        rows.append(row)
 
 
 def _decoder(connection: Any, ros1: bool) -> Any:

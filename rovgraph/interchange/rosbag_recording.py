@@ -1,6 +1,5 @@
 """From what a bag's topics say to a recording: which topic feeds a sensor, by which clock, in which axes."""
 
-from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,16 +16,18 @@ from rovgraph.interchange.formats import Options
 from rovgraph.interchange.pressure import depth, surface_pressure
 from rovgraph.interchange.rates import too_slow
 from rovgraph.interchange.receiver import receiver_clock
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording, in_files
 from rovgraph.interchange.rosbag_frames import FRD_OF_FLU, Frames, Mounting
 from rovgraph.interchange.rosbag_messages import COLUMNS, DOWN, GENERAL
 from rovgraph.interchange.rosbag_nucleus import CLOCK as NUCLEUS
+from rovgraph.spilling import FlatTable, computed, every, taken
 
 HEADERS, RECORDER = "headers of messages", "recorder"
 SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
 APART_S = 1.0  # between stamp and arrival; more is another clock
 BACK_S = 1.0  # by which stamps go back where their clock was set
 LATENCY_SD_S = 0.05
+SOME = 10_000  # messages that something is told by
 SEA = 1025.0  # density of water [kg/m3]
 NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
@@ -48,14 +49,18 @@ class Topic:
     name: str
     type: str
     frame: str = ""
-    rows: "dict[str, array[float]]" = field(default_factory=dict)
+    rows: dict[str, FlatTable] = field(default_factory=dict)
     latencies: int = 0
     clock: str = ""
     declination_deg: float = 0.0
 
     def table(self, sensor: str) -> Array:
-        """Rows of a sensor, shape (n, 2 + columns)."""
-        return np.frombuffer(self.rows[sensor]).reshape(-1, 2 + len(COLUMNS[sensor]))
+        """Rows of a sensor, shape (n, 2 + columns), not to be changed."""
+        return self.rows[sensor].table()
+
+    def some(self, sensor: str) -> Array:
+        """Some thousands of them, spread evenly."""
+        return every(self.table(sensor), max(len(self.rows[sensor]) // SOME, 1))
 
 
 def recording(
@@ -114,7 +119,8 @@ class _Made:
     def _channel(self, sensor: str, topic: Topic, first: bool) -> Channel:
         table = topic.table(sensor)
         keep, time, clock = self._times(topic, table)
-        received, values = table[keep, 1], table[keep, 2:]
+        table = table if keep.all() else taken(table, keep)
+        received, values = table[:, 1], table[:, 2:]
         frame = f"{topic.frame or 'no frame'} of the messages" if sensor not in ("depth", "fix", "dvl_altitude") else ""
         if sensor == "fix":
             new = self._new_fixes(topic, time, values)
@@ -123,7 +129,7 @@ class _Made:
         if first:
             self._mountings[sensor] = self._frames.mounting(topic.frame)
         source = f"{topic.name} ({topic.type})"
-        return Channel(sensor, columns, source, frame, clock, received, RECORDER)
+        return in_files(Channel(sensor, columns, source, frame, clock, received, RECORDER))
 
     def _columns(self, sensor: str, topic: Topic, values: Array) -> dict[str, Array]:
         if sensor == "depth":
@@ -203,17 +209,18 @@ class _Made:
 
     def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
         """The IMU's axes relative to NED; gravity tells whether the messages' world has z up or down."""
-        R_ws = matrix_from_quaternion(xyzw)
         up = -1.0
         if topic.clock == NUCLEUS:
             self.notes.append(f"{topic.name}: heading less the declination that the instrument has added")
         else:
-            acc = np.nanmedian(topic.table("imu")[:, 2:5], axis=0)
+            acc = np.nanmedian(topic.some("imu")[:, 2:5], axis=0)
+            R_ws = matrix_from_quaternion(topic.some("ahrs")[:, 2:])
             whole = np.isfinite(R_ws[:, 2, 2])
             up = float(np.median(R_ws[whole, 2, :] @ acc)) if whole.any() else 1.0
             if up < 0.0:
                 self.notes.append(f"{topic.name}: gravity says that its orientation is relative to NED, not to ENU")
-        angles = rpy_from_matrix(R_ws if up < 0.0 else NED_OF_ENU @ R_ws)
+        R_nw = np.eye(3) if up < 0.0 else NED_OF_ENU
+        angles = computed(lambda q: rpy_from_matrix(R_nw @ matrix_from_quaternion(q)), xyzw)
         self.notes.append(f"{topic.name}: its yaw is taken relative to magnetic north")
         return {f"ahrs_{name}": angles[:, k] for k, name in enumerate(("roll", "pitch", "yaw"))}
 
@@ -246,8 +253,9 @@ class _Made:
             )
 
     def _imu_mounting(self, topic: Topic, columns: Mapping[str, Array]) -> dict[str, Any]:
-        acc = np.array([np.nanmean(columns[name]) if np.isfinite(columns[name]).any() else np.nan for name in
-                        ("acc_x", "acc_y", "acc_z")])  # fmt: skip
+        some = max(len(columns["time"]) // SOME, 1)
+        axes_s = [every(columns[name], some) for name in ("acc_x", "acc_y", "acc_z")]
+        acc = np.array([np.nanmean(values) if np.isfinite(values).any() else np.nan for values in axes_s])
         mounting = self._mountings["imu"]
         if mounting is None:
             upwards = bool(acc[2] > 0.0)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.interchange.recording import Channel
+from rovgraph.spilling import steps, taken
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 JUMP = 86400.0  # ahead, after which a stamp is of another epoch [s]
@@ -66,10 +67,39 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     where, time = f"{file}: {channel.source}", np.asarray(channel.columns["time"], dtype=float)
     if _increase(time):
         return channel, []
+    said: list[str] = []
+    kept = None if _of_one_clock(time) else _usable(time, where, said)
+    stamps = time if kept is None else time[kept]
+    late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps)))
+    if late:
+        said.append(f"{where}: {late} rows are earlier than a row above them, sorted")
+    order = np.argsort(stamps, kind="stable")
+    order = order if kept is None else kept[order]
+    if len(order) == len(time) and not late:
+        return channel, said
+    received = None if channel.received is None else taken(channel.received, order)
+    columns = {name: taken(np.asarray(values), order) for name, values in channel.columns.items()}
+    return replace(channel, columns=columns, received=received), said
+
+
+def _increase(time: NDArray[np.float64]) -> bool:
+    """Whether all stamps are known and in order, as most are: a large channel is not copied to find out."""
+    known = len(time) > 0 and bool(np.isfinite(time[[0, -1]]).all())
+    return known and not len(steps(time, lambda step: ~((step >= 0.0) & (step <= JUMP))))
+
+
+def _of_one_clock(time: NDArray[np.float64]) -> bool:
+    """Whether all stamps are known and nearly in order: then all rows are of one epoch, found without a copy."""
+    return len(time) > 1 and not len(steps(time, lambda step: ~((step > -0.5 * STEP_BACK) & (step <= JUMP))))
+
+
+def _usable(time: NDArray[np.float64], where: str, said: list[str]) -> NDArray[np.int64]:
+    """Indices of the rows whose stamps can be used; what is left out is said."""
     stamped = np.isfinite(time)
     if not stamped.any():
         raise InputError(f"{where}: no row has a time")
-    said = [f"{where}: {np.count_nonzero(~stamped)} rows without time left out"] if not stamped.all() else []
+    if not stamped.all():
+        said.append(f"{where}: {np.count_nonzero(~stamped)} rows without time left out")
     rows = np.flatnonzero(stamped)
     kept = rows[_of_one_epoch(time[rows])]
     if lost := len(rows) - len(kept):
@@ -79,21 +109,7 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
         if lost > LOST * len(rows):
             raise InputError(f"{where}: {told}; was the clock set, or are two dives in one file? Split it")
         said.append(f"{where}: {told}; left out")
-    late = int(np.count_nonzero(time[kept] < np.maximum.accumulate(time[kept])))
-    if late:
-        said.append(f"{where}: {late} rows are earlier than a row above them, sorted")
-    order = kept[np.argsort(time[kept], kind="stable")]
-    if len(order) == len(time) and not late:
-        return channel, said
-    received = None if channel.received is None else channel.received[order]
-    columns = {name: np.asarray(values)[order] for name, values in channel.columns.items()}
-    return replace(channel, columns=columns, received=received), said
-
-
-def _increase(time: NDArray[np.float64]) -> bool:
-    """Whether all stamps are known and in order, as most are: a large channel is not copied to find out."""
-    known = len(time) > 0 and np.isfinite(time[[0, -1]]).all() and (time[1:] >= time[:-1]).all()
-    return bool(known and (time[-1] - time[0] <= JUMP or (np.diff(time) <= JUMP).all()))
+    return kept
 
 
 def _of_one_epoch(time: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -9,8 +9,10 @@ from rovgraph.interchange.mavlink_frames import TIME, V1, begins, dialect, frame
 from rovgraph.interchange.mavlink_recording import recording
 from rovgraph.interchange.mavlink_rows import WANTED, Gatherer
 from rovgraph.interchange.recording import Recording
+from rovgraph.spilling import release
 
 RECEIVER = "ground station"
+RELEASED = 1 << 24  # bytes of the file that are in memory
 FRAMES = 3  # in a row that make a telemetry log
 
 
@@ -33,10 +35,13 @@ class TelemetryLog:
         mavlink = dialect()
         parser = mavlink.MAVLink(None)
         gatherer = Gatherer()
-        done = 0
+        done = released = 0
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             for data, received in frames_with_times(content):
                 done += TIME + len(data)
+                if done > released + RELEASED:
+                    release(content)
+                    released = done
                 options.progress(min(done, len(content)), len(content))
                 _take(gatherer, mavlink, parser, data, received)
         return recording(path, self.name, gatherer, RECEIVER, options)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, all_columns
 from rovgraph.log.table import Table
+from rovgraph.spilling import release
 
 STAMP_DIGITS = 6  # of a second, as a log is written
 
@@ -74,6 +75,8 @@ def pieces(parts: Sequence[Part], count: int) -> Iterator[list[Rows]]:
                 for part, begin in zip(parts, begins, strict=True)]  # fmt: skip
         spans = zip(parts, begins, ends, strict=True)
         yield in_order([part.rows(begin, end) for part, begin, end in spans if begin < end])
+        for part in parts:
+            release(*part.columns.values())
         begins = ends
 
 
