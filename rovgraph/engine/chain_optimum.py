@@ -82,20 +82,25 @@ class ChainOptimum:
         return self._wide.eliminate(self.state, self.solution.gates, kept=1)
 
     @cached_property
-    def _marginals(self) -> tuple[Array, Array, float, float]:
-        """Covariances of the keyframes and of the border, and `linear`.
+    def _marginals(self) -> tuple[Array, Array]:
+        """Covariances of the keyframes and of the border.
 
         What they come of would be the larger part of a long dive.
         """
-        root, held = self._wide.eliminate(self.state, self.solution.gates), len(self._believed)
+        root = self._wide.eliminate(self.state, self.solution.gates)
+        self.__dict__["linear"] = self._linear(root)  # for nothing, now that it is at hand
         P_y = root.border_covariance(self._believed)
-        return root.covariances(P_y), P_y, root.log_determinant(held), root.least(held)
+        return root.turn_into_covariances(P_y), P_y
 
-    @property
+    @cached_property
     def linear(self) -> tuple[float, float]:
         """Log determinant of the information of what is estimated, linearised at the optimum, and its least sum of
         squares."""
-        return self._marginals[2:]
+        return self._linear(self._wide.eliminate(self.state, self.solution.gates, diagonal=True))
+
+    def _linear(self, root: SquareRoot) -> tuple[float, float]:
+        held = len(self._believed)
+        return root.log_determinant(held), root.least(held)
 
     def relative_sd(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""

@@ -121,7 +121,7 @@ class _Baseline:
     def linear_gain(self, name: str, sd: float, time_constant: float) -> float:
         """Of log likelihood, by one more error, of the dive as it is linearised here."""
         wider = _with(self.chain, name, sd, time_constant)
-        root = wider.eliminate(_begin(wider, self.solution.point), self.solution.gates)
+        root = wider.eliminate(_begin(wider, self.solution.point), self.solution.gates, diagonal=True)
         without = 0.5 * self.least + _freedom(self.chain, self.log_determinant)
         return without - 0.5 * root.left - _freedom(wider, root.log_determinant())
 
@@ -129,7 +129,7 @@ class _Baseline:
         """The dive with one more error, solved from here."""
         wider = _with(self.chain, name, sd, time_constant)
         solution = minimise(wider, _begin(wider, self.solution.point), tolerance=TOLERANCE)
-        root = wider.eliminate(solution.point, solution.gates)
+        root = wider.eliminate(solution.point, solution.gates, diagonal=True)
         return _Baseline(wider, solution, root.log_determinant(), root.left)
 
 

@@ -1,6 +1,6 @@
 """From GTSAM values and covariances to an `Estimate` of the body's origin."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -114,20 +114,17 @@ def calibration_history(name: str, time: Array, value: Array, sd: Array) -> Hist
     return History(TABLE[name].labels, TABLE[name].unit, time, value, sd)
 
 
-def residual_frame(
-    blocks: Mapping[str, Block], keyframes: Mapping[str, State], weights: Mapping[str, Array]
-) -> pd.DataFrame:
+def residual_frame(measured: Iterable[tuple[str, Block, State, Array]] = ()) -> pd.DataFrame:
     """Innovation, normalised innovation and weight of every measurement, in order of time.
 
     Parameters
     ----------
-    blocks : sensor -> Block
-    keyframes : sensor -> State of each measurement's keyframe
-    weights : sensor -> ndarray, shape (n,)
+    measured : sensor, its n measurements, State of each one's keyframe, their weights of shape (n,); they may be made
+        one after the other, as those of a long dive are large
     """
     parts: dict[str, list[ArrayLike]] = {}
-    for sensor, block in blocks.items():
-        predicted = block.predicted(keyframes[sensor])
+    for sensor, block, state, weight in measured:
+        predicted = block.predicted(state)
         nu = innovation(block.instrument.model, block.z, predicted)
         normalised = np.einsum("nij,nj->ni", block.W, nu)
         sd = np.sqrt(np.diagonal(np.linalg.inv(transpose(block.W) @ block.W), axis1=1, axis2=2))
@@ -141,7 +138,7 @@ def residual_frame(
                 "innovation": nu[:, k],
                 "sd": sd[:, k],
                 "normalised": normalised[:, k],
-                "weight": weights[sensor],
+                "weight": weight,
                 "row": block.line,
             }
             for name, values in columns.items():

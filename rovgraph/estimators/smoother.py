@@ -14,7 +14,7 @@ from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.log_assembly import assemble_log
-from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_states
+from rovgraph.engine.optimum import Optimum, joint_prior_sd, residual_state
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
@@ -148,7 +148,7 @@ class BatchSmoother:
         means = {name: belief.mean for name, belief in beliefs(b.config).items()}
         states = dead_reckon(self.intervals, b, means)
         trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)
-        return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
+        return Estimate("dead_reckoning", trajectory, [], {}, residual_frame())
 
 
 def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
@@ -181,6 +181,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
         spread[name] = best.covariances(name)[-1]
         both = np.tile(final[name], (2, 1)), np.tile(np.sqrt(np.diag(spread[name])), (2, 1))
         history[name] = calibration_history(name, trajectory.time[ends], *both)
+    best.forget_covariances()  # of a long dive they are large
     return Estimate(
         "smoothed",
         trajectory,
@@ -188,7 +189,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             best.beliefs, [s for s in b.streams if s in {*best.blocks, "imu"}], final, spread, relative
         ),
         history,
-        residual_frame(best.blocks, residual_states(best), best.weights),
+        residual_frame((s, b, residual_state(best, b), best.weights[s]) for s, b in best.blocks.items()),
         {
             "keyframes": n,
             "cost": best.solution.cost,

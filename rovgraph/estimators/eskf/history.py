@@ -1,6 +1,6 @@
 """What a filter has found on its way through a dive, and the estimate that comes of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -100,22 +100,18 @@ class FilterHistory:
         sensors = [s for s in engine.initial.streams if s in {*self._processed, "imu"}]
         last = {name: value[-1] for name, value in states.calibration.items()}
         calibration = calibration_estimates(engine.beliefs, sensors, last, final)
-        residuals = residual_frame(*self._residuals(smoothed))
+        residuals = residual_frame(self._measured(smoothed))
         return Estimate(kind, trajectory, calibration, history, residuals, self._summary())
 
-    def _residuals(
-        self, smoothed: State | None
-    ) -> tuple[Mapping[str, Block], Mapping[str, State], Mapping[str, Array]]:
-        """Measurements, the states they are compared with, and their weights."""
-        blocks, here, weights = {}, {}, {}
+    def _measured(self, smoothed: State | None) -> Iterator[tuple[str, Block, State, Array]]:
+        """Each sensor's measurements, the states they are compared with, and their weights."""
         for sensor, rows in self._processed.items():
-            blocks[sensor] = block = self._engine.block([one.measurement for one in rows])
-            here[sensor] = stack_states(rows) if smoothed is None else smoothed.at(block.keyframe)
+            block = self._engine.block([one.measurement for one in rows])
+            here = stack_states(rows) if smoothed is None else smoothed.at(block.keyframe)
             places = [one.place for one in rows if one.place is not None]
             if places:
-                here[sensor] = here[sensor].seeing(np.array(places))
-            weights[sensor] = np.array([one.weight for one in rows])
-        return blocks, here, weights
+                here = here.seeing(np.array(places))
+            yield sensor, block, here, np.array([one.weight for one in rows])
 
     def _summary(self) -> dict[str, Any]:
         """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
