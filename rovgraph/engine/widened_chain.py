@@ -53,6 +53,9 @@ class _WidenedChain(Chain):
 
     @cached_property
     def given(self) -> dict[str, Block]:
+        given = self._unknown_to_kernels
+        if given <= self.timed.keys():  # in the order in which they measure first, as of all blocks
+            return {sensor: block for sensor, block in self.timed.items() if sensor in given}
         return {sensor: self.timed.get(sensor, block) for sensor, block in super().given.items()}
 
 

@@ -144,11 +144,14 @@ def _solve(
             estimates.append(passed.solve())
             states = None if batch.measurements else passed.states()  # where the filter went is close by
             del passed  # of a long dive it is large
-            give_back()
+        batch.forget_motion_covariances()
+        give_back()
         if estimate != "filtered":
             progress("smoothing", 0.5)
             best = batch.optimum(states)
+            del states
             estimates.insert(0, smoothed(best, initial))
+            give_back()
     intervals = batch.intervals if best is None else best.intervals
     numbers = statistics(Evidence(initial, estimates, intervals, best, frozen, gaps))
     left_out = _left_out(batch, frozen, gaps)

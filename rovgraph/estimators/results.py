@@ -36,7 +36,7 @@ def body_trajectory(
     cov_pose : ndarray, shape (n, 6, 6), in GTSAM's tangent space, or None
     cov_velocity : ndarray, shape (n, 3, 3), in n, or None
     """
-    R, lever_arm_b = states.R_nb, np.asarray(lever_arm_b, dtype=float)
+    R, lever_arm_b = np.ascontiguousarray(states.R_nb), np.asarray(lever_arm_b, dtype=float)
     time = np.array([i.time for i in intervals])
     rate_b = np.array([i.rate_b for i in intervals])
     rate_sd = np.array([i.rate_sd for i in intervals])[:, None, None]
@@ -104,14 +104,15 @@ def bias_histories(time: Array, bias: Array, sd: Array, sensors: Sequence[str]) 
         return {}
     acc, gyr = (tuple(f"{s}_bias{c}" for c in _XYZ) for s in ("acc", "gyr"))
     return {
-        "acc_bias": History(acc, "m/s2", time, bias[:, :3], sd[:, :3]),
-        "gyr_bias": History(gyr, "rad/s", time, bias[:, 3:], sd[:, 3:]),
+        "acc_bias": History(acc, "m/s2", time, bias[:, :3].copy(), sd[:, :3].copy()),
+        "gyr_bias": History(gyr, "rad/s", time, bias[:, 3:].copy(), sd[:, 3:].copy()),
     }
 
 
 def calibration_history(name: str, time: Array, value: Array, sd: Array) -> History:
     """A calibration variable against time; ``value`` and ``sd`` have shape (n, dim)."""
-    return History(TABLE[name].labels, TABLE[name].unit, time, value, sd)
+    # copies: views would keep all the rest of what a filter has found
+    return History(TABLE[name].labels, TABLE[name].unit, time, value.copy(), sd.copy())
 
 
 def residual_frame(measured: Iterable[tuple[str, Block, State, Array]] = ()) -> pd.DataFrame:

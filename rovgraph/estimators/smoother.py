@@ -29,7 +29,7 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.log import Log, Measurement
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.state import BIAS, PLACE, POSE, VELOCITY, State
 
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
 PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
@@ -84,6 +84,11 @@ class BatchSmoother:
         if self._rows is None or len(self._rows) != len(self.intervals):
             self._rows = DiveRows.of(self.intervals, [*self.initial.instruments])
         return self._rows
+
+    def forget_motion_covariances(self) -> None:
+        """Free the memory of what a filter needs, and GTSAM's graph of a dive that sees places, but not the chain."""
+        if self._rows is not None and PLACE not in self._rows.used:
+            self._rows = self._rows.without_covariances(self.intervals)
 
     def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
