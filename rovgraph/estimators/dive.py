@@ -141,12 +141,12 @@ def _solve(
             estimates.append(solver.filtered())
     else:
         estimates, states, best = [], None, None
-        if estimate != "smoothed":
-            passed = _filter(batch, progress)
+        passed = _filter(batch, progress) if estimate != "smoothed" else None
+        batch.forget_motion_covariances()
+        if passed is not None:
             estimates.append(passed.solve())
             states = None if batch.measurements else passed.states()  # where the filter went is close by
-            del passed  # of a long dive it is large
-        batch.forget_motion_covariances()
+            passed = None  # of a long dive it is large
         give_back()
         if estimate != "filtered":
             progress("smoothing", 0.5)

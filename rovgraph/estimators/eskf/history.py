@@ -18,6 +18,7 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array
+from rovgraph.process import give_back
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
 # of some keyframes, their number first in every shape: state, calibration, covariances of pose and velocity, sd of the
@@ -82,6 +83,7 @@ class FilterHistory:
     def estimate(self, kind: str) -> Estimate:
         """The filtered estimate of every keyframe."""
         self._pieces = [_joined(self._pieces)]  # of a long dive they are not kept twice
+        give_back()
         return self._estimate(kind, self._pieces[0], None)
 
     def smoothed(self, kind: str, known: Sequence[Gaussian]) -> Estimate:
