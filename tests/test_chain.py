@@ -128,6 +128,12 @@ def test_both_come_to_the_same_cost(solved):
         np.testing.assert_array_equal(chain.solution.gates[sensor], gate)
 
 
+def test_an_elimination_of_which_the_diagonal_is_kept_is_as_likely(solved):
+    chain, state, gates = solved[0].chain, solved[0].state, solved[0].solution.gates
+    whole, diagonal = chain.eliminate(state, gates), chain.eliminate(state, gates, diagonal=True)
+    assert (whole.log_determinant(), whole.least()) == (diagonal.log_determinant(), diagonal.least())
+
+
 def test_both_come_to_the_same_states(solved):
     chain, graph = solved
     a, b = chain.state, graph.state

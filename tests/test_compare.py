@@ -271,7 +271,7 @@ def constant(p_n: tuple[float, float, float], v_n: tuple[float, float, float], s
 
 def test_measures_of_a_constant_error_by_hand(recorded):
     truth = constant((0.0, 0.0, 5.0), (0.1, 0.0, 0.0), np.nan)
-    estimate = Estimate("x", constant((3.0, 4.0, 9.0), (0.1, 0.2, 7.0), 2.0), [], {}, residual_frame({}, {}, {}))
+    estimate = Estimate("x", constant((3.0, 4.0, 9.0), (0.1, 0.2, 7.0), 2.0), [], {}, residual_frame())
     row = measures(estimate, Case(recorded.log, recorded.config, truth), chain("x"))
     assert (row["end_north_m"], row["end_east_m"]) == (3.0, 4.0)
     wanted = {
@@ -288,13 +288,13 @@ def test_measures_of_a_constant_error_by_hand(recorded):
 
 
 def test_an_estimate_that_is_not_finite_is_a_failure(recorded):
-    estimate = Estimate("x", constant((np.nan, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), [], {}, residual_frame({}, {}, {}))
+    estimate = Estimate("x", constant((np.nan, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), [], {}, residual_frame())
     with pytest.raises(FloatingPointError, match="diverged"):
         measures(estimate, recorded, chain("x"))
 
 
 def test_a_reference_on_another_clock_is_a_failure_that_says_so(recorded):
-    estimate = Estimate("x", constant((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), [], {}, residual_frame({}, {}, {}))
+    estimate = Estimate("x", constant((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), [], {}, residual_frame())
     late = Trajectory(recorded.reference.time + 1e6, *list(vars(recorded.reference).values())[1:])
     with pytest.raises(InputError, match="on the same clock"):
         measures(estimate, Case(recorded.log, recorded.config, late), chain("x"))

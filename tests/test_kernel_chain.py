@@ -169,6 +169,8 @@ def test_covariances_are_blocks_of_the_inverse_information(chain):
         if k + 1 < n:
             assert_close(following[k], P[here, (k + 1) * d : (k + 2) * d])
     assert_close(root.covariances(P_y), own)
+    expected = root.covariances(P_y)
+    np.testing.assert_array_equal(root.turn_into_covariances(P_y), expected)
 
 
 def test_the_derivative_by_the_border_is_that_of_the_optimum(chain):

@@ -10,7 +10,8 @@ from dives import altered, batch, changed, falcon, simulated, true_at
 from rovgraph.calibration import TABLE
 from rovgraph.config import parse_config
 from rovgraph.engine.chain import Chain
-from rovgraph.engine.lasting import LASTING, find_lasting, unity
+from rovgraph.engine.lasting import LASTING, _Baseline, find_lasting, unity
+from rovgraph.engine.linear_constants import LinearConstants
 from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.unstated_noise import noise_factor
 from rovgraph.gauss_markov import stationary_walk
@@ -174,3 +175,13 @@ def test_times_in_which_everything_was_rejected_do_not_count_as_agreement():
     alone = unity(part, None, H[:120], np.full(120, True))
     assert unity(whole, None, H, time < 120.0) == pytest.approx(alone)
     assert unity(whole, None, H, np.full(400, False)) == 1.0
+
+
+def test_gains_of_constants_by_one_elimination_are_those_of_each_by_itself(correlated):
+    best = batch(correlated[0].log, correlated[1]).optimum()
+    chain, solution, now = best.chain, best.solution, _Baseline(best.chain, best.solution, *best.linear)
+    names = ["dvl_scale", "gyr_scale", *(n for n, walk in chain.unknowns.walks.items() if walk == 0.0)]
+    constants = LinearConstants.of(chain, solution, names)
+    for name in names:
+        for sd in (0.5 * chain.beliefs[name].sd, 10.0 * chain.beliefs[name].sd):
+            assert constants.gain({name: sd}) == pytest.approx(now.linear_gain(name, sd, np.inf), abs=1e-6)

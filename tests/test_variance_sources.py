@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 import rovgraph as rg
+from rovgraph.engine.released import release
 from rovgraph.engine.variance_sources import variance_sources
 from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.initialise import initialise
@@ -35,6 +36,15 @@ def test_the_parts_add_up_to_the_variance_anywhere_in_the_dive(share):
     R = best.state.R_nb[k]
     P = R @ best.covariances(POSE)[k][3:6, 3:6] @ R.T
     assert sum(variance_sources(best, k).values()) == pytest.approx(P[0, 0] + P[1, 1], rel=1e-5)
+
+
+def test_a_dive_in_pieces_is_a_whole_dive(monkeypatch):
+    dive = simulated()
+    best = assemble(dive.log, initialise(dive.log, dive.config)).optimum(None)
+    released = "gyr_scale", "dvl_time_offset", "mag_time_offset"
+    whole = variance_sources(best, 100), release(best, released)
+    monkeypatch.setattr("rovgraph.engine.pieces.LENGTH", 64)
+    assert (variance_sources(best, 100), release(best, released)) == whole
 
 
 def test_a_start_known_to_ten_metres_limits_a_dive_without_fixes(tmp_path):

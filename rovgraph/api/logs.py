@@ -83,7 +83,7 @@ def check(log: Log, config: Config | None = None) -> Report:
     if not report.at("error") and refusal(log, config):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the report has it
-            bridged = bridge_jumps(log, config)
+            bridged, _ = bridge_jumps(log, config)
         if reason := refusal(bridged, config):
             report.findings.append(Finding("smooth", "error", reason))
     return report
@@ -100,8 +100,9 @@ def prepared(log: Log, config: Config) -> Log:
     -----
     DataWarning : findings of the check
     """
-    log = bridge_jumps(log, given(log, config))
-    warn_of_findings(log, config)
+    config = given(log, config)
+    log, examined = bridge_jumps(log, config)
+    warn_of_findings(log, config, examined)
     return log
 
 

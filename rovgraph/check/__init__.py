@@ -6,13 +6,14 @@ findings; it knows nothing of other checks.
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 from rovgraph.check.agreement import headings, vertical
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
 from rovgraph.check.fixes import repeated, track
 from rovgraph.check.frozen_sensors import standstill
-from rovgraph.check.jumps import bridge_jumps
+from rovgraph.check.jumps import Examined, bridge_jumps
 from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
 from rovgraph.check.start import start
@@ -48,27 +49,30 @@ CHECKS: tuple[Check, ...] = (
 )
 
 
-def examine(log: Log, config: Config | None = None) -> Report:
+def examine(log: Log, config: Config | None = None, examined: Examined | None = None) -> Report:
     """Run every check.
 
     Parameters
     ----------
     log : as read
     config : what is believed of the vehicle; defaults where it is not given
+    examined : what `bridge_jumps` knows of the log with this configuration
     """
     config = Config() if config is None else config
-    findings = [finding for check in CHECKS for finding in check(log, config)]
+    once = partial(dvl_and_imu, examined=examined)
+    checks = [once if check is dvl_and_imu else check for check in CHECKS]
+    findings = [finding for check in checks for finding in check(log, config)]
     return Report(log.source, [timing(stream) for stream in log.streams.values()], findings)
 
 
-def warn(log: Log, config: Config | None = None) -> None:
+def warn(log: Log, config: Config | None = None, examined: Examined | None = None) -> None:
     """Issue a `DataWarning` for whatever looks wrong.
 
     Raises
     ------
     InputError : what the log cannot be worked with for; the first of these findings
     """
-    report = examine(log, config)
+    report = examine(log, config, examined)
     for finding in report.at("warning"):
         issue_warning(f"{report.source}: {finding.sensor}: {finding.text}")
     refuse(report)

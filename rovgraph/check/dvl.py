@@ -10,7 +10,7 @@ import numpy as np
 from rovgraph.check.acceleration import BETTER, FOLLOWS, ORIENTATIONS, Comparison, Fit, Search
 from rovgraph.check.agreement import dives_with_depth
 from rovgraph.check.findings import Finding
-from rovgraph.check.jumps import compare, find_jump
+from rovgraph.check.jumps import Examined, compare, find_jump
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, log_rotation
 from rovgraph.log import Log
@@ -25,15 +25,15 @@ EVIDENCE = 30.0  # in chi-square that a lag explains
 TURNED = np.deg2rad(30.0)  # a mounting that is no small error; steady circles confuse smaller ones with a lag
 
 
-def dvl_and_imu(log: Log, config: Config) -> Iterator[Finding]:
-    """Axes, mounting and clock of the DVL, by the IMU's accelerations."""
-    compared = compare(log, config)
+def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> Iterator[Finding]:
+    """Axes, mounting and clock of the DVL, by the IMU's accelerations; ``examined`` is of `bridge_jumps`."""
+    compared = compare(log, config) if examined is None else examined.compared
     if compared is None:
         return
     found = compared.search()
     if np.isfinite(found.error).sum() == 0:
         return
-    jump = find_jump(log, compared)
+    jump = find_jump(log, compared) if examined is None else examined.jump
     if jump is not None:
         yield jump.finding(log)
         return

@@ -83,6 +83,14 @@ class Jump:
         return Finding(self.sensor, "warning", f"{text} from there on, or split the log", "jump")
 
 
+@dataclass(frozen=True)
+class Examined:
+    """The DVL beside the IMU, and the jump of one of their clocks, where there is one."""
+
+    compared: Comparison
+    jump: Jump | None
+
+
 def compare(log: Log, config: Config) -> Comparison | None:
     """The DVL beside the IMU; None where there is too little of them, or gravity is not where it should be."""
     if not {"dvl", "imu"} <= log.sensors or tilt(log, config) > GRAVITY_ANGLE:
@@ -129,8 +137,13 @@ def _refined(compared: Comparison, split: Jump, lags: list[float]) -> Jump:
     return replace(split, lags=(fits[0].lag, fits[1].lag), sd=float(np.hypot(fits[0].lag_sd, fits[1].lag_sd)))
 
 
-def bridge_jumps(log: Log, config: Config) -> Log:
+def bridge_jumps(log: Log, config: Config) -> tuple[Log, Examined | None]:
     """A log whose clocks go on: where a gap tells whose clock was set, its later stamps are put back by as much.
+
+    Returns
+    -------
+    Log : the log, or one that is bridged
+    Examined : of that log, as far as it is known by now, so that a check need not look again
 
     Warns
     -----
@@ -138,9 +151,11 @@ def bridge_jumps(log: Log, config: Config) -> Log:
     """
     for _ in range(MOST_JUMPS):
         compared = compare(log, config)
-        jump = None if compared is None else find_jump(log, compared)
+        if compared is None:
+            return log, None
+        jump = find_jump(log, compared)
         if jump is None or not jump.bridgeable:
-            break
+            return log, Examined(compared, jump)
         streams = {name: _put_back(stream, jump) for name, stream in log.streams.items()}
         shifted = [name for name, stream in streams.items() if stream is not log[name]]
         warn(
@@ -150,7 +165,7 @@ def bridge_jumps(log: Log, config: Config) -> Log:
         )
         beams = None if log.beams is None else _put_back(log.beams, jump)
         log = replace(log, streams=streams, beams=beams)
-    return log
+    return log, None
 
 
 def _put_back(stream: Stream, jump: Jump) -> Stream:

@@ -29,6 +29,7 @@ from rovgraph.engine.measurements import (
     loss_and_weight,
     measurement_cost,
 )
+from rovgraph.engine.pieces import pieces
 from rovgraph.engine.sensor_rows import compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
@@ -137,7 +138,7 @@ class Chain:
 
     def seen(self, state: State, blocks: Mapping[str, Block]) -> Seen:
         """Sensors' blocks, with the state of each measurement's keyframe."""
-        return [(sensor, block, state.at(block.keyframe)) for sensor, block in blocks.items()]
+        return ((sensor, block, state.at(block.keyframe)) for sensor, block in blocks.items())
 
     def measured(self) -> dict[str, Measured]:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
@@ -252,10 +253,17 @@ class Chain:
         J[3:6, 3:6] = R
         return self._prior_weight @ J
 
-    def eliminate(self, point: State, gates: Gates, stops: Sequence[int] = (), kept: int | None = None) -> SquareRoot:
+    def eliminate(
+        self,
+        point: State,
+        gates: Gates,
+        stops: Sequence[int] = (),
+        kept: int | None = None,
+        diagonal: bool = False,
+    ) -> SquareRoot:
         """All factors linearised at a point and eliminated; with ``stops`` the border ends with the first attitude.
 
-        ``kept`` is as of `rovgraph.engine.chain_information.square_root`.
+        ``kept`` and ``diagonal`` are as of `rovgraph.engine.chain_information.square_root`.
 
         Raises
         ------
@@ -263,8 +271,8 @@ class Chain:
         """
         given, clones = (self._rows_with_clone, CLONED) if len(stops) else (self._rows, 0)
         self._put_priors(given, point, clones)
-        for place, (sensor, block, state) in enumerate(self.seen(point, self.given), PRIORS):
-            self._put_block(given, place, block, state, gates[sensor])
+        for place, (sensor, block) in enumerate(self.given.items(), PRIORS):
+            self._put_block(given, place, block, point, gates[sensor])
         r, n, d, c = self.rows, len(self.intervals), self.layout.d, self.layout.c + clones
         dive = r.motions, r.weights, r.scales, r.rows, r.which, r.first, r.row_scales, self._sensors
         gravity = self.initial.gravity
@@ -283,7 +291,7 @@ class Chain:
             return eliminate_dive(*dive, self._entered(gates), *point_and_layout, *rest, *out)
 
         try:
-            return square_root(n, d, c, len(stops), fill, kept)
+            return square_root(n, d, c, len(stops), fill, kept, diagonal)
         except UndeterminedError as error:
             raise InputError(self.layout.indeterminate(error.keyframe, error.component)) from None
 
@@ -320,19 +328,21 @@ class Chain:
         rows.put(2, np.zeros((1, clones)), tie, -STIFF * np.eye(clones)[None], clone, _ONE)
 
     def _put_block(
-        self, rows: MeasurementRows, place: int, block: Block, state: State, gate: NDArray[np.bool_]
+        self, rows: MeasurementRows, place: int, block: Block, point: State, gate: NDArray[np.bool_]
     ) -> None:
         """The measurements of one sensor, weighted."""
-        r, H = block.linearize(state)
-        weight = loss_and_weight(r, block.instrument.loss)[1] * gate
-        J = np.zeros((*r.shape, MOTION))
-        for variable, columns in COLUMNS.items():
-            if variable in H:
-                J[..., columns] = H[variable]
         names = self._columns_of(block)
-        C = np.concatenate([np.empty((*r.shape, 0)), *(H[n] for n in names)], axis=2)
         targets = np.concatenate([NOTHING, *(self.layout.target(n) for n in names)])
-        rows.put(place, r, J, C, targets, weight)
+        for part in pieces(0, len(block)):
+            some = block.at(part)
+            r, H = some.linearize(point.at(some.keyframe))
+            weight = loss_and_weight(r, block.instrument.loss)[1] * gate[part]
+            J = np.zeros((*r.shape, MOTION))
+            for variable, columns in COLUMNS.items():
+                if variable in H:
+                    J[..., columns] = H[variable]
+            C = np.concatenate([np.empty((*r.shape, 0)), *(H[n] for n in names)], axis=2)
+            rows.put(place, r, J, C, targets, weight, part)
 
     def _columns_of(self, block: Block) -> list[str]:
         """Calibration that a sensor's measurements depend on, of what is estimated."""

@@ -17,6 +17,8 @@ from rovgraph.geometry import Array, transpose
 from rovgraph.kernels import chain, chain_posterior
 from rovgraph.kernels.chain import Index
 
+EVERY = slice(None)
+
 
 class UndeterminedError(Exception):
     """The rows do not determine some component.
@@ -61,7 +63,9 @@ class MeasurementRows:
         self.values = np.zeros((self.first[-1], s + others + 1))
         self.targets = np.full((self.first[-1], others), -1, dtype=np.int64)
 
-    def put(self, sensor: int, r: Array, J: Array, C: Array, targets: Index, weight: Array) -> None:
+    def put(
+        self, sensor: int, r: Array, J: Array, C: Array, targets: Index, weight: Array, part: slice = EVERY
+    ) -> None:
         """Rows of a sensor's measurements, in place of those it had.
 
         Parameters
@@ -71,9 +75,10 @@ class MeasurementRows:
         J : ndarray, shape (m, dim, s), Jacobians by the keyframe
         C, targets : ndarray, shapes (m, dim, e) and (e,), Jacobians by other columns
         weight : ndarray, shape (m,), of squares: 0 takes a measurement out
+        part : which of the sensor's measurements they are
         """
         packed = np.ascontiguousarray
-        begins, rows = self._begins[sensor], (self.values, self.targets)
+        begins, rows = self._begins[sensor][part], (self.values, self.targets)
         chain.place_rows(packed(r), packed(J), packed(C), packed(targets), packed(weight), begins, *rows)
 
 
@@ -83,7 +88,8 @@ class SquareRoot:
 
     Attributes
     ----------
-    conditionals : ndarray, shape (n, d, 2 d + c + 1), R, S, T and z of every keyframe, or (1, ...) of the last one
+    conditionals : ndarray, shape (n, d, 2 d + c + 1), R, S, T and z of every keyframe, or (1, ...) of the last one, or
+        (n, d, 1), R's diagonal alone
     border : ndarray, shape (c, c + 1), R and z of the border
     left : sum of squares at the minimum
     filtered : ndarray, shape (f, d + c, d + c + 1), R and z of a keyframe and the border, of the data up to it
@@ -149,6 +155,20 @@ class SquareRoot:
         """
         return self._covariances(P_y, 0, 0)[0]
 
+    def turn_into_covariances(self, P_y: Array) -> Array:
+        """As `covariances`, in the memory of ``conditionals``, which are lost: of a long dive both would be large.
+
+        They are written from the last keyframe backwards into the end of it, over conditionals that have been read.
+        """
+        (n, d), values = self.conditionals.shape[:2], self.conditionals.reshape(-1)
+        size, none = n * d * d, np.empty((0, d, d))
+        P = values[-size:].reshape(n, d, d)
+        cross = np.empty((0, d, len(self.border)))
+        chain_posterior.covariances(self.conditionals, np.ascontiguousarray(P_y), P, cross, none)
+        values[:size] = values[-size:]
+        self.conditionals.resize((n, d, d), refcheck=False)
+        return self.conditionals
+
     def joint_covariances(self, P_y: Array) -> tuple[Array, Array, Array]:
         """As `covariances`, with the border, shape (n, d, c), and with keyframes after them, shape (n - 1, d, d)."""
         n = len(self.conditionals)
@@ -197,7 +217,8 @@ class SquareRoot:
 
     def log_determinant(self, held: int = 0) -> float:
         """Of the information of keyframes and border, the border's last components held."""
-        diagonals = np.einsum("kii->ki", self.conditionals[:, :, : self.conditionals.shape[1]])
+        R = self.conditionals[:, :, : self.conditionals.shape[1]]
+        diagonals = R[:, :, 0] if R.shape[2] == 1 else np.einsum("kii->ki", R)
         border = np.diagonal(self.border)[: len(self.border) - held]
         return 2.0 * float(np.log(np.abs(diagonals)).sum() + np.log(np.abs(border)).sum())
 
@@ -208,7 +229,13 @@ class SquareRoot:
 
 
 def square_root(
-    n: int, d: int, c: int, stops: int, fill: Callable[[Array, Array, Array, Array], int], kept: int | None = None
+    n: int,
+    d: int,
+    c: int,
+    stops: int,
+    fill: Callable[[Array, Array, Array, Array], int],
+    kept: int | None = None,
+    diagonal: bool = False,
 ) -> SquareRoot:
     """What an elimination of n keyframes of d components and a border of c leaves.
 
@@ -217,12 +244,14 @@ def square_root(
     stops : number of keyframes at which to keep what is known
     fill : writes ``conditionals_out`` to ``left_out`` and returns, as `rovgraph.kernels.linear_chain.eliminate`
     kept : keyframes whose conditionals are kept, None = all, 1 = the last
+    diagonal : nothing is kept of them but R's diagonal
 
     Raises
     ------
     UndeterminedError : the rows do not determine some component
     """
-    conditionals, border = np.empty((n if kept is None else kept, d, 2 * d + c + 1)), np.empty((c, c + 1))
+    width = 1 if diagonal else 2 * d + c + 1
+    conditionals, border = np.empty((n if kept is None else kept, d, width)), np.empty((c, c + 1))
     filtered, left = np.empty((stops, d + c, d + c + 1)), np.empty(1)
     failing = fill(conditionals, border, filtered, left)
     if failing >= n * d:

@@ -90,21 +90,29 @@ class ChainOptimum:
         return len(self.intervals) <= SHORT
 
     @cached_property
-    def _marginals(self) -> tuple[Array, Array, float, float]:
-        """Covariances of the keyframes and of the border, and `linear`.
+    def _marginals(self) -> tuple[Array, Array]:
+        """Covariances of the keyframes and of the border.
 
         What they come of would be the larger part of a long dive.
         """
-        root = self._end if self._short else self._wide.eliminate(self.state, self.solution.gates)
-        held = len(self._believed)
+        if self._short:
+            P_y = self._end.border_covariance(self._believed)
+            return self._end.covariances(P_y), P_y
+        root = self._wide.eliminate(self.state, self.solution.gates)
+        self.__dict__["linear"] = self._linear(root)  # for nothing, now that it is at hand
         P_y = root.border_covariance(self._believed)
-        return root.covariances(P_y), P_y, root.log_determinant(held), root.least(held)
+        return root.turn_into_covariances(P_y), P_y
 
-    @property
+    @cached_property
     def linear(self) -> tuple[float, float]:
         """Log determinant of the information of what is estimated, linearised at the optimum, and its least sum of
         squares."""
-        return self._marginals[2:]
+        root = self._end if self._short else self._wide.eliminate(self.state, self.solution.gates, diagonal=True)
+        return self._linear(root)
+
+    def _linear(self, root: SquareRoot) -> tuple[float, float]:
+        held = len(self._believed)
+        return root.log_determinant(held), root.least(held)
 
     def relative_sd(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""

@@ -1,7 +1,7 @@
 """A dive's motions and measurements as arrays that kernels take, for smoother and filter alike."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +95,16 @@ class DiveRows:
         first, taken = keyframe.searchsorted(np.arange(n + 1)), interval.searchsorted(np.arange(1, n + 1))
         rows = np.ascontiguousarray(rows[:, : measured.ROW])
         return DiveRows(motions, weights, scales, rows, which, row_scales, first, taken, time, sensors)
+
+    def without_covariances(self, intervals: Sequence[KeyframeInterval]) -> "DiveRows":
+        """The same without the covariances of the motions, for a smoother, which has ``weights`` instead.
+
+        The motions of ``intervals``, whose arrays these are, lose theirs as well.
+        """
+        motions = self.motions[:, : motion_row.COVARIANCE].copy()
+        for interval, row in zip(intervals[1:], motions, strict=True):
+            object.__setattr__(interval.motion, "row", row)
+        return replace(self, motions=motions)
 
     def __len__(self) -> int:
         return len(self.taken)

@@ -97,7 +97,7 @@ class Transition:
     predicted: Gaussian
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ProcessedMeasurement:
     """A measurement as the filter met it.
 

@@ -1,5 +1,6 @@
 """Keyframes: the interval that leads to each, and the measurements that belong to it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -133,7 +134,7 @@ class KeyframeInterval:
     rate_b: Array
     rate_sd: float
     motion: Motion | None
-    measurements: list[KeyframeMeasurement]
+    measurements: Sequence[KeyframeMeasurement]
     scale_to_bias: Array | None = None
 
     @property

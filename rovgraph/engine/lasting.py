@@ -28,6 +28,7 @@ from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import Solution, minimise
+from rovgraph.engine.linear_constants import LinearConstants, begin_at, with_lasting
 from rovgraph.engine.measurements import Block
 from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
@@ -120,16 +121,16 @@ class _Baseline:
 
     def linear_gain(self, name: str, sd: float, time_constant: float) -> float:
         """Of log likelihood, by one more error, of the dive as it is linearised here."""
-        wider = _with(self.chain, name, sd, time_constant)
-        root = wider.eliminate(_begin(wider, self.solution.point), self.solution.gates)
+        wider = with_lasting(self.chain, name, sd, time_constant)
+        root = wider.eliminate(begin_at(wider, self.solution.point), self.solution.gates, diagonal=True)
         without = 0.5 * self.least + _freedom(self.chain, self.log_determinant)
         return without - 0.5 * root.left - _freedom(wider, root.log_determinant())
 
     def with_error(self, name: str, sd: float, time_constant: float) -> "_Baseline":
         """The dive with one more error, solved from here."""
-        wider = _with(self.chain, name, sd, time_constant)
-        solution = minimise(wider, _begin(wider, self.solution.point), tolerance=TOLERANCE)
-        root = wider.eliminate(solution.point, solution.gates)
+        wider = with_lasting(self.chain, name, sd, time_constant)
+        solution = minimise(wider, begin_at(wider, self.solution.point), tolerance=TOLERANCE)
+        root = wider.eliminate(solution.point, solution.gates, diagonal=True)
         return _Baseline(wider, solution, root.log_determinant(), root.left)
 
 
@@ -189,19 +190,23 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
     unknowns = now.chain.unknowns
     own = [n for n in unknowns.considered if error.sensor in TABLE[n].sensors and not TABLE[n].time_offset]
-    constant, held = _as_constant(now, error, own)
+    known = [n for n, walk in unknowns.walks.items() if walk == 0.0]
+    rivals = [error.variable, *known]
+    constants = LinearConstants.of(now.chain, now.solution, [*own, *rivals])
+    constant, held = _as_constant(now, error, own, constants)
     if constant.gain >= max(gain, CLEAR):
         return constant, held
-    known = [n for n, walk in unknowns.walks.items() if walk == 0.0]
-    return replace(error, gain=gain - _as_constant(now, error, [error.variable, *known])[0].gain), fitted
+    return replace(error, gain=gain - _as_constant(now, error, rivals, constants)[0].gain), fitted
 
 
-def _as_constant(now: _Baseline, error: LastingError, names: Collection[str]) -> tuple[LastingError, _Baseline]:
+def _as_constant(
+    now: _Baseline, error: LastingError, names: Collection[str], constants: LinearConstants
+) -> tuple[LastingError, _Baseline]:
     """The constant that explains the dive best where an error might, its gain at least 0, and the dive with it."""
     rivals = [
-        replace(error, variable=name, sd=sd, time_constant=np.inf, gain=now.linear_gain(name, sd, np.inf))
+        replace(error, variable=name, sd=sd, time_constant=np.inf, gain=constants.gain({name: sd}))
         for name in names
-        for sd in CONSTANT * now.chain.beliefs[name].sd
+        for sd in (CONSTANT * now.chain.beliefs[name].sd).tolist()
         if name not in now.chain.unknowns.walks or sd > now.chain.beliefs[name].sd
     ]
     best = max(rivals, key=lambda rival: rival.gain, default=replace(error, gain=0.0))
@@ -263,23 +268,6 @@ def _implausible(chain: Chain, error: LastingError) -> bool:
     longest = _time_constants(chain, error.sensor)[1]
     all_the_time = error.sensor in LONGEST and error.time_constant > AT_LONGEST * longest
     return all_the_time or error.sd > IMPLAUSIBLE * TABLE[error.variable].sd
-
-
-def _begin(chain: Chain, point: State) -> State:
-    """A point of a chain, from one of a chain with other unknowns."""
-    n, calibration = len(chain.intervals), dict(point.calibration)
-    for name in chain.layout.walking:
-        calibration[name] = np.array(np.broadcast_to(calibration[name], (n, TABLE[name].dim)))
-    return replace(point, calibration=calibration)
-
-
-def _with(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
-    """The chain with an error that lasts among its unknowns; one of infinite time constant is constant."""
-    walk = stationary_walk(sd, time_constant)
-    believed = replace(
-        chain.beliefs[name], estimate=True, considered=False, sd=sd, walk=walk, time_constant=time_constant
-    )
-    return replace(chain, beliefs={**chain.beliefs, name: believed}, unknowns=chain.unknowns.with_lasting(believed))
 
 
 def _freedom(chain: Chain, log_determinant: float) -> float:

@@ -6,7 +6,7 @@ What it does interval by interval is done here for all at once, on arrays: of th
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -15,15 +15,10 @@ from numpy.typing import NDArray
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.aiding import Aiding
 from rovgraph.engine.dive_rows import DiveRows
-from rovgraph.engine.keyframes import (
-    KeyframeInterval,
-    KeyframeMeasurement,
-    LandmarkObservation,
-    measurement_rows,
-    sd_of,
-)
+from rovgraph.engine.keyframes import KeyframeInterval, measurement_rows, sd_of
 from rovgraph.engine.landmarks import STILL_IN_VIEW, Landmarks
-from rovgraph.engine.late_stamp_window import LateStampWindow, beyond_samples, window_around
+from rovgraph.engine.late_stamp_window import beyond_samples, window_around
+from rovgraph.engine.log_measurements import Extra, MeasurementsOfInterval, MeasurementTable
 from rovgraph.engine.motion import Motion
 from rovgraph.engine.preintegration import preintegration_params
 from rovgraph.engine.samples import HALF_WINDOW_S, knocked, means, rates, surveyed
@@ -52,13 +47,6 @@ class AssembledLog:
 
     intervals: list[KeyframeInterval]
     rows: DiveRows
-
-
-class _Extra(NamedTuple):
-    """Of a measurement, as of `KeyframeMeasurement`."""
-
-    window: LateStampWindow | None
-    landmark: LandmarkObservation | None
 
 
 class _Taken(NamedTuple):
@@ -260,7 +248,7 @@ class _LogAssembly:
         preintegrate(self.whole.imu, *parts, stops, first_stop, rows, snapshots)
         return rows, snapshots
 
-    def _extras(self, taken: _Taken) -> tuple[Bools, dict[int, _Extra]]:
+    def _extras(self, taken: _Taken) -> tuple[Bools, dict[int, Extra]]:
         """Which measurements are kept, shape (m,), and of those what has no place in a row, by their place then."""
         found, kept, extras = taken.found, np.ones(len(taken.ping), bool), {}
         lags = [self.time_offsets.lag(stream.sensor) for stream in found.streams]
@@ -284,7 +272,7 @@ class _LogAssembly:
                     self.left_out[stream.sensor, STILL_IN_VIEW] += 1
                     kept[j] = False
                     continue
-            extras[j] = _Extra(window, landmark)
+            extras[j] = Extra(window, landmark)
         place = np.cumsum(kept) - 1
         return kept, {int(place[j]): extra for j, extra in extras.items()}
 
@@ -312,7 +300,7 @@ class _LogAssembly:
         return rows
 
     def _intervals(
-        self, dive: DiveRows, rows: Array, taken: _Taken, extras: Mapping[int, _Extra], stops: Array, first_stop: Index
+        self, dive: DiveRows, rows: Array, taken: _Taken, extras: Mapping[int, Extra], stops: Array, first_stop: Index
     ) -> Iterator[KeyframeInterval]:
         """The intervals, whose numbers are views of ``dive`` and of ``rows``."""
         found, streams = taken.found, taken.found.streams
@@ -320,15 +308,10 @@ class _LogAssembly:
         for k, stream in enumerate(streams):
             own = found.which == k
             line[own] = stream.row[found.index[own]]
-        sensors, dims = [s.sensor for s in streams], {s: i.model.dim for s, i in self.instruments.items()}
-        columns = (a.tolist() for a in (found.which, taken.keyframe, self.segment[taken.keyframe], line))
-        scales = dive.row_scales if self.scaled else [None] * len(line)
-        measurements = [
-            KeyframeMeasurement(sensors[which], keyframe, segment, row, dims[sensors[which]], own, None, scale)
-            for which, keyframe, segment, row, own, scale in zip(*columns, rows, scales, strict=True)
-        ]
-        for j, extra in extras.items():
-            measurements[j] = replace(measurements[j], window=extra.window, landmark=extra.landmark)
+        sensors, scales = [s.sensor for s in streams], dive.row_scales if self.scaled else None
+        dims = [self.instruments[s].model.dim if s in self.instruments else 0 for s in sensors]
+        columns = found.which, taken.keyframe, line, self.segment
+        table = MeasurementTable(sensors, dims, *columns, rows, scales, extras)
         stop, begin = first_stop.tolist(), [0, *dive.taken.tolist()]
         times, parts = self.keys.time.tolist(), zip(self.first.tolist(), self.last.tolist(), strict=True)
         rate_sd, segment = self.rate_sd.tolist(), self.segment.tolist()
@@ -336,7 +319,7 @@ class _LogAssembly:
             motion, scale = None, None
             if k > 0:
                 own = stops[stop[k - 1] : stop[k]]
-                motion = Motion(dive.motions[k - 1], self.whole.imu[first:last], times[k - 1], time, own)
+                motion = Motion(dive.motions[k - 1], self.whole.samples(first, last), times[k - 1], time, own)
                 scale = dive.scales[k - 1] if self.scaled else None
-            here = measurements[begin[k] : begin[k + 1]]
+            here = MeasurementsOfInterval(table, begin[k], begin[k + 1])
             yield KeyframeInterval(k, time, segment[k], self.rate_b[k], rate_sd[k], motion, here, scale)

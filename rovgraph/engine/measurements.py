@@ -5,7 +5,7 @@ rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero wher
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 """
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 
@@ -266,7 +266,7 @@ def _cost_and_weight(d2: Array, loss: str, dim: int) -> tuple[Array, Array]:
     return rho, weight
 
 
-Seen = list[tuple[str, Block, State]]  # every sensor's block, with the state of each measurement's keyframe
+Seen = Iterable[tuple[str, Block, State]]  # every sensor's block, with the state of each measurement's keyframe
 
 
 def gates_of(seen: Seen) -> Gates:

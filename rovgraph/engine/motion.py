@@ -1,6 +1,7 @@
 """The IMU's preintegrated motion between two keyframes, and to measurements in between."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,6 +9,33 @@ from rovgraph.geometry import Array, exp_rotation
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.motion import LONGEST_BRIDGED_S
 from rovgraph.kernels.preintegration import integrated_steps
+from rovgraph.log import Stream
+
+
+class SamplesOfLog(NamedTuple):
+    """Samples ``first`` to before ``last`` of a log's IMU, which are not kept in body axes beside it.
+
+    Attributes
+    ----------
+    stream : the IMU's
+    R_sb : ndarray, shape (3, 3), from body axes to the IMU's
+    """
+
+    stream: Stream
+    R_sb: Array
+    first: int
+    last: int
+
+    def in_body(self) -> Array:
+        """As of `Motion`, shape (m, 7)."""
+        own = slice(self.first, self.last)
+        return np.column_stack([self.stream.time[own], in_body(self.stream.data[own, :6], self.R_sb)])
+
+
+def in_body(values: Array, R_sb: Array) -> Array:
+    """Specific force and rate, shape (..., 6), from the IMU's axes to the body's."""
+    # sample by sample, so that one alone comes out as it does among many
+    return (values.reshape(-1, 2, 3) @ R_sb).reshape(values.shape)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -17,13 +45,13 @@ class Motion:
     Attributes
     ----------
     row : ndarray, shape (ROW,), as `rovgraph.kernels.motion_row` lays it out: what kernels take
-    imu : ndarray, shape (m, 7), samples that cover it: time, specific force, rate in body axes
+    samples : ndarray, shape (m, 7), that cover it: time, specific force, rate in body axes; or their place in a log
     start, end : of the interval [s]
     stops : ndarray, shape (k,), times of measurements in it, where a step of the integration ends [s]
     """
 
     row: Array
-    imu: Array
+    samples: "Array | SamplesOfLog"
     start: float
     end: float
     stops: Array
@@ -85,7 +113,8 @@ class Motion:
 
     def steps(self) -> Array:
         """What it was integrated from, shape (s, 8): end of each step, its length, specific force, rate."""
-        return integrated_steps(self.imu, self.start, self.stops, self.end, np.ascontiguousarray(self.bias))
+        imu = self.samples.in_body() if isinstance(self.samples, SamplesOfLog) else self.samples
+        return integrated_steps(imu, self.start, self.stops, self.end, np.ascontiguousarray(self.bias))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

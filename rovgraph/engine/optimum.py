@@ -120,12 +120,9 @@ class Optimum(Protocol):
         ...
 
 
-def residual_states(optimum: Optimum) -> dict[str, State]:
-    """Sensor -> State of each measurement's keyframe, with the place that it sees, where it sees one."""
-    return {
-        sensor: block.with_places(optimum.state.at(block.keyframe), optimum.places)
-        for sensor, block in optimum.blocks.items()
-    }
+def residual_state(optimum: Optimum, block: Block) -> State:
+    """State of each measurement's keyframe, with the place that it sees, where it sees one."""
+    return block.with_places(optimum.state.at(block.keyframe), optimum.places)
 
 
 def joint_prior_sd(optimum: Optimum, keyframe: int) -> dict[str, Array]:

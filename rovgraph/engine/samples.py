@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.config import Config, mount_matrix
-from rovgraph.engine.motion import Motion
+from rovgraph.engine.motion import Motion, in_body
 from rovgraph.engine.noise_floor import NoiseFloor
 from rovgraph.engine.preintegration import (
     KNOCK,
@@ -194,12 +194,6 @@ class Samples:
         """Take other noise densities, where they differ enough to matter."""
         if max(abs(acc / self._noise[0] - 1.0), abs(gyr / self._noise[1] - 1.0)) > 0.05:
             self._noise, self.params = (acc, gyr), preintegration_params(self._config, acc, gyr)
-
-
-def in_body(values: Array, R_sb: Array) -> Array:
-    """Specific force and rate, shape (..., 6), from the IMU's axes to the body's."""
-    # sample by sample, so that one alone comes out as it does among many
-    return (values.reshape(-1, 2, 3) @ R_sb).reshape(values.shape)
 
 
 def longest_regular(periods: Sequence[float]) -> float:

@@ -7,6 +7,8 @@ Jacobian and s = (A'A)^-1 u the covariance of all variables with the position al
 
 and each term is what row i brings. What is considered, not estimated (Schmidt), adds the square of its effect times
 its prior's variance.
+
+A long dive is gone through in pieces: what is eliminated of it, and the Jacobians of its measurements, are large.
 """
 
 import numpy as np
@@ -18,6 +20,7 @@ from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_layout import COLUMNS, MOTION
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.measurements import Block
+from rovgraph.engine.pieces import pieces
 from rovgraph.engine.widened_chain import widened
 from rovgraph.geometry import Array, transpose
 from rovgraph.kernels import chain_posterior
@@ -43,12 +46,13 @@ def variance_sources(best: ChainOptimum, keyframe: int) -> dict[str, float]:
     u[POSITION] = best.state.R_nb[keyframe].T[:, :2]
     found: dict[str, float] = {}
     x, y = _covariance_with(root, keyframe, u, held)
+    effect = u.T @ _by_held(root, keyframe, held)
+    del root
     for own_x, own_y in zip(np.moveaxis(x, 2, 0), y.T, strict=True):
         step = ChainStep(np.ascontiguousarray(own_x), own_y)
         for source, variance in [*_of_noise(wide, best.state, step), *_of_measurements(wide, best, step)]:
             found[source] = found.get(source, 0.0) + variance
     if held:
-        effect = u.T @ _by_held(root, held)[keyframe]
         sd = np.concatenate([np.full(TABLE[name].dim, best.beliefs[name].sd) for name in names])
         brought = np.sum((effect * sd) ** 2, axis=0)
         ends = np.cumsum([TABLE[name].dim for name in names])
@@ -64,12 +68,14 @@ def _covariance_with(root: SquareRoot, keyframe: int, u: Array, held: int) -> tu
     """
     (n, d), c = root.conditionals.shape[:2], len(root.border)
     free, later = c - held, root.conditionals[keyframe:]
-    inverse = transpose(np.asarray(np.linalg.inv(later[:, :, :d]), dtype=float))
-    onward = -inverse[1:] @ transpose(later[:-1, :, d : 2 * d])
     z = np.zeros((n, d, u.shape[1]))
-    z[keyframe] = inverse[0] @ u
-    for k, carry in enumerate(onward, keyframe + 1):
-        z[k] = carry @ z[k - 1]
+    z[keyframe] = _inverse_transposed(later[:1, :, :d])[0] @ u
+    for part in pieces(keyframe + 1, n):
+        before = slice(part.start - 1, part.stop - 1)
+        S = transpose(root.conditionals[before, :, d : 2 * d])
+        onward = -_inverse_transposed(root.conditionals[part, :, :d]) @ S
+        for k, carry in enumerate(onward, part.start):
+            z[k] = carry @ z[k - 1]
     y = np.zeros((c, u.shape[1]))
     if free:
         rest = -np.einsum("kdc,kdm->cm", later[:, :, 2 * d : 2 * d + free], z[keyframe:])
@@ -79,16 +85,20 @@ def _covariance_with(root: SquareRoot, keyframe: int, u: Array, held: int) -> tu
     return z, y
 
 
-def _by_held(root: SquareRoot, held: int) -> Array:
-    """Derivative of the keyframes by what is held in the border, shape (n, d, held)."""
-    free, (n, d) = len(root.border) - held, root.conditionals.shape[:2]
+def _inverse_transposed(R: Array) -> Array:
+    return transpose(np.asarray(np.linalg.inv(R), dtype=float))
+
+
+def _by_held(root: SquareRoot, keyframe: int, held: int) -> Array:
+    """Derivative of a keyframe by what is held in the border, shape (d, held)."""
+    free, later = len(root.border) - held, root.conditionals[keyframe:]
     y = np.zeros((len(root.border), held))
     y[free:] = np.eye(held)
     if free:
         y[:free] = -solve_triangular(root.border[:free, :free], root.border[:free, free:-1])
-    x = np.zeros((n, d, held))
-    chain_posterior.back_substitute(root.conditionals, y, x)
-    return x
+    x = np.zeros((*later.shape[:2], held))
+    chain_posterior.back_substitute(later, y, x)
+    return np.asarray(x[0])
 
 
 def _of_noise(chain: Chain, point: State, step: ChainStep) -> list[tuple[str, float]]:
@@ -110,10 +120,14 @@ def _of_noise(chain: Chain, point: State, step: ChainStep) -> list[tuple[str, fl
 
 def _of_measurements(chain: Chain, best: ChainOptimum, step: ChainStep) -> list[tuple[str, float]]:
     """What each sensor's noise brings, by its weighted Jacobians."""
-    return [
-        (sensor, _squares(_along(chain, block, block.weighted(state, best.solution.gates[sensor])[1], step)))
-        for sensor, block, state in chain.seen(best.state, best.chain.blocks)
-    ]
+    out = []
+    for sensor, block in best.chain.blocks.items():
+        moved, gate = np.empty(block.z.shape), best.solution.gates[sensor]
+        for part in pieces(0, len(block)):
+            own = block.at(part)
+            moved[part] = _along(chain, own, own.weighted(best.state.at(own.keyframe), gate[part])[1], step)
+        out.append((sensor, _squares(moved)))
+    return out
 
 
 def _along(chain: Chain, block: Block, H: dict[str, Array], step: ChainStep) -> Array:

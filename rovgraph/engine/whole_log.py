@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from rovgraph.config import Config, mount_matrix
 from rovgraph.engine.admission import admitted
-from rovgraph.engine.samples import PERIODS, in_body, longest_regular, too_long
+from rovgraph.engine.motion import SamplesOfLog
+from rovgraph.engine.samples import PERIODS, longest_regular, too_long
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
@@ -117,10 +118,10 @@ class WholeLog:
         left_out: Counter[tuple[str, str]],
     ) -> None:
         self._config, self._time_offsets, self._left_out = config, time_offsets, left_out
+        self._R_sb = mount_matrix(config.imu.mount_rpy_deg).T
         self.imu, self._stream = np.empty((0, 7)), log.streams.get("imu")
         if self._stream is not None and len(self._stream):
-            R_sb = mount_matrix(config.imu.mount_rpy_deg).T
-            self.imu = np.column_stack([self._stream.time, in_body(self._stream.data[:, :6], R_sb)])
+            self.imu = self.samples(0, len(self._stream)).in_body()
         self._check_gaps()
         self.begin, self.end = np.inf, -np.inf
         if len(self.imu):
@@ -132,6 +133,11 @@ class WholeLog:
             if sensor in instruments and sensor != "thruster":
                 mask = admitted(sensor, stream.data, config, left_out)
                 self._streams.append(stream if mask.all() else stream.take(mask))
+
+    def samples(self, first: int, last: int) -> SamplesOfLog:
+        """Some of the IMU's, as a `Motion` refers to them."""
+        assert self._stream is not None
+        return SamplesOfLog(self._stream, self._R_sb, first, last)
 
     def longest_step(self, count: Index) -> Array:
         """Step between two samples that is no gap, as it is known after so many samples [s]."""

@@ -14,6 +14,7 @@ from rovgraph.calibration import Belief
 from rovgraph.config import mount_matrix
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.measurements import Block
+from rovgraph.engine.pieces import pieces
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, rotate
@@ -52,6 +53,9 @@ class _WidenedChain(Chain):
 
     @cached_property
     def given(self) -> dict[str, Block]:
+        given = self._unknown_to_kernels
+        if given <= self.timed.keys():  # in the order in which they measure first, as of all blocks
+            return {sensor: block for sensor, block in self.timed.items() if sensor in given}
         return {sensor: self.timed.get(sensor, block) for sensor, block in super().given.items()}
 
 
@@ -60,6 +64,11 @@ class _TimedBlock(Block):
     """A block whose stamps may be late: ``slope``, shape (n, dim), is how a prediction changes with time."""
 
     slope: Array | None = None
+
+    def at(self, index: slice | Array) -> "_TimedBlock":
+        some, slope = super().at(index), self.slope
+        assert isinstance(some, _TimedBlock) and slope is not None
+        return replace(some, slope=slope[index])
 
     def predict(self, state: State) -> tuple[Array, Jacobians]:
         predicted, H = super().predict(state)
@@ -73,11 +82,13 @@ def _timed(block: Block, wide: Unknowns, chain: Chain, state: State) -> _TimedBl
     wider = replace(block, unknowns=wide.of([*block.instrument.calibration, *scales]))
     model, time, rate_b = block.instrument.model, chain.rows.time, np.array([i.rate_b for i in chain.intervals])
     before = np.maximum(block.keyframe - (block.motion.dt < SHORT_S), 0)
-    after = np.minimum(block.keyframe + 1, len(time) - 1)
-    here, there = state.at(before), state.at(after)
-    there = replace(there, calibration=here.calibration)  # errors that come and go are no motion
-    begin, end = model.predict(here, rate_b[before])[0], model.predict(there, rate_b[after])[0]
-    slope = np.asarray(innovation(model, end, begin) / np.maximum(time[after] - time[before], 1e-6)[:, None])
+    after, slope = np.minimum(block.keyframe + 1, len(time) - 1), np.empty(block.z.shape)
+    for part in pieces(0, len(block)):
+        k, j = before[part], after[part]
+        here, there = state.at(k), state.at(j)
+        there = replace(there, calibration=here.calibration)  # errors that come and go are no motion
+        begin, end = model.predict(here, rate_b[k])[0], model.predict(there, rate_b[j])[0]
+        slope[part] = innovation(model, end, begin) / np.maximum(time[j] - time[k], 1e-6)[:, None]
     return _TimedBlock(**{f.name: getattr(wider, f.name) for f in fields(Block)}, slope=slope)
 
 

@@ -23,6 +23,7 @@ from rovgraph.estimators.unstated_noise import UnstatedNoise, find_noise
 from rovgraph.estimators.unstated_noise import changed as with_noise
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
+from rovgraph.process import give_back
 from rovgraph.progress import Progress, no_progress
 from rovgraph.trajectory import Trajectory
 
@@ -96,11 +97,13 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
         if not more:
             break
         found, config = found + more, with_noise(config, more)
-        best = None  # a long dive is not kept twice
+        del dive, best  # a long dive is not kept twice
         dive, best = _solve(log, config, frozen, gaps, estimate, progress)
         if more[-1].lasts:
             break
     if isinstance(best, ChainOptimum):
+        best = ChainOptimum(replace(best.chain), best.solution)  # without what it keeps at hand, which is large
+        give_back()
         dive = _with_main(dive, variance_sources=_sources_where_largest(dive.estimates[0].trajectory, best))
     return _saying(dive, found) if found else dive
 
@@ -138,16 +141,19 @@ def _solve(
             estimates.append(solver.filtered())
     else:
         estimates, states, best = [], None, None
-        if estimate != "smoothed":
-            passed = _filter(batch, progress)
+        passed = _filter(batch, progress) if estimate != "smoothed" else None
+        batch.forget_motion_covariances()
+        if passed is not None:
             estimates.append(passed.solve())
             states = None if batch.measurements else passed.states()  # where the filter went is close by
-            del passed  # of a long dive it is large
+            passed = None  # of a long dive it is large
+        give_back()
         if estimate != "filtered":
             progress("smoothing", 0.5)
             best = batch.optimum(states)
+            del states
             estimates.insert(0, smoothed(best, initial))
-            best.forget_covariances()  # of a long dive they are large
+            give_back()
     intervals = batch.intervals if best is None else best.intervals
     numbers = statistics(Evidence(initial, estimates, intervals, best, frozen, gaps))
     left_out = _left_out(batch, frozen, gaps)
@@ -164,6 +170,7 @@ def assemble(log: Log, initial: InitialConditions) -> BatchSmoother:
     """All keyframes of a log and what lies between them."""
     batch = BatchSmoother(initial)
     batch.take(log)
+    give_back()
     return batch
 
 

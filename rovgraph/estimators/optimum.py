@@ -34,7 +34,8 @@ def optimum(
     ------
     InputError : the data do not determine some variable, which is named
     """
-    if any(m.sensor == PLACE for interval in intervals for m in interval.measurements):
+    used = rows.used if rows else {m.sensor for interval in intervals for m in interval.measurements}
+    if PLACE in used:
         from rovgraph.graph.places import smooth_graph  # GTSAM is slow to load, and not everywhere to be had
 
         best: Optimum = smooth_graph(intervals, initial, states, calibration)

@@ -1,6 +1,6 @@
 """From GTSAM values and covariances to an `Estimate` of the body's origin."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -36,7 +36,7 @@ def body_trajectory(
     cov_pose : ndarray, shape (n, 6, 6), in GTSAM's tangent space, or None
     cov_velocity : ndarray, shape (n, 3, 3), in n, or None
     """
-    R, lever_arm_b = states.R_nb, np.asarray(lever_arm_b, dtype=float)
+    R, lever_arm_b = np.ascontiguousarray(states.R_nb), np.asarray(lever_arm_b, dtype=float)
     time = np.array([i.time for i in intervals])
     rate_b = np.array([i.rate_b for i in intervals])
     rate_sd = np.array([i.rate_sd for i in intervals])[:, None, None]
@@ -104,30 +104,28 @@ def bias_histories(time: Array, bias: Array, sd: Array, sensors: Sequence[str]) 
         return {}
     acc, gyr = (tuple(f"{s}_bias{c}" for c in _XYZ) for s in ("acc", "gyr"))
     return {
-        "acc_bias": History(acc, "m/s2", time, bias[:, :3], sd[:, :3]),
-        "gyr_bias": History(gyr, "rad/s", time, bias[:, 3:], sd[:, 3:]),
+        "acc_bias": History(acc, "m/s2", time, bias[:, :3].copy(), sd[:, :3].copy()),
+        "gyr_bias": History(gyr, "rad/s", time, bias[:, 3:].copy(), sd[:, 3:].copy()),
     }
 
 
 def calibration_history(name: str, time: Array, value: Array, sd: Array) -> History:
     """A calibration variable against time; ``value`` and ``sd`` have shape (n, dim)."""
-    return History(TABLE[name].labels, TABLE[name].unit, time, value, sd)
+    # copies: views would keep all the rest of what a filter has found
+    return History(TABLE[name].labels, TABLE[name].unit, time, value.copy(), sd.copy())
 
 
-def residual_frame(
-    blocks: Mapping[str, Block], keyframes: Mapping[str, State], weights: Mapping[str, Array]
-) -> pd.DataFrame:
+def residual_frame(measured: Iterable[tuple[str, Block, State, Array]] = ()) -> pd.DataFrame:
     """Innovation, normalised innovation and weight of every measurement, in order of time.
 
     Parameters
     ----------
-    blocks : sensor -> Block
-    keyframes : sensor -> State of each measurement's keyframe
-    weights : sensor -> ndarray, shape (n,)
+    measured : sensor, its n measurements, State of each one's keyframe, their weights of shape (n,); they may be made
+        one after the other, as those of a long dive are large
     """
     parts: dict[str, list[ArrayLike]] = {}
-    for sensor, block in blocks.items():
-        predicted = block.predicted(keyframes[sensor])
+    for sensor, block, state, weight in measured:
+        predicted = block.predicted(state)
         nu = innovation(block.instrument.model, block.z, predicted)
         normalised = np.einsum("nij,nj->ni", block.W, nu)
         sd = np.sqrt(np.diagonal(np.linalg.inv(transpose(block.W) @ block.W), axis1=1, axis2=2))
@@ -141,7 +139,7 @@ def residual_frame(
                 "innovation": nu[:, k],
                 "sd": sd[:, k],
                 "normalised": normalised[:, k],
-                "weight": weights[sensor],
+                "weight": weight,
                 "row": block.line,
             }
             for name, values in columns.items():

@@ -14,7 +14,7 @@ from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.log_assembly import assemble_log
-from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd, residual_states
+from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
@@ -29,7 +29,7 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.log import Log, Measurement
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.state import BIAS, PLACE, POSE, VELOCITY, State
 
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
 PLACED_WITHIN_S = 0.02  # the IMU adds next to no noise over that time
@@ -84,6 +84,11 @@ class BatchSmoother:
         if self._rows is None or len(self._rows) != len(self.intervals):
             self._rows = DiveRows.of(self.intervals, [*self.initial.instruments])
         return self._rows
+
+    def forget_motion_covariances(self) -> None:
+        """Free the memory of what a filter needs, and GTSAM's graph of a dive that sees places, but not the chain."""
+        if self._rows is not None and PLACE not in self._rows.used:
+            self._rows = self._rows.without_covariances(self.intervals)
 
     def add(self, measurement: Measurement) -> list[KeyframeInterval]:
         """Take a measurement; times must not decrease."""
@@ -148,7 +153,7 @@ class BatchSmoother:
         means = {name: belief.mean for name, belief in beliefs(b.config).items()}
         states = dead_reckon(self.intervals, b, means)
         trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)
-        return Estimate("dead_reckoning", trajectory, [], {}, residual_frame({}, {}, {}))
+        return Estimate("dead_reckoning", trajectory, [], {}, residual_frame())
 
 
 def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
@@ -181,6 +186,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
         spread[name] = best.covariances(name)[-1]
         both = np.tile(final[name], (2, 1)), np.tile(np.sqrt(np.diag(spread[name])), (2, 1))
         history[name] = calibration_history(name, trajectory.time[ends], *both)
+    best.forget_covariances()  # of a long dive they are large
     return Estimate(
         "smoothed",
         trajectory,
@@ -188,7 +194,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             best.beliefs, [s for s in b.streams if s in {*best.blocks, "imu"}], final, spread, relative
         ),
         history,
-        residual_frame(best.blocks, residual_states(best), best.weights),
+        residual_frame((s, b, residual_state(best, b), best.weights[s]) for s, b in best.blocks.items()),
         {
             "keyframes": n,
             "cost": best.solution.cost,

@@ -221,7 +221,10 @@ def absorb(
 
 @helper
 def pass_on(k: int, n: int, room: Room, conditionals_out: Array) -> int:
-    """Eliminate keyframe k from W; what is left is known of the one after it. Returns what is not determined, or -1."""
+    """Eliminate keyframe k from W; what is left is known of the one after it. Returns what is not determined, or -1.
+
+    Of its conditional only R's diagonal is kept where there is room for one column.
+    """
     W, d = room.W, room.W.shape[0] // 2
     c = room.scale.shape[0] - d
     if k < n - 1:
@@ -229,6 +232,10 @@ def pass_on(k: int, n: int, room: Room, conditionals_out: Array) -> int:
         append_rows(W, d, 2 * d, d, d + c + 1, 0, room.V)
     # before the last keyframe, where scale is that of the next by now, a motion determines all that is a number
     failing, row = undetermined(W, room.scale, 0, d, k * d), min(k, conditionals_out.shape[0] - 1)
+    if conditionals_out.shape[2] == 1:
+        for i in range(d):
+            conditionals_out[row, i, 0] = W[i, i]
+        return failing
     for i in range(d):
         for j in range(2 * d + c + 1):
             conditionals_out[row, i, j] = W[i, j]

@@ -1,6 +1,6 @@
 """What a filter has found on its way through a dive, and the estimate that comes of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,12 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array
+from rovgraph.process import give_back
 from rovgraph.state import BIAS, POSE, VELOCITY, State
 
-Row = tuple[Array, Array, Array, Array, Array]  # state, calibration, covariances of pose and velocity, sd of the error
+# of some keyframes, their number first in every shape: state, calibration, covariances of pose and velocity, sd of the
+# error
+Columns = tuple[Array, Array, Array, Array, Array]
 
 
 class FilterHistory:
@@ -37,58 +40,65 @@ class FilterHistory:
 
     def __init__(self, engine: FilterEngine) -> None:
         self._engine = engine
-        self._rows: list[Row] = []
+        self._pieces: list[Columns] = []
         self._processed: dict[str, list[ProcessedMeasurement]] = {}
         self.intervals: list[KeyframeInterval] = []
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.intervals)
 
     def append(self, interval: KeyframeInterval, known: Gaussian, processed: Sequence[ProcessedMeasurement]) -> None:
         """Take the next keyframe."""
         self.intervals.append(interval)
-        self._rows.append(self._row(known))
+        self._pieces.append(self._columns(known))
         for one in processed:
             self._processed.setdefault(one.measurement.sensor, []).append(one)
 
     def extend(self, intervals: Sequence[KeyframeInterval], run: FilterRun) -> None:
         """Take the intervals that a filter has run through."""
-        columns = zip(run.x, run.c, run.pose, run.velocity, run.sd, strict=True)
         met = zip(run.nis.tolist(), run.weight.tolist(), strict=True)
-        for k, (interval, row) in enumerate(zip(intervals, columns, strict=True)):
-            before, predicted = self._rows[-1][:2], (run.predicted_x[k], run.predicted_c[k])
-            self.intervals.append(interval)
-            self._rows.append(row)
+        before = self._pieces[-1][0][-1], self._pieces[-1][1][-1]
+        for k, interval in enumerate(intervals):
+            predicted = run.predicted_x[k], run.predicted_c[k]
             for m in interval.measurements:
                 x, c = before if m.keyframe < interval.index else predicted
                 nis, weight = next(met)
                 self._processed.setdefault(m.sensor, []).append(ProcessedMeasurement(m, x, c, nis, weight))
+            before = run.x[k], run.c[k]
+        self.intervals += intervals
+        if len(intervals):
+            self._pieces.append((run.x, run.c, run.pose, run.velocity, run.sd))
 
     def replace_last(self, known: Gaussian) -> None:
         """Take another estimate of the newest keyframe."""
-        self._rows[-1] = self._row(known)
+        x, c, pose, velocity, sd = self._pieces.pop()
+        self._pieces += [(x[:-1], c[:-1], pose[:-1], velocity[:-1], sd[:-1]), self._columns(known)]
 
     @property
     def states(self) -> State:
         """Of n keyframes; calibration has shape (n, dim)."""
-        return states_of(np.array([row[0] for row in self._rows]), np.array([row[1] for row in self._rows]))
+        x, c = (np.concatenate([piece[column] for piece in self._pieces]) for column in range(2))
+        return states_of(x, c)
 
     def estimate(self, kind: str) -> Estimate:
         """The filtered estimate of every keyframe."""
-        return self._estimate(kind, self._rows, None)
+        self._pieces = [_joined(self._pieces)]  # of a long dive they are not kept twice
+        give_back()
+        return self._estimate(kind, self._pieces[0], None)
 
     def smoothed(self, kind: str, known: Sequence[Gaussian]) -> Estimate:
         """The estimate of every keyframe that a smoother has found."""
-        return self._estimate(kind, [self._row(one) for one in known], stack_states(known))
+        return self._estimate(kind, _joined([self._columns(one) for one in known]), stack_states(known))
 
-    def _row(self, known: Gaussian) -> Row:
+    def _columns(self, known: Gaussian) -> Columns:
+        """Of one keyframe."""
         size, columns, P = self._engine.layout.size, self._engine.layout.columns, known.covariance
         pose, velocity = (P[columns[v], columns[v]].copy() for v in (POSE, VELOCITY))
-        return known.x, known.c, pose, velocity, np.sqrt(np.diagonal(P)[:size])
+        return known.x[None], known.c[None], pose[None], velocity[None], np.sqrt(np.diagonal(P)[:size])[None]
 
-    def _estimate(self, kind: str, rows: Sequence[Row], smoothed: State | None) -> Estimate:
+    def _estimate(self, kind: str, found: Columns, smoothed: State | None) -> Estimate:
         """An estimate; residuals are those before the measurements entered where nothing was smoothed."""
-        x, c, pose, velocity, sd = (np.array([row[k] for row in rows]) for k in range(5))
+        x, c, pose, velocity, sd = found
         engine, states = self._engine, states_of(x, c)
         columns, estimated = engine.layout.columns, engine.unknowns.estimated
         arm = engine.initial.config.imu.lever_arm_m
@@ -100,22 +110,18 @@ class FilterHistory:
         sensors = [s for s in engine.initial.streams if s in {*self._processed, "imu"}]
         last = {name: value[-1] for name, value in states.calibration.items()}
         calibration = calibration_estimates(engine.beliefs, sensors, last, final)
-        residuals = residual_frame(*self._residuals(smoothed))
+        residuals = residual_frame(self._measured(smoothed))
         return Estimate(kind, trajectory, calibration, history, residuals, self._summary())
 
-    def _residuals(
-        self, smoothed: State | None
-    ) -> tuple[Mapping[str, Block], Mapping[str, State], Mapping[str, Array]]:
-        """Measurements, the states they are compared with, and their weights."""
-        blocks, here, weights = {}, {}, {}
+    def _measured(self, smoothed: State | None) -> Iterator[tuple[str, Block, State, Array]]:
+        """Each sensor's measurements, the states they are compared with, and their weights."""
         for sensor, rows in self._processed.items():
-            blocks[sensor] = block = self._engine.block([one.measurement for one in rows])
-            here[sensor] = stack_states(rows) if smoothed is None else smoothed.at(block.keyframe)
+            block = self._engine.block([one.measurement for one in rows])
+            here = stack_states(rows) if smoothed is None else smoothed.at(block.keyframe)
             places = [one.place for one in rows if one.place is not None]
             if places:
-                here[sensor] = here[sensor].seeing(np.array(places))
-            weights[sensor] = np.array([one.weight for one in rows])
-        return blocks, here, weights
+                here = here.seeing(np.array(places))
+            yield sensor, block, here, np.array([one.weight for one in rows])
 
     def _summary(self) -> dict[str, Any]:
         """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
@@ -130,3 +136,9 @@ class FilterHistory:
             }
         bridged = sum(interval.bridged for interval in self.intervals)
         return {"keyframes": len(self.intervals), "nis": nis, "bridged_intervals": bridged}
+
+
+def _joined(pieces: Sequence[Columns]) -> Columns:
+    """Of all keyframes."""
+    x, c, pose, velocity, sd = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    return x, c, pose, velocity, sd
