@@ -22,8 +22,9 @@ It solves a dive some dozens of times. Of a long dive it solves the part around 
 """
 
 import math
+import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Protocol
 
@@ -92,11 +93,40 @@ class Partition(Protocol[Point, Step]):
         ...
 
 
+@dataclass
+class Searches:
+    """What was found in a dive, for other solutions of it as configured the same.
+
+    A search depends on where it begins, which is an optimum. Optima with the same gates are the same one, from
+    wherever they were found, so that what was found from one of them holds for the others.
+
+    Attributes
+    ----------
+    saved_s : processor time of the searches that were not made again [s]
+    """
+
+    saved_s: float = 0.0
+    _found: dict[tuple[bytes, ...], tuple[Solution[Any], float]] = field(default_factory=dict)
+
+    def from_optimum(self, best: Solution[Point], search: Callable[[], Solution[Point]]) -> Solution[Point]:
+        """What ``search`` returns, which begins at an optimum, or returned before."""
+        key = tuple(gate.tobytes() for gate in best.gates.values())
+        if key in self._found:
+            found, spent = self._found[key]
+            self.saved_s += spent
+            return found
+        began = clock.process_time()
+        found = search()
+        self._found[key] = found, clock.process_time() - began
+        return found
+
+
 def solve(
     problem: Linearizable[Point, Step],
     point: Point,
     freed: Callable[[Point], Linearizable[Point, Step]] | None = None,
     partition: Partition[Point, Step] | None = None,
+    searches: Searches | None = None,
 ) -> Solution[Point]:
     """The cheapest optimum of a dive: from ``point``, and without stretches in which a sensor contradicts the others.
 
@@ -106,6 +136,7 @@ def solve(
     freed : the dive, from where it is linearised, with what ``problem`` holds and does not know exactly estimated: an
         error that a mounting explains is no stretch's
     partition : makes the parts of a long dive in which stretches are sought; None = they are sought in all of it
+    searches : that were made for other solutions of the same dive, as configured the same
 
     Raises
     ------
@@ -114,12 +145,17 @@ def solve(
     best = minimise(problem, point)
     if not _bursts(problem.measured(), best):
         return best
-    if freed is None:
-        found = _without_stretches(problem, best, partition)
-        return resume(problem, found.point, found) if found.stretches else found
-    free = freed(best.point)
-    found = _without_stretches(free, minimise(free, best.point, best.gates), partition)
-    return resume(problem, best.point, found) if found.stretches else replace(best, runner_up=found.runner_up)
+
+    def search() -> Solution[Point]:
+        if freed is None:
+            return _without_stretches(problem, best, partition)
+        free = freed(best.point)
+        return _without_stretches(free, minimise(free, best.point, best.gates), partition)
+
+    found = search() if searches is None else searches.from_optimum(best, search)
+    if not found.stretches:
+        return replace(best, runner_up=found.runner_up)
+    return resume(problem, found.point if freed is None else best.point, found)
 
 
 def _without_stretches(
