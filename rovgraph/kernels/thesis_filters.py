@@ -52,9 +52,7 @@ def evaluate_polynomials(c: Array, places: Index, factors: Index, x: Array, y_ou
 
 
 @kernel("void(f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1])")
-def step_polynomials(
-    c: Array, places: Index, factors: Index, x: Array, dt: Array, x_out: Array, F_out: Array
-) -> None:
+def step_polynomials(c: Array, places: Index, factors: Index, x: Array, dt: Array, x_out: Array, F_out: Array) -> None:
     """Forward Euler of x' = y(x) over times of each filter, shape (filters,) [s]; shapes (filters, n), (.., n, n)."""
     n = x.shape[1]
     x_out[:], F_out[:] = 0.0, 0.0
