@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from broken import BROKEN, FROM, changed_data
 from dives import Simulated, altered, batch, falcon, interrupted, position_errors, rms, simulated, smoothed
+from numpy.testing import assert_array_equal
 
 import rovgraph as rg
 from rovgraph.config import beliefs
@@ -76,6 +77,21 @@ def test_with_a_biased_stretch_the_track_is_as_good_as_without_its_pings(seed):
     silent = interrupted(case.log, float(log["imu"].time[0]) + FROM, BIASED_S, "dvl")
     errors = [rms(position_errors(smoothed(one, case.config).trajectory, case)) for one in (log, silent)]
     assert errors[0] <= 1.5 * errors[1]
+
+
+@pytest.mark.slow
+def test_solutions_of_a_dive_with_the_same_gates_share_the_search(case, monkeypatch):
+    log = BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log)
+    dive, searches, search = batch(log, case.config), [], stretches._without_stretches
+    monkeypatch.setattr(stretches, "_without_stretches", lambda *given: searches.append(1) or search(*given))
+    first = dive.optimum()
+    again = dive.optimum()
+    assert len(searches) == 1
+    assert dive.searches.saved_s > 0.0
+    assert again.solution.stretches == first.solution.stretches != ()
+    assert_array_equal(again.state.p_n, first.state.p_n)
+    dive.optimum(first.state)  # where the biased pings are out from the start: another optimum
+    assert len(searches) == 2
 
 
 @pytest.mark.slow

@@ -5,10 +5,12 @@ Each iteration linearises all factors and eliminates them in the order of time, 
 factors are those of the graph that `rovgraph.graph` gives to GTSAM, and a test holds both optima equal.
 """
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
+from weakref import ReferenceType, ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +44,8 @@ CLONED = 3  # of the first keyframe, its attitude, that a border ends with where
 PRIORS = 3  # rows at the first keyframe that are no measurements: two priors, and the tie of its clone
 STIFF = 1e8  # square-root information that ties the clone to it [1/rad]
 
+NEWEST = 2  # points whose costs are kept: the last, and the one before it if that was better
+
 _ONE = np.ones(1)
 
 
@@ -58,6 +62,15 @@ class ChainStep:
     x: Array
     y: Array
     promised: float = 0.0
+
+
+@dataclass(frozen=True)
+class _PointCosts:
+    """A point, what its motions, walks and priors cost, and squared lengths of whitened innovations, shape (m,)."""
+
+    point: ReferenceType[State]
+    cost: float
+    squares: Array
 
 
 @dataclass(frozen=True)
@@ -154,19 +167,31 @@ class Chain:
 
     def gates(self, point: State) -> Gates:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
-        within = self._squared_lengths(point) <= self._sensors[self.rows.which, GATE] ** 2
+        within = self._at(point).squares <= self._sensors[self.rows.which, GATE] ** 2
         known = {sensor: within[places] for sensor, places in self._places.items()}
         return {**known, **gates_of(self.seen(point, self.given))}
 
     def cost(self, point: State, gates: Gates) -> float:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
-        motions = self.rows.motion_residuals(point)
-        total = 0.5 * float(np.vdot(motions, motions))
-        total += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
-        total += 0.5 * float(np.sum(self.walk_residuals(point) ** 2))
-        squares = self._squared_lengths(point)
-        total += robust_costs(squares, self.rows.which, self._sensors, self._entered(gates))
+        here = self._at(point)
+        total = here.cost + robust_costs(here.squares, self.rows.which, self._sensors, self._entered(gates))
         return total + measurement_cost(self.seen(point, self.given), gates)
+
+    def _at(self, point: State) -> "_PointCosts":
+        """What does not depend on gates; kept of the newest points, which are asked for with other gates next."""
+        known = next((one for one in self._newest if one.point() is point), None)
+        if known is None:
+            motions = self.rows.motion_residuals(point)
+            cost = 0.5 * float(np.vdot(motions, motions))
+            cost += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
+            cost += 0.5 * float(np.sum(self.walk_residuals(point) ** 2))
+            known = _PointCosts(ref(point), cost, self._squared_lengths(point))
+            self._newest.append(known)
+        return known
+
+    @cached_property
+    def _newest(self) -> "deque[_PointCosts]":
+        return deque(maxlen=NEWEST)
 
     def _squared_lengths(self, point: State) -> Array:
         """Of the whitened innovations of what kernels know, shape (m,)."""

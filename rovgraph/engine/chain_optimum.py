@@ -18,7 +18,7 @@ from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, weights_of
 from rovgraph.engine.optimum import Knowledge
-from rovgraph.engine.stretches import resume, solve
+from rovgraph.engine.stretches import Searches, resume, solve
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.engine.widened_chain import widened
 from rovgraph.geometry import Array
@@ -186,6 +186,7 @@ def smooth_chain(
     states: State,
     calibration: Mapping[str, Array] | None = None,
     rows: DiveRows | None = None,
+    searches: Searches | None = None,
 ) -> ChainOptimum:
     """Solve a dive that closes no loop.
 
@@ -195,6 +196,7 @@ def smooth_chain(
     states : State of its keyframes to begin with
     calibration : to begin with, its prior means where it is None
     rows : the dive as arrays, where they are at hand
+    searches : of other solutions of the dive, as configured the same
 
     Raises
     ------
@@ -205,4 +207,4 @@ def smooth_chain(
     chain = Chain(intervals, initial, beliefs, wanted, rows)
     held = [name for name in wanted.considered if not beliefs[name].variable.time_offset]
     freed = partial(widened, chain, names=tuple(held)) if held else None
-    return ChainOptimum(chain, solve(chain, chain.start(states, calibration), freed, window))
+    return ChainOptimum(chain, solve(chain, chain.start(states, calibration), freed, window, searches))

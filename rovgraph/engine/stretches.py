@@ -22,8 +22,9 @@ It solves a dive some dozens of times. Of a long dive it solves the part around 
 """
 
 import math
+import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Protocol
 
@@ -92,11 +93,40 @@ class Partition(Protocol[Point, Step]):
         ...
 
 
+@dataclass
+class Searches:
+    """What was found in a dive, for other solutions of it as configured the same.
+
+    A search depends on where it begins, which is an optimum. Optima with the same gates are the same one, from
+    wherever they were found, so that what was found from one of them holds for the others.
+
+    Attributes
+    ----------
+    saved_s : processor time of the searches that were not made again [s]
+    """
+
+    saved_s: float = 0.0
+    _found: dict[tuple[bytes, ...], tuple[Solution[Any], float]] = field(default_factory=dict)
+
+    def from_optimum(self, best: Solution[Point], search: Callable[[], Solution[Point]]) -> Solution[Point]:
+        """What ``search`` returns, which begins at an optimum, or returned before."""
+        key = tuple(gate.tobytes() for gate in best.gates.values())
+        if key in self._found:
+            found, spent = self._found[key]
+            self.saved_s += spent
+            return found
+        began = clock.process_time()
+        found = search()
+        self._found[key] = found, clock.process_time() - began
+        return found
+
+
 def solve(
     problem: Linearizable[Point, Step],
     point: Point,
     freed: Callable[[Point], Linearizable[Point, Step]] | None = None,
     partition: Partition[Point, Step] | None = None,
+    searches: Searches | None = None,
 ) -> Solution[Point]:
     """The cheapest optimum of a dive: from ``point``, and without stretches in which a sensor contradicts the others.
 
@@ -106,6 +136,7 @@ def solve(
     freed : the dive, from where it is linearised, with what ``problem`` holds and does not know exactly estimated: an
         error that a mounting explains is no stretch's
     partition : makes the parts of a long dive in which stretches are sought; None = they are sought in all of it
+    searches : that were made for other solutions of the same dive, as configured the same
 
     Raises
     ------
@@ -114,12 +145,17 @@ def solve(
     best = minimise(problem, point)
     if not _bursts(problem.measured(), best):
         return best
-    if freed is None:
-        found = _without_stretches(problem, best, partition)
-        return resume(problem, found.point, found) if found.stretches else found
-    free = freed(best.point)
-    found = _without_stretches(free, minimise(free, best.point, best.gates), partition)
-    return resume(problem, best.point, found) if found.stretches else replace(best, runner_up=found.runner_up)
+
+    def search() -> Solution[Point]:
+        if freed is None:
+            return _without_stretches(problem, best, partition)
+        free = freed(best.point)
+        return _without_stretches(free, minimise(free, best.point, best.gates), partition)
+
+    found = search() if searches is None else searches.from_optimum(best, search)
+    if not found.stretches:
+        return replace(best, runner_up=found.runner_up)
+    return resume(problem, found.point if freed is None else best.point, found)
 
 
 def _without_stretches(
@@ -134,22 +170,29 @@ def _without_stretches(
             break
         tried.append(burst)
         part = partition and partition(problem, best, burst.begin - REACH_S, burst.end + REACH_S)
-        found = _without_stretch_in(part, problem, best, burst) if part else _without_stretch(problem, best, burst)
+        if part:
+            found = _without_stretch_in(part, problem, best, burst)
+        else:
+            found = _without_stretch(problem, best, burst, MOST_SHARE)
         if found is not None and _right_elsewhere(problem, found):
             best, runner_up = found, min(runner_up, found.runner_up)
     return replace(best, runner_up=runner_up)
 
 
 def _without_stretch(
-    problem: Linearizable[Point, Step], best: Solution[Point], burst: Stretch
+    problem: Linearizable[Point, Step], best: Solution[Point], burst: Stretch, most: float = math.inf
 ) -> Solution[Point] | None:
-    """The cheapest of an optimum and those without a sensor around a burst; None = the rest of it fits badly, too."""
+    """The cheapest of an optimum and those without a sensor around a burst.
+
+    None = the rest of it fits badly, too, or the stretch holds more than a share ``most`` of a sensor's measurements.
+    """
     without = [_taken_out_around(problem, best, burst, sensor) for sensor in problem.measured()]
     ranked = sorted([best, *filter(None, without)], key=lambda one: one.cost)
     if _level(problem, ranked[0]) > WELL:
         return None
-    fitted = best if ranked[0] is best else _with_fitted_edges(problem, ranked[0])
-    return replace(fitted, runner_up=min((other.cost - ranked[0].cost for other in ranked[1:]), default=math.inf))
+    fitted = best if ranked[0] is best else _with_fitted_edges(problem, ranked[0], most)
+    runner_up = min((other.cost - ranked[0].cost for other in ranked[1:]), default=math.inf)
+    return fitted and replace(fitted, runner_up=runner_up)
 
 
 def _without_stretch_in(
@@ -225,22 +268,27 @@ def _taken_out_around(
     return min(filter(None, found), key=lambda one: one.cost, default=None)
 
 
-def _with_fitted_edges(problem: Linearizable[Point, Step], best: Solution[Point]) -> Solution[Point]:
+def _with_fitted_edges(
+    problem: Linearizable[Point, Step], best: Solution[Point], most: float
+) -> Solution[Point] | None:
     """The newest stretch as short as it can be at next to no cost, its edges put out where they are not sharp.
 
+    None = it turns out to hold more than a share ``most`` of the sensor's measurements, which may be clear early.
     Good measurements cost about as much as they save, so the cost is flat outside of the stretch and a wall within. An
     error that grows from nothing is there before it costs anything: the less steep the wall, the longer before.
     """
     time = problem.measured()[best.stretches[-1].sensor].time
-    for end in (False, True):
-        best = _with_fitted_edge(problem, best, time, end)
-    return best
+    begun = _with_fitted_edge(problem, best, time, end=False, most=math.inf)
+    return begun and _with_fitted_edge(problem, begun, time, end=True, most=most * len(time))
 
 
 def _with_fitted_edge(
-    problem: Linearizable[Point, Step], best: Solution[Point], time: Array, end: bool
-) -> Solution[Point]:
-    """The same for one edge: in by bisection until it is clear, then out by doubled steps until nothing shows."""
+    problem: Linearizable[Point, Step], best: Solution[Point], time: Array, end: bool, most: float
+) -> Solution[Point] | None:
+    """The same for one edge: in by bisection until it is clear, then out by doubled steps until nothing shows.
+
+    None = there are more than ``most`` measurements in it, with the other edge as it is.
+    """
     newest, least, nearest = best.stretches[-1], best.cost, best
 
     @cache  # from whichever edge was nearest when it was first asked for
@@ -251,8 +299,10 @@ def _with_fitted_edge(
 
     inside = np.flatnonzero((time >= newest.begin) & (time <= newest.end)).tolist()
     outer, inner = (inside[-1], inside[0]) if end else (inside[0], inside[-1])
-    clear = outer
+    other, clear = inner, outer
     while abs(inner - clear) > 1:
+        if abs(inner - other) > most:  # the edge that is sought lies beyond the inner one
+            return None
         middle = (inner + clear) // 2
         shorter = at(middle)
         if shorter is not None and shorter.cost <= least + CLEAR:

@@ -11,6 +11,7 @@ from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.stretches import Searches
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.engine.variance_sources import variance_sources
 from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
@@ -166,9 +167,9 @@ def _saying(dive: Dive, found: list[UnstatedNoise]) -> Dive:
     return replace(_with_main(dive, noise_found=[asdict(one) for one in found]), initial=initial)
 
 
-def assemble(log: Log, initial: InitialConditions) -> BatchSmoother:
-    """All keyframes of a log and what lies between them."""
-    batch = BatchSmoother(initial)
+def assemble(log: Log, initial: InitialConditions, searches: Searches | None = None) -> BatchSmoother:
+    """All keyframes of a log and what lies between them; ``searches`` as of `BatchSmoother`."""
+    batch = BatchSmoother(initial, searches=searches or Searches())
     batch.take(log)
     give_back()
     return batch

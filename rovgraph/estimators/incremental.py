@@ -25,6 +25,7 @@ from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMe
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.stretches import Searches
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.optimum import optimum
@@ -56,6 +57,7 @@ class IncrementalEstimator:
     ----------
     initial : of `rovgraph.estimators.initialise.initialise`
     update_s : of the dive, between updates of iSAM2; in between, the filter goes on from it [s]
+    searches : of other solutions of the dive, as configured the same
     intervals : the dive, as far as it has been taken, landmarks given to their places
     known : Gaussian of the newest keyframe
     history : the filtered estimate of every keyframe
@@ -63,6 +65,7 @@ class IncrementalEstimator:
 
     initial: InitialConditions
     update_s: float = 0.0
+    searches: Searches | None = None
 
     def __post_init__(self) -> None:
         b = self.initial
@@ -191,7 +194,7 @@ class IncrementalEstimator:
         states = self.states()
         given = self.initial, states, newest_calibration(states.calibration)
         if not self._own_places:
-            return optimum(self.intervals, *given)
+            return optimum(self.intervals, *given, searches=self.searches)
         best = associated_optimum(resolved_associations(self.intervals), *given)
         block = best.blocks[PLACE]
         if not (out := block.time[block.believed & ~best.solution.gates[PLACE]]).size:
@@ -210,9 +213,10 @@ def run_isam2(
     initial: InitialConditions,
     progress: Callable[[float], None] = lambda done: None,
     update_s: float = 0.0,
+    searches: Searches | None = None,
 ) -> IncrementalEstimator:
     """iSAM2 that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
-    estimator = IncrementalEstimator(initial, update_s)
+    estimator = IncrementalEstimator(initial, update_s, searches)
     for interval in intervals:
         estimator.step(interval)
         if interval.index % 50 == 0:

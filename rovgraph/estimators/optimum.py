@@ -8,6 +8,7 @@ from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.stretches import Searches
 from rovgraph.estimators.observability import shown
 from rovgraph.estimators.without_imu import unseen
 from rovgraph.geometry import Array
@@ -20,6 +21,7 @@ def optimum(
     states: State,
     calibration: Mapping[str, Array] | None = None,
     rows: DiveRows | None = None,
+    searches: Searches | None = None,
 ) -> Optimum:
     """Solve a dive; what is considered is estimated where the dive shows it.
 
@@ -29,6 +31,7 @@ def optimum(
     states : State of its keyframes to begin with
     calibration : to begin with, its prior means where it is None
     rows : the dive as arrays, where they are at hand
+    searches : of other solutions of the dive, as configured the same
 
     Raises
     ------
@@ -40,7 +43,7 @@ def optimum(
 
         best: Optimum = smooth_graph(intervals, initial, states, calibration)
     else:
-        best = smooth_chain(intervals, initial, states, calibration, rows)
+        best = smooth_chain(intervals, initial, states, calibration, rows, searches)
     hidden = unseen(best.blocks) if has_constant_velocity(initial.config) else []
     seen = [name for name in shown(best) if name not in hidden]
     return best.estimating(seen) if seen else best

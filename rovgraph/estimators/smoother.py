@@ -1,7 +1,7 @@
 """Batch smoothing of a whole dive."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from math import isfinite
 from typing import Any
 
@@ -15,6 +15,7 @@ from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.log_assembly import assemble_log
 from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
+from rovgraph.engine.stretches import Searches
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.estimate import Estimate
@@ -44,11 +45,13 @@ class BatchSmoother:
     ----------
     initial : of `rovgraph.estimators.initialise.initialise`
     time_offsets : how late they are; None = as the configuration believes
+    searches : for stretches of wrong measurements, shared with whoever solves the same dive
     intervals : the dive, as far as it has been taken
     """
 
     initial: InitialConditions
     time_offsets: TimeOffsets | None = None
+    searches: Searches = field(default_factory=Searches)
 
     def __post_init__(self) -> None:
         b = self.initial
@@ -121,7 +124,7 @@ class BatchSmoother:
         for _ in range(MAX_PLACINGS):
             if states is None:
                 states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
-            best = optimum(dive.intervals, b, states, calibration, dive.rows)
+            best = optimum(dive.intervals, b, states, calibration, dive.rows, dive.searches)
             found = best.state.calibration
             again = dive.placed_again(found)
             if again is None:

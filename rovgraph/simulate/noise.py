@@ -1,9 +1,9 @@
 """Noise of the thesis's sensors: full covariances, and a line in the accelerometer."""
 
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
-from scipy.signal import lfilter  # type: ignore[attr-defined]
 
 from rovgraph.gauss_markov import stationary_walk, walked
 from rovgraph.geometry import Array
@@ -75,4 +75,7 @@ def remembered(white: Array, steps: float) -> Array:
     keep, sd = walked(stationary_walk(1.0, steps), steps, 1.0)
     driven = white * sd
     driven[0] = white[0]  # it has been going on for long
-    return np.asarray(lfilter([1.0], [1.0, -float(keep)], driven, axis=0))
+    share = float(keep)
+    # scipy.signal's filter does the same, and takes longer to load than a dive to simulate
+    own = [list(accumulate(column, lambda before, new: share * before + new)) for column in driven.T.tolist()]
+    return np.column_stack(own)

@@ -2,18 +2,21 @@
 
 The first stage of a chain takes a log and a configuration, each of the others what the stage
 before made. Estimators whose chains begin alike share what those stages made (filter and
-smoother of one pass, everything that needs the same keyframes), and each is charged for the
-whole of its chain. The thesis's filters of one kind, which have no chain, run side by side over all
-dives, and each is charged for its share of that, by the seconds of its log.
+smoother of one pass, everything that needs the same keyframes), those of one configuration the
+search for stretches of wrong measurements, and each is charged for the whole of its chain. The
+thesis's filters of one kind, which have no chain, run side by side over all dives, and each is
+charged for its share of that, by the seconds of its log.
 """
 
 import itertools
 import time
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from rovgraph.config import Config
+from rovgraph.engine.stretches import Searches
 from rovgraph.errors import InputError
 from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
@@ -31,10 +34,17 @@ SHORTEST_S = 1e-3  # for which a log counts where time is shared
 
 @dataclass(frozen=True)
 class Task:
-    """What the first stage of a chain takes."""
+    """What the first stage of a chain takes.
+
+    Attributes
+    ----------
+    log, config : the dive, and what is believed of vehicle and sensors
+    searches : for stretches of wrong measurements, of all estimators with the same configuration
+    """
 
     log: Log
     config: Config
+    searches: Searches = field(default_factory=Searches)
 
 
 @dataclass(frozen=True)
@@ -90,8 +100,8 @@ class EstimatorSpec:
         assert outcome.estimate is not None
         return outcome.estimate
 
-    def task(self, log: Log, config: Config) -> Task:
-        """The log with the configuration that this estimator works with.
+    def task(self, log: Log, config: Config, searches: Searches | None = None) -> Task:
+        """The log with the configuration that this estimator works with; ``searches`` as of `Task`.
 
         Raises
         ------
@@ -101,7 +111,7 @@ class EstimatorSpec:
             config = with_headings(log, config, self.headings)
         if self.hydrodynamics:
             config = with_hydrodynamics(config)
-        return Task(log, with_misalignment(config, self.misalignment))
+        return Task(log, with_misalignment(config, self.misalignment), searches or Searches())
 
 
 @dataclass(frozen=True)
@@ -148,6 +158,7 @@ def outcomes_of_dives(estimators: Sequence[EstimatorSpec], dives: Sequence[Task]
     side_by_side: dict[Filter, dict[tuple[int, str], Outcome]] = {}
     for k, dive in enumerate(dives):
         made: Made = {}
+        searches: dict[Hashable, Searches] = defaultdict(Searches)
         for named in estimators:
             if named.variant is not None:
                 kind = named.variant.kind
@@ -157,7 +168,7 @@ def outcomes_of_dives(estimators: Sequence[EstimatorSpec], dives: Sequence[Task]
                 yield k, side_by_side[kind].pop((k, named.name))
                 continue
             try:
-                result, seconds = _run_chain(named, named.stages, dive, made)
+                result, seconds = _run_chain(named, dive, made, searches[named.configuration_key])
                 yield k, Outcome(named, result, None, seconds)
             except Exception as error:  # whatever an estimator runs into is a result of the comparison
                 yield k, Outcome(named, None, error, float("nan"))
@@ -197,15 +208,15 @@ def _recorded_s(log: Log) -> float:
     return max(float(time[-1] - time[0]), SHORTEST_S)
 
 
-def _run_chain(named: EstimatorSpec, stages: Sequence[Stage], dive: Task, made: Made) -> tuple[Any, float]:
-    """The result of stages of an estimator and its processor time; ``made`` keeps results by what led to them."""
-    result: Any = named.task(dive.log, dive.config)
+def _run_chain(named: EstimatorSpec, dive: Task, made: Made, searches: Searches) -> tuple[Any, float]:
+    """The result of an estimator and its processor time; ``made`` keeps results by what led to them."""
+    result: Any = named.task(dive.log, dive.config, searches)
     chain, total = named.configuration_key, 0.0
-    for stage in stages:
+    for stage in named.stages:
         chain = (*chain, stage)
         if chain not in made:
-            began = time.process_time()
-            made[chain] = stage(result), time.process_time() - began
+            began = time.process_time() + searches.saved_s  # a search that was made before is charged again
+            made[chain] = stage(result), time.process_time() + searches.saved_s - began
         result, seconds = made[chain]
         total += seconds
     return result, total
@@ -245,7 +256,7 @@ def with_hydrodynamics(config: Config) -> Config:
 
 def assembled(task: Task) -> BatchSmoother:
     """Keyframes of a log and what lies between them."""
-    return assemble(task.log, initialise(task.log, task.config))
+    return assemble(task.log, initialise(task.log, task.config), task.searches)
 
 
 def stepped(batch: BatchSmoother) -> ErrorStateFilter:
@@ -262,7 +273,7 @@ def incremental(batch: BatchSmoother) -> Any:
     """iSAM2 over the same keyframes: an `rovgraph.estimators.incremental.IncrementalEstimator`."""
     from rovgraph.estimators.incremental import run_isam2  # GTSAM is slow to load, and not everywhere to be had
 
-    return run_isam2(batch.intervals, batch.initial)
+    return run_isam2(batch.intervals, batch.initial, searches=batch.searches)
 
 
 def filtered_by_isam2(estimator: Any) -> Estimate:

@@ -1,28 +1,22 @@
-"""The arithmetic of a Kalman filter, and models that are quadratic in the state.
+"""A model and the update of a Kalman filter, of several side by side.
 
-    P <- F P F' + Q
-    L L' = H P H' + R,  W = L^-1 H P,  e = L^-1 (z - h)
-    x <- x + W' e,  P <- P - W' W
-
-The whitened innovation e has unit covariance if the filter is consistent, and its sum of
-squares is the normalised innovation squared (Bar-Shalom, Li and Kirubarajan 2001, 5.4).
-W' W is symmetric to the last bit, so that P stays symmetric without being told.
-
-All of it broadcasts: a leading axis, where there is one, is that of filters side by side.
-What comes out of one does not depend on the others, to the last bit.
+The arithmetic is that of `rovgraph.kernels.thesis_filters`. A leading axis, where there is one, is that of filters
+side by side. What comes out of one does not depend on the others, to the last bit.
 """
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
+from rovgraph.kernels import thesis_filters as kernels
 
 Linearized = tuple[Array, Array]  # a model's value and its Jacobian
 Innovate = Callable[[Array], Linearized]  # state -> innovation and H
+Mask = NDArray[np.bool_]
 
-_cholesky, _invert_triangle = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
+ORDER = 3  # of the polynomials, at most
 
 
 def times(A: Array, x: Array) -> Array:
@@ -30,36 +24,66 @@ def times(A: Array, x: Array) -> Array:
     return np.asarray((A @ x[..., None])[..., 0])
 
 
-class Quadratic:
-    """y = c + L x + x' T x / 2, with its Jacobian J = L + T x; so y = c + (L + J) x / 2.
+class Polynomials:
+    """Polynomials of the state, of the third order at most, with their Jacobian.
 
     Parameters
     ----------
-    constant : ndarray, shape (..., m)
-    linear : ndarray, shape (..., m, n)
-    second : ndarray, shape (..., m, n, n), symmetric in the last two axes
+    m, n : number of polynomials, and length of the state
     """
 
-    def __init__(self, constant: Array, linear: Array, second: Array) -> None:
-        *batch, m, n = linear.shape
-        slope = second.reshape(*batch, m * n, n)
-        self._parts = constant, linear, second
-        self._varying = np.flatnonzero(slope.any(axis=(*range(len(batch)), -1)))
-        self._slope = slope[..., self._varying, :].copy()
-        self._base = linear.reshape(*batch, m * n)[..., self._varying]
+    def __init__(self, m: int, n: int) -> None:
+        self._size = m, n
+        self._places, self._factors = np.empty(0, np.int64), np.empty((0, ORDER), np.int64)
+        self._c = np.empty((1, 0))
+
+    def add(self, rows: slice, tensor: Array, *parts: slice) -> None:
+        """Add ``sum over j, k.. of tensor[i, j, k..] u_j v_k..`` to the i-th of some polynomials.
+
+        Parameters
+        ----------
+        rows : which
+        tensor : ndarray, shape (rows, len(u), len(v)..)
+        parts : places of u, v.. in the state
+        """
+        place = np.indices(tensor.shape).reshape(tensor.ndim, -1)
+        factors = np.full((ORDER, tensor.size), -1)
+        for k, part in enumerate(parts):
+            factors[k] = part.start + place[k + 1]
+        self._places = np.concatenate([self._places, rows.start + place[0]])
+        self._factors = np.concatenate([self._factors, np.sort(factors, axis=0).T])
+        self._c = np.concatenate([self._c, tensor.reshape(1, -1)], axis=1)
 
     @classmethod
-    def together(cls, members: Sequence["Quadratic"]) -> "Quadratic":
-        """Those of several filters side by side."""
-        return cls(*(np.stack(parts) for parts in zip(*(m._parts for m in members), strict=True)))
+    def together(cls, members: Sequence["Polynomials"]) -> "Polynomials":
+        """Those of several filters side by side, which differ in their coefficients alone."""
+        whole = cls(*members[0]._size)
+        terms = np.column_stack([members[0]._places, members[0]._factors])
+        unlike, which = np.unique(terms, axis=0, return_inverse=True)  # x_i x_j and x_j x_i are one term
+        c = np.zeros((len(members), len(unlike)))
+        np.add.at(c.T, which.ravel(), np.concatenate([m._c for m in members]).T)
+        c = c[:1] if (c == c[0]).all() else c
+        own = c.any(axis=0)
+        whole._places, whole._factors = unlike[own, 0].copy(), unlike[own, 1:].copy()
+        whole._c = np.ascontiguousarray(c[:, own])
+        return whole
 
     def __call__(self, x: Array) -> Linearized:
-        """Value, shape (..., m), and Jacobian, shape (..., m, n)."""
-        constant, linear, _ = self._parts
-        J = np.empty((*x.shape[:-1], *linear.shape[-2:]))
-        J[...] = linear
-        J.reshape(*x.shape[:-1], -1)[..., self._varying] = self._base + times(self._slope, x)
-        return constant + 0.5 * times(linear + J, x), J
+        """Values, shape (..., m), and Jacobian, shape (..., m, n)."""
+        m, n = self._size
+        y, J = np.empty((*x.shape[:-1], m)), np.empty((*x.shape[:-1], m, n))
+        terms = self._c, self._places, self._factors
+        kernels.evaluate_polynomials(*terms, x.reshape(-1, n), y.reshape(-1, m), J.reshape(-1, m, n))
+        return y, J
+
+    def step(self, x: Array, dt: float | Array) -> Linearized:
+        """``x + dt y``, where y is the rate of x, by forward Euler (2.26), and F."""
+        n = x.shape[-1]
+        new, F = np.empty(x.shape), np.empty((*x.shape, n))
+        terms, flat = (self._c, self._places, self._factors), x.reshape(-1, n)
+        dt = np.full(len(flat), dt) if np.ndim(dt) == 0 else np.asarray(dt)
+        kernels.step_polynomials(*terms, flat, dt, new.reshape(-1, n), F.reshape(-1, n, n))
+        return new, F
 
 
 def diagonal(A: Array) -> Array:
@@ -68,79 +92,43 @@ def diagonal(A: Array) -> Array:
     return A.reshape(*A.shape[:-2], n * n)[..., :: n + 1]
 
 
-def propagate_covariance(P: Array, F: Array, moving: int) -> Array:
-    """F P F', symmetric.
-
-    Parameters
-    ----------
-    P, F : ndarray, shape (..., n, n)
-    moving : beyond the first so many, the state stands still: F is the identity there
-    """
-    F = F[..., :moving, :moving]
-    spread = F @ P[..., :moving, :]
-    square = spread[..., :moving] @ F.mT
-    new = P.copy()
-    new[..., :moving, :moving] = 0.5 * (square + square.mT)
-    new[..., :moving, moving:] = spread[..., moving:]
-    new[..., moving:, :moving] = spread[..., moving:].mT
-    return new
-
-
-def inverse_root(S: Array) -> Array:
-    """L^-1 of ``L L' = S``, shape (..., m, m); NaN where S is not positive definite.
-
-    LAPACK by itself, for one after the other, takes less time than NumPy's functions of them all.
-    """
-    out = np.empty_like(S)
-    for root, each in zip(out.reshape(-1, *S.shape[-2:]), S.reshape(-1, *S.shape[-2:]), strict=True):
-        L, failed = _cholesky(each, lower=1)
-        root[...] = np.nan if failed else _invert_triangle(L, lower=1)[0]
-    return out
-
-
-def update(x: Array, P: Array, residual: Array, H: Array, R: Array) -> tuple[Array, Array, Array, Array]:
-    """One measurement.
-
-    Parameters
-    ----------
-    x, P : ndarray, shapes (..., n), (..., n, n)
-    residual : ndarray, shape (..., m), measured minus predicted
-    H, R : ndarray, shapes (..., m, n), (..., m, m)
-
-    Returns
-    -------
-    x, P : after the measurement; not finite where the innovation's covariance is not
-        positive definite: the filter has diverged
-    normalised : ndarray, shape (..., m), whitened innovation
-    sd : ndarray, shape (..., m), standard deviations of the innovation
-    """
-    HP = H @ P
-    S = HP @ H.mT + R
-    whitener = inverse_root(S)
-    W, normalised = whitener @ HP, times(whitener, residual)
-    sd = np.sqrt(S.diagonal(axis1=-2, axis2=-1))
-    return x + times(W.mT, normalised), P - W.mT @ W, normalised, sd
+def propagate_covariance(P: Array, F: Array, Q: Array, moving: int) -> Array:
+    """F P F' + Q, as `rovgraph.kernels.thesis_filters.propagate_covariances`; Q may be whole matrices."""
+    new, whole = np.empty_like(P), Q.ndim == P.ndim
+    kernels.propagate_covariances(P, F, np.zeros(P.shape[:2]) if whole else Q, moving, new)
+    return new + Q if whole else new
 
 
 def iterated_update(
-    x: Array, P: Array, innovate: Innovate, R: Array, iterations: int = 1
+    x: Array, P: Array, innovate: Innovate, R: Array, measured: Mask, iterations: int = 1
 ) -> tuple[Array, Array, Array, Array, Array]:
     """A measurement linearised again at each iterate (Bell and Cathey 1993).
 
     Parameters
     ----------
-    x, P : ndarray, shapes (..., n), (..., n, n)
-    innovate : state -> innovation, shape (..., m), and H, shape (..., m, n)
-    R : ndarray, shape (..., m, m)
+    x, P : ndarray, shapes (filters, n), (filters, n, n)
+    innovate : state -> innovation, shape (filters, m), and H, shape (filters, m, n)
+    R : ndarray, shape (filters, m, m)
+    measured : ndarray, shape (filters, m), of bool; what is not changes nothing
     iterations : 1 is the plain extended Kalman filter
 
     Returns
     -------
-    innovation, x, P, normalised, sd : the first and the last two as of the first iteration
+    innovation, x, P, normalised, sd : the first and the last two as of the first iteration; the innovation of what is
+        not measured is undefined
     """
     innovation, H = innovate(x)
-    new, P_new, normalised, sd = update(x, P, innovation, H, R)
+    new, P_new, normalised, sd = _update(x, P, innovation, H, R, measured)
     for _ in range(iterations - 1):
         residual, H = innovate(new)
-        new, P_new, _, _ = update(x, P, residual - times(H, x - new), H, R)
+        new, P_new, _, _ = _update(x, P, residual - times(H, x - new), H, R, measured)
     return innovation, new, P_new, normalised, sd
+
+
+def _update(
+    x: Array, P: Array, residual: Array, H: Array, R: Array, measured: Mask
+) -> tuple[Array, Array, Array, Array]:
+    """State and covariance after a measurement, whitened innovation and its sd before."""
+    out = np.empty_like(x), np.empty_like(P), np.empty_like(residual), np.empty_like(residual)
+    kernels.update(x, P, residual, H, R, measured, *out)
+    return out

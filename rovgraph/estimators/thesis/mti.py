@@ -14,11 +14,11 @@ from typing import Protocol, Self
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.estimators.thesis.core import Linearized, Quadratic, times
+from rovgraph.estimators.thesis.core import Linearized, Polynomials, times
 from rovgraph.estimators.thesis.epochs import Epochs, Index
 from rovgraph.estimators.thesis.known import KnownMotion
 from rovgraph.estimators.thesis.processes import Layout, centripetal, length
-from rovgraph.estimators.thesis.quaternion import Turn, by_vector
+from rovgraph.estimators.thesis.quaternion import Turn
 from rovgraph.geometry import Array, rotate, transpose
 from rovgraph.instruments import Instrument
 from rovgraph.sensors import MagneticField, field_direction
@@ -74,49 +74,38 @@ class Mti:
     def __init__(
         self, body: bool, places: Layout, R_bs: Array, lever_arm_b: Array, gravity: float, field_n: Array
     ) -> None:
-        self._places, self._body = places, body
-        R_sb, n = R_bs.T, length(places)
-        self._turn = Turn(inverse=True, left=R_sb)
+        R_sb, a, w, q = R_bs.T, places["a"], places["w"], places["q"]
+        turn = 0.5 * Turn(inverse=True, left=R_sb).second  # R_sn = R_sb + q' turn q
         g_n = np.array([0.0, 0.0, gravity])
-        linear, second = np.zeros((9, n)), np.zeros((9, n, n))
-        for k, bias in enumerate(BIASES):
-            linear[3 * k : 3 * k + 3, places[bias]] = _EYE
-        linear[3:6, places["w"]] = R_sb
-        if body:
-            linear[:3, places["a"]] = R_sb
-        second[:3, places["w"], places["w"]] = np.einsum("ij,jkl->ikl", R_sb, _swing(lever_arm_b))
-        second[6:, places["q"], places["q"]] = np.einsum("ijkl,j->ikl", self._turn.second, field_n)
-        constant = np.concatenate([np.zeros(6), R_sb @ field_n])
-        if body:
-            second[:3, places["q"], places["q"]] = -np.einsum("ijkl,j->ikl", self._turn.second, g_n)
-            constant[:3] = -R_sb @ g_n
-        self._g_n = g_n
-        self._quadratic = Quadratic(constant, linear, second)
+        force, rate, field = slice(0, 3), slice(3, 6), slice(6, 9)
+        self._samples = samples = Polynomials(self.dim, length(places))
+        for rows, bias in zip((force, rate, field), BIASES, strict=True):
+            samples.add(rows, _EYE, places[bias])
+        samples.add(rate, R_sb, w)
+        samples.add(field, R_sb @ field_n)
+        samples.add(field, np.einsum("ijkl,j->ikl", turn, field_n), q, q)
+        samples.add(force, np.einsum("ij,jkl->ikl", R_sb, _swing(lever_arm_b)), w, w)
+        samples.add(force, -R_sb @ g_n)
+        samples.add(force, -np.einsum("ijkl,j->ikl", turn, g_n), q, q)
+        samples.add(force, R_sb, a)
+        if not body:
+            samples.add(force, turn, a, q, q)
 
     @classmethod
     def together(cls, members: Sequence[Self]) -> Self:
         whole = copy.copy(members[0])
-        whole._g_n = np.stack([m._g_n for m in members])
-        whole._turn = Turn.together([m._turn for m in members])
-        whole._quadratic = Quadratic.together([m._quadratic for m in members])
+        whole._samples = Polynomials.together([m._samples for m in members])
         return whole
 
     def __call__(self, x: Array, epoch: Index) -> Linearized:
         """Predicted samples, shape (..., 9), and H, shape (..., 9, n)."""
-        h, H = self._quadratic(x)
-        if not self._body:  # cubic: R_sb R_bn (a_n - g)
-            a, q = self._places["a"], self._places["q"]
-            R_sn, slope = self._turn(x[..., q])
-            force_n = x[..., a] - self._g_n
-            h[..., :3] += times(R_sn, force_n)
-            H[..., :3, a], H[..., :3, q] = R_sn, by_vector(force_n, slope)
-        return h, H
+        return self._samples(x)
 
 
 def _swing(lever_arm_b: Array) -> Array:
-    """Second derivative of w x (w x l) = w (w.l) - l (w.w) by w, shape (3, 3, 3)."""
+    """w x (w x l) = w (w.l) - l (w.w) as a quadratic form of w, shape (3, 3, 3)."""
     along = np.einsum("ij,k->ijk", _EYE, lever_arm_b)
-    return np.asarray(along + np.swapaxes(along, 1, 2) - 2.0 * np.einsum("i,jk->ijk", lever_arm_b, _EYE))
+    return np.asarray(along - np.einsum("i,jk->ijk", lever_arm_b, _EYE))
 
 
 class Accelerometer:

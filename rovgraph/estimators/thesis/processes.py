@@ -23,10 +23,10 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rovgraph.estimators.thesis.core import Linearized, Quadratic, diagonal, times
+from rovgraph.estimators.thesis.core import Linearized, Polynomials, diagonal, times
 from rovgraph.estimators.thesis.epochs import Epochs, Index
 from rovgraph.estimators.thesis.known import KnownMotion
-from rovgraph.estimators.thesis.quaternion import RATES, Turn, by_vector, matrix
+from rovgraph.estimators.thesis.quaternion import RATES, SECOND, matrix
 from rovgraph.estimators.thesis.variants import Filter, Numbers
 from rovgraph.geometry import Array, cross, exp_rotation, right_jacobian, skew, transpose
 from rovgraph.thesis import SAMPLE_S
@@ -112,8 +112,7 @@ class ConstantAcceleration:
         self._exact = self._body and variant.coriolis == "exact"
         names = [n for n in SIZES if n != "mount" or variant.misalignment]
         self.layout = layout(*names)
-        self._rhs = self._right_hand_side()
-        self._turn = Turn()
+        self._rate = self._right_hand_side()
         self._q = noise_per_second(self.layout, variant.numbers)
         own = "body" if self._body else "earth"
         isotropic = len(set(variant.numbers.acceleration)) == 1
@@ -122,34 +121,28 @@ class ConstantAcceleration:
     @classmethod
     def together(cls, members: Sequence[Self]) -> Self:
         whole = copy.copy(members[0])
+        whole._rate = Polynomials.together([m._rate for m in members])
         whole._q = np.stack([m._q for m in members])
         whole._turned_noise = any(m._turned_noise for m in members)
         return whole
 
-    def _right_hand_side(self) -> Quadratic:
-        """x' but for (2.9)'s cubic R_nb v."""
+    def _right_hand_side(self) -> Polynomials:
+        """x' of (2.9) or (2.8)."""
         s, n = self.layout, length(self.layout)
-        linear, second = np.zeros((n, n)), np.zeros((n, n, n))
-        linear[s["v"], s["a"]] = np.eye(3)
-        _bilinear(second, s["q"], s["q"], s["w"], 0.5 * np.swapaxes(RATES, 1, 2))
+        rate = Polynomials(n, n)
+        rate.add(s["v"], np.eye(3), s["a"])
+        rate.add(s["q"], 0.5 * RATES, s["w"], s["q"])
+        rate.add(s["p"], np.eye(3), s["v"])
         if self._body:
             for moved in ("a", "v"):
-                _bilinear(second, s[moved], s[moved], s["w"], -_LEVI_CIVITA)
-        else:
-            linear[s["p"], s["v"]] = np.eye(3)
-        return Quadratic(np.zeros(n), linear, second)
+                rate.add(s[moved], -_LEVI_CIVITA, s[moved], s["w"])
+            rate.add(s["p"], 0.5 * SECOND, s["v"], s["q"], s["q"])  # R_nb = I + q' SECOND q / 2
+        return Polynomials.together([rate])
 
     def step(self, x: Array, dt: float | Array, epoch: Index) -> Linearized:
-        s, dt = self.layout, np.asarray(dt)[..., None]
-        rhs, A = self._rhs(x)
-        if self._body:
-            R_nb, slope = self._turn(x[..., s["q"]])
-            v_b = x[..., s["v"]]
-            A[..., s["p"], s["v"]], A[..., s["p"], s["q"]] = R_nb, by_vector(v_b, slope)
-            rhs[..., s["p"]] = times(R_nb, v_b)
-        new, F = x + dt * rhs, _euler(A, dt)
+        new, F = self._rate.step(x, dt)
         if self._exact:
-            self._turn_exactly(x, new, F, dt)
+            self._turn_exactly(x, new, F, np.asarray(dt)[..., None])
         return new, F
 
     def _turn_exactly(self, x: Array, new: Array, F: Array, dt: Array) -> None:
@@ -180,12 +173,6 @@ def _euler(A: Array, dt: Array) -> Array:
     A *= dt[..., None]
     diagonal(A)[...] += 1.0
     return A
-
-
-def _bilinear(second: Array, rows: slice, u: slice, w: slice, tensor: Array) -> None:
-    """Enter ``sum over j, k of tensor[i, j, k] u_j w_k`` into a symmetric second derivative."""
-    second[rows, u, w] += tensor
-    second[rows, w, u] += np.swapaxes(tensor, 1, 2)
 
 
 class KnownAttitude:

@@ -10,8 +10,6 @@ the equations as they are.
 R_nb is quadratic in q, T is linear: their derivatives are constant tensors, made once.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
@@ -61,25 +59,15 @@ class Turn:
 
     def __init__(self, inverse: bool = False, left: Array | None = None) -> None:
         second = np.swapaxes(SECOND, 0, 1) if inverse else SECOND
-        self._inverse, self._base = inverse, _EYE if left is None else left
+        self._base = _EYE if left is None else left
         self.second: Array = np.einsum("...ij,jkab->...ikab", self._base, second)
         self._flat = self.second.reshape(*self._base.shape[:-2], 36, 4)
-
-    @classmethod
-    def together(cls, members: Sequence["Turn"]) -> "Turn":
-        """Those of several filters side by side."""
-        return cls(members[0]._inverse, np.stack([m._base for m in members]))
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
         """The matrix, shape (..., 3, 3), and its derivative by q, shape (..., 3, 3, 4)."""
         slope = times(self._flat, q).reshape(*q.shape[:-1], 9, 4)
         turned: Array = self._base + 0.5 * times(slope, q).reshape(*q.shape[:-1], 3, 3)
         return turned, slope.reshape(*q.shape[:-1], 3, 3, 4)
-
-
-def by_vector(u: Array, slope: Array) -> Array:
-    """Derivative of ``A(q) @ u`` from that of A, shape (..., 3, 4)."""
-    return np.asarray((u[..., None, None, :] @ slope)[..., 0, :])
 
 
 _TURN = Turn()

@@ -4,8 +4,7 @@ Inertial samples come at their own epochs, pings at theirs: a ping between two s
 reached by a shorter step. Filters of one kind go in lock step (`timetable`), as one
 recursion over arrays with a leading axis for the filters: at 25 states a filter by itself
 spends most of its time on calling NumPy. Who is idle at a step moves by no time and
-measures nothing; what is not measured has no row in H, an innovation of zero and a noise
-of one, which changes neither state nor covariance. So each filter does what it would do
+measures nothing, which changes neither state nor covariance. So each filter does what it would do
 alone, and the others go on where one diverges.
 """
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from rovgraph.errors import InputError
-from rovgraph.estimators.thesis.core import Innovate, Linearized, diagonal, iterated_update, propagate_covariance
+from rovgraph.estimators.thesis.core import Innovate, Linearized, Mask, iterated_update, propagate_covariance
 from rovgraph.estimators.thesis.dvl import HEADING, DvlModel, ping_rows
 from rovgraph.estimators.thesis.epochs import Epochs, widened
 from rovgraph.estimators.thesis.mti import ImuModel
@@ -29,7 +28,6 @@ from rovgraph.estimators.thesis.truth import TrueMotion
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.thesis import SAMPLE_S
 
-Mask = NDArray[np.bool_]
 InsertResult = tuple[Mask, Array, Array, Array]  # a measurement: which components, innovation, whitened, sd
 
 LONGEST_STEP_S = 1.5 * SAMPLE_S  # of forward Euler; a longer interval is divided
@@ -130,8 +128,8 @@ class _Batch:
         self._imu = None if first.imu is None else first.imu.together([s.imu for s in setups if s.imu is not None])
         self._samples = Epochs.together([Epochs(widened(s.samples, dim)) for s in setups])
         self._pings = Epochs.together([Epochs(ping_rows(s.pings)) for s in setups])
-        self._R_imu = _Noise([block_diag(s.R_imu, np.eye(dim - len(s.R_imu))) for s in setups])
-        self._R_dvl = _Noise([s.R_dvl for s in setups])
+        self._R_imu = np.stack([block_diag(s.R_imu, np.eye(dim - len(s.R_imu))) for s in setups])
+        self._R_dvl = np.stack([s.R_dvl for s in setups])
         self._true_motion = [m.true_motion for m in members if m.true_motion is not None]
         self._x, self._P = np.stack([m.x for m in members]), np.stack([m.P for m in members])
         self._time, self._epoch = np.array([m.time for m in members]), np.array([m.epoch for m in members])
@@ -164,14 +162,11 @@ class _Batch:
     def _predict(self, dt: Array) -> None:
         """A step of forward Euler."""
         Q = self._process.noise(self._x)
+        Q = dt.reshape(-1, *[1] * (Q.ndim - 1)) * Q
         x, F = self._process.step(self._x, dt, self._epoch)
         if self._true_motion:
             F = self._process.step(self._truth(self._x), dt, self._epoch)[1]
-        self._x, self._P = x, propagate_covariance(self._P, F, self._moving)
-        if Q.ndim == 2:
-            diagonal(self._P)[...] += dt[:, None] * Q
-        else:
-            self._P += dt[:, None, None] * Q
+        self._x, self._P = x, propagate_covariance(self._P, F, Q, self._moving)
 
     def _take_sample(self, model: ImuModel, active: Mask) -> InsertResult:
         z = self._samples.at(self._epoch)
@@ -195,22 +190,19 @@ class _Batch:
 
         return self._update(innovate, measured, self._R_dvl)
 
-    def _update(self, innovate: Innovate, measured: Mask, noise: "_Noise") -> InsertResult:
+    def _update(self, innovate: Innovate, measured: Mask, R: Array) -> InsertResult:
         """Update with the components that were measured and bring quaternions back to unit length."""
-        R, all_measured, none_measured = noise.of(measured)
 
-        def innovate_measured(x: Array) -> Linearized:
+        def innovate_at(x: Array) -> Linearized:
             residual, H = innovate(x)
-            if self._true_motion:
-                H = innovate(self._truth(x))[1]
-            return (residual, H) if all_measured else (np.where(measured, residual, 0.0), H * measured[..., None])
+            return residual, (innovate(self._truth(x))[1] if self._true_motion else H)
 
         residual, self._x, self._P, normalised, sd = iterated_update(
-            self._x, self._P, innovate_measured, R, self._iterations
+            self._x, self._P, innovate_at, R, measured, self._iterations
         )
         if self._quaternion is not None:
             q = self._x[:, self._quaternion]
-            q /= np.where(none_measured, 1.0, np.sqrt(np.einsum("ij,ij->i", q, q)))[:, None]
+            q /= np.where(measured.any(axis=1), np.sqrt(np.einsum("ij,ij->i", q, q)), 1.0)[:, None]
         return measured, residual, normalised, sd
 
     def _truth(self, x: Array) -> Array:
@@ -242,24 +234,3 @@ class _Batch:
         for b in np.flatnonzero(which).tolist():
             state = self._x[b].copy(), self._P[b].copy()
             self._members[b].kept.append((float(self._time[b]), int(self._epoch[b]), *state))
-
-
-class _Noise:
-    """R of a measurement of which some components were not measured: there it is one.
-
-    Parameters
-    ----------
-    R : of all components, a matrix for each member
-    """
-
-    def __init__(self, R: Sequence[Array]) -> None:
-        self._R, self._made = np.stack(R), dict[bytes, tuple[Array, bool, Mask]]()
-
-    def of(self, measured: Mask) -> tuple[Array, bool, Mask]:
-        """R, shape (members, m, m), whether all components of all were measured, and of whom none was."""
-        key = measured.tobytes()
-        if key not in self._made:
-            both = measured[:, :, None] & measured[:, None, :]
-            R = np.where(both, self._R, np.eye(measured.shape[1]))
-            self._made[key] = R, bool(measured.all()), np.logical_not(np.any(measured, axis=1))
-        return self._made[key]

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest, chi2  # type: ignore[attr-defined]
 
 from rovgraph.studies.misalignment.plan import Cell
 
@@ -36,6 +35,8 @@ def cell_table(runs: pd.DataFrame, cells: Sequence[Cell]) -> pd.DataFrame:
 
 
 def _row(cell: Cell, runs: pd.DataFrame) -> dict[str, Any]:
+    from scipy.stats import binomtest, chi2  # type: ignore[attr-defined]  # a second to load, which no worker needs
+
     good = runs[runs["failure"].isna()]
     row = {"cell": cell.id, **cell.model_dump(), "runs": len(runs), "failed": len(runs) - len(good)}
     if not len(good):
