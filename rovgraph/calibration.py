@@ -380,6 +380,18 @@ TABLE: dict[str, Variable] = {
         ),
         *_compass("vehicle_compass", "VW", "vehicle_heading", "the vehicle's own heading"),
         _compass_error("vehicle_compass", "5", "vehicle_heading", "the vehicle's own heading"),
+        Variable(
+            "water_oscillation",
+            "6",
+            ("_north", "_east", "_down"),
+            "m/s",
+            0.05,
+            ("thruster",),
+            "velocity of the water that waves move to and fro, and the vehicle with it, without drag",
+            "a DVL over ground, within its time constant",
+            estimate=True,
+            time_constant=0.5,
+        ),
     )
 }
 

@@ -56,7 +56,8 @@ def with_thrusters(config: Config, on: bool = True) -> Config:
 @pytest.fixture(scope="module")
 def still() -> Case:
     """Pushes on every axis in a current without waves, noise or biases, and a vehicle with more drag than believed."""
-    config = changed(lake(), vehicle={"acceleration_sd_mps2": BELIEVED_SD})
+    calm = {"water_oscillation": {"estimate": False}}
+    config = changed(lake(), vehicle={"acceleration_sd_mps2": BELIEVED_SD}, calibration=calm)
     drag = {name: [TRUE_DRAG * c for c in getattr(config.vehicle, name)] for name in COEFFICIENTS}
     world = World.drawn(changed(config, vehicle=drag), Choices(noise=False, dropouts=(LOST,)), 0)
     forces = np.array([[30, 0, 0, 0], [0, 90, 0, 0], [0, 0, 25, 0], [140, 0, 0, 40], [0, 220, 0, 0], [0, 0, 110, 0]])
@@ -134,7 +135,8 @@ def at_truth(case: Case, graph: BatchSmoother) -> Array:
     attached = [a for i in graph.intervals for a in i.measurements if a.sensor == "thruster"]
     motion = case.dive.path.motion(np.array([a.time for a in attached]))
     arm = rotate(motion.R_nb, np.cross(motion.w_b, case.config.imu.lever_arm_m))
-    truth = dict.fromkeys(COEFFICIENTS, np.full(3, TRUE_DRAG - 1.0)) | {"current": CURRENT}
+    truth = dict.fromkeys(COEFFICIENTS, np.full(3, TRUE_DRAG - 1.0))
+    truth |= {"current": CURRENT, "water_oscillation": np.zeros(3)}
     state = State(motion.R_nb, motion.p_n, motion.v_n + arm, np.zeros((len(attached), 6)), truth)
     aiding = instruments(case.config, case.config.imu.lever_arm_m)["thruster"].model
     return np.array([a.z for a in attached]) - aiding.predict(state, np.array([a.rate_b for a in attached]))[0]

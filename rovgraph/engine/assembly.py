@@ -38,6 +38,7 @@ from rovgraph.engine.motion import Motion
 from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
 from rovgraph.engine.scale import scale_to_bias, wanted
 from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
+from rovgraph.engine.unknowns import unknowns
 from rovgraph.engine.whole_log import SHORTEST_S
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
@@ -89,7 +90,7 @@ class Assembler:
         self.time_offsets = assumed or TimeOffsets.of(self.config, self.instruments)
         believed = beliefs(self.config)
         self._scaled = wanted(believed)
-        lasting = any(b.estimate and np.isfinite(b.time_constant) for b in believed.values())  # at every keyframe
+        lasting = unknowns(believed, self.instruments).time_constants  # which begin a segment at every keyframe
         self._segment_s = 0.0 if lasting else self.config.graph.segment_s
         self._around = HALF_WINDOW_S + self.time_offsets.span
         self._dim = max(i.model.dim for i in self.instruments.values()) if self.instruments else 0

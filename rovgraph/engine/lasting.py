@@ -37,7 +37,8 @@ from rovgraph.state import State
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time_constant)}  # sensor -> its error
+# sensor -> its error, estimated where the dive shows it
+LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time_constant) and not v.estimate}
 ENOUGH = 30  # measurements
 LIKELY = 3.0  # gain of log likelihood, at the optimum without the error, that is worth a look
 WINDOW_S = 20.0  # over which residuals are summed

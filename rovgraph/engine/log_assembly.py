@@ -24,6 +24,7 @@ from rovgraph.engine.preintegration import preintegration_params
 from rovgraph.engine.samples import HALF_WINDOW_S, knocked, means, rates, surveyed
 from rovgraph.engine.scale import scale_to_bias, wanted
 from rovgraph.engine.time_offsets import TimeOffsets
+from rovgraph.engine.unknowns import unknowns
 from rovgraph.engine.whole_log import Ordered, WholeLog
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
@@ -118,7 +119,7 @@ class _LogAssembly:
         self.around = HALF_WINDOW_S + time_offsets.span
         believed = beliefs(config)
         self.scaled, self.R_bs = wanted(believed), mount_matrix(config.imu.mount_rpy_deg)
-        lasting = any(b.estimate and np.isfinite(b.time_constant) for b in believed.values())  # at every keyframe
+        lasting = unknowns(believed, instruments).time_constants  # which begin a segment at every keyframe
         self.segment_s = 0.0 if lasting else config.graph.segment_s
         noise = config.imu.noise
         self.noise, self.params = (noise.acc, noise.gyr), preintegration_params(config, noise.acc, noise.gyr)

@@ -6,8 +6,11 @@ on the velocity through the water, that force measures the velocity when nothing
 the lever arm l, v the velocity relative to the water and a(v, w) the acceleration of (2.18)
 without thrust,
 
-    v = R_bn (v_n - c_n) - w x l,    w = rate - b_g
+    v = R_bn (v_n - c_n - o_n) - w x l,    w = rate - b_g
     f = a(v, w) + w x v - R_bn g_n + w x (w x l) + b_a
+
+with the current c and what waves move to and fro, o: the vehicle goes with it, so there is no drag. What it
+accelerates is in the noise.
 
 The measurement is the mean specific force of a short piece of time less what thrust and
 angular acceleration give, M^-1 F + alpha x l, and belongs to the piece's middle. The
@@ -60,7 +63,7 @@ class ModelAiding:
     dim = 3
     angular = False
     state = (POSE, VELOCITY, BIAS)
-    calibration = ("drag_linear", "drag_quadratic", "current")
+    calibration = ("drag_linear", "drag_quadratic", "current", "water_oscillation")
 
     @property
     def memory(self) -> float:
@@ -103,8 +106,8 @@ class ModelAiding:
         n, l_b = len(state), self.lever_arm_b
         R_bn = transpose(state.R_nb)
         w = rate_b - state.bias[:, 3:]
-        water_n = np.zeros((n, 3))
-        water_n[:, :2] = state.calibration["current"]
+        water_n = np.zeros((n, 3)) + state.calibration["water_oscillation"]
+        water_n[:, :2] += state.calibration["current"]
         through_b = rotate(R_bn, state.v_n - water_n)
         swing = cross(w, l_b)
         v = through_b - swing
@@ -126,6 +129,7 @@ class ModelAiding:
             "drag_linear": by["drag"][..., :3],
             "drag_quadratic": by["drag"][..., 3:],
             "current": -by_v @ R_bn[..., :2],
+            "water_oscillation": -by_v @ R_bn,
         }
         return a + cross(w, v) - g_b + cross(w, swing) + state.bias[:, :3], H
 

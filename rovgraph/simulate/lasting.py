@@ -8,7 +8,7 @@ import numpy as np
 from rovgraph.config import beliefs
 from rovgraph.geometry import Array
 from rovgraph.simulate.noise import remembered
-from rovgraph.simulate.truth import Truth
+from rovgraph.simulate.truth import Truth, of_waves
 
 STEPS = 50  # of a process, in its time constant
 
@@ -46,7 +46,8 @@ def draw_lasting(
     """
     series: dict[str, tuple[Array, Array]] = {}
     for own, (name, belief) in zip(rng.spawn(len(beliefs(truth.config))), beliefs(truth.config).items(), strict=True):
-        if truth.noise and belief.estimate and np.isfinite(belief.time_constant) and name not in truth.calibration:
+        lasts = belief.estimate and np.isfinite(belief.time_constant) and not of_waves(belief)
+        if truth.noise and lasts and name not in truth.calibration:
             step = belief.time_constant / STEPS
             time = step * np.arange(int(seconds / step) + 2.0)
             white = belief.sd * own.standard_normal((len(time), belief.variable.dim))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rovgraph.calibration import Belief
 from rovgraph.config import Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -86,7 +87,7 @@ class Truth:
         for name, belief in beliefs(self.config).items():
             own = np.random.default_rng([entropy, zlib.crc32(name.encode())])
             draw = belief.sd * own.standard_normal(belief.variable.dim)
-            uncertain = belief.estimate or belief.considered
+            uncertain = (belief.estimate or belief.considered) and not of_waves(belief)
             value = belief.mean + draw if uncertain and self.noise else belief.mean
             out[name] = np.array(self.calibration.get(name, value), float).reshape(belief.variable.dim)
         return out
@@ -104,3 +105,8 @@ class Truth:
         """Offset of the true start from the planned one, shape (3,) [m]."""
         draw = self.config.start.position_sd_m * rng.standard_normal(3)
         return draw if self.start_error else np.zeros(3)
+
+
+def of_waves(belief: Belief) -> bool:
+    """Whether a variable stands for what waves do, which is in a simulated path."""
+    return belief.variable.name == "water_oscillation"
