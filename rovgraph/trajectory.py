@@ -8,6 +8,7 @@ tools such as ``evo_ape``.
 
 import zlib
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ class Trajectory:
         """Of the position, north, east, down [m^2], shape (n, 3, 3): ``cov_p``."""
         return self.cov_p
 
-    @property
+    @cached_property
     def rpy(self) -> Array:
         """Roll, pitch, yaw [rad], shape (n, 3)."""
         return rpy_from_matrix(self.R_nb)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions, restored
@@ -391,10 +391,10 @@ class Navigator:
         """Estimated calibration by label: value and sd."""
         sd, columns = np.sqrt(np.diag(known.covariance)), engine.filter.layout.columns
         return {
-            label: (float(value), float(own))
+            label: (value, own)
             for name in engine.filter.unknowns.estimated
             for label, value, own in zip(
-                TABLE[name].labels, known.state.calibration[name].reshape(-1), sd[columns[name]], strict=True
+                TABLE[name].labels, known.c[LAYOUT[name]].tolist(), sd[columns[name]].tolist(), strict=True
             )
         }
 
