@@ -57,8 +57,9 @@ class Intake:
             self._local = True
         elif sensor == "mag":
             values = self.calibrated(values)
-        if len(values) != self._sizes.setdefault(sensor, len(values)):
-            self._left_out[sensor, f"{len(values)} signals, and {self._sizes[sensor]} before"] += 1
+        size = len(values)
+        if size != self._sizes.setdefault(sensor, size):
+            self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
             return None
         newest = self._newest.get(sensor, -np.inf)
         if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):

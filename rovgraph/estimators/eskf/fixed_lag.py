@@ -18,7 +18,7 @@ import numpy as np
 
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gates, Gaussian, ProcessedMeasurement, stack_states
+from rovgraph.engine.filter_step import Gates, Gaussian, ProcessedMeasurement, states_of
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.remembered_places import RememberedPlace
@@ -96,17 +96,18 @@ class FixedLag:
 
     def add(self, measurement: Measurement) -> InsertResult:
         """Take a measurement, whenever it arrives."""
-        record, position, again = self._record, len(self._record), False
+        record = self._record
         if record and measurement.time <= record[-1].time and (own := place(measurement)) <= place(record[-1]):
             position = bisect_right(record, own, key=place)
-            again = position > 0 and place(record[position - 1]) == own
-        if position < self._settled:
-            return InsertResult.LATE
-        if again:
-            return InsertResult.AGAIN
-        record.insert(position, measurement)
-        if position < self._taken:
-            self._back_to(position)
+            if position < self._settled:
+                return InsertResult.LATE
+            if position > 0 and place(record[position - 1]) == own:
+                return InsertResult.AGAIN
+            record.insert(position, measurement)
+            if position < self._taken:
+                self._back_to(position)
+        else:
+            record.append(measurement)
         if measurement.sensor == "imu" and measurement.time > self._newest:
             self._newest = measurement.time
         self._go_on(self._newest - self.hold_s)
@@ -251,7 +252,7 @@ class FixedLag:
         """
         columns, arm = self.filter.layout.columns, self.initial.config.imu.lever_arm_m
         pose, velocity = (np.array([k.covariance[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
-        return body_trajectory(intervals, stack_states(known), arm, pose, velocity)
+        return body_trajectory(intervals, states_of(np.array([k.x for k in known])), arm, pose, velocity)
 
     def _go_on(self, until: float) -> None:
         """Take measurements up to a time."""
