@@ -45,6 +45,7 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.sensors import SENSORS, ModelAiding
+from rovgraph.sensors.sensor import none_refused
 from rovgraph.state import PLACE
 
 _AT_KEYFRAME = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])[None]  # a snapshot without motion
@@ -79,6 +80,7 @@ class Assembler:
         self._closing = {*self.instruments} if self._ticking else {"dvl"}  # sensors that make keyframes
         self._arrived: list[StampedMeasurement] = []  # since `_take_until` looked last
         self._waiting: deque[StampedMeasurement] = deque()  # in order, admitted
+        self._refusing = {sensor for sensor in self.instruments if SENSORS[sensor].refused is not none_refused}
         self._due = math.inf  # time of the first that waits or has arrived, and closes an interval [s]
         self._aiding: Aiding | None = None
         if "thruster" in self.instruments:
@@ -233,9 +235,11 @@ class Assembler:
         arrived, self._arrived = self._arrived, []
         values: dict[str, list[Array]] = {}
         for m in arrived:
-            values.setdefault(m.sensor, []).append(m.values)
+            if m.sensor in self._refusing:
+                values.setdefault(m.sensor, []).append(m.values)
         may = {s: iter(admitted(s, np.array(own), self.config, self.left_out).tolist()) for s, own in values.items()}
-        self._waiting = deque(sorted([*self._waiting, *(m for m in arrived if next(may[m.sensor]))], key=_time))
+        admissible = [m for m in arrived if m.sensor not in may or next(may[m.sensor])]
+        self._waiting = deque(sorted([*self._waiting, *admissible], key=_time))
 
     def _first_closing(self) -> float:
         """Time of the first that waits and closes an interval [s]."""

@@ -16,7 +16,6 @@ from rovgraph.engine.preintegration import (
     PreintegrationParams,
     integrate_motion,
     preintegration_params,
-    scatter,
 )
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -198,7 +197,7 @@ class Samples:
     def _params_for(self, table: Array, shown: Sequence[float]) -> PreintegrationParams:
         """The believed noise, or where a knock shakes the samples far more, what they show."""
         if self._learn_noise:
-            self._floor.take(scatter(table[:, 0], table[:, 1:]))
+            self._floor.take(table)
             self._raise(*self._floor.densities().tolist())
         acc, gyr = self._noise
         if not knocked(np.array(shown), self._noise):

@@ -7,7 +7,7 @@ assumption may be renewed while measurements come.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,7 +71,7 @@ class TimeOffsets:
 
     def copy(self) -> "TimeOffsets":
         """One that goes on by itself from here."""
-        return replace(self, assumed=dict(self.assumed))
+        return TimeOffsets(self.variable, self.lags, dict(self.assumed))
 
     @property
     def span(self) -> float:
