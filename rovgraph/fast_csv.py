@@ -33,7 +33,7 @@ def write_csv(
     decimals : column -> digits after the point, of columns of floats that are all known
     """
     fixed = {name: f"%.{count}f" for name, count in (decimals or {}).items()}
-    columns = {str(name): np.asarray(table[name]) for name in table}
+    columns = {str(name): np.asarray(own) for name, own in table.items()}
     holey = {name: bool(np.isnan(column).any()) for name, column in columns.items() if column.dtype.kind == "f"}
     formats = [fixed.get(name) or _format(column, holey.get(name, False), digits) for name, column in columns.items()]
     if None in formats or path.suffix != ".csv":

@@ -29,7 +29,7 @@ def state_vector(state: State) -> Array:
 
 
 def states_of(x: Array, c: Array | None = None) -> State:
-    """A `State` of n epochs from state vectors, shape (n, 21), and calibration vectors, shape (n, C) or (C,), if any."""
+    """`State` of n epochs from state vectors, shape (n, 21), and calibration vectors, if any, shape (n, C) or (C,)."""
     calibration = {} if c is None else {name: c[..., part] for name, part in LAYOUT.items()}
     return State(x[:, :9].reshape(-1, 3, 3), x[:, 9:12], x[:, 12:15], x[:, 15:21], calibration)
 

@@ -75,8 +75,10 @@ class Lags:
     def _average(self) -> None:
         """One sample of the IMU instead of some."""
         some, self._samples = self._samples, []
-        time, values = sum(m.time for m in some) / len(some), sum(m.values for m in some) / len(some)
-        self._newest.append(Measurement(time, "imu", values, some[0].row))
+        first, *rest = some
+        time = sum((m.time for m in rest), first.time) / len(some)
+        values = sum((m.values for m in rest), first.values) / len(some)
+        self._newest.append(Measurement(time, "imu", values, first.row))
 
     def _take_newest(self, since: float) -> None:
         """Put the newest measurements into the window, in order, and forget those before a time [s]."""
