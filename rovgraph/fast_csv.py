@@ -16,31 +16,37 @@ _QUOTED = frozenset('",\n\r')  # what a cell holds that has to be quoted
 
 
 def write_csv(
-    frame: pd.DataFrame, path: Path, digits: int = 7, append: bool = False, decimals: Mapping[str, int] | None = None
+    table: "pd.DataFrame | Mapping[str, NDArray[Any]]",
+    path: Path,
+    digits: int = 7,
+    append: bool = False,
+    decimals: Mapping[str, int] | None = None,
 ) -> None:
     """Write a table without its index, to the byte what ``DataFrame.to_csv(float_format="%.7g")`` writes.
 
     Parameters
     ----------
-    frame : columns of numbers or text; NaN is an empty cell
+    table : columns of numbers or text; NaN is an empty cell
     path : of the file; one that is to be compressed is left to pandas
     digits : significant digits of a float
     append : to an older file, without the names
     decimals : column -> digits after the point, of columns of floats that are all known
     """
     fixed = {name: f"%.{count}f" for name, count in (decimals or {}).items()}
-    formats = [fixed.get(str(name)) or _format(frame[name], digits) for name in frame]
+    columns = {str(name): np.asarray(own) for name, own in table.items()}
+    holey = {name: bool(np.isnan(column).any()) for name, column in columns.items() if column.dtype.kind == "f"}
+    formats = [fixed.get(name) or _format(column, holey.get(name, False), digits) for name, column in columns.items()]
     if None in formats or path.suffix != ".csv":
+        frame = pd.DataFrame(table)
         frame = frame.assign(**{name: frame[name].map(form.__mod__) for name, form in fixed.items()})
         frame.to_csv(path, mode="a" if append else "w", header=not append, index=False, float_format=f"%.{digits}g")
         return
     row = ",".join(str(own) for own in formats) + "\n"
-    columns = [(frame[name], bool(frame[name].isna().any())) for name in frame]
     with path.open("a" if append else "w", encoding="utf-8", newline="") as file:
         if not append:
-            file.write(",".join(str(name) for name in frame) + "\n")
-        for begin in range(0, len(frame), ROWS):
-            parts = [_cells(column.iloc[begin : begin + ROWS], holey, digits) for column, holey in columns]
+            file.write(",".join(columns) + "\n")
+        for begin in range(0, len(next(iter(columns.values()), ())), ROWS):
+            parts = [_cells(column[begin : begin + ROWS], holey.get(name), digits) for name, column in columns.items()]
             cells: list[object] = [None] * (len(parts) * len(parts[0]))
             for k, part in enumerate(parts):
                 cells[k :: len(parts)] = part
@@ -123,19 +129,19 @@ def _text(
     return "".join([lines[k] for k in which.tolist()]) % tuple(numbers.tolist())
 
 
-def _format(column: "pd.Series[Any]", digits: int) -> str | None:
+def _format(column: NDArray[Any], holey: bool, digits: int) -> str | None:
     """How a cell is formatted; None where pandas knows better."""
     if column.dtype.kind == "f":
-        return "%s" if column.isna().any() else f"%.{digits}g"
+        return "%s" if holey else f"%.{digits}g"
     if column.dtype.kind in "iu":
         return "%d"
-    texts = column.unique().tolist() if column.dtype.kind != "b" else [True]
+    texts = set(column.tolist()) if column.dtype.kind == "O" else {True}
     return "%s" if all(isinstance(text, str) and _QUOTED.isdisjoint(text) for text in texts) else None
 
 
-def _cells(column: "pd.Series[Any]", holey: bool, digits: int) -> list[object]:
+def _cells(column: NDArray[Any], holey: bool | None, digits: int) -> list[object]:
     """Some rows of a column; ``holey`` = somewhere in it a value is not known."""
     values: list[object] = column.tolist()
-    if column.dtype.kind == "f" and holey:
+    if holey:
         return ["" if value != value else f"%.{digits}g" % value for value in values]
     return values

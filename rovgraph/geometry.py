@@ -99,14 +99,11 @@ def rpy_from_matrix(R: ArrayLike) -> Array:
     ndarray, shape (..., 3)
     """
     R = np.asarray(R, dtype=float)
-    return np.stack(
-        [
-            np.arctan2(R[..., 2, 1], R[..., 2, 2]),
-            -np.arcsin(np.clip(R[..., 2, 0], -1.0, 1.0)),
-            np.arctan2(R[..., 1, 0], R[..., 0, 0]),
-        ],
-        axis=-1,
-    )
+    out = np.empty(R.shape[:-1])
+    out[..., 0] = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    out[..., 1] = -np.arcsin(np.minimum(np.maximum(R[..., 2, 0], -1.0), 1.0))
+    out[..., 2] = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return out
 
 
 def level_from_force(force_b: Array) -> Array:

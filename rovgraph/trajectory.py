@@ -8,6 +8,7 @@ tools such as ``evo_ape``.
 
 import zlib
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ class Trajectory:
         """Of the position, north, east, down [m^2], shape (n, 3, 3): ``cov_p``."""
         return self.cov_p
 
-    @property
+    @cached_property
     def rpy(self) -> Array:
         """Roll, pitch, yaw [rad], shape (n, 3)."""
         return rpy_from_matrix(self.R_nb)
@@ -128,16 +129,16 @@ class Trajectory:
         covariances = linear(self.cov_p), linear(self.cov_theta), linear(self.cov_v)
         return Trajectory(np.asarray(time, float), linear(self.p_n), R_nb, linear(self.v_n), *covariances)
 
+    def columns(self) -> dict[str, Array]:
+        """The columns of the contract, each of shape (n,)."""
+        values, sds = (self.p_n, self.rpy, self.v_n), (self.p_sd, self.rpy_sd, self.v_sd)
+        known = dict(zip(COLUMNS[1:], np.concatenate(values, axis=1).T, strict=True))
+        known |= zip([f"{name}_sd" for name in COLUMNS[1:]], np.concatenate(sds, axis=1).T, strict=True)
+        return {"time": self.time, **known, "cov_north_east": self.cov_p[:, 0, 1]}
+
     def to_frame(self) -> pd.DataFrame:
         """The columns of the contract, one row per epoch."""
-        values = np.column_stack([self.p_n, self.rpy, self.v_n])
-        frame = pd.DataFrame(values, columns=pd.Index(COLUMNS[1:]))
-        frame.insert(0, "time", self.time)
-        sds = np.column_stack([self.p_sd, self.rpy_sd, self.v_sd])
-        for name, sd in zip(COLUMNS[1:], sds.T, strict=True):
-            frame[name + "_sd"] = sd
-        frame["cov_north_east"] = self.cov_p[:, 0, 1]
-        return frame
+        return pd.DataFrame(self.columns())
 
     def geodetic(self, origin: tuple[float, float]) -> tuple[Array, Array]:
         """Latitude and longitude [deg], each of shape (n,).
@@ -167,20 +168,19 @@ class Trajectory:
         origin : latitude and longitude [deg] of north = east = 0, for columns ``lat`` and ``lon``; None = without
         unix : whether there is a column ``unix_time``, empty for other times; None = if the time is Unix time
         """
-        frame = self.to_frame().dropna(axis="columns", how="all").round(12) + 0.0  # no -0
+        rounded = {name: np.round(own, 12) + 0.0 for name, own in self.columns().items()}  # no -0
+        known = {name: own for name, own in rounded.items() if not np.isnan(own).all()}
         decimals = {"time": 4}
-        far = [
-            name for name in POSITION if name in frame and frame[name].abs().max() >= FAR and frame[name].notna().all()
-        ]
+        far = [name for name in POSITION if name in known and np.abs(known[name]).max() >= FAR]  # none where one is NaN
         decimals |= dict.fromkeys(far, 4)  # seven digits of a grid's northing are a metre
         dated = is_unix(self.time)
         if unix or (unix is None and dated):
-            frame["unix_time"] = frame["time"] if dated else np.nan
+            known["unix_time"] = known["time"] if dated else np.full(len(self), np.nan)
             decimals |= {"unix_time": 4} if dated else {}
         if origin is not None:
-            frame["lat"], frame["lon"] = self.geodetic(origin)
+            known["lat"], known["lon"] = self.geodetic(origin)
             decimals |= {"lat": 9, "lon": 9}  # a tenth of a millimetre
-        write_csv(frame, as_path(path, "path"), append=more, decimals=decimals)
+        write_csv(known, as_path(path, "path"), append=more, decimals=decimals)
 
     def write_tum(self, path: Path | str) -> None:
         """Write a TUM file: ``time x y z qx qy qz qw``, n axes; its first line says so (its name should: `TUM`)."""

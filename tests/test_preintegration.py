@@ -9,13 +9,14 @@ from dives import LIVELY, altered, as_log, batch, changed, falcon, fed, kept, le
 from rovgraph.config import Config, parse_config
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.motion import Motion
-from rovgraph.engine.preintegration import PreintegrationParams, preintegrate, preintegration_params
+from rovgraph.engine.preintegration import PreintegrationParams, preintegrate, preintegration_params, scatter
 from rovgraph.engine.transition import predict
 from rovgraph.errors import InputError
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import earth_rate_n, log_rotation, rpy_from_matrix
 from rovgraph.kernels.coasting import BRIDGE_GYR
+from rovgraph.kernels.imu_samples import typical_scatter
 from rovgraph.simulate import Path, scenario
 from rovgraph.simulate.imu import specific_force_and_rate
 from rovgraph.state import State
@@ -236,3 +237,13 @@ def test_helpers_of_these_tests_make_logs_in_the_logs_contract():
     zeroed = altered(again, "depth", 0 * again["depth"].data)
     assert not zeroed["depth"].data.any()
     assert level_log(1.0, np.zeros(3), np.zeros(3))["imu"].data.shape == (101, 6)
+
+
+@pytest.mark.parametrize("count", [3, 4, 33])
+def test_typical_scatter_is_the_median_over_samples_and_the_mean_over_axes(count):
+    rng = np.random.default_rng(3)
+    table = np.column_stack([0.01 * np.arange(count), rng.normal(size=(count, 6))])
+    typical = np.empty(2)
+    typical_scatter(table, typical)
+    middle = np.sort(np.abs(scatter(table[:, 0], table[:, 1:])), axis=0)[(count - 2) // 2]
+    np.testing.assert_allclose(typical, 1.4826 * middle.reshape(2, 3).mean(axis=1), rtol=1e-15)

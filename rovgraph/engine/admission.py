@@ -26,7 +26,7 @@ def admitted(sensor: str, values: Array, config: Config, left_out: Counter[tuple
     """
     mask = np.ones(len(values), bool)
     for reason, bad in SENSORS[sensor].refused(values, config):
-        if (bad & mask).any():
-            left_out[sensor, reason] += int((bad & mask).sum())
+        if count := int((bad & mask).sum()):
+            left_out[sensor, reason] += count
             mask &= ~bad
     return mask

@@ -13,7 +13,7 @@ longer than that, and counting each sample would make the estimate too sure of i
 """
 
 import math
-from bisect import bisect_right, insort
+from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
@@ -46,7 +46,8 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.log import Measurement
 from rovgraph.log.packing import pack, unpack
 from rovgraph.sensors import SENSORS, ModelAiding
-from rovgraph.state import PLACE, State
+from rovgraph.sensors.sensor import none_refused
+from rovgraph.state import PLACE
 
 _AT_KEYFRAME = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])[None]  # a snapshot without motion
 
@@ -78,7 +79,10 @@ class Assembler:
         self._ticking = has_constant_velocity(self.config)
         self._samples = Ticks(self.config) if self._ticking else Samples(self.config, self.learn_noise)
         self._closing = {*self.instruments} if self._ticking else {"dvl"}  # sensors that make keyframes
-        self._waiting: deque[StampedMeasurement] = deque()
+        self._arrived: list[StampedMeasurement] = []  # since `_take_until` looked last
+        self._waiting: deque[StampedMeasurement] = deque()  # in order, admitted
+        self._refusing = {sensor for sensor in self.instruments if SENSORS[sensor].refused is not none_refused}
+        self._due = math.inf  # time of the first that waits or has arrived, and closes an interval [s]
         self._aiding: Aiding | None = None
         if "thruster" in self.instruments:
             self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
@@ -92,6 +96,8 @@ class Assembler:
         self._scaled = wanted(believed)
         lasting = unknowns(believed, self.instruments).time_constants  # which begin a segment at every keyframe
         self._segment_s = 0.0 if lasting else self.config.graph.segment_s
+        graph = self.config.graph
+        self._longest_gap = graph.max_gap_s + graph.ping_due_s  # a ping that is late may still come
         self._around = HALF_WINDOW_S + self.time_offsets.span
         self._dim = max(i.model.dim for i in self.instruments.values()) if self.instruments else 0
         # the rate reaches these: by a lever arm, or by the motion of a turning body
@@ -112,25 +118,27 @@ class Assembler:
             if measurement.sensor == "thruster":
                 if self._aiding is not None:
                     self._aiding.add(measurement)
-            elif self._admissible(measurement):
-                insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
+            elif measurement.sensor in self.instruments:
+                self._put(measurement)
             if not self._ticking:
                 return []
             measurement = tick(measurement)
         elif self._ticking:
             return []
         if self._samples.add(measurement):  # after a gap: a keyframe here, so that nothing is carried through it
-            insort(self._waiting, self.time_offsets.placed(measurement), key=_time)
-        done: list[KeyframeInterval] = []
+            self._put(measurement)
+        until = measurement.time - self._around
         if self._index < 0:
-            done.append(self._begin(measurement.time))
-        return done + self._take_until(measurement.time - self._around)
+            return [self._begin(measurement.time), *self._take_until(until)]
+        if until < self._due and until - self._start <= self._longest_gap:
+            return []
+        return self._take_until(until)
 
     def copy(self) -> "Assembler":
         """One that goes on by itself from here."""
         twin = copy(self)
         twin._samples, twin.left_out = self._samples.copy(), self.left_out.copy()
-        twin._waiting, twin._between = self._waiting.copy(), self._between[:]
+        twin._arrived, twin._waiting, twin._between = self._arrived[:], self._waiting.copy(), self._between[:]
         twin._landmarks = self._landmarks.copy()
         twin.time_offsets = self.time_offsets.copy()
         if self._aiding is not None:
@@ -139,6 +147,7 @@ class Assembler:
 
     def state(self) -> dict[str, Any]:
         """Where it stands, as plain values and arrays."""
+        self._admit()
         return {
             **self._samples.state(),
             "waiting": pack_stamped(self._waiting),
@@ -155,6 +164,7 @@ class Assembler:
         """Go on from where another stood."""
         self._samples.restore(state)
         self._waiting, self._between = deque(unpack_stamped(state["waiting"])), unpack_stamped(state["between"])
+        self._arrived, self._due = [], self._first_closing()
         self.time_offsets.assumed.update(state["assumed"])
         if self._aiding is not None:
             self._aiding.signals = unpack(state["signals"])
@@ -162,28 +172,29 @@ class Assembler:
         self.bias = state["bias"]
         self._landmarks.seen, self._landmarks.count = dict(state["sighted"].tolist()), state["landmarks"]
 
-    def ahead(self, samples: Sequence[Measurement], time: float, state: State) -> KeyframeInterval:
+    def ahead(self, samples: Sequence[Measurement], time: float, x: Array) -> KeyframeInterval:
         """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.
 
         Parameters
         ----------
         samples : of the IMU, those that have not been taken yet
         time : [s]
-        state : State of one epoch, of the newest keyframe
+        x : ndarray, shape (21,), state vector of the newest keyframe, as of `rovgraph.engine.filter_step.Gaussian`
         """
-        force = state.R_nb[0].T @ np.array([0.0, 0.0, -self.config.environment.gravity_mps2])
-        table = self._samples.ahead(samples, time, np.concatenate([force, np.zeros(3)]) + state.bias[0])
+        at_rest = x[15:].copy()
+        at_rest[:3] -= self.config.environment.gravity_mps2 * x[6:9]
+        table = self._samples.ahead(samples, time, at_rest)
         motion, _ = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
         rate_b, rate_sd = self._samples.rate(table, time)
         return KeyframeInterval(self._index + 1, time, self._segment, rate_b, rate_sd, motion, [])
 
     def _take_until(self, time: float) -> list[KeyframeInterval]:
         """Place what has waited for the IMU up to a time."""
-        due = self.config.graph.ping_due_s
+        self._admit()
         done: list[KeyframeInterval] = []
         while self._waiting and self._waiting[0].time <= time:
             m = self._waiting.popleft()
-            done += self._silence(m.time, due)
+            done += self._silence(m.time, self._longest_gap)
             if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
                 done.append(self._close(m.time))
             elif self._ticking and m.time - self._heard > LONGEST_CRUISED_S:
@@ -194,7 +205,9 @@ class Assembler:
             elif m.sensor != "imu":
                 self._between.append(m)
             self._heard = m.time
-        return done + self._silence(time, due)
+        done += self._silence(time, self._longest_gap)
+        self._due = self._first_closing()
+        return done
 
     def finish(self) -> list[KeyframeInterval]:
         """Place the rest, and a last keyframe at the last IMU sample."""
@@ -202,30 +215,50 @@ class Assembler:
         if end == -math.inf:
             return []
         done = self._take_until(end)
-        done += self._silence(end, 0.0)
+        done += self._silence(end, self.config.graph.max_gap_s)
         self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
         if end - self._start < SHORTEST_S:
             self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
             return done
         return [*done, self._close(end)]
 
-    def _admissible(self, m: Measurement) -> bool:
-        """Whether a measurement may enter the graph; counts those that may not."""
-        return m.sensor in self.instruments and bool(admitted(m.sensor, m.values[None], self.config, self.left_out)[0])
+    def _put(self, m: Measurement) -> None:
+        """Keep a measurement until `_take_until` looks; one of the IMU marks a gap before it."""
+        placed = self.time_offsets.placed(m)
+        self._arrived.append(placed)
+        if m.sensor in self._closing or m.sensor == "imu":
+            self._due = min(self._due, placed.time)
+
+    def _admit(self) -> None:
+        """Put those that have arrived, and may enter the graph, in order; count those that may not."""
+        if not self._arrived:
+            return
+        arrived, self._arrived = self._arrived, []
+        values: dict[str, list[Array]] = {}
+        for m in arrived:
+            if m.sensor in self._refusing:
+                values.setdefault(m.sensor, []).append(m.values)
+        may = {s: iter(admitted(s, np.array(own), self.config, self.left_out).tolist()) for s, own in values.items()}
+        admissible = [m for m in arrived if m.sensor not in may or next(may[m.sensor])]
+        self._waiting = deque(sorted([*self._waiting, *admissible], key=_time))
+
+    def _first_closing(self) -> float:
+        """Time of the first that waits and closes an interval [s]."""
+        return min((m.time for m in self._waiting if m.sensor in self._closing or m.sensor == "imu"), default=math.inf)
 
     def _begin(self, time: float) -> KeyframeInterval:
         """The first keyframe, at the first IMU sample, before which nothing can be placed."""
+        self._admit()
         early = [m for m in self._waiting if m.time < time]
         self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
         self._waiting = deque(m for m in self._waiting if m.time >= time)
         return self._close(time)
 
-    def _silence(self, time: float, ping_due_s: float) -> list[KeyframeInterval]:
-        """Keyframes for a time without pings; one that is ``ping_due_s`` late may still come."""
+    def _silence(self, time: float, longest: float) -> list[KeyframeInterval]:
+        """Keyframes for a time without pings, wherever it is longer than ``longest`` [s]."""
         done = []
-        gap = self.config.graph.max_gap_s
-        while time - self._start > gap + ping_due_s:
-            done.append(self._close(self._start + gap))
+        while time - self._start > longest:
+            done.append(self._close(self._start + self.config.graph.max_gap_s))
         return done
 
     def _together_with(self, m: StampedMeasurement) -> Iterator[StampedMeasurement]:

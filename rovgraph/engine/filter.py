@@ -91,6 +91,7 @@ class FilterEngine:
             s for s, i in instruments.items() if not compiled(i, i.time_offset in self.unknowns.walks) or s == PLACE
         }
         self._sensors = sensor_table(instruments, sorted(self._given))
+        self._no_rows = np.empty(0), np.empty((0, self.layout.width))
         self._index = {sensor: k for k, sensor in enumerate(instruments)}
 
     def start(self) -> Gaussian:
@@ -249,8 +250,9 @@ class FilterEngine:
     ) -> Gaussian:
         """The estimate corrected by measurements of no places."""
         given = [self._of_block(before, m) for m in measurements if m.sensor in self._given]
-        r = np.concatenate([own for own, _ in given]) if given else np.empty(0)
-        H = np.vstack([own for _, own in given]) if given else np.empty((0, self.layout.width))
+        r, H = self._no_rows
+        if given:
+            r, H = np.concatenate([own for own, _ in given]), np.vstack([own for _, own in given])
         scaled = measurements[0].scale_to_bias is not None
         scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
         rows = np.array([m.row[: at.ROW] for m in measurements])

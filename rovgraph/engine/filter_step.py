@@ -28,9 +28,9 @@ def state_vector(state: State) -> Array:
     return np.concatenate([state.R_nb.ravel(), state.p_n[0], state.v_n[0], state.bias[0]])
 
 
-def states_of(x: Array, c: Array) -> State:
-    """A `State` of n epochs from state vectors, shape (n, 21), and calibration vectors, shape (n, C) or (C,)."""
-    calibration = {name: c[..., part] for name, part in LAYOUT.items()}
+def states_of(x: Array, c: Array | None = None) -> State:
+    """`State` of n epochs from state vectors, shape (n, 21), and calibration vectors, if any, shape (n, C) or (C,)."""
+    calibration = {} if c is None else {name: c[..., part] for name, part in LAYOUT.items()}
     return State(x[:, :9].reshape(-1, 3, 3), x[:, 9:12], x[:, 12:15], x[:, 15:21], calibration)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rovgraph.geometry import Array
+from rovgraph.kernels.imu_samples import typical_scatter
 
 NOISIER = 1.25  # times the believed density, before the samples' own is taken
 INTERVALS = 200  # the newest ones, over which it is taken
@@ -41,10 +42,9 @@ class NoiseFloor:
         """Remember what another did."""
         self._seen[: len(state)], self._count = state, len(state)
 
-    def take(self, odd: Array) -> None:
-        """Take an interval's scatter, shape (m, 6), of `rovgraph.engine.preintegration.scatter`."""
-        middle = np.sort(np.abs(odd), axis=0)[len(odd) // 2]
-        self._seen[self._count % INTERVALS] = 1.4826 * middle.reshape(2, 3).mean(axis=1)
+    def take(self, table: Array) -> None:
+        """Take an interval's samples, shape (m, 7), at least three."""
+        typical_scatter(table, self._seen[self._count % INTERVALS])
         self._count += 1
 
     def densities(self) -> Array:

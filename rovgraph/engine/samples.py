@@ -16,7 +16,6 @@ from rovgraph.engine.preintegration import (
     PreintegrationParams,
     integrate_motion,
     preintegration_params,
-    scatter,
 )
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -45,17 +44,21 @@ class Samples:
     Attributes
     ----------
     longest_step : between two samples that are no gap [s]
+    newest : time of the newest sample [s]; -inf where there is none
     params : of preintegration, with the noise that is believed
     """
 
     def __init__(self, config: Config, learn_noise: bool) -> None:
         self._config, self._learn_noise = config, learn_noise
+        self._max_gap_s = config.imu.max_gap_s
         self._R_sb = mount_matrix(config.imu.mount_rpy_deg).T
         self._noise = config.imu.noise.acc, config.imu.noise.gyr
         self._floor = NoiseFloor(np.array(self._noise))
         self.params = preintegration_params(config, *self._noise)
         self._bridge = preintegration_params(config, BRIDGE_ACC, BRIDGE_GYR)
         self._rows, self._first, self._last = np.empty((ROOM, 7)), 0, 0  # motions hold views of rows: write only once
+        self._fresh: list[Measurement] = []  # that have no row yet
+        self.newest = -math.inf
         self._periods: list[float] = []
         self.longest_step = math.inf
 
@@ -71,30 +74,24 @@ class Samples:
         InputError : a gap longer than ``imu.max_gap_s``
         """
         missing = False
-        if self._last > self._first:
+        if self.newest > -math.inf:
             period = m.time - self.newest
             missing = period > self.longest_step
-            if period > self._config.imu.max_gap_s:
+            if period > self._max_gap_s:
                 raise too_long(self._config, period, m.time, m.row)
-            self._take_period(period)
-        if self._last == len(self._rows):
-            kept = self.table
-            self._rows = np.empty((len(kept) + ROOM, 7))
-            self._rows[: len(kept)], self._first, self._last = kept, 0, len(kept)
-        row = self._rows[self._last]
-        row[0], row[1:] = m.time, in_body(m.values[:6], self._R_sb)
-        self._last += 1
+            if len(self._periods) < PERIODS:
+                self._take_period(period)
+        self._fresh.append(m)
+        self.newest = m.time
         return missing
 
     @property
     def table(self) -> Array:
         """All that are kept, shape (m, 7): time, specific force, rate in body axes."""
+        if self._fresh:
+            self._append(self._fresh)
+            self._fresh = []
         return self._rows[self._first : self._last]
-
-    @property
-    def newest(self) -> float:
-        """Time of the newest sample [s]; -inf where there is none."""
-        return float(self._rows[self._last - 1, 0]) if self._last > self._first else -math.inf
 
     def forget(self, time: float, before: float) -> None:
         """Keep those that cover a time and what is up to ``before`` it [s]."""
@@ -111,8 +108,7 @@ class Samples:
         """
         rows = [self.table]
         if later:
-            values = in_body(np.array([m.values[:6] for m in later]), self._R_sb)
-            rows.append(np.column_stack([[m.time for m in later], values]))
+            rows.append(self._in_body(later))
         if time - rows[-1][-1, 0] > self.longest_step:
             rows.append(np.concatenate([[time], at_rest])[None])
         return np.concatenate(rows)
@@ -159,6 +155,7 @@ class Samples:
         """One that goes on by itself from here."""
         twin = copy(self)
         twin._rows, twin._first, twin._last = self.table, 0, len(self.table)  # full: the next sample goes elsewhere
+        twin._fresh = []
         twin._floor, twin._periods = self._floor.copy(), self._periods[:]
         return twin
 
@@ -169,6 +166,7 @@ class Samples:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
         self._rows, self._first, self._last = np.ascontiguousarray(state["imu"]), 0, len(state["imu"])
+        self._fresh, self.newest = [], float(self._rows[-1, 0]) if self._last else -math.inf
         self._periods = list(state["periods"])
         self.longest_step = longest_regular(self._periods)
         self._floor.restore(state["floor"])
@@ -176,14 +174,30 @@ class Samples:
             self._raise(*self._floor.densities().tolist())
 
     def _take_period(self, period: float) -> None:
-        if len(self._periods) < PERIODS:
-            self._periods.append(period)
-            self.longest_step = longest_regular(self._periods)
+        self._periods.append(period)
+        self.longest_step = longest_regular(self._periods)
+
+    def _append(self, samples: Sequence[Measurement]) -> None:
+        """Give samples rows: all of an interval at once."""
+        if self._last + len(samples) > len(self._rows):
+            kept = self._rows[self._first : self._last]
+            self._rows = np.empty((len(kept) + len(samples) + ROOM, 7))
+            self._rows[: len(kept)], self._first, self._last = kept, 0, len(kept)
+        last = self._last + len(samples)
+        self._rows[self._last : last] = self._in_body(samples)
+        self._last = last
+
+    def _in_body(self, samples: Sequence[Measurement]) -> Array:
+        """Rows of samples, shape (n, 7)."""
+        rows = np.empty((len(samples), 7))
+        rows[:, 0] = [m.time for m in samples]
+        rows[:, 1:] = in_body(np.array([m.values[:6] for m in samples]), self._R_sb)
+        return rows
 
     def _params_for(self, table: Array, shown: Sequence[float]) -> PreintegrationParams:
         """The believed noise, or where a knock shakes the samples far more, what they show."""
         if self._learn_noise:
-            self._floor.take(scatter(table[:, 0], table[:, 1:]))
+            self._floor.take(table)
             self._raise(*self._floor.densities().tolist())
         acc, gyr = self._noise
         if not knocked(np.array(shown), self._noise):

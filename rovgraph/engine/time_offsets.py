@@ -7,11 +7,12 @@ assumption may be renewed while measurements come.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rovgraph.calibration import LAYOUT
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.late_stamp_window import KNOT_S
 from rovgraph.geometry import Array
@@ -70,7 +71,7 @@ class TimeOffsets:
 
     def copy(self) -> "TimeOffsets":
         """One that goes on by itself from here."""
-        return replace(self, assumed=dict(self.assumed))
+        return TimeOffsets(self.variable, self.lags, dict(self.assumed))
 
     @property
     def span(self) -> float:
@@ -90,10 +91,10 @@ class TimeOffsets:
         """Lateness that is reckoned with for a sensor, shape (K,) [s]; None where it is not estimated."""
         return self.lags.get(self.variable.get(sensor, ""))
 
-    def assume(self, calibration: Mapping[str, Array]) -> None:
-        """Renew the assumption, as far as it was reckoned with."""
+    def assume(self, c: Array) -> None:
+        """Renew the assumption by a calibration vector, shape (C,), as far as it was reckoned with."""
         for name, lag in self.lags.items():
-            self.assumed[name] = float(np.clip(np.mean(calibration[name]), lag[0], lag[-1]))
+            self.assumed[name] = float(np.clip(np.mean(c[LAYOUT[name]]), lag[0], lag[-1]))
 
     def off(self, calibration: Mapping[str, Array]) -> float:
         """How far the assumption lies from estimates, at most [s]."""

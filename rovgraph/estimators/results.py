@@ -44,8 +44,8 @@ def body_trajectory(
     v_n = states.v_n - rotate(R, cross(rate_b - states.bias[:, 3:], lever_arm_b))
     if cov_pose is None or cov_velocity is None:
         return Trajectory.certain(time, p_n, R, v_n)
-    J = R @ np.concatenate([skew(lever_arm_b), np.eye(3)], axis=-1)  # p - R l, right perturbation
     arm = R @ skew(lever_arm_b)
+    J = np.concatenate([arm, R], axis=-1)  # p - R l, right perturbation
     return Trajectory(
         time,
         p_n,

@@ -116,6 +116,24 @@ def survey(table: Array, first: Index, last: Index, start: Array, end: Array, fo
         found_out[n, 0], found_out[n, 1], found_out[n, 2], found_out[n, 3] = longest, within, acc, gyr
 
 
+@kernel("void(f8[:, ::1], f8[::1])")
+def typical_scatter(imu: Array, typical_out: Array) -> None:
+    """How much at least three samples, shape (m, 7), scatter as a rule, as noise densities; shape (2,).
+
+    By the median along each axis, which knocks leave as it is, of differences as `survey` takes them.
+    """
+    inner = len(imu) - 2
+    odd = np.empty(inner)
+    root = math.sqrt((imu[inner + 1, 0] - imu[0, 0]) / (inner + 1) / 1.5)
+    for half in range(2):
+        total = 0.0
+        for i in range(1 + 3 * half, 4 + 3 * half):
+            for k in range(inner):
+                odd[k] = abs((imu[k + 1, i] - 0.5 * (imu[k, i] + imu[k + 2, i])) * root)
+            total += np.sort(odd)[inner // 2]
+        typical_out[half] = 1.4826 * (total / 3.0)
+
+
 @kernel("void(f8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], i8, f8[:, ::1])")
 def mean_signals(
     table: Array, first: Index, last: Index, begin: Array, end: Array, count: int, mean_out: Array

@@ -94,9 +94,7 @@ class Clocks:
         """
         if message.stamp is None:
             return message.arrival if self._base is None else message.arrival - self._base.delay.value
-        clock = self._clocks.setdefault(
-            (message.source, message.clock), _Clock(f"{message.source} {message.clock}".strip())
-        )
+        clock = self._clocks.get((message.source, message.clock)) or self._met(message)
         if self._base is None and any(r.sensor == "imu" for r in message.readings):
             self._base, clock.apart = clock, 0.0
         clock.newest, processing = message.stamp, message.latency or 0.0
@@ -134,6 +132,12 @@ class Clocks:
             self._clocks[known["source"][0], known["source"][1]] = clock
             if clock.name == state["base"]:
                 self._base = clock
+
+    def _met(self, message: Message) -> _Clock:
+        """A clock that has not been read before."""
+        clock = _Clock(f"{message.source} {message.clock}".strip())
+        self._clocks[message.source, message.clock] = clock
+        return clock
 
     def _recorded(self, stamp: float, clock: _Clock) -> float:
         """The time of a recording's stamp."""

@@ -7,12 +7,12 @@ and those before it that were, taken back. What disagrees with the estimate is t
 reject.
 """
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from rovgraph.geometry import Array
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.live.solution import Event
 from rovgraph.log import Measurement
@@ -66,7 +66,7 @@ class Watch:
     values: bytes = b""
     since: float = 0.0  # of the first of equal values
     equal: int = 0
-    turned: Array = field(default_factory=lambda: np.zeros(3))  # how far the vehicle had by then [rad]
+    turned: tuple[float, ...] = (0.0, 0.0, 0.0)  # how far the vehicle had by then [rad]
     by_hand: bool = False  # no sensor has measured yet: nothing is late
 
 
@@ -83,7 +83,7 @@ class Faults:
     watches: dict[str, Watch] = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
     _now: float = -np.inf
-    _turned: Array = field(default_factory=lambda: np.zeros(3))  # since the beginning, by the gyro [rad]
+    _turned: tuple[float, ...] = (0.0, 0.0, 0.0)  # since the beginning, by the gyro [rad]
     _speeds: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=3))
 
     def look(self, m: Measurement) -> Verdict:
@@ -99,15 +99,26 @@ class Faults:
         if watch.time > -np.inf:
             step = m.time - watch.time
             if m.sensor == "imu" and 0.0 < step < LONGEST_STEP_S:
-                self._turned = self._turned + m.values[3:6] * step
+                (x, y, z), (a, b, c) = self._turned, m.values[3:6].tolist()
+                self._turned = x + a * step, y + b * step, z + c * step
             watch.period = step if not watch.period else watch.period + 0.05 * (step - watch.period)
-        self._now = max(self._now, m.time)
-        watch.time, watch.heard, watch.values = max(m.time, watch.time), self._now, values
+        if m.time > self._now:
+            self._now = m.time
+        if m.time > watch.time:
+            watch.time = m.time
+        watch.heard, watch.values = self._now, values
         if m.sensor == "dvl":
             return self._ping(m, watch)
-        frozen = watch.equal >= FROZEN.get(m.sensor, np.inf) or (
-            watch.equal > 2 and m.sensor in HEADING_STREAMS and np.abs(self._turned - watch.turned).max() > TURNED
+        frozen = watch.equal > 1 and (
+            watch.equal >= FROZEN.get(m.sensor, math.inf)
+            or (
+                watch.equal > 2
+                and m.sensor in HEADING_STREAMS
+                and max(abs(now - then) for now, then in zip(self._turned, watch.turned, strict=True)) > TURNED
+            )
         )
+        if not frozen and watch.state == "ok" and not watch.reported:
+            return _GOOD
         return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
 
     def accept(self, m: Measurement) -> Verdict:

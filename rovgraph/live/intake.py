@@ -8,6 +8,7 @@ import pymap3d
 
 from rovgraph.config import Config, Mag
 from rovgraph.geometry import Array
+from rovgraph.live.geodesy import geodetic
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.log import Measurement
 
@@ -56,8 +57,9 @@ class Intake:
             self._local = True
         elif sensor == "mag":
             values = self.calibrated(values)
-        if len(values) != self._sizes.setdefault(sensor, len(values)):
-            self._left_out[sensor, f"{len(values)} signals, and {self._sizes[sensor]} before"] += 1
+        size = len(values)
+        if size != self._sizes.setdefault(sensor, size):
+            self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
             return None
         newest = self._newest.get(sensor, -np.inf)
         if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
@@ -81,5 +83,4 @@ class Intake:
         """Latitude and longitude [deg] of a position, shape (3,), where the origin is known."""
         if self.origin is None:
             return None, None
-        latitude, longitude, _ = pymap3d.ned2geodetic(p_n[0], p_n[1], 0.0, *self.origin, 0.0)
-        return float(latitude), float(longitude)
+        return geodetic(float(p_n[0]), float(p_n[1]), self.origin)

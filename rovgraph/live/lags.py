@@ -5,7 +5,7 @@ turning by compasses and gyro, the DVL's way and fixes, its vertical velocity an
 is said, and again after half an hour if it lasts, with the figures that it then has.
 """
 
-from collections import deque
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -16,7 +16,8 @@ from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding
 from rovgraph.check.fixes import track
 from rovgraph.config import Config
-from rovgraph.log import Log, Measurement, gathered
+from rovgraph.log import Log, Measurement, Stream, gathered
+from rovgraph.log.streams import joined
 
 WINDOW_S = 300.0  # of motion that is compared
 FIRST_S = 60.0  # of motion, before which nothing is compared
@@ -36,9 +37,10 @@ class Lags:
     """
 
     config: Config
-    _window: deque[Measurement] = field(default_factory=deque)
+    _window: dict[str, Stream] = field(default_factory=dict)
+    _newest: list[Measurement] = field(default_factory=list)  # since the last comparison
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
-    _next: float = np.inf
+    _next: float = math.inf
     _suspected: set[tuple[str, str]] = field(default_factory=set)
     _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
@@ -50,34 +52,46 @@ class Lags:
         list of (sensor, text) : what is known to be late from now on, with the configuration that mends it
         """
         if m.sensor != "imu":
-            self._window.append(m)
+            self._newest.append(m)
             return []
         self._samples.append(m)
         if m.time - self._samples[0].time < STEP_S:
             return []
         self._average()
-        if not np.isfinite(self._next):
+        if self._next == math.inf:
             self._next = m.time + FIRST_S
         if m.time < self._next:
             return []
-        while self._window[0].time < m.time - WINDOW_S:
-            self._window.popleft()
-        span = m.time - self._window[0].time
-        self._next = m.time + float(np.clip(0.25 * span, *EVERY_S))
+        self._take_newest(m.time - WINDOW_S)
+        span = m.time - min(float(stream.time[0]) for stream in self._window.values())
+        self._next = m.time + min(max(0.25 * span, EVERY_S[0]), EVERY_S[1])
         return list(self._compared())
 
     def finish(self) -> list[tuple[str, str]]:
         """No more measurements: what `add` has not said yet."""
+        self._take_newest(-math.inf)
         return list(self._compared()) if self._suspected else []
 
     def _average(self) -> None:
         """One sample of the IMU instead of some."""
         some, self._samples = self._samples, []
-        time, values = np.mean([m.time for m in some]), np.mean([m.values for m in some], axis=0)
-        self._window.append(some[0]._replace(time=float(time), values=values))
+        first, *rest = some
+        time = sum((m.time for m in rest), first.time) / len(some)
+        values = sum((m.values for m in rest), first.values) / len(some)
+        self._newest.append(Measurement(time, "imu", values, first.row))
+
+    def _take_newest(self, since: float) -> None:
+        """Put the newest measurements into the window, in order, and forget those before a time [s]."""
+        newest, self._newest = gathered(self._newest, "the newest").streams, []
+        for sensor in {**self._window, **newest}:
+            both = joined([streams[sensor] for streams in (self._window, newest) if sensor in streams])
+            if len(recent := both.take(both.time >= since)):
+                self._window[sensor] = recent
+            else:
+                self._window.pop(sensor, None)
 
     def _compared(self) -> Iterator[tuple[str, str]]:
-        log = gathered(sorted(self._window, key=lambda m: m.time), "the last minutes")
+        log = Log("the last minutes", self._window, None)
         found = [f for check in CHECKS for f in check(log, self.config) if f.clock and f.level != "ok"]
         found = [f for f in found if f.clock == "jump"] or found  # a lag before and after is the mean of two
         for finding in found:

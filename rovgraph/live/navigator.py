@@ -4,6 +4,7 @@ A message's time is reconciled, its readings are looked at for faults, and go to
 `Navigator.solution` carries the newest keyframe on to the present with the IMU.
 """
 
+import math
 import time as host
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions, restored
@@ -119,7 +120,7 @@ class Navigator:
         heard = (f"{url}: {', '.join(sorted(self._heard.get(url, ()))) or 'nothing yet'}" for url in sources)
         return "; ".join([self._startup.expects, *heard])
 
-    def take(self, message: Message) -> list[tuple[float, tuple[Reading, ...]]]:
+    def take(self, message: Message) -> Sequence[tuple[float, tuple[Reading, ...]]]:
         """Take a message; its readings with their times [s], and none where those cannot be known."""
         time = self.clocks.time(message)
         while self.clocks.news:
@@ -131,7 +132,7 @@ class Navigator:
         self._arrival = message.arrival
         if self.engine is None:
             self._hear(message)
-        rows = list(self._intake.timed(time, message.readings))
+        rows = self._intake.timed(time, message.readings)
         for at, own in rows:
             for reading in own:
                 if (measurement := self._intake.measurement(at, reading)) is not None:
@@ -259,7 +260,8 @@ class Navigator:
 
     def _consider(self, m: Measurement, by_hand: bool = False) -> None:
         """Give a measurement, of a sensor or of a person, to the engine, unless it is none."""
-        self.time = max(self.time, m.time)
+        if m.time > self.time:
+            self.time = m.time
         if m.sensor == "dvl_altitude":
             self._altitude = m.time, float(m.values[0])
         verdict = self.faults.accept(m) if by_hand else self.faults.look(m)
@@ -389,13 +391,11 @@ class Navigator:
 
     def _calibration(self, engine: FixedLag, known: Gaussian) -> dict[str, tuple[float, float]]:
         """Estimated calibration by label: value and sd."""
-        sd, columns = np.sqrt(np.diag(known.covariance)), engine.filter.layout.columns
+        c, sd, columns = known.c.tolist(), np.sqrt(known.covariance.diagonal()).tolist(), engine.filter.layout.columns
         return {
-            label: (float(value), float(own))
+            label: (value, own)
             for name in engine.filter.unknowns.estimated
-            for label, value, own in zip(
-                TABLE[name].labels, known.state.calibration[name].reshape(-1), sd[columns[name]], strict=True
-            )
+            for label, value, own in zip(TABLE[name].labels, c[LAYOUT[name]], sd[columns[name]], strict=True)
         }
 
     def _travelled(self, p_n: Array, sd: Array) -> float:
@@ -403,7 +403,7 @@ class Navigator:
         if sd.max() > 0.5 * ANYWHERE_M:
             self._here = np.full(3, np.nan)
             return self._distance
-        step = float(np.linalg.norm(p_n - self._here))
+        step = math.dist(p_n.tolist(), self._here.tolist())
         if not step < 1.0:
             self._distance += step if np.isfinite(step) else 0.0
             self._here = p_n

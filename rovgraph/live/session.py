@@ -21,7 +21,7 @@ from rovgraph.live.warnings import Warnings
 
 RATE_HZ = 5.0  # of solutions, about that of pings
 PAGE_RATE_HZ = 10.0  # where a person watches
-COLLECT = (50_000, 20, 50)  # thresholds of the collector: next to nothing here is cyclic
+COLLECT = (5_000, 200, 50)  # thresholds of the collector: next to nothing here is cyclic; few objects, short pauses
 QUIET_S = 0.5  # without the IMU, after which time goes on by the host's clock
 
 

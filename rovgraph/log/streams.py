@@ -4,7 +4,7 @@ import math
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -113,6 +113,12 @@ class Stream:
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Stream":
         """Some of its measurements, by index or by mask."""
         return Stream(self.sensor, self.columns, self.time[index], self.data[index], self.row[index])
+
+
+def joined(parts: Sequence[Stream]) -> Stream:
+    """One stream of some of one sensor, at least one, in the order of time."""
+    time, data, row = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "data", "row"))
+    return replace(parts[0], time=time, data=data, row=row).take(np.argsort(time, kind="stable"))
 
 
 def in_precedence(streams: Iterable[Stream]) -> list[Stream]:

@@ -102,7 +102,7 @@ class ErrorStateFilter:
         self.known = done.filtered
         self.history.append(interval, self.known, done.processed)
         self._reinitialise()
-        self.assembler.time_offsets.assume(self.latest().calibration)
+        self.assembler.time_offsets.assume(self.known.c)
         return done
 
     def run(

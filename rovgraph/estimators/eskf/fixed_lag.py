@@ -18,7 +18,7 @@ import numpy as np
 
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gates, Gaussian, ProcessedMeasurement, stack_states
+from rovgraph.engine.filter_step import Gates, Gaussian, ProcessedMeasurement, states_of
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.remembered_places import RememberedPlace
@@ -96,20 +96,20 @@ class FixedLag:
 
     def add(self, measurement: Measurement) -> InsertResult:
         """Take a measurement, whenever it arrives."""
-        record, position, again = self._record, len(self._record), False
-        if record and measurement.time <= record[-1].time:
-            own = place(measurement)
+        record = self._record
+        if record and measurement.time <= record[-1].time and (own := place(measurement)) <= place(record[-1]):
             position = bisect_right(record, own, key=place)
-            again = position > 0 and place(record[position - 1]) == own
-        if position < self._settled:
-            return InsertResult.LATE
-        if again:
-            return InsertResult.AGAIN
-        record.insert(position, measurement)
-        if position < self._taken:
-            self._back_to(position)
-        if measurement.sensor == "imu":
-            self._newest = max(self._newest, measurement.time)
+            if position < self._settled:
+                return InsertResult.LATE
+            if position > 0 and place(record[position - 1]) == own:
+                return InsertResult.AGAIN
+            record.insert(position, measurement)
+            if position < self._taken:
+                self._back_to(position)
+        else:
+            record.append(measurement)
+        if measurement.sensor == "imu" and measurement.time > self._newest:
+            self._newest = measurement.time
         self._go_on(self._newest - self.hold_s)
         return InsertResult.IN
 
@@ -138,7 +138,7 @@ class FixedLag:
             filter_step = self.filter.step(mark.interval, self.marks[-1].known, self._gates)
             after = replace(mark, known=filter_step.filtered, gates=dict(self._gates), processed=filter_step.processed)
             self.marks.append(after)
-        self._assembler.time_offsets.assume(self.marks[-1].known.state.calibration)
+        self._assembler.time_offsets.assume(self.marks[-1].known.c)
         return True
 
     def adopt_passed(self, known: Gaussian, gates: Gates) -> None:
@@ -153,7 +153,7 @@ class FixedLag:
             done = self.filter.step(mark.interval, known, self._gates)
             known = done.filtered
             self.marks[k] = replace(mark, known=known, gates=dict(self._gates), processed=done.processed)
-        self._assembler.time_offsets.assume(known.state.calibration)
+        self._assembler.time_offsets.assume(known.c)
 
     def continued(self, initial: InitialConditions, position_sd: float = 0.0) -> "FixedLag":
         """A filter that knows more sensors, or less of where it is, and goes on from here.
@@ -229,7 +229,8 @@ class FixedLag:
     def finish(self) -> None:
         """Take what is held back, and close the last interval."""
         self._go_on(float("inf"))
-        self._step(self._assembler.finish())
+        if intervals := self._assembler.finish():
+            self._step(intervals)
         while self.marks:
             self.passed(self.marks.popleft())
 
@@ -239,7 +240,7 @@ class FixedLag:
         if time <= mark.interval.time:
             return mark.interval, mark.known
         later = [m for m in self._record[self._taken :] if m.sensor == "imu" and m.time <= time]
-        interval = self._assembler.ahead(later, time, mark.known.state)
+        interval = self._assembler.ahead(later, time, mark.known.x)
         return interval, self.filter.predict(interval, mark.known).predicted
 
     def trajectory(self, intervals: Sequence[KeyframeInterval], known: Sequence[Gaussian]) -> Trajectory:
@@ -251,25 +252,24 @@ class FixedLag:
         """
         columns, arm = self.filter.layout.columns, self.initial.config.imu.lever_arm_m
         pose, velocity = (np.array([k.covariance[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
-        return body_trajectory(intervals, stack_states(known), arm, pose, velocity)
+        return body_trajectory(intervals, states_of(np.array([k.x for k in known])), arm, pose, velocity)
 
     def _go_on(self, until: float) -> None:
         """Take measurements up to a time."""
         while self._taken < len(self._record) and self._record[self._taken].time <= until:
             self._taken += 1
-            self._step(self._assembler.add(self._record[self._taken - 1]))
+            if intervals := self._assembler.add(self._record[self._taken - 1]):
+                self._step(intervals)
 
     def _step(self, intervals: list[KeyframeInterval]) -> None:
         """Take intervals that are complete, and forget what the lag has passed."""
-        if not intervals:
-            return
         known = self.marks[-1].known if self.marks else self.filter.start()
         taken, passed = self._forgotten + self._taken, []
         for interval in intervals:
             filter_step = self.filter.step(interval, known, self._gates)
             known = filter_step.filtered
             passed.append((interval, known, dict(self._gates), filter_step.processed))
-        self._assembler.time_offsets.assume(known.state.calibration)
+        self._assembler.time_offsets.assume(known.c)
         assembler = self._assembler.copy()
         self.marks += [FilterSnapshot(*one, assembler, taken) for one in passed]
         while self.marks[0].interval.time < self.marks[-1].interval.time - self.lag_s:

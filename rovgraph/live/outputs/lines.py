@@ -7,10 +7,12 @@ from typing import Any
 from rovgraph.live.solution import Solution
 from rovgraph.trajectory import ATTITUDE, POSITION, VELOCITY
 
+_ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
+
 
 def json_line(solution: Solution) -> bytes:
     """One line with its end, in ASCII; what is not known or not finite is null."""
-    return (json.dumps(as_dict(solution), allow_nan=False, separators=(",", ":")) + "\n").encode("ascii")
+    return (_ENCODER.encode(as_dict(solution)) + "\n").encode("ascii")
 
 
 def as_dict(solution: Solution) -> dict[str, Any]:
