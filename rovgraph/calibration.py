@@ -385,7 +385,7 @@ TABLE: dict[str, Variable] = {
             "6",
             ("_north", "_east", "_down"),
             "m/s",
-            0.05,
+            0.03,
             ("thruster",),
             "velocity of the water that waves move to and fro, and the vehicle with it, without drag",
             "a DVL over ground, within its time constant",

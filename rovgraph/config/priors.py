@@ -49,8 +49,8 @@ def _estimate_of(variable: Variable) -> tuple[Any, Any, str]:
         kind = Annotated[bool | Literal["considered"], BeforeValidator(_estimate(CONSIDERED))]
         return kind, CONSIDERED if variable.considered else variable.estimate, "true, considered or false"
     if np.isfinite(variable.time_constant):
-        kind = Annotated[bool | Literal["auto"], BeforeValidator(_estimate(AUTO))]
-        return kind, variable.estimate or AUTO, "true, auto or false"
+        lasting = Annotated[bool | Literal["auto"], BeforeValidator(_estimate(AUTO))]
+        return lasting, variable.estimate or AUTO, "true, auto or false"
     return bool, variable.estimate, "estimate it"
 
 

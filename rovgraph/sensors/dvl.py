@@ -105,7 +105,7 @@ def _instrument(sensor: str, sd: tuple[float, float, float], config: Config, ori
     dvl = config.dvl
     model = DvlVelocity(np.array(dvl.lever_arm_m) - origin_b, sensor)
     gain = mount_matrix(dvl.mount_rpy_deg).T @ skew(-model.lever_arm_b)
-    yaw = config.calibration.dvl_yaw
+    yaw = config.calibration.dvl_yaw  # type: ignore[attr-defined]
     if yaw.estimate is True and yaw.sd_deg > KNOWN_YAW_SD_DEG:
         gain = _evenly(gain)
     return instrument(dvl, model, sd, ("x", "y", "z"), gain, TIME_OFFSET)
