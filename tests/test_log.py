@@ -232,6 +232,7 @@ HOSTILE = {
         "line 2, column dvl_valid: 255, expected 0 or 1",
     ),
     "latitude": ("time,fix_lat,fix_lon\n1,421234567,31234567\n", "line 2: latitude .* units: {fix: degE7}"),
+    "one line": (b"x" * (1 << 20), "first line is longer than a megabyte"),
     "binary": (b"\x7fELF\x02\x01\xff\xfe\x00\x81", "line 1 is not UTF-8 text"),
     "zeros": (b"time,depth\n1,2\n\0\0\0\0", "line 3 holds binary data"),
     "gzip cut off": (gzip.compress(b"time,depth\n1,2\n" * 50)[:-12], "gzip data are damaged"),

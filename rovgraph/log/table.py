@@ -25,6 +25,8 @@ from rovgraph.log.streams import label_number
 
 NUMBERS = Real, Decimal, np.bool_  # what a cell of a column of objects may be
 _TIMES = "dates", "durations"
+GZIP = b"\x1f\x8b"
+LONGEST_HEADER = 1 << 20  # bytes of the first line
 SUFFIXES = (".csv.gz", ".csv", ".parquet")  # of a log that is written
 
 
@@ -171,8 +173,13 @@ def _content(path: Path) -> bytes:
     if path.is_dir():
         raise InputError(f"{path}: is a directory, expected a log file; give a CSV or Parquet file in it")
     try:
-        content = path.read_bytes()
-        if content.startswith(b"\x1f\x8b"):
+        with path.open("rb") as file:
+            head = file.read(LONGEST_HEADER)
+            if len(head) == LONGEST_HEADER and not head.startswith((b"PAR1", GZIP)) and not {*b"\r\n"} & {*head}:
+                raise InputError(f"{path}: its first line is longer than a megabyte, so it is no log in columns")
+            file.seek(0)
+            content = file.read()
+        if content.startswith(GZIP):
             content = gzip.decompress(content)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the name") from None
