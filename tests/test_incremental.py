@@ -302,7 +302,9 @@ def test_smooth_writes_both_estimates_of_one_pass(case):
 def test_comparing_both_estimates_runs_isam2_once(case, monkeypatch):
     ran = []
     original = incremental_module.run_isam2
-    monkeypatch.setattr(incremental_module, "run_isam2", lambda *given, **more: ran.append(1) or original(*given, **more))
+    monkeypatch.setattr(
+        incremental_module, "run_isam2", lambda *given, **more: ran.append(1) or original(*given, **more)
+    )
     chosen = select(["isam2-filtered-a", "isam2-smoothed-a"])
     found = list(outcomes(chosen, case.log, case.config))
     assert [o.error for o in found] == [None, None] and ran == [1]
