@@ -219,6 +219,10 @@ def _refused(error: OSError) -> Exception:
     reason = error.strerror or str(error)
     if error.errno == errno.ENOMEM:
         return MemoryError(reason)
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return InputError(
+            f"no temporary file can be opened ({reason}); allow more (ulimit -n 4096), or convert fewer files at once"
+        )
     folder = tempfile.tempdir or "any temporary folder"
     return InputError(
         f"no temporary file can be written in {folder} ({reason}); set TMPDIR to a folder with more space"

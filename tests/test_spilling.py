@@ -1,6 +1,5 @@
 """Long columns are kept in temporary files: the same log comes out, memory is bounded, and no file stays."""
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -171,6 +170,22 @@ def test_no_space_for_temporary_files_is_one_line_and_writes_nothing(before, tmp
     assert told.startswith("error: no temporary file can be written in /")
     assert told.endswith("; set TMPDIR to a folder with more space")
     assert [each.name for each in tmp_path.iterdir()] == ["dive.BIN"]
+
+
+@linux
+def test_too_many_open_files_are_not_taken_for_a_full_disk(monkeypatch):
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    monkeypatch.setattr(spilling, "IN_MEMORY", 0)
+    columns = [spilling.Column(float) for _ in range(100)]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len([*Path("/proc/self/fd").iterdir()]) + 10, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"Too many open files.*ulimit -n"):
+            for column in columns:
+                column.extend(np.ones(3))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 @linux
