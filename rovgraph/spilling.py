@@ -171,8 +171,9 @@ def holds(condition: Callable[..., NDArray[np.bool_]], *columns: NDArray[Any]) -
 
 
 def steps(values: NDArray[Any], found: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> NDArray[np.int64]:
-    """Rows whose difference from the row before is such, by their indices."""
-    rows = [np.flatnonzero(found(np.diff(piece))) for (piece,) in in_pieces(values, beyond=1)]
+    """Rows whose difference from the row before, perhaps NaN, is such, by their indices."""
+    with np.errstate(invalid="ignore"):  # between infinite values
+        rows = [np.flatnonzero(found(np.diff(piece))) for (piece,) in in_pieces(values, beyond=1)]
     return np.concatenate([np.empty(0, np.int64), *(1 + k * PIECE + own for k, own in enumerate(rows))])
 
 

@@ -1,5 +1,6 @@
 """Long columns are kept in temporary files: the same log comes out, memory is bounded, and no file stays."""
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -170,6 +171,14 @@ def test_no_space_for_temporary_files_is_one_line_and_writes_nothing(before, tmp
     assert told.startswith("error: no temporary file can be written in /")
     assert told.endswith("; set TMPDIR to a folder with more space")
     assert [each.name for each in tmp_path.iterdir()] == ["dive.BIN"]
+
+
+def test_damaged_stamps_are_left_out_without_a_warning_of_numpy(short, recwarn):
+    time = np.append(np.arange(30.0), [np.inf, np.inf, -np.inf])
+    channel, said = put_in_order(Channel("depth", {"time": time, "depth": np.ones(33)}, "depths"), "file")
+    np.testing.assert_array_equal(channel.columns["time"], np.arange(30.0))
+    assert said == ["file: depths: 3 rows without time left out"]
+    assert not recwarn
 
 
 @linux
