@@ -171,8 +171,9 @@ def holds(condition: Callable[..., NDArray[np.bool_]], *columns: NDArray[Any]) -
 
 
 def steps(values: NDArray[Any], found: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> NDArray[np.int64]:
-    """Rows whose difference from the row before is such, by their indices."""
-    rows = [np.flatnonzero(found(np.diff(piece))) for (piece,) in in_pieces(values, beyond=1)]
+    """Rows whose difference from the row before, perhaps NaN, is such, by their indices."""
+    with np.errstate(invalid="ignore"):  # between infinite values
+        rows = [np.flatnonzero(found(np.diff(piece))) for (piece,) in in_pieces(values, beyond=1)]
     return np.concatenate([np.empty(0, np.int64), *(1 + k * PIECE + own for k, own in enumerate(rows))])
 
 
@@ -219,6 +220,10 @@ def _refused(error: OSError) -> Exception:
     reason = error.strerror or str(error)
     if error.errno == errno.ENOMEM:
         return MemoryError(reason)
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return InputError(
+            f"no temporary file can be opened ({reason}); allow more (ulimit -n 4096), or convert fewer files at once"
+        )
     folder = tempfile.tempdir or "any temporary folder"
     return InputError(
         f"no temporary file can be written in {folder} ({reason}); set TMPDIR to a folder with more space"

@@ -78,15 +78,19 @@ class Trajectory:
         """Of the position, north, east, down [m^2], shape (n, 3, 3): ``cov_p``."""
         return self.cov_p
 
-    @cached_property
+    @property
     def rpy(self) -> Array:
-        """Roll, pitch, yaw [rad], shape (n, 3)."""
+        """Roll, pitch, yaw [rad], shape (n, 3); a copy, so that it may be changed."""
+        return self._rpy.copy()
+
+    @cached_property
+    def _rpy(self) -> Array:
         return rpy_from_matrix(self.R_nb)
 
     @property
     def rpy_sd(self) -> Array:
         """Standard deviation of roll, pitch, yaw [rad], shape (n, 3)."""
-        J = rpy_jacobian(self.rpy)
+        J = rpy_jacobian(self._rpy)
         return _sd(J @ self.cov_theta @ transpose(J))
 
     @property
@@ -131,7 +135,7 @@ class Trajectory:
 
     def columns(self) -> dict[str, Array]:
         """The columns of the contract, each of shape (n,)."""
-        values, sds = (self.p_n, self.rpy, self.v_n), (self.p_sd, self.rpy_sd, self.v_sd)
+        values, sds = (self.p_n, self._rpy, self.v_n), (self.p_sd, self.rpy_sd, self.v_sd)
         known = dict(zip(COLUMNS[1:], np.concatenate(values, axis=1).T, strict=True))
         known |= zip([f"{name}_sd" for name in COLUMNS[1:]], np.concatenate(sds, axis=1).T, strict=True)
         return {"time": self.time, **known, "cov_north_east": self.cov_p[:, 0, 1]}

@@ -8,9 +8,10 @@ import pytest
 from dives import Simulated, batch, changed, falcon, fed, interrupted, renewed, simulated, started
 from test_consistency import band, nees
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config, beliefs, parse_config
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
+from rovgraph.engine.lasting import LASTING
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
@@ -177,6 +178,13 @@ def test_a_walk_of_what_is_considered_is_refused_and_not_passed_over(changes):
         with pytest.raises(InputError, match=rf"calibration\.dvl_yaw.*{changes.split(':')[0]}"):
             parse_config(f"calibration: {{dvl_yaw: {{{stated}{changes}}}}}")
     assert parse_config(f"calibration: {{dvl_yaw: {{estimate: true, {changes}}}}}")
+
+
+def test_what_is_estimated_in_any_case_cannot_be_left_to_a_search_that_does_not_look_for_it():
+    with pytest.raises(InputError, match=r"calibration\.water_oscillation\.estimate"):
+        parse_config("calibration: {water_oscillation: {estimate: auto}}")
+    automatic = [name for name in TABLE if getattr(parse_config("").calibration, name).estimate == AUTO]
+    assert sorted(automatic) == sorted(LASTING.values())
 
 
 def test_a_word_that_is_none_is_refused():

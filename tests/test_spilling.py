@@ -173,6 +173,30 @@ def test_no_space_for_temporary_files_is_one_line_and_writes_nothing(before, tmp
     assert [each.name for each in tmp_path.iterdir()] == ["dive.BIN"]
 
 
+def test_damaged_stamps_are_left_out_without_a_warning_of_numpy(short, recwarn):
+    time = np.append(np.arange(30.0), [np.inf, np.inf, -np.inf])
+    channel, said = put_in_order(Channel("depth", {"time": time, "depth": np.ones(33)}, "depths"), "file")
+    np.testing.assert_array_equal(channel.columns["time"], np.arange(30.0))
+    assert said == ["file: depths: 3 rows without time left out"]
+    assert not recwarn
+
+
+@linux
+def test_too_many_open_files_are_not_taken_for_a_full_disk(monkeypatch):
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    monkeypatch.setattr(spilling, "IN_MEMORY", 0)
+    columns = [spilling.Column(float) for _ in range(100)]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len([*Path("/proc/self/fd").iterdir()]) + 10, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"Too many open files.*ulimit -n"):
+            for column in columns:
+                column.extend(np.ones(3))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
 @linux
 @pytest.mark.parametrize("error", [KeyboardInterrupt, InputError, None])
 def test_no_temporary_file_stays(short, error, monkeypatch, tmp_path):

@@ -158,6 +158,14 @@ def test_interpolation_clamps_outside_and_is_unknown_beside_the_unknown(trajecto
     assert np.isnan(R).all(axis=(1, 2)).tolist() == [False, True, True, True, False]
 
 
+def test_angles_may_be_converted_in_place_and_the_trajectory_keeps_its_own(trajectory):
+    before = trajectory.to_frame()
+    angles = trajectory.rpy
+    angles *= 180.0 / np.pi
+    pd.testing.assert_frame_equal(trajectory.to_frame(), before)
+    np.testing.assert_array_equal(trajectory.rpy, rpy_from_matrix(trajectory.R_nb))
+
+
 def test_rpy_sd_agrees_with_monte_carlo():
     rpy, root = np.array([0.3, -0.6, 2.0]), np.array([[2, 0, 0], [1, 3, 0], [-1, 1, 2]]) * 1e-3
     R = matrix_from_rpy(rpy)

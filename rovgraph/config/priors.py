@@ -19,6 +19,11 @@ def considerable(variable: Variable) -> bool:
     return constant and not variable.time_offset
 
 
+def lasts_perhaps(variable: Variable) -> bool:
+    """Whether it can be left to the dive: what comes and goes, and is not estimated in any case, is looked for."""
+    return bool(np.isfinite(variable.time_constant)) and not variable.estimate
+
+
 def _components(dim: int) -> Callable[[Any], Any]:
     """Refuses what is neither one number for all components nor one for each; null passes."""
     expected = "expected a number" if dim == 1 else f"expected one number or {count(dim)}"
@@ -48,9 +53,8 @@ def _estimate_of(variable: Variable) -> tuple[Any, Any, str]:
     if considerable(variable):
         kind = Annotated[bool | Literal["considered"], BeforeValidator(_estimate(CONSIDERED))]
         return kind, CONSIDERED if variable.considered else variable.estimate, "true, considered or false"
-    if np.isfinite(variable.time_constant):
-        lasting = Annotated[bool | Literal["auto"], BeforeValidator(_estimate(AUTO))]
-        return lasting, variable.estimate or AUTO, "true, auto or false"
+    if lasts_perhaps(variable):
+        return Annotated[bool | Literal["auto"], BeforeValidator(_estimate(AUTO))], AUTO, "true, auto or false"
     return bool, variable.estimate, "estimate it"
 
 
