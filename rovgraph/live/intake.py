@@ -8,7 +8,6 @@ import pymap3d
 
 from rovgraph.config import Config, Mag
 from rovgraph.geometry import Array
-from rovgraph.live.geodesy import geodetic
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.log import Measurement
 
@@ -83,4 +82,5 @@ class Intake:
         """Latitude and longitude [deg] of a position, shape (3,), where the origin is known."""
         if self.origin is None:
             return None, None
-        return geodetic(float(p_n[0]), float(p_n[1]), self.origin)
+        latitude, longitude, _ = pymap3d.ned2geodetic(p_n[0], p_n[1], 0.0, *self.origin, 0.0)
+        return float(latitude), float(longitude)

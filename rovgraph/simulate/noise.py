@@ -1,7 +1,6 @@
 """Noise of the thesis's sensors: full covariances, and a line in the accelerometer."""
 
 from dataclasses import dataclass
-from itertools import accumulate
 
 import numpy as np
 
@@ -75,7 +74,6 @@ def remembered(white: Array, steps: float) -> Array:
     keep, sd = walked(stationary_walk(1.0, steps), steps, 1.0)
     driven = white * sd
     driven[0] = white[0]  # it has been going on for long
-    share = float(keep)
-    # scipy.signal's filter does the same, and takes longer to load than a dive to simulate
-    own = [list(accumulate(column, lambda before, new: share * before + new)) for column in driven.T.tolist()]
-    return np.column_stack(own)
+    from scipy.signal import lfilter  # type: ignore[attr-defined]  # takes a second to load, and few dives need it
+
+    return np.asarray(lfilter([1.0], [1.0, -float(keep)], driven, axis=0))
