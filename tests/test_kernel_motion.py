@@ -336,11 +336,10 @@ def test_weights_whiten(case):
     before = ends(8, case.bias)
     after = predict(row, before).moved(0.01 * np.random.default_rng(5).normal(size=(1, 15)))
     r, A_i, A_j = error(row, before, after)
-    whitened = r.copy(), A_i.copy(), A_j.copy()
-    whiten_motion(W, *whitened)
-    close(whitened[0], W @ r)
-    close(whitened[1], W @ A_i)
-    close(whitened[2], W @ A_j)
+    motion = np.column_stack([A_i, r, A_j, np.zeros(15)])
+    whitened = np.empty_like(motion)
+    whiten_motion(W, motion, whitened)
+    close(whitened, W @ motion)
 
 
 def test_many_intervals_are_each_alone():

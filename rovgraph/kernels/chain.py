@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.compile import helper, kernel, view_helper
 from rovgraph.kernels.householder import padded, triangularise
 
 Index = NDArray[np.int64]
@@ -70,7 +70,7 @@ def make_room(d: int, c: int, most: int, border_rows: Array) -> Room:
     return Room(V, W, Y, scale, np.zeros(max(2 * d + most, Y.shape[0])), np.zeros(W.shape[1]))
 
 
-@helper
+@view_helper
 def append_rows(source: Array, begin: int, end: int, column: int, columns: int, at: int, Y_out: Array) -> int:
     """Copy columns of a source's rows into rows ``at`` and on; returns the row after them."""
     for i in range(begin, end):
@@ -80,7 +80,7 @@ def append_rows(source: Array, begin: int, end: int, column: int, columns: int, 
     return at
 
 
-@helper
+@view_helper
 def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
     """Fold the rows below the border's triangle into it; returns the square that no value of the border explains."""
     triangularise(Y, c, c, end, v, w)
@@ -90,7 +90,7 @@ def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
     return left
 
 
-@helper
+@view_helper
 def load_measurements(rows: Array, targets: Index, begin: int, end: int, s: int, d: int, room: Room) -> int:
     """Rows of a keyframe's measurements into V, below the d rows that are known of it; returns the row after them."""
     last, V_out, scale_out = rows.shape[1] - 1, room.V, room.scale
@@ -109,21 +109,15 @@ def load_measurements(rows: Array, targets: Index, begin: int, end: int, s: int,
     return d + end - begin
 
 
-@helper
-def load_motion(
-    k: int,
-    A_i: Array,
-    A_j: Array,
-    r: Array,
-    C: Array,
-    targets: Index,
-    walk: Array,
-    kept: Array,
-    walk_r: Array,
-    room: Room,
-) -> None:
-    """Rows of the motion after keyframe k into W, below its own d; the scale becomes that of the keyframe after it."""
-    s, d, W_out, scale_out = A_i.shape[1], A_i.shape[1] + walk.shape[1], room.W, room.scale
+@view_helper
+def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, walk_r: Array, room: Room) -> None:
+    """Rows of the motion after a keyframe into W, below its own d; the scale becomes that of the keyframe after it.
+
+    A has shape (s, 2 (s + 1)): columns of the keyframe before, right-hand side, columns of the keyframe after. The rest
+    is that of `rovgraph.kernels.linear_chain.eliminate`, of one motion.
+    """
+    s, d, W_out, scale_out = len(A), len(A) + len(walk), room.W, room.scale
+    last = d + len(scale_out)
     for i in range(d, 2 * d):
         for j in range(W_out.shape[1]):
             W_out[i, j] = 0.0
@@ -131,24 +125,24 @@ def load_motion(
         scale_out[j] = 0.0
     for i in range(s):
         for j in range(s):
-            W_out[d + i, j] = A_i[k, i, j]
-            W_out[d + i, d + j] = A_j[k, i, j]
-            scale_out[j] += A_j[k, i, j] * A_j[k, i, j]
-        for j in range(targets.shape[0]):
+            W_out[d + i, j] = A[i, j]
+            W_out[d + i, d + j] = A[i, s + 1 + j]
+            scale_out[j] += A[i, s + 1 + j] * A[i, s + 1 + j]
+        for j in range(len(targets)):
             if targets[j] >= d:
-                W_out[d + i, d + targets[j]] += C[k, i, j]
-                scale_out[targets[j]] += C[k, i, j] * C[k, i, j]
+                W_out[d + i, d + targets[j]] += C[i, j]
+                scale_out[targets[j]] += C[i, j] * C[i, j]
             elif targets[j] >= 0:
-                W_out[d + i, targets[j]] += C[k, i, j]
-        W_out[d + i, d + scale_out.shape[0]] = r[k, i]
+                W_out[d + i, targets[j]] += C[i, j]
+        W_out[d + i, last] = A[i, s]
     for i in range(s, d):
-        factor = walk[k, i - s]
-        W_out[d + i, i], W_out[d + i, d + i] = -factor * kept[k, i - s], factor
-        W_out[d + i, d + scale_out.shape[0]] = walk_r[k, i - s]
+        factor = walk[i - s]
+        W_out[d + i, i], W_out[d + i, d + i] = -factor * kept[i - s], factor
+        W_out[d + i, last] = walk_r[i - s]
         scale_out[i] = factor * factor
 
 
-@helper
+@view_helper
 def join(V: Array, Y: Array, d: int, c: int, at: int, joint_out: Array) -> None:
     """Rows of a keyframe and of the border as one triangle with its right-hand side."""
     for i in range(d):
@@ -161,7 +155,7 @@ def join(V: Array, Y: Array, d: int, c: int, at: int, joint_out: Array) -> None:
             joint_out[at, d + i, d + j] = Y[i, j]
 
 
-@helper
+@view_helper
 def undetermined(triangle: Array, scale: Array, begin: int, end: int, shift: int) -> int:
     """The first column whose pivot is rounding or no number, plus ``shift``, or -1.
 
@@ -174,7 +168,7 @@ def undetermined(triangle: Array, scale: Array, begin: int, end: int, shift: int
     return -1
 
 
-@helper
+@view_helper
 def absorb(
     k: int,
     n: int,
@@ -219,7 +213,7 @@ def absorb(
     return last, stop, failing
 
 
-@helper
+@view_helper
 def pass_on(k: int, n: int, room: Room, conditionals_out: Array) -> int:
     """Eliminate keyframe k from W; what is left is known of the one after it. Returns what is not determined, or -1.
 
@@ -242,7 +236,7 @@ def pass_on(k: int, n: int, room: Room, conditionals_out: Array) -> int:
     return failing
 
 
-@helper
+@view_helper
 def close_border(n: int, d: int, room: Room, border_out: Array) -> int:
     """The border's triangle, when all keyframes are eliminated; returns what is not determined, or -1."""
     c = room.scale.shape[0] - d

@@ -22,7 +22,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import helper
-from rovgraph.kernels.motion_row import DURATION, NOISE, TANGENT
+from rovgraph.kernels.motion_row import AFTER, DURATION, NOISE, RESIDUAL, TANGENT
 from rovgraph.kernels.rotations import exp_rotation
 
 BRIDGE_ACC, BRIDGE_GYR = 0.3, 0.3  # densities over a gap: an ROV at its liveliest [SI/rtHz]
@@ -111,11 +111,9 @@ def coasting_error(
     p_j: Array,
     v_j: Array,
     bias_j: Array,
-    r_out: Array,
-    A_i_out: Array,
-    A_j_out: Array,
+    A_out: Array,
 ) -> None:
-    """Residual: roll, pitch, yaw, position, velocity, bias, and its derivatives by both states."""
+    """Residual: roll, pitch, yaw, position, velocity, bias, and its derivatives by both states; ``A_out`` was zero."""
     before, predicted, rpy, B_i, B_j = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     kept = _kept(row)
     roll_pitch_yaw(R_i, before)
@@ -124,21 +122,19 @@ def coasting_error(
     _by_turn(before, B_i)
     _by_turn(rpy, B_j)
     for i in range(15):
-        for j in range(15):
-            A_i_out[i, j] = A_j_out[i, j] = 0.0
-        A_i_out[i, i], A_j_out[i, i] = -1.0, 1.0
+        A_out[i, i], A_out[i, AFTER + i] = -1.0, 1.0
     for i in range(3):
         angle = rpy[i] - predicted[i]
-        r_out[i] = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-        r_out[3 + i] = p_j[i] - p_i[i] - row[DURATION] * v_i[i]
-        r_out[6 + i] = v_j[i] - v_i[i]
-        A_i_out[3 + i, 6 + i] = -row[DURATION]
+        A_out[i, RESIDUAL] = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+        A_out[3 + i, RESIDUAL] = p_j[i] - p_i[i] - row[DURATION] * v_i[i]
+        A_out[6 + i, RESIDUAL] = v_j[i] - v_i[i]
+        A_out[3 + i, 6 + i] = -row[DURATION]
         for j in range(3):
-            A_i_out[i, j] = -B_i[i, j] * (kept if i < 2 else 1.0)
-            A_j_out[i, j] = B_j[i, j]
-            A_i_out[3 + i, 3 + j], A_j_out[3 + i, 3 + j] = -R_i[i, j], R_j[i, j]
+            A_out[i, j] = -B_i[i, j] * (kept if i < 2 else 1.0)
+            A_out[i, AFTER + j] = B_j[i, j]
+            A_out[3 + i, 3 + j], A_out[3 + i, AFTER + 3 + j] = -R_i[i, j], R_j[i, j]
     for i in range(6):
-        r_out[9 + i] = bias_j[i] - bias_i[i]
+        A_out[9 + i, RESIDUAL] = bias_j[i] - bias_i[i]
 
 
 @helper

@@ -60,7 +60,7 @@ def split(row: Array, L: Array, H_out: Array, H_y_out: Array) -> None:
 def linearize_keyframe(
     x: Array,
     c: Array,
-    measured: tuple[Array, Index, Array, Index, Array, float, int],
+    measured: tuple[Array, Index, Array, Array, float, int],
     first: Index,
     scratch: Scratch,
     r_out: Array,
@@ -72,14 +72,14 @@ def linearize_keyframe(
 
     Columns of what is considered, behind the ``estimated`` ones, are multiplied by L.
     """
-    rows, which, sensors, column, scale, gravity, estimated = measured
+    rows, which, sensors, scale, gravity, estimated = measured
     wide = np.zeros((len(r_out), estimated + len(L))) if len(L) else H_out
-    R, p, v, b, exact = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21], np.empty((0, 0))
+    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     for j in range(len(which)):
         sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
         if sensor[KIND] != GIVEN:
-            own, own_r, own_H = scale[j] if len(scale) else exact, r_out[begin:end], wide[begin:end]
-            linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, own_r, own_H)
+            own, own_r, own_H = scale[j] if len(scale) else scratch.exact, r_out[begin:end], wide[begin:end]
+            linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, scratch, own_r, own_H)
             if len(L):
                 for a in range(begin, end):
                     split(wide[a], L, H_out[a, :estimated], H_y_out[a])
@@ -101,7 +101,7 @@ def relinearize(
     P: Array,
     B: Array,
     L: Array,
-    measured: tuple[Array, Index, Array, Index, Array, float, int],
+    measured: tuple[Array, Index, Array, Array, float, int],
     first: Index,
     losses: tuple[Index, Array, Array, Array, Array],
     layout: ErrorLayout,
@@ -212,7 +212,7 @@ def correct(
         first[j + 1] = first[j] + int(sensors[which[j], DIM])
     r, H, H_y = np.zeros(first[m]), np.zeros((first[m], n)), np.zeros((first[m], len(L)))
     HP, S = np.empty((first[m], n)), np.empty((first[m], first[m]))
-    loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(c))
+    loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(c), column)
     for j in range(m):
         sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
         loss[j], bend[j] = int(sensor[LOSS]), sensor[BEND]
@@ -221,7 +221,7 @@ def correct(
                 r[a] = given_r[taken]
                 split(given_H[taken], L, H[a, : given_H.shape[1] - len(L)], H_y[a])
                 taken += 1
-    measured = (rows, which, sensors, column, scale, gravity, len(columns))
+    measured = (rows, which, sensors, scale, gravity, len(columns))
     linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
     innovation_covariance(P, H, HP, S)
     entered = False

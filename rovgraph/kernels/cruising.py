@@ -14,7 +14,7 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import helper
-from rovgraph.kernels.motion_row import DURATION, NOISE
+from rovgraph.kernels.motion_row import AFTER, DURATION, NOISE, RESIDUAL
 from rovgraph.kernels.rotations import (
     inverse_right_jacobian,
     log_rotation,
@@ -60,40 +60,41 @@ def cruising_error(
     p_j: Array,
     v_j: Array,
     bias_j: Array,
-    r_out: Array,
-    A_i_out: Array,
-    A_j_out: Array,
+    A_out: Array,
 ) -> None:
-    """Residual: rotation, position in n, velocity in the body's axes, bias; its derivatives by both states."""
-    half, u, S, turn, Jr = (
+    """Residual: rotation, position in n, velocity in the body's axes, bias; its derivatives by both states.
+
+    ``A_out`` was zero.
+    """
+    half, u, S, turn, Jr, phi = (
         0.5 * row[DURATION],
         np.empty((2, 3)),
         np.empty((2, 3, 3)),
         np.empty((3, 3)),
         np.empty((3, 3)),
+        np.empty(3),
     )
     multiply_transposed(R_i, R_j, turn)
-    log_rotation(turn, r_out[0:3])
-    inverse_right_jacobian(r_out[0:3], Jr)
+    log_rotation(turn, phi)
+    inverse_right_jacobian(phi, Jr)
     rotate_back(R_i, v_i, u[0])
     rotate_back(R_j, v_j, u[1])
     skew(u[0], S[0])
     skew(u[1], S[1])
     for i in range(15):
-        for j in range(15):
-            A_i_out[i, j] = A_j_out[i, j] = 0.0
-        A_i_out[i, i], A_j_out[i, i] = -1.0, 1.0
+        A_out[i, i], A_out[i, AFTER + i] = -1.0, 1.0
     for i in range(3):
-        r_out[3 + i] = p_j[i] - p_i[i] - half * (v_i[i] + v_j[i])
-        r_out[6 + i] = u[1, i] - u[0, i]
-        A_i_out[3 + i, 6 + i] = A_j_out[3 + i, 6 + i] = -half
+        A_out[i, RESIDUAL] = phi[i]
+        A_out[3 + i, RESIDUAL] = p_j[i] - p_i[i] - half * (v_i[i] + v_j[i])
+        A_out[6 + i, RESIDUAL] = u[1, i] - u[0, i]
+        A_out[3 + i, 6 + i] = A_out[3 + i, AFTER + 6 + i] = -half
         for j in range(3):
-            A_i_out[i, j], A_j_out[i, j] = -Jr[j, i], Jr[i, j]  # Jl^-1 is Jr^-1 transposed
-            A_i_out[3 + i, 3 + j], A_j_out[3 + i, 3 + j] = -R_i[i, j], R_j[i, j]
-            A_i_out[6 + i, j], A_j_out[6 + i, j] = -S[0, i, j], S[1, i, j]
-            A_i_out[6 + i, 6 + j], A_j_out[6 + i, 6 + j] = -R_i[j, i], R_j[j, i]
+            A_out[i, j], A_out[i, AFTER + j] = -Jr[j, i], Jr[i, j]  # Jl^-1 is Jr^-1 transposed
+            A_out[3 + i, 3 + j], A_out[3 + i, AFTER + 3 + j] = -R_i[i, j], R_j[i, j]
+            A_out[6 + i, j], A_out[6 + i, AFTER + j] = -S[0, i, j], S[1, i, j]
+            A_out[6 + i, 6 + j], A_out[6 + i, AFTER + 6 + j] = -R_i[j, i], R_j[j, i]
     for i in range(6):
-        r_out[9 + i] = bias_j[i] - bias_i[i]
+        A_out[9 + i, RESIDUAL] = bias_j[i] - bias_i[i]
 
 
 @helper

@@ -30,18 +30,19 @@ from rovgraph.kernels.chain import (
     make_room,
     pass_on,
 )
-from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.compile import kernel, view_helper
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch, squared_length
 from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, MOST
-from rovgraph.kernels.motion_residual import motion_error, whiten_motion
+from rovgraph.kernels.motion_residual import make_residual_scratch, motion_error, whiten_motion
+from rovgraph.kernels.motion_row import AFTER, RESIDUAL, WIDTH
 from rovgraph.kernels.weighting import loss_weight, robust_cost
 
 Index = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
-@helper
+@view_helper
 def load_linearized(
     begin: int,
     end: int,
@@ -56,14 +57,13 @@ def load_linearized(
     row_scales: Array,
     sensors: Array,
     entered: Flags,
-    column: Index,
     gravity: float,
     room: Room,
     scratch: Scratch,
     r: Array,
 ) -> int:
     """Weighted rows of measurements ``begin`` to ``end`` into V from ``row`` on; returns the row after them."""
-    V, sums, last, exact = room.V, room.scale, len(room.scale), np.empty((0, 0))
+    V, sums, last = room.V, room.scale, len(room.scale)
     for m in range(begin, end):
         sensor = sensors[which[m]]
         if not entered[m] or sensor[KIND] == GIVEN:
@@ -73,9 +73,9 @@ def load_linearized(
             r[a] = 0.0
             for j in range(V.shape[1]):
                 V[row + a, j] = 0.0
-        scale = row_scales[m] if len(row_scales) else exact
+        scale = row_scales[m] if len(row_scales) else scratch.exact
         H = V[row : row + dim]
-        square = linearize_measurement(R, p, v, b, c, rows[m], sensor, scale, gravity, column, scratch, r, H)
+        square = linearize_measurement(R, p, v, b, c, rows[m], sensor, scale, gravity, scratch, r, H)
         root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
         for a in range(dim):
             for j in range(last):
@@ -140,9 +140,9 @@ def eliminate_dive(
     for k in range(n):
         most = max(most, given_first[k + 1] - given_first[k] + MOST * (first[k + 1] - first[k]))
     room, last, stop = make_room(d, border_out.shape[0], most, border_rows), len(border_out) + len(border_rows), 0
-    scratch, own = make_scratch(size), np.empty(MOST)
-    A_i, A_j, r = np.empty((1, MOTION, MOTION)), np.empty((1, MOTION, MOTION)), np.empty((1, MOTION))
-    C, targets, bias = np.zeros((1, MOTION, 6 * of_scale)), np.empty(6 * of_scale, np.int64), np.empty((2, 6))
+    scratch, own = make_scratch(size, column), np.empty(MOST)
+    moving, unwhitened, A = make_residual_scratch(), np.empty((MOTION, WIDTH)), np.empty((MOTION, WIDTH))
+    C, targets, bias = np.zeros((MOTION, 6 * of_scale)), np.empty(6 * of_scale, np.int64), np.empty((2, 6))
     for i in range(len(targets)):
         targets[i] = column[MOTION + ACC_SCALE + i]
     left_out[0] = 0.0
@@ -150,7 +150,7 @@ def eliminate_dive(
         c_k = c[k * of_c]
         end = load_measurements(given, given_targets, given_first[k], given_first[k + 1], MOTION, d, room)
         state, measured = (R[k], p[k], v[k], b[k], c_k), (rows, which, row_scales, sensors, entered)
-        end = load_linearized(first[k], first[k + 1], end, *state, *measured, column, gravity, room, scratch, own)
+        end = load_linearized(first[k], first[k + 1], end, *state, *measured, gravity, room, scratch, own)
         last, stop, failing = absorb(k, n, end, last, stops, stop, room, filtered_out, left_out)
         if k < n - 1:
             for i in range(6):
@@ -159,15 +159,15 @@ def eliminate_dive(
                     shift += scales[k, i, j] * c[(k + 1) * of_c, ACC_SCALE + j]
                 bias[0, i], bias[1, i] = b[k, i] + shift, b[k + 1, i] + shift
             after = R[k + 1], p[k + 1], v[k + 1], bias[1]
-            motion_error(motions[k], R[k], p[k], v[k], bias[0], *after, r[0], A_i[0], A_j[0])
-            whiten_motion(W[k], r[0], A_i[0], A_j[0])
+            motion_error(motions[k], R[k], p[k], v[k], bias[0], *after, unwhitened, moving)
+            whiten_motion(W[k], unwhitened, A)
             for i in range(MOTION):
-                r[0, i] = -r[0, i]
+                A[i, RESIDUAL] = -A[i, RESIDUAL]
                 for j in range(len(targets)):
-                    C[0, i, j] = 0.0
+                    C[i, j] = 0.0
                     for m in range(6):  # of both biases alike, which leaves the walk of the bias out of it
-                        C[0, i, j] += (A_i[0, i, 9 + m] + A_j[0, i, 9 + m]) * scales[k, m, j]
-            load_motion(0, A_i, A_j, r, C, targets, walk[k : k + 1], kept[k : k + 1], walk_r[k : k + 1], room)
+                        C[i, j] += (A[i, 9 + m] + A[i, AFTER + 9 + m]) * scales[k, m, j]
+            load_motion(A, C, targets, walk[k], kept[k], walk_r[k], room)
         failing = max(failing, pass_on(k, n, room, conditionals_out))
         if failing >= 0:
             return failing
@@ -193,12 +193,12 @@ def squared_lengths(
     square_out: Array,
 ) -> None:
     """Squared lengths of the whitened innovations of a dive's measurements, shape (m,); 0 of those that are `GIVEN`."""
-    scratch, of_c, exact = make_scratch(c.shape[1]), len(c) > 1, np.empty((0, 0))
+    scratch, of_c = make_scratch(c.shape[1], np.empty(0, np.int64)), len(c) > 1
     for k in range(len(first) - 1):
         for m in range(first[k], first[k + 1]):
             sensor, square_out[m] = sensors[which[m]], 0.0
             if sensor[KIND] != GIVEN:
-                scale = row_scales[m] if len(row_scales) else exact
+                scale = row_scales[m] if len(row_scales) else scratch.exact
                 state = R[k], p[k], v[k], b[k], c[k * of_c]
                 square_out[m] = squared_length(*state, rows[m], sensor, scale, gravity, scratch)
 

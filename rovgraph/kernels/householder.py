@@ -3,7 +3,7 @@
 import math
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper
+from rovgraph.kernels.compile import helper, view_helper
 
 LANES = 8  # columns are worked on in multiples of it, so that loops become vector instructions
 
@@ -14,7 +14,7 @@ def padded(columns: int) -> int:
     return (columns + LANES - 1) // LANES * LANES
 
 
-@helper
+@view_helper
 def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, w: Array) -> None:
     """Householder reflection of the rows ``pivot`` and ``first`` to ``last`` of W that clears a column of the latter.
 
@@ -45,10 +45,14 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
     width = (W.shape[1] // LANES - column // LANES) * LANES
     for c in range(width):
         w[c] = lead * W[pivot, begin + c]
-    for i in range(count):
+    fours = count // 4
+    for k in range(fours):  # rows at a time, so that w is written less often
+        i, v_0, v_1, v_2, v_3 = first + 4 * k, v[4 * k], v[4 * k + 1], v[4 * k + 2], v[4 * k + 3]
+        for c in range(width):
+            two = v_0 * W[i, begin + c] + v_1 * W[i + 1, begin + c]
+            w[c] += two + v_2 * W[i + 2, begin + c] + v_3 * W[i + 3, begin + c]
+    for i in range(4 * fours, count):
         factor = v[i]
-        if factor == 0.0:
-            continue
         for c in range(width):
             w[c] += factor * W[first + i, begin + c]
     factor = gain * lead
@@ -63,7 +67,7 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
             W[first + i, begin + c] += factor * w[c]
 
 
-@helper
+@view_helper
 def triangularise(W: Array, columns: int, top: int, end: int, v: Array, w: Array) -> None:
     """Clear the first columns of W's rows ``top`` to ``end`` below the diagonal; rows above are triangular."""
     for j in range(columns):

@@ -1,5 +1,7 @@
 """A chain whose rows are at hand, eliminated: for studies of the solver; `rovgraph.kernels.dive` makes them itself."""
 
+import numpy as np
+
 from rovgraph.geometry import Array
 from rovgraph.kernels.chain import Index, absorb, close_border, load_measurements, load_motion, make_room, pass_on
 from rovgraph.kernels.compile import kernel
@@ -56,12 +58,17 @@ def eliminate(
     for k in range(n):
         most = max(most, first[k + 1] - first[k])
     room, last, stop = make_room(d, c, most, border_rows), c + border_rows.shape[0], 0
+    motion = np.empty((s, 2 * (s + 1)))
     left_out[0] = 0.0
     for k in range(n):
         end = load_measurements(rows, targets, first[k], first[k + 1], s, d, room)
         last, stop, failing = absorb(k, n, end, last, stops, stop, room, filtered_out, left_out)
         if k < n - 1:
-            load_motion(k, A_i, A_j, r, C, C_targets, walk, kept, walk_r, room)
+            for i in range(s):
+                motion[i, s] = r[k, i]
+                for j in range(s):
+                    motion[i, j], motion[i, s + 1 + j] = A_i[k, i, j], A_j[k, i, j]
+            load_motion(motion, C[k], C_targets, walk[k], kept[k], walk_r[k], room)
         failing = max(failing, pass_on(k, n, room, conditionals_out))
         if failing >= 0:
             return failing

@@ -53,6 +53,8 @@ class Scratch(NamedTuple):
     R, there : shapes (3, 3), (2, 3), attitude, position and velocity at the measurement's time
     F : shape (15, 15), zero at first
     predicting, moving : shapes (WORK, 3, 3)
+    used, column : shapes (u,), components of state and calibration that are estimated, and the column of each
+    exact : shape (0, 0), bias by the IMU's scales where these are exact
     """
 
     bias: Array
@@ -64,15 +66,30 @@ class Scratch(NamedTuple):
     F: Array
     predicting: Array
     moving: Array
+    used: Index
+    column: Index
+    exact: Array
 
 
 @helper
-def make_scratch(calibration_size: int) -> Scratch:
-    """Arrays for a calibration vector of that length; made once."""
+def make_scratch(calibration_size: int, column: Index) -> Scratch:
+    """Arrays for a calibration vector of that length; made once.
+
+    ``column``, shape (15 + C,), is the column of each component of state and calibration, -1 where it is not
+    estimated; of shape (0,) nothing is.
+    """
+    count, used, columns = 0, np.empty(len(column), np.int64), np.empty(len(column), np.int64)
+    for j in range(len(column)):
+        if column[j] >= 0:
+            used[count], columns[count] = j, column[j]
+            count += 1
     H, F = np.zeros((MOST, MOTION + calibration_size)), np.zeros((MOTION, MOTION))
     state = np.empty((3, 3)), np.empty((2, 3))
     work = np.empty((PREDICT_WORK, 3, 3)), np.empty((PROPAGATE_WORK, 3, 3))
-    return Scratch(np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST)), *state, F, *work)
+    estimated = used[:count].copy(), columns[:count].copy()
+    return Scratch(
+        np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST)), *state, F, *work, *estimated, np.empty((0, 0))
+    )
 
 
 @view_helper
@@ -96,8 +113,10 @@ def _innovate(
         bias[i] = b[i]
         for k in range(len(scale)):
             bias[i] += scale[i, k] * c[ACC_SCALE + k]
-    for a in range(dim):
-        for j in range(H.shape[1]):
+    for a in range(dim):  # columns that are not estimated nobody reads
+        for j in range(MOTION):
+            H[a, j] = 0.0
+        for j in scratch.used:
             H[a, j] = 0.0
     rate, params, work = row[RATE : RATE + 3], sensor[PARAMS:], scratch.predicting
     if dt != 0.0:
@@ -114,8 +133,10 @@ def _innovate(
     if derive:
         for a in range(dim):
             for k in range(len(scale)):
+                by_bias = 0.0
                 for i in range(6):
-                    H[a, MOTION + ACC_SCALE + k] += H[a, 9 + i] * scale[i, k]
+                    by_bias += H[a, 9 + i] * scale[i, k]
+                H[a, MOTION + ACC_SCALE + k] = by_bias
     whiten(row[SD : SD + dim], sensor[GAIN : GAIN + 9].reshape(3, 3)[:dim, :dim], row[RATE_SD], W)
     for a in range(dim):
         difference = row[Z + a] - z[a]
@@ -157,7 +178,6 @@ def linearize_measurement(
     sensor: Array,
     scale: Array,
     gravity: float,
-    column: Index,
     scratch: Scratch,
     r_out: Array,
     H_out: Array,
@@ -171,7 +191,6 @@ def linearize_measurement(
     row, sensor : of `rovgraph.kernels.measurement_row`
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
     gravity : [m/s^2]
-    column : shape (15 + C,), column of each component of state and calibration, -1 where it is not estimated
     scratch : of `make_scratch`
     r_out, H_out : shapes (dim,), (dim, n), zero before
     """
@@ -181,12 +200,11 @@ def linearize_measurement(
         for k in range(a + 1):
             r_out[a] += W[a, k] * z[k]
         square += r_out[a] * r_out[a]
-    for j in range(H.shape[1]):
-        own = column[j]
-        if own >= 0:
-            for a in range(int(sensor[DIM])):
-                for k in range(a + 1):
-                    H_out[a, own] += W[a, k] * H[k, j]
+    for u in range(len(scratch.used)):
+        j, own = scratch.used[u], scratch.column[u]
+        for a in range(int(sensor[DIM])):
+            for k in range(a + 1):
+                H_out[a, own] += W[a, k] * H[k, j]
     return square
 
 
@@ -208,13 +226,13 @@ def linearize(
 
     ``weighted`` ones are multiplied by the root of the weight of their loss.
     """
-    begin, scratch, exact = 0, make_scratch(len(c)), np.empty((0, 0))
+    begin, scratch = 0, make_scratch(len(c), column)
     R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     for j in range(len(which)):
         sensor = sensors[which[j]]
         end = begin + int(sensor[DIM])
-        own, r, H = scale[j] if len(scale) else exact, r_out[begin:end], H_out[begin:end]
-        square = linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, column, scratch, r, H)
+        own, r, H = scale[j] if len(scale) else scratch.exact, r_out[begin:end], H_out[begin:end]
+        square = linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, scratch, r, H)
         if weighted:
             root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
             for a in range(begin, end):

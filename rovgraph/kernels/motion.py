@@ -15,16 +15,18 @@ k of the IMU's scale, b + S k. Derivatives are by rotation, position (in body ax
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coast, coasting_transition
-from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.compile import helper, kernel, view_helper
 from rovgraph.kernels.cruising import cruise, cruising_transition
 from rovgraph.kernels.motion_row import BIAS, BY_BIAS, COVARIANCE, DURATION, EARTH_RATE, GAP, GRAVITY, NO_IMU, TANGENT
 from rovgraph.kernels.rotations import (
     cross,
+    dot,
     exp_rotation,
     multiply,
     right_jacobian,
@@ -35,19 +37,47 @@ from rovgraph.kernels.rotations import (
 LONGEST_BRIDGED_S = 0.75  # intervals in a gap of the IMU that is longer are coasted through
 
 
+class MotionScratch(NamedTuple):
+    """Arrays to calculate with.
+
+    Attributes
+    ----------
+    zeta : shape (9,), the motion, corrected for the bias
+    turn : shape (3, 3), Exp(theta)
+    E, ER : shapes (3, 3), the rotation by which the axes of n turn back meanwhile, and of the body's after it
+    vectors, matrices : shapes (5, 3), (4, 3, 3)
+    J : shape (9, 15)
+    """
+
+    zeta: Array
+    turn: Array
+    E: Array
+    ER: Array
+    vectors: Array
+    matrices: Array
+    J: Array
+
+
 @helper
+def make_motion_scratch() -> MotionScratch:
+    """Arrays for all motions of a dive; made once."""
+    turns = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    return MotionScratch(np.empty(9), *turns, np.empty((5, 3)), np.empty((4, 3, 3)), np.empty((9, 15)))
+
+
+@view_helper
 def is_coasted(row: Array) -> bool:
     """Whether an interval is coasted through."""
     return bool(row[GAP] > LONGEST_BRIDGED_S)
 
 
-@helper
+@view_helper
 def is_cruising(row: Array) -> bool:
     """Whether there is no IMU."""
     return bool(row[GAP] == NO_IMU)
 
 
-@helper
+@view_helper
 def correct_motion(row: Array, bias: Array, zeta_out: Array) -> None:
     """The motion, corrected for the bias."""
     for i in range(9):
@@ -56,14 +86,13 @@ def correct_motion(row: Array, bias: Array, zeta_out: Array) -> None:
             zeta_out[i] += row[BY_BIAS + 6 * i + j] * (bias[j] - row[BIAS + j])
 
 
-@helper
-def _gravity(row: Array, rate: Array, p_out: Array, v_out: Array) -> None:
+@view_helper
+def _gravity(row: Array, rate: Array, once: Array, twice: Array, p_out: Array, v_out: Array) -> None:
     """What gravity adds to position and velocity while n turns at a rate."""
-    t, g, once, twice = row[DURATION], np.zeros(3), np.empty(3), np.empty(3)
-    g[2] = row[GRAVITY]
-    cross(rate, g, once)
+    t, g = row[DURATION], row[GRAVITY]
+    once[0], once[1], once[2] = rate[1] * g, -rate[0] * g, 0.0
     cross(rate, once, twice)
-    square = t * t * (rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2])
+    square = t * t * dot(rate, rate)
     if square < 0.01:
         a = 0.5 * (1.0 - square / 12.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0)))
         b = (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))) / 6.0
@@ -74,56 +103,78 @@ def _gravity(row: Array, rate: Array, p_out: Array, v_out: Array) -> None:
         b = (angle - math.sin(angle)) / (angle * square)
         c = (0.5 - a) / square
     for i in range(3):
-        v_out[i] = t * (g[i] + t * (a * once[i] + t * b * twice[i]))
-        p_out[i] = t * t * (0.5 * g[i] + t * (b * once[i] + t * c * twice[i]))
+        v_out[i] += t * t * (a * once[i] + t * b * twice[i])
+        p_out[i] += t * t * t * (b * once[i] + t * c * twice[i])
+    v_out[2] += t * g
+    p_out[2] += 0.5 * t * t * g
 
 
-@helper
+@view_helper
 def _turning(row: Array) -> bool:
     return bool(row[EARTH_RATE] != 0.0 or row[EARTH_RATE + 1] != 0.0 or row[EARTH_RATE + 2] != 0.0)
 
 
-@helper
+@view_helper
 def _predict(
-    row: Array, zeta: Array, R: Array, p: Array, v: Array, E: Array, R_out: Array, p_out: Array, v_out: Array
+    row: Array, R: Array, p: Array, v: Array, R_out: Array, p_out: Array, v_out: Array, scratch: MotionScratch
 ) -> None:
-    """The state after the motion ``zeta``, and the rotation ``E`` by which the axes of n turned back meanwhile."""
-    t, turn, rate, turned = row[DURATION], np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    fast, far, along, gravity = np.empty(3), np.empty(3), np.empty(3), np.empty((2, 3))
+    """The state after the motion ``zeta`` of the scratch, whose ``turn`` and, on a turning Earth, ``E`` it makes."""
+    t, zeta, turn = row[DURATION], scratch.zeta, scratch.turn
+    exp_rotation(zeta, turn)
+    for i in range(3):
+        p_out[i] = p[i] + t * v[i] + R[i, 0] * zeta[3] + R[i, 1] * zeta[4] + R[i, 2] * zeta[5]
+        v_out[i] = v[i] + R[i, 0] * zeta[6] + R[i, 1] * zeta[7] + R[i, 2] * zeta[8]
+    if not _turning(row):
+        p_out[2] += 0.5 * t * t * row[GRAVITY]
+        v_out[2] += t * row[GRAVITY]
+        multiply(R, turn, R_out)
+        return
+    vectors = scratch.vectors
+    rate, far, fast, along, twice = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     for i in range(3):
         rate[i] = row[EARTH_RATE + i]
-    cross(rate, p, fast)
-    _gravity(row, rate, gravity[0], gravity[1])
+    _gravity(row, rate, along, twice, p_out, v_out)
+    cross(rate, p, along)
     for i in range(3):
-        fast[i] += v[i]
-        far[i] = p[i] + t * fast[i] + gravity[0, i] + R[i, 0] * zeta[3] + R[i, 1] * zeta[4] + R[i, 2] * zeta[5]
-        fast[i] += gravity[1, i] + R[i, 0] * zeta[6] + R[i, 1] * zeta[7] + R[i, 2] * zeta[8]
+        fast[i] = v_out[i] + along[i]
+        far[i] = p_out[i] + t * along[i]
         along[i] = -t * rate[i]
-    exp_rotation(zeta, turn)
-    exp_rotation(along, E)
-    multiply(R, turn, turned)
-    multiply(E, turned, R_out)
-    rotate(E, far, p_out)
-    rotate(E, fast, v_out)
+    exp_rotation(along, scratch.E)
+    multiply(R, turn, scratch.ER)
+    multiply(scratch.E, scratch.ER, R_out)
+    rotate(scratch.E, far, p_out)
+    rotate(scratch.E, fast, v_out)
     cross(rate, p_out, along)
     for i in range(3):
         v_out[i] -= along[i]
 
 
-@helper
+@view_helper
 def predict_with_jacobian(
-    row: Array, R: Array, p: Array, v: Array, bias: Array, R_out: Array, p_out: Array, v_out: Array, J_out: Array
+    row: Array,
+    R: Array,
+    p: Array,
+    v: Array,
+    bias: Array,
+    R_out: Array,
+    p_out: Array,
+    v_out: Array,
+    scratch: MotionScratch,
 ) -> None:
     """The state after an interval, and how it depends on that before it.
 
-    ``J_out`` has shape (9, 15): turn of the body, position and velocity in n by rotation, position, velocity, bias.
+    J of the scratch becomes the turn of the body, position and velocity in n by rotation, position, velocity, bias.
     """
-    zeta, t = np.empty(9), row[DURATION]
-    E, ER, turn, Jr = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    zeta, t, turning, turn, Jr = scratch.zeta, row[DURATION], _turning(row), scratch.turn, scratch.matrices[0]
+    E, ER, J_out = scratch.E, scratch.ER, scratch.J
     correct_motion(row, bias, zeta)
-    _predict(row, zeta, R, p, v, E, R_out, p_out, v_out)
-    multiply(E, R, ER)
-    exp_rotation(zeta, turn)
+    _predict(row, R, p, v, R_out, p_out, v_out, scratch)
+    if turning:
+        multiply(E, R, ER)
+    else:
+        for i in range(3):
+            for j in range(3):
+                ER[i, j], E[i, j] = R[i, j], 1.0 if i == j else 0.0
     right_jacobian(zeta, Jr)
     for i in range(3):
         for j in range(3):
@@ -142,19 +193,18 @@ def predict_with_jacobian(
             J_out[3 + i, 9 + j] = ER[i, 0] * row[at] + ER[i, 1] * row[at + 6] + ER[i, 2] * row[at + 12]
             at += 18
             J_out[6 + i, 9 + j] = ER[i, 0] * row[at] + ER[i, 1] * row[at + 6] + ER[i, 2] * row[at + 12]
-    if _turning(row):
-        _add_turning(row, E, R, J_out)
+    if turning:
+        _add_turning(row, R, scratch)
 
 
-@helper
-def _add_turning(row: Array, E: Array, R: Array, J: Array) -> None:
+@view_helper
+def _add_turning(row: Array, R: Array, scratch: MotionScratch) -> None:
     """What a turning Earth adds to the derivatives: v + S(w) p is what goes on."""
-    t, rate, spin, spun, turned = row[DURATION], np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for i in range(3):
-        rate[i] = row[EARTH_RATE + i]
+    t, rate, J = row[DURATION], scratch.vectors[0], scratch.J
+    spin, spun, turned = scratch.matrices[1], scratch.matrices[2], scratch.matrices[3]
     skew(rate, spin)
     multiply(spin, R, spun)
-    multiply(E, spun, turned)
+    multiply(scratch.E, spun, turned)
     for i in range(3):
         for j in range(3):
             J[3 + i, 3 + j] += t * turned[i, j]
@@ -164,14 +214,21 @@ def _add_turning(row: Array, E: Array, R: Array, J: Array) -> None:
             J[6 + i, j] -= spin[i, 0] * J[3, j] + spin[i, 1] * J[4, j] + spin[i, 2] * J[5, j]
 
 
-@helper
+@view_helper
 def predict_motion(
-    row: Array, R: Array, p: Array, v: Array, bias: Array, R_out: Array, p_out: Array, v_out: Array
+    row: Array,
+    R: Array,
+    p: Array,
+    v: Array,
+    bias: Array,
+    R_out: Array,
+    p_out: Array,
+    v_out: Array,
+    scratch: MotionScratch,
 ) -> None:
     """The state at the end of one interval that is not coasted through, without derivatives."""
-    zeta, E = np.empty(9), np.empty((3, 3))
-    correct_motion(row, bias, zeta)
-    _predict(row, zeta, R, p, v, E, R_out, p_out, v_out)
+    correct_motion(row, bias, scratch.zeta)
+    _predict(row, R, p, v, R_out, p_out, v_out, scratch)
 
 
 @helper
@@ -201,8 +258,9 @@ def predict_with_transition(
         coast(row, R, p, v, R_out, p_out, v_out)
         coasting_transition(row, R, R_out, F_out, Q_out)
         return
-    J = np.empty((9, 15))
-    predict_with_jacobian(row, R, p, v, bias, R_out, p_out, v_out, J)
+    scratch = make_motion_scratch()
+    J = scratch.J
+    predict_with_jacobian(row, R, p, v, bias, R_out, p_out, v_out, scratch)
     for i in range(15):
         for j in range(15):
             F_out[i, j], Q_out[i, j] = 0.0, row[COVARIANCE + 15 * i + j]

@@ -10,15 +10,23 @@ Of an interval that is coasted through it is that of `rovgraph.kernels.coasting`
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coasting_covariance, coasting_error
-from rovgraph.kernels.compile import helper, kernel
+from rovgraph.kernels.compile import helper, kernel, view_helper
 from rovgraph.kernels.cruising import cruising_covariance, cruising_error
-from rovgraph.kernels.motion import is_coasted, is_cruising, predict_motion, predict_with_jacobian
-from rovgraph.kernels.motion_row import COVARIANCE
+from rovgraph.kernels.motion import (
+    MotionScratch,
+    is_coasted,
+    is_cruising,
+    make_motion_scratch,
+    predict_motion,
+    predict_with_jacobian,
+)
+from rovgraph.kernels.motion_row import AFTER, COVARIANCE, RESIDUAL, WIDTH
 from rovgraph.kernels.rotations import (
     inverse_jacobian_with_slope,
     inverse_right_jacobian,
@@ -26,6 +34,38 @@ from rovgraph.kernels.rotations import (
     multiply_transposed,
     rotate_back,
 )
+
+
+class ResidualScratch(NamedTuple):
+    """Arrays to calculate with.
+
+    Attributes
+    ----------
+    motion : of `rovgraph.kernels.motion`
+    R, away : shapes (3, 3), (2, 3), the predicted attitude, and how far the state after is from what is predicted
+    apart, phi, Jr : shapes (3, 3), (3,), (3, 3), the rotation between them, its logarithm and Jr(phi)^-1
+    seen, Jl, slope, back : shapes (3,), (3, 3), (3, 3), (3, 3), of one of the linear errors
+    """
+
+    motion: MotionScratch
+    R: Array
+    away: Array
+    apart: Array
+    phi: Array
+    Jr: Array
+    seen: Array
+    Jl: Array
+    slope: Array
+    back: Array
+
+
+@helper
+def make_residual_scratch() -> ResidualScratch:
+    """Arrays for all motions of a dive; made once."""
+    ends = np.empty((3, 3)), np.empty((2, 3)), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    return ResidualScratch(
+        make_motion_scratch(), *ends, np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    )
 
 
 @helper
@@ -39,62 +79,80 @@ def motion_error(
     p_j: Array,
     v_j: Array,
     bias_j: Array,
-    r_out: Array,
-    A_i_out: Array,
-    A_j_out: Array,
+    A_out: Array,
+    scratch: ResidualScratch,
 ) -> None:
-    """Residual of one interval, shape (15,), and its derivatives by both states, shape (15, 15)."""
+    """Residual of one interval and its derivatives by both states, shape (15, WIDTH)."""
+    for i in range(15):
+        for j in range(WIDTH):
+            A_out[i, j] = 0.0
     if is_cruising(row):
-        cruising_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, r_out, A_i_out, A_j_out)
-        return
-    if is_coasted(row):
-        coasting_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, r_out, A_i_out, A_j_out)
-        return
-    R, away, J = np.empty((3, 3)), np.empty((2, 3)), np.empty((9, 15))
-    phi, apart, Jr = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    predict_with_jacobian(row, R_i, p_i, v_i, bias_i, R, away[0], away[1], J)
+        cruising_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, A_out)
+    elif is_coasted(row):
+        coasting_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, A_out)
+    else:
+        _inertial_error(row, R_i, p_i, v_i, bias_i, R_j, p_j, v_j, bias_j, A_out, scratch)
+
+
+@view_helper
+def _inertial_error(
+    row: Array,
+    R_i: Array,
+    p_i: Array,
+    v_i: Array,
+    bias_i: Array,
+    R_j: Array,
+    p_j: Array,
+    v_j: Array,
+    bias_j: Array,
+    A_out: Array,
+    scratch: ResidualScratch,
+) -> None:
+    """`motion_error` of an interval with samples; ``A_out`` was zero."""
+    R, away, apart, phi, Jr = scratch.R, scratch.away, scratch.apart, scratch.phi, scratch.Jr
+    predict_with_jacobian(row, R_i, p_i, v_i, bias_i, R, away[0], away[1], scratch.motion)
     multiply_transposed(R_j, R, apart)
     log_rotation(apart, phi)
     inverse_right_jacobian(phi, Jr)
-    for i in range(15):
-        for j in range(15):
-            A_i_out[i, j] = A_j_out[i, j] = 0.0
+    J = scratch.motion.J
     for i in range(6):
-        r_out[9 + i] = bias_i[i] - bias_j[i]
-        A_i_out[9 + i, 9 + i], A_j_out[9 + i, 9 + i] = 1.0, -1.0
+        A_out[9 + i, RESIDUAL] = bias_i[i] - bias_j[i]
+        A_out[9 + i, 9 + i], A_out[9 + i, AFTER + 9 + i] = 1.0, -1.0
     for i in range(3):
-        r_out[i], away[0, i], away[1, i] = phi[i], away[0, i] - p_j[i], away[1, i] - v_j[i]
+        A_out[i, RESIDUAL], away[0, i], away[1, i] = phi[i], away[0, i] - p_j[i], away[1, i] - v_j[i]
         for j in range(15):
-            A_i_out[i, j] = Jr[i, 0] * J[0, j] + Jr[i, 1] * J[1, j] + Jr[i, 2] * J[2, j]
+            A_out[i, j] = Jr[i, 0] * J[0, j] + Jr[i, 1] * J[1, j] + Jr[i, 2] * J[2, j]
         for j in range(3):
-            A_j_out[i, j] = -Jr[j, i]  # Jl^-1 is Jr^-1 transposed
-    for k in range(2):
-        _linear_error(3 + 3 * k, away[k], R_j, J, r_out, A_i_out, A_j_out)
+            A_out[i, AFTER + j] = -Jr[j, i]  # Jl^-1 is Jr^-1 transposed
+    _linear_error(3, away[0], R_j, A_out, scratch)
+    _linear_error(6, away[1], R_j, A_out, scratch)
     for i in range(3):  # position is perturbed in body axes
-        x, y, z = A_j_out[3 + i, 3], A_j_out[3 + i, 4], A_j_out[3 + i, 5]
+        x, y, z = A_out[3 + i, AFTER + 3], A_out[3 + i, AFTER + 4], A_out[3 + i, AFTER + 5]
         for j in range(3):
-            A_j_out[3 + i, 3 + j] = x * R_j[0, j] + y * R_j[1, j] + z * R_j[2, j]
+            A_out[3 + i, AFTER + 3 + j] = x * R_j[0, j] + y * R_j[1, j] + z * R_j[2, j]
 
 
-@helper
-def _linear_error(at: int, away: Array, R_j: Array, J: Array, r: Array, A_i: Array, A_j: Array) -> None:
-    """Rows ``at`` to ``at + 2``: Jl(phi)^-1 R_j' away, where phi and its derivatives are in the first three."""
-    seen, Jl, slope, back = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+@view_helper
+def _linear_error(at: int, away: Array, R_j: Array, A: Array, scratch: ResidualScratch) -> None:
+    """Rows ``at`` to ``at + 2``: Jl(phi)^-1 R_j' away, where the derivatives of phi are in the first three."""
+    seen, Jl, slope, back, J = scratch.seen, scratch.Jl, scratch.slope, scratch.back, scratch.motion.J
     rotate_back(R_j, away, seen)
-    inverse_jacobian_with_slope(r, seen, -0.5, Jl, slope)
+    inverse_jacobian_with_slope(scratch.phi, seen, -0.5, Jl, slope)
     x, y, z = seen[0], seen[1], seen[2]
     for i in range(3):
-        r[at + i] = Jl[i, 0] * x + Jl[i, 1] * y + Jl[i, 2] * z
-        A_j[at + i, 0] = Jl[i, 1] * z - Jl[i, 2] * y
-        A_j[at + i, 1] = Jl[i, 2] * x - Jl[i, 0] * z
-        A_j[at + i, 2] = Jl[i, 0] * y - Jl[i, 1] * x
+        row = A[at + i]
+        row[RESIDUAL] = Jl[i, 0] * x + Jl[i, 1] * y + Jl[i, 2] * z
+        row[AFTER] = Jl[i, 1] * z - Jl[i, 2] * y
+        row[AFTER + 1] = Jl[i, 2] * x - Jl[i, 0] * z
+        row[AFTER + 2] = Jl[i, 0] * y - Jl[i, 1] * x
         for j in range(3):
             back[i, j] = Jl[i, 0] * R_j[j, 0] + Jl[i, 1] * R_j[j, 1] + Jl[i, 2] * R_j[j, 2]
-            A_j[at + i, at + j] = -back[i, j]
-            A_j[at + i, j] += slope[i, 0] * A_j[0, j] + slope[i, 1] * A_j[1, j] + slope[i, 2] * A_j[2, j]
+            row[AFTER + at + j] = -back[i, j]
+            after = AFTER + j
+            row[after] += slope[i, 0] * A[0, after] + slope[i, 1] * A[1, after] + slope[i, 2] * A[2, after]
         for j in range(15):
-            for k in range(3):
-                A_i[at + i, j] += back[i, k] * J[at + k, j] + slope[i, k] * A_i[k, j]
+            row[j] = back[i, 0] * J[at, j] + back[i, 1] * J[at + 1, j] + back[i, 2] * J[at + 2, j]
+            row[j] += slope[i, 0] * A[0, j] + slope[i, 1] * A[1, j] + slope[i, 2] * A[2, j]
 
 
 @helper
@@ -118,22 +176,17 @@ def _whitening(S: Array, W_out: Array) -> None:
             W_out[i, j] = total / S[i, i]
 
 
-@helper
-def whiten_motion(W: Array, r: Array, A_i: Array, A_j: Array) -> None:
-    """W r, W A_i, W A_j of one interval in place, for the lower triangular W of `motion_weights`."""
-    for i in range(14, -1, -1):
-        total = 0.0
-        for k in range(i + 1):
-            total += W[i, k] * r[k]
-        r[i] = total
-        for j in range(15):
-            A_i[i, j] *= W[i, i]
-            A_j[i, j] *= W[i, i]
-        for k in range(i):
-            w = W[i, k]
-            for j in range(15):
-                A_i[i, j] += w * A_i[k, j]
-                A_j[i, j] += w * A_j[k, j]
+@view_helper
+def whiten_motion(W: Array, A: Array, A_out: Array) -> None:
+    """W A of one interval, for the lower triangular W of `motion_weights` and A of `motion_error`."""
+    for i in range(15):
+        x, y, z = W[i, 0], W[i, 1], W[i, 2]
+        for j in range(WIDTH):
+            A_out[i, j] = x * A[0, j] + y * A[1, j] + z * A[2, j]
+        for k in range(1, i // 3 + 1):  # three at a time: a row that is added to is written less often
+            x, y, z = W[i, 3 * k], W[i, 3 * k + 1], W[i, 3 * k + 2]
+            for j in range(WIDTH):
+                A_out[i, j] += x * A[3 * k, j] + y * A[3 * k + 1, j] + z * A[3 * k + 2, j]
 
 
 @helper
@@ -164,16 +217,19 @@ def motion_residuals(
     r_out : ndarray, shape (n - 1, 15)
     """
     R_end, p_end, v_end, apart, seen = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-    r, b_i, b_j, Jr, A = np.empty(15), np.empty(6), np.empty(6), np.empty((3, 3)), np.empty((2, 15, 15))
+    r, b_i, b_j, Jr, A = np.empty(15), np.empty(6), np.empty(6), np.empty((3, 3)), np.empty((15, WIDTH))
+    scratch = make_residual_scratch()
     for k in range(len(motions)):
         for i in range(6):
             own = shift[k, i] if len(shift) else 0.0
             b_i[i], b_j[i] = bias[k, i] + own, bias[k + 1, i] + own
             r[9 + i] = b_i[i] - b_j[i]
         if is_coasted(motions[k]):
-            motion_error(motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, r, A[0], A[1])
+            motion_error(motions[k], R[k], p[k], v[k], b_i, R[k + 1], p[k + 1], v[k + 1], b_j, A, scratch)
+            for i in range(15):
+                r[i] = A[i, RESIDUAL]
         else:
-            predict_motion(motions[k], R[k], p[k], v[k], b_i, R_end, p_end, v_end)
+            predict_motion(motions[k], R[k], p[k], v[k], b_i, R_end, p_end, v_end, scratch.motion)
             multiply_transposed(R[k + 1], R_end, apart)
             log_rotation(apart, r[0:3])
             inverse_right_jacobian(r[0:3], Jr)
@@ -214,21 +270,14 @@ def motion_errors(
     For the keyframes of a dive in a row these are ``R[:-1]`` and ``R[1:]`` and so on. The derivative by errors of
     the IMU's scale is that by the bias before, rows 0 to 8, times S.
     """
+    scratch, A = make_residual_scratch(), np.empty((15, WIDTH))
     for k in range(len(motions)):
-        motion_error(
-            motions[k],
-            R_i[k],
-            p_i[k],
-            v_i[k],
-            bias_i[k],
-            R_j[k],
-            p_j[k],
-            v_j[k],
-            bias_j[k],
-            r_out[k],
-            A_i_out[k],
-            A_j_out[k],
-        )
+        before = R_i[k], p_i[k], v_i[k], bias_i[k]
+        motion_error(motions[k], *before, R_j[k], p_j[k], v_j[k], bias_j[k], A, scratch)
+        for i in range(15):
+            r_out[k, i] = A[i, RESIDUAL]
+            for j in range(15):
+                A_i_out[k, i, j], A_j_out[k, i, j] = A[i, j], A[i, AFTER + j]
 
 
 @kernel("void(f8[:, ::1], f8[:, :, ::1])")

@@ -11,6 +11,9 @@
 `BY_BIAS`           54  derivative of zeta by the bias, shape (9, 6)
 `COVARIANCE`       225  of the residual: rotation, position, velocity, biases, shape (15, 15)
 ===============  =====  ========================================================================================
+
+What a motion says of the states at its ends is an array of shape (15, `WIDTH`): columns of the state before it, the
+residual in column `RESIDUAL`, columns of the state after it from `AFTER` on, and one that stays zero.
 """
 
 import numpy as np
@@ -18,3 +21,5 @@ import numpy as np
 DURATION, GAP, TANGENT, BIAS, NOISE, GRAVITY, EARTH_RATE, BY_BIAS, COVARIANCE = 0, 1, 2, 11, 17, 22, 23, 26, 80
 ROW = COVARIANCE + 225
 NO_IMU = np.inf  # instead of a gap
+
+RESIDUAL, AFTER, WIDTH = 15, 16, 32
