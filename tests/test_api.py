@@ -104,6 +104,13 @@ assert type(rg.check).__name__ == "function"
     assert done.returncode == 0, done.stderr
 
 
+def test_the_package_runs_as_a_module_and_refuses_as_the_script_does():
+    command = [sys.executable, "-m", "rovgraph", "smooth", "nothing.csv"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr == "error: nothing.csv: no such file; check the name\n"
+
+
 def test_the_package_says_that_it_is_typed():
     assert (Path(rg.__file__).parent / "py.typed").is_file()
 

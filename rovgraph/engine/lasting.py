@@ -28,8 +28,9 @@ from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import Solution, minimise
-from rovgraph.engine.linear_constants import LinearConstants, begin_at, with_lasting
+from rovgraph.engine.linear_constants import LinearConstants
 from rovgraph.engine.measurements import Block
+from rovgraph.engine.widened_chain import begin_at, with_lasting
 from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
 from rovgraph.state import State

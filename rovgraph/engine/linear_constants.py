@@ -9,14 +9,14 @@ up to what is the same for all (`rovgraph.engine.lasting`).
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.gauss_newton import Solution
-from rovgraph.gauss_markov import stationary_walk
+from rovgraph.engine.widened_chain import begin_at, with_lasting
 from rovgraph.geometry import Array
 from rovgraph.state import State
 
@@ -70,20 +70,3 @@ class LinearConstants:
         S = self.information[np.ix_(chosen, chosen)] * scaled + np.eye(len(sd))  # in units of the sds
         s = self.score[chosen] * sd + off
         return 0.5 * float(off @ off - s @ np.linalg.solve(S, s) + np.linalg.slogdet(S)[1])
-
-
-def begin_at(chain: Chain, point: State) -> State:
-    """A point of a chain, from one of a chain with other unknowns."""
-    n, calibration = len(chain.intervals), dict(point.calibration)
-    for name in chain.layout.walking:
-        calibration[name] = np.array(np.broadcast_to(calibration[name], (n, TABLE[name].dim)))
-    return replace(point, calibration=calibration)
-
-
-def with_lasting(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
-    """The chain with an error that lasts among its unknowns; one of infinite time constant is constant."""
-    walk = stationary_walk(sd, time_constant)
-    believed = replace(
-        chain.beliefs[name], estimate=True, considered=False, sd=sd, walk=walk, time_constant=time_constant
-    )
-    return replace(chain, beliefs={**chain.beliefs, name: believed}, unknowns=chain.unknowns.with_lasting(believed))

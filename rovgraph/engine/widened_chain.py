@@ -1,7 +1,8 @@
-"""A chain with constants in its border that its estimate holds, linearised where it stands.
+"""Chains with more unknowns than a dive's: constants that its estimate holds, or errors that last.
 
-What they would do to the estimate follows from one elimination, without another solution: their derivatives are those
-of the measurement equations, of the IMU's mean signals for its scales, and of the predictions by time for stamps.
+What held constants would do to the estimate follows from one elimination where it stands, without another solution:
+their derivatives are those of the measurement equations, of the IMU's mean signals for its scales, and of the
+predictions by time for stamps.
 """
 
 from collections.abc import Mapping
@@ -10,13 +11,14 @@ from functools import cached_property
 
 import numpy as np
 
-from rovgraph.calibration import Belief
+from rovgraph.calibration import TABLE, Belief
 from rovgraph.config import mount_matrix
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.pieces import pieces
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.unknowns import Unknowns
+from rovgraph.gauss_markov import stationary_walk
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import motion_row as at
 from rovgraph.sensors import innovation
@@ -43,6 +45,23 @@ def widened(chain: Chain, state: State, names: tuple[str, ...], beliefs: Mapping
     if {*SCALES} & set(names) and not len(rows.scales):
         rows = replace(rows, scales=_mean_signal_to_bias(chain, state))
     return _WidenedChain(chain.intervals, chain.initial, beliefs or chain.beliefs, wide, rows, timed)
+
+
+def begin_at(chain: Chain, point: State) -> State:
+    """A point of a chain, from one of a chain with other unknowns."""
+    n, calibration = len(chain.intervals), dict(point.calibration)
+    for name in chain.layout.walking:
+        calibration[name] = np.array(np.broadcast_to(calibration[name], (n, TABLE[name].dim)))
+    return replace(point, calibration=calibration)
+
+
+def with_lasting(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
+    """The chain with an error that lasts among its unknowns; one of infinite time constant is constant."""
+    walk = stationary_walk(sd, time_constant)
+    believed = replace(
+        chain.beliefs[name], estimate=True, considered=False, sd=sd, walk=walk, time_constant=time_constant
+    )
+    return replace(chain, beliefs={**chain.beliefs, name: believed}, unknowns=chain.unknowns.with_lasting(believed))
 
 
 @dataclass(frozen=True)

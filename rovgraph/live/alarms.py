@@ -145,7 +145,7 @@ class LiveAlarms:
         self, known: Gaussian, engine: FilterEngine, watches: Mapping[str, Watch], time: float
     ) -> Iterator[Statistic]:
         begin = max(self._start, time - MINUTE)
-        for sensor in {name for counts in self._counts for name in counts}:
+        for sensor in dict.fromkeys(name for counts in self._counts for name in counts):
             of = [counts[sensor] for counts in self._counts if sensor in counts]
             used, rejected = sum(c.used for c in of), sum(c.rejected for c in of)
             if rejected:
