@@ -19,7 +19,7 @@ def considerable(variable: Variable) -> bool:
     return constant and not variable.time_offset
 
 
-def lasts_perhaps(variable: Variable) -> bool:
+def looked_for(variable: Variable) -> bool:
     """Whether it can be left to the dive: what comes and goes, and is not estimated in any case, is looked for."""
     return bool(np.isfinite(variable.time_constant)) and not variable.estimate
 
@@ -53,7 +53,7 @@ def _estimate_of(variable: Variable) -> tuple[Any, Any, str]:
     if considerable(variable):
         kind = Annotated[bool | Literal["considered"], BeforeValidator(_estimate(CONSIDERED))]
         return kind, CONSIDERED if variable.considered else variable.estimate, "true, considered or false"
-    if lasts_perhaps(variable):
+    if looked_for(variable):
         return Annotated[bool | Literal["auto"], BeforeValidator(_estimate(AUTO))], AUTO, "true, auto or false"
     return bool, variable.estimate, "estimate it"
 
