@@ -388,7 +388,7 @@ TABLE: dict[str, Variable] = {
             0.03,
             ("thruster",),
             "velocity of the water that waves move to and fro, and the vehicle with it, without drag",
-            "nothing: it is another one within a second",
+            "nothing, as it is another one within a second",
             estimate=True,
             time_constant=0.5,
         ),

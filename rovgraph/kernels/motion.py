@@ -46,7 +46,7 @@ class MotionScratch(NamedTuple):
     turn : shape (3, 3), Exp(theta)
     E, ER : shapes (3, 3), the rotation by which the axes of n turn back meanwhile, and of the body's after it
     vectors, matrices : shapes (5, 3), (4, 3, 3)
-    J : shape (9, 15)
+    J : shape (9, 15), derivative by the state before, of `predict_with_jacobian`
     """
 
     zeta: Array
@@ -88,7 +88,7 @@ def correct_motion(row: Array, bias: Array, zeta_out: Array) -> None:
 
 @view_helper
 def _gravity(row: Array, rate: Array, once: Array, twice: Array, p_out: Array, v_out: Array) -> None:
-    """What gravity adds to position and velocity while n turns at a rate."""
+    """Add to position and velocity what gravity does while n turns at a rate."""
     t, g = row[DURATION], row[GRAVITY]
     once[0], once[1], once[2] = rate[1] * g, -rate[0] * g, 0.0
     cross(rate, once, twice)
@@ -118,8 +118,8 @@ def _turning(row: Array) -> bool:
 def _predict(
     row: Array, R: Array, p: Array, v: Array, R_out: Array, p_out: Array, v_out: Array, scratch: MotionScratch
 ) -> None:
-    """The state after the motion ``zeta`` of the scratch, whose ``turn`` and, on a turning Earth, ``E`` it makes."""
-    t, zeta, turn = row[DURATION], scratch.zeta, scratch.turn
+    """The state after the motion ``zeta`` of the scratch, whose ``turn`` and ``E`` it makes."""
+    t, zeta, turn, E = row[DURATION], scratch.zeta, scratch.turn, scratch.E
     exp_rotation(zeta, turn)
     for i in range(3):
         p_out[i] = p[i] + t * v[i] + R[i, 0] * zeta[3] + R[i, 1] * zeta[4] + R[i, 2] * zeta[5]
@@ -128,6 +128,9 @@ def _predict(
         p_out[2] += 0.5 * t * t * row[GRAVITY]
         v_out[2] += t * row[GRAVITY]
         multiply(R, turn, R_out)
+        for i in range(3):
+            for j in range(3):
+                E[i, j] = 1.0 if i == j else 0.0
         return
     vectors = scratch.vectors
     rate, far, fast, along, twice = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
@@ -139,11 +142,11 @@ def _predict(
         fast[i] = v_out[i] + along[i]
         far[i] = p_out[i] + t * along[i]
         along[i] = -t * rate[i]
-    exp_rotation(along, scratch.E)
+    exp_rotation(along, E)
     multiply(R, turn, scratch.ER)
-    multiply(scratch.E, scratch.ER, R_out)
-    rotate(scratch.E, far, p_out)
-    rotate(scratch.E, fast, v_out)
+    multiply(E, scratch.ER, R_out)
+    rotate(E, far, p_out)
+    rotate(E, fast, v_out)
     cross(rate, p_out, along)
     for i in range(3):
         v_out[i] -= along[i]
@@ -165,16 +168,11 @@ def predict_with_jacobian(
 
     J of the scratch becomes the turn of the body, position and velocity in n by rotation, position, velocity, bias.
     """
-    zeta, t, turning, turn, Jr = scratch.zeta, row[DURATION], _turning(row), scratch.turn, scratch.matrices[0]
+    zeta, t, turn, Jr = scratch.zeta, row[DURATION], scratch.turn, scratch.matrices[0]
     E, ER, J_out = scratch.E, scratch.ER, scratch.J
     correct_motion(row, bias, zeta)
     _predict(row, R, p, v, R_out, p_out, v_out, scratch)
-    if turning:
-        multiply(E, R, ER)
-    else:
-        for i in range(3):
-            for j in range(3):
-                ER[i, j], E[i, j] = R[i, j], 1.0 if i == j else 0.0
+    multiply(E, R, ER)
     right_jacobian(zeta, Jr)
     for i in range(3):
         for j in range(3):
@@ -193,7 +191,7 @@ def predict_with_jacobian(
             J_out[3 + i, 9 + j] = ER[i, 0] * row[at] + ER[i, 1] * row[at + 6] + ER[i, 2] * row[at + 12]
             at += 18
             J_out[6 + i, 9 + j] = ER[i, 0] * row[at] + ER[i, 1] * row[at + 6] + ER[i, 2] * row[at + 12]
-    if turning:
+    if _turning(row):
         _add_turning(row, R, scratch)
 
 
