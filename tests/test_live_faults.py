@@ -59,6 +59,35 @@ def test_a_frozen_ping_is_taken_back_from_its_first_appearance():
     assert faults.look(moving(5.0)) == Verdict()
 
 
+def depth(time: float, metres: float) -> Measurement:
+    return Measurement(time, "depth", np.array([metres]), 0)
+
+
+def depths_used(values: list[float]) -> tuple[list[bool], Faults]:
+    """Which depths of 5 Hz are used, beside an IMU that works."""
+    faults, used = Faults(), []
+    for k, metres in enumerate(values):
+        faults.look(sample(0.2 * k))
+        verdict = faults.look(depth(0.2 * k, metres))
+        used.append(verdict.use)
+        if verdict.retract_since is not None:
+            used[round(verdict.retract_since / 0.2) :] = [False] * (k + 1 - round(verdict.retract_since / 0.2))
+    return used, faults
+
+
+def test_a_depth_that_loses_its_noise_is_left_out_from_its_first_repetition():
+    live = (5.0 + 0.02 * RNG.standard_normal(50)).tolist()
+    used, faults = depths_used([*live, *[5.0] * 50, *live])
+    assert used == [True] * 50 + [False] * 50 + [True] * 50
+    assert kinds(faults) == ["frozen", "back"]
+
+
+def test_a_coarse_depth_may_stand_still():
+    coarse = np.round(np.linspace(5.0, 6.0, 60), 1)  # each value is held for a second
+    used, faults = depths_used([*coarse.tolist(), *[6.0] * 100])
+    assert all(used) and faults.events == []
+
+
 def test_a_compass_that_stands_still_while_the_vehicle_turns_is_frozen():
     faults, used = Faults(), []
     for k in range(1000):

@@ -73,7 +73,7 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
     used = own + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
-    assumptions += unchecked(config, sources, present)
+    assumptions += unchecked(config, sources, log.sensors, expected)
 
     first = level(log, config)
     bias, bias_sd = no_bias() if has_constant_velocity(config) else _bias(config, first, assumptions)

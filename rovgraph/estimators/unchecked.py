@@ -13,7 +13,9 @@ from rovgraph.estimators.headings import OFFSETS
 from rovgraph.units import behind, shown
 
 
-def unchecked(config: Config, sources: Collection[str], present: Collection[str]) -> list[str]:
+def unchecked(
+    config: Config, sources: Collection[str], present: Collection[str], expected: Collection[str] = ()
+) -> list[str]:
     """What heading, distances and depth rest on where nothing checks them, a line each.
 
     Parameters
@@ -21,18 +23,20 @@ def unchecked(config: Config, sources: Collection[str], present: Collection[str]
     config : as stated, before the log fills anything in
     sources : heading sources in use
     present : streams of the log
+    expected : streams that may still come
     """
     priors, start = beliefs(config), config.start
     lines: list[str] = []
     if "fix" not in present:
+        so_far = " so far" if "fix" in expected else ""
         rests = [_held_by(priors[OFFSETS[source]]) for source in sources]
         if start.heading_deg is not None:
             rests.append(f"start.heading_deg, sd {start.heading_sd_deg:g} deg")
-        lines.append(f"no fix shows a constant error of the heading, which rests on {'; '.join(rests)}")
-        if "dvl" in present:
+        lines.append(f"no fix{so_far} shows a constant error of the heading, which rests on {'; '.join(rests)}")
+        if "dvl" in {*present, *expected}:
             scale = _held_by(priors["dvl_scale"])
-            lines.append(f"no fix shows a constant error of the DVL's scale, which rests on {scale}")
-    if "depth" in present and start.down_m is None:
+            lines.append(f"no fix{so_far} shows a constant error of the DVL's scale, which rests on {scale}")
+    if "depth" in {*present, *expected} and start.down_m is None:
         lines.append(f"nothing shows a constant error of the depth, which rests on {_held_by(priors['depth_offset'])}")
     return lines
 

@@ -1,9 +1,9 @@
 """Sensors that fail while they go on talking, or fall silent.
 
 What is wrong is told from a sensor's own values and the IMU's: a DVL that reports exact
-zeros although it moved a moment ago, or turns; values that repeat exactly; a compass that
-stands still while the vehicle turns. A measurement that is part of such a failure is kept out,
-and those before it that were, taken back. What disagrees with the estimate is the filter's to
+zeros although it moved a moment ago, or turns; values that repeat exactly though they never
+did; a compass that stands still while the vehicle turns. A measurement that is part of such
+a failure is kept out, and those before it that were, taken back. What disagrees with the estimate is the filter's to
 reject.
 """
 
@@ -16,6 +16,7 @@ import numpy as np
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.live.solution import Event
 from rovgraph.log import Measurement
+from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, NEVER_REPEATS
 
 SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
 SILENT_AT_FIRST_S = 30.0  # after a first measurement, as long as the period is not known
@@ -23,6 +24,8 @@ MOVED = 0.1  # speed of a vehicle that does not stop within a ping [m/s]
 RECENT_S = 5.0
 TELL_S = 2.0  # a ping without bottom lock is not worth an event
 FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
+NOISY = {"mag", "depth", "dvl_water"}  # sensors whose noise may show, so that values hardly ever repeat
+ENOUGH_VALUES = 20  # different ones, that show it
 TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
 LONGEST_STEP_S = 1.0  # of the gyro, over which a turn is reckoned
 OCCASIONAL = {"place"}  # sensors that speak when there is something to be seen
@@ -66,6 +69,8 @@ class Watch:
     values: bytes = b""
     since: float = 0.0  # of the first of equal values
     equal: int = 0
+    values_seen: int = 0  # different ones, of which no more than a few in a row were equal,
+    measured: int = 0  # and how many measurements they were
     turned: tuple[float, ...] = (0.0, 0.0, 0.0)  # how far the vehicle had by then [rad]
     by_hand: bool = False  # no sensor has measured yet: nothing is late
 
@@ -95,6 +100,8 @@ class Faults:
         if values == watch.values:
             watch.equal += 1
         else:
+            if watch.equal < MIN_REPEATS:
+                watch.values_seen, watch.measured = watch.values_seen + 1, watch.measured + watch.equal
             watch.equal, watch.since, watch.turned = 1, m.time, self._turned
         if watch.time > -np.inf:
             step = m.time - watch.time
@@ -116,10 +123,24 @@ class Faults:
                 and m.sensor in HEADING_STREAMS
                 and max(abs(now - then) for now, then in zip(self._turned, watch.turned, strict=True)) > TURNED
             )
+            or (m.sensor in NOISY and self._has_lost_its_noise(m, watch))
         )
         if not frozen and watch.state == "ok" and not watch.reported:
             return _GOOD
         return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
+
+    def _has_lost_its_noise(self, m: Measurement, watch: Watch) -> bool:
+        """Whether a sensor repeats itself that hardly ever did, while the IMU goes on to show its own noise."""
+        imu = self.watches.get("imu")
+        return (
+            watch.equal >= MIN_REPEATS
+            and m.time - watch.since >= MIN_SECONDS
+            and watch.values_seen >= ENOUGH_VALUES
+            and watch.measured <= NEVER_REPEATS * watch.values_seen
+            and bool(m.values[:3].any())
+            and imu is not None
+            and imu.state == "ok"
+        )
 
     def accept(self, m: Measurement) -> Verdict:
         """Take a measurement that a person gives, as it is; a sensor that gives the like is not said to have spoken."""

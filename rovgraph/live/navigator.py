@@ -22,12 +22,12 @@ from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertR
 from rovgraph.geometry import Array
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
+from rovgraph.live.crosscheck import Crosscheck
 from rovgraph.live.faults import Faults
 from rovgraph.live.health import Health
 from rovgraph.live.incoherence import Incoherence
 from rovgraph.live.intake import Intake
 from rovgraph.live.joining import ANYWHERE_M, can_join, is_late, joined, unlocated
-from rovgraph.live.lags import Lags
 from rovgraph.live.message import Message, Reading
 from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
@@ -81,7 +81,7 @@ class Navigator:
     def __post_init__(self) -> None:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
-        self._lags = Lags(self.config)
+        self._crosscheck = Crosscheck(self.config)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
         self._adopted = -1  # newest keyframe of iSAM2 that the filter has gone on from
@@ -184,8 +184,7 @@ class Navigator:
 
     def finish(self) -> None:
         """No more measurements: take what is held back."""
-        for sensor, text in self._lags.finish():
-            self.say(sensor, "clock", text)
+        self._events += self._crosscheck.finish()
         if self.engine is None and (initial := self._startup.begin(self.origin)) is not None:
             self._begin(initial)
         if self.engine is not None:
@@ -273,8 +272,7 @@ class Navigator:
         if not verdict.use:
             self.left_out[m.sensor, self.faults.watches[m.sensor].state] += 1
             return
-        for sensor, text in self._lags.add(m):
-            self.say(sensor, "clock", text)
+        self._events += self._crosscheck.add(m)
         if self._incoherence.keeps_out(m.sensor, m.time):
             self.left_out[m.sensor, "incoherent"] += 1
         elif self.engine is None:

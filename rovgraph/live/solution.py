@@ -16,7 +16,7 @@ class Event:
     ----------
     time : [s], the estimate's time
     source : sensor or source that it is about
-    kind : short and fixed, as "rejected", "readmitted", "silent", "frozen", "gap", "clock",
+    kind : short and fixed, as "rejected", "readmitted", "silent", "frozen", "gap", "clock", "check",
         "doubtful", "wrong", "over"
     text : one line for a person
     """

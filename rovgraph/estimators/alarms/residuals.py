@@ -229,7 +229,10 @@ def _remedy_of_lasting(sensor: str) -> str:
             f"or raise {sd_key(sensor)}"
         )
     if sensor == "fix":
-        return "the fixes are all off there: remove them from the log, or raise fix.sd_m"
+        return (
+            "the fixes are all off there: remove them from the log, raise fix.sd_m, or, if their errors are "
+            "correlated, estimate calibration.fix_error"
+        )
     if sensor == "depth":
         return "the depth contradicts the DVL's vertical velocity: check depth, dvl.mount_rpy_deg and imu.mount_rpy_deg"
     if sensor.startswith("dvl"):

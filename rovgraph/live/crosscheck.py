@@ -1,4 +1,4 @@
-"""The motion of the last minutes, as each sensor shows it: whose stamps are late, and whose clock has jumped.
+"""The motion of the last minutes, as each sensor shows it: whose stamps are late, and whose axes or heading are wrong.
 
 What was received goes through the comparisons of `rovgraph check` again and again: acceleration by DVL and IMU,
 turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What two windows in a row say
@@ -9,13 +9,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from rovgraph.check.agreement import headings, vertical
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding
 from rovgraph.check.fixes import track
 from rovgraph.config import Config
+from rovgraph.live.solution import Event
 from rovgraph.log import Log, Measurement, Stream, gathered
 from rovgraph.log.streams import joined
 
@@ -28,8 +27,8 @@ CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, h
 
 
 @dataclass
-class Lags:
-    """Compares the clocks of sensors by the motion that they show.
+class Crosscheck:
+    """Compares sensors by the motion that they show.
 
     Attributes
     ----------
@@ -44,13 +43,8 @@ class Lags:
     _suspected: set[tuple[str, str]] = field(default_factory=set)
     _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
-    def add(self, m: Measurement) -> list[tuple[str, str]]:
-        """Take a measurement.
-
-        Returns
-        -------
-        list of (sensor, text) : what is known to be late from now on, with the configuration that mends it
-        """
+    def add(self, m: Measurement) -> list[Event]:
+        """Take a measurement; what is known to be late or wrong from now on, with the configuration that mends it."""
         if m.sensor != "imu":
             self._newest.append(m)
             return []
@@ -67,7 +61,7 @@ class Lags:
         self._next = m.time + min(max(0.25 * span, EVERY_S[0]), EVERY_S[1])
         return list(self._compared())
 
-    def finish(self) -> list[tuple[str, str]]:
+    def finish(self) -> list[Event]:
         """No more measurements: what `add` has not said yet."""
         self._take_newest(-math.inf)
         return list(self._compared()) if self._suspected else []
@@ -90,15 +84,24 @@ class Lags:
             else:
                 self._window.pop(sensor, None)
 
-    def _compared(self) -> Iterator[tuple[str, str]]:
+    def _compared(self) -> Iterator[Event]:
         log = Log("the last minutes", self._window, None)
-        found = [f for check in CHECKS for f in check(log, self.config) if f.clock and f.level != "ok"]
-        found = [f for f in found if f.clock == "jump"] or found  # a lag before and after is the mean of two
-        for finding in found:
-            key = finding.sensor, finding.clock
-            now = float(log["imu"].time[-1])
-            if key in self._suspected and now - self._said.get(key, -np.inf) > AGAIN_S:
+        now = float(log["imu"].time[-1])
+        start = min(float(stream.time[0]) for stream in log.streams.values())
+        found = {
+            (f.sensor, f.clock or check.__name__): f
+            for check in CHECKS
+            for f in check(log, self.config)
+            if f.level != "ok"
+        }
+        if any(f.clock == "jump" for f in found.values()):  # a lag before and after is the mean of two
+            found = {key: f for key, f in found.items() if f.clock == "jump"}
+        late = {f.sensor for f in found.values() if f.clock}  # which explains what else disagrees
+        found = {key: f for key, f in found.items() if f.clock or f.sensor not in late}
+        for key, finding in found.items():
+            if key in self._suspected and now - self._said.get(key, -math.inf) > AGAIN_S:
                 self._said[key] = now
-                start = min(float(stream.time[0]) for stream in log.streams.values())
-                yield finding.sensor, finding.text + (f"; 0 s is {start:.1f} s" if finding.clock == "jump" else "")
-        self._suspected = {(finding.sensor, finding.clock) for finding in found}
+                zero = f"; 0 s is {start:.1f} s" if finding.clock == "jump" else ""
+                kind = "clock" if finding.clock else "check"
+                yield Event(now, finding.sensor, kind, f"{finding.text}{zero}")
+        self._suspected = {*found}
