@@ -1,6 +1,6 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -164,7 +164,7 @@ def _solve(
 def _saying(dive: Dive, found: list[UnstatedNoise]) -> Dive:
     """A dive that says what noise was found in it."""
     initial = replace(dive.initial, assumptions=[*(one.text for one in found), *dive.initial.assumptions])
-    return replace(_with_main(dive, noise_found=[asdict(one) for one in found]), initial=initial)
+    return replace(_with_main(dive, noise_found=[one.as_dict() for one in found]), initial=initial)
 
 
 def assemble(log: Log, initial: InitialConditions, searches: Searches | None = None) -> BatchSmoother:

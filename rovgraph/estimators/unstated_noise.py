@@ -11,7 +11,7 @@ The factor of white noise comes from differences of successive residuals, which 
 with m the median of chi-square. A smoother's residuals vary less than the noise, so the factor is a little low.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
-from rovgraph.estimators.alarms import Alarm
+from rovgraph.estimators.alarms import Alarm, Statistic
 from rovgraph.estimators.alarms.residuals import SD_KEY
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
@@ -44,13 +44,28 @@ class UnstatedNoise:
     sensor : log stream
     key : of the configuration, that holds it
     values : what stands there with it; numbers, or keys of the section and theirs
-    text : one line
+    cause, done : what is so, and what is done about it
     """
 
     sensor: str
     key: str
     values: Any
-    text: str
+    cause: str
+    done: str
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        return f"{self.sensor}: {self.cause}; {self.done}"
+
+    @property
+    def remedy(self) -> str:
+        """What states it in a configuration."""
+        return f"if it lasts, state {self.key}: {_as_yaml(self.values)}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"sensor": self.sensor, "key": self.key, "values": self.values, "text": self.text}
 
     @property
     def lasts(self) -> bool:
@@ -80,6 +95,22 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
     return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
 
 
+def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Iterator[Statistic]:
+    """The same as alarms, of an estimate that goes on without it; parameters are those of `find_noise`."""
+    begin, end = best.intervals[0].time, best.intervals[-1].time
+    for one in find_noise(best, config, alarms):
+        yield Statistic("unstated", one.sensor, begin, end, 1.0, 0.0, np.inf, one.cause, one.remedy)
+
+
+def _as_yaml(values: Any) -> str:
+    """Numbers or keys on one line."""
+    if isinstance(values, Mapping):
+        return "{" + ", ".join(f"{key}: {_as_yaml(value)}" for key, value in values.items()) + "}"
+    if isinstance(values, tuple):
+        return "[" + ", ".join(map(_as_yaml, values)) + "]"
+    return str(values).lower() if isinstance(values, bool) else f"{values:.2g}"
+
+
 def changed(config: Config, found: Sequence[UnstatedNoise]) -> Config:
     """The configuration with the noise that was found."""
     for one in found:
@@ -107,8 +138,8 @@ def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | 
     if factor is None or factor < LARGER or not _is_stated(best, sensor):
         return None
     value = tuple(factor * s for s in stated) if isinstance(stated, tuple) else factor * stated
-    text = f"{sensor}: its noise is {factor:.2g} times what {key} states, by its residuals; the larger noise is used"
-    return UnstatedNoise(sensor, key, value, text)
+    cause = f"its noise is {factor:.2g} times what {key} states, by its residuals"
+    return UnstatedNoise(sensor, key, value, cause, "the larger noise is used")
 
 
 def noise_factor(r: Array) -> float | None:
@@ -132,14 +163,10 @@ def _lasting(error: LastingError, config: Config) -> UnstatedNoise:
     sd, seconds = factor * error.sd, float(error.time_constant)
     key = f"calibration.{error.variable}"
     if np.isinf(seconds):
-        text = (
-            f"{error.sensor}: {variable.about}: the dive determines it better than its sd, so it is estimated ({key})"
-        )
-        return UnstatedNoise(error.sensor, key, {"estimate": True, "sd_deg" if variable.angular else "sd": sd}, text)
+        cause = f"{variable.about}: the dive determines it better than its sd"
+        values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd}
+        return UnstatedNoise(error.sensor, key, values, cause, f"it is estimated ({key})")
     values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd, "time_constant_s": seconds}
     size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"
-    text = (
-        f"{error.sensor}: its errors are correlated over {seconds:.0f} s with an sd of {size}; "
-        f"they are estimated ({key})"
-    )
-    return UnstatedNoise(error.sensor, key, values, text)
+    cause = f"its errors are correlated over {seconds:.0f} s with an sd of {size}"
+    return UnstatedNoise(error.sensor, key, values, cause, f"they are estimated ({key})")

@@ -32,9 +32,9 @@ from rovgraph.estimators.alarms.stretches import taken_out_in
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.live.faults import Watch
+from rovgraph.live.reinitialisations import Adopted
 from rovgraph.live.solution import Event
 from rovgraph.state import BIAS, PLACE
-from rovgraph.trajectory import Trajectory
 
 EVERY_S = 5.0  # between looks
 LASTING_EVERY_S = 20.0  # between looks at what lasts, which cost more
@@ -80,6 +80,7 @@ class LiveAlarms:
         self._pieces: deque[dict[str, SensorResiduals]] = deque(maxlen=round(MINUTE / LASTING_EVERY_S))
         self._lasting: list[Statistic] = []
         self._told: list[tuple[float, Statistic]] = []
+        self._shown: list[Statistic] = []  # by the smoothed dive, at the newest re-initialisation
         self._raised: dict[tuple[str, str], _Raised] = {}
 
     @property
@@ -130,11 +131,12 @@ class LiveAlarms:
             self._look([*self._statistics(mark.known, engine, watches, time)], now)
             self._counts.append({})
 
-    def reinitialised(self, smoothed: Trajectory, filtered: Trajectory) -> None:
-        """The keyframe from which the filter goes on, of the smoothed dive so far, and as the filter had it."""
-        time = float(smoothed.time[-1])
+    def reinitialised(self, adopted: Adopted) -> None:
+        """The filter goes on from the smoothed dive so far."""
+        time = float(adopted.smoothed.time[-1])
         if not np.isnan(self._start):
-            self._told += [(time, one) for one in apart(smoothed, filtered, self._start)]
+            self._told += [(time, one) for one in apart(adopted.smoothed, adopted.filtered, self._start)]
+        self._shown = adopted.shown
 
     def taken_out(self, stretch: Stretch) -> None:
         """A sensor is left out for some time."""
@@ -163,6 +165,7 @@ class LiveAlarms:
         yield from self._lasting
         self._told = [(when, one) for when, one in self._told if time - when < MINUTE]
         yield from (one for _, one in self._told)
+        yield from self._shown
 
     def _constants(self, known: Gaussian, engine: FilterEngine, time: float) -> Iterator[Statistic]:
         """Of the calibration that is estimated, and of the gyro's bias."""

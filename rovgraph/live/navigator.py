@@ -315,9 +315,9 @@ class Navigator:
             waited = 0.0
             if self._reinitialisations is not None:
                 waited = self._reinitialisations.step(engine)
-                if self._reinitialisations.moved is not None:
-                    self.alarms.reinitialised(*self._reinitialisations.moved)
-                    self._reinitialisations.moved = None
+                if (adopted := self._reinitialisations.adopted) is not None:
+                    self.alarms.reinitialised(adopted)
+                    self._reinitialisations.adopted = None
             if self.isam2 is not None and self.passed and self.isam2.updated > self._adopted:
                 self._adopt(engine, self.isam2)
             if (stretch := self._incoherence.step(engine)) is not None:

@@ -1,4 +1,8 @@
-"""The filter goes on from the smoothed dive so far, which a thread computes while measurements come."""
+"""The filter goes on from the smoothed dive so far, which a thread computes while measurements come.
+
+The smoothed dive also shows what the filter cannot: constants that are held wrongly, and errors that last. It is
+examined as `rovgraph smooth` examines a whole dive, for alarms.
+"""
 
 import time as host
 from collections.abc import Sequence
@@ -7,17 +11,44 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rovgraph.engine.chain_layout import COLUMNS
+from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian, states_of
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.released import as_chain
 from rovgraph.errors import InputError
+from rovgraph.estimators.alarms import Statistic, find_alarms
+from rovgraph.estimators.alarms.constants import held_in
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.estimators.eskf.reinitialisation import reinitialised
+from rovgraph.estimators.unstated_noise import unstated
 from rovgraph.geometry import Array
+from rovgraph.state import VELOCITY
 from rovgraph.trajectory import Trajectory
 
 Keyframe = tuple[KeyframeInterval, Array, Array]  # its interval, state vector and calibration vector
+_Smoothed = tuple[Gaussian, list[Statistic]]
+
+EXAMINED_FROM_S = 60.0  # of the dive: what was held wrongly for less shows little
+
+
+@dataclass(frozen=True)
+class Adopted:
+    """A keyframe from which the filter goes on.
+
+    Attributes
+    ----------
+    smoothed, filtered : by the smoothed dive so far, and as the filter had it
+    shown : what the smoothed dive shows of constants and noise
+    """
+
+    smoothed: Trajectory
+    filtered: Trajectory
+    shown: list[Statistic]
 
 
 @dataclass
@@ -28,20 +59,20 @@ class Reinitialisations:
     ----------
     patient : wait for the thread, so that a replay can be repeated
     news : what went wrong, one line each, since it was last emptied
-    moved : the newest keyframe that was adopted, smoothed and as the filter had it, until it is taken
+    adopted : what the filter goes on from, until it is taken
     waited : for the thread, which only a replay does that is faster than it [s]
     """
 
     patient: bool
     news: list[str] = field(default_factory=list)
-    moved: tuple[Trajectory, Trajectory] | None = None
+    adopted: "Adopted | None" = None
     waited: float = 0.0
 
     def __post_init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="reinitialisation")
         self._due = list(REINITIALISE_AT_S)
         self._passed: list[Keyframe] = []
-        self._running: tuple[int, Future[Gaussian]] | None = None
+        self._running: tuple[int, Future[_Smoothed]] | None = None
 
     def take(self, snapshot: FilterSnapshot) -> None:
         """Remember a keyframe that the lag has passed, as long as any reinitialisation is to come."""
@@ -80,12 +111,12 @@ class Reinitialisations:
         keyframes = [*self._passed, *waiting]
         self._running = oldest.interval.index, self._thread.submit(_smoothed, engine.filter, keyframes)
 
-    def _adopt(self, engine: FixedLag, index: int, future: "Future[Gaussian]") -> None:
+    def _adopt(self, engine: FixedLag, index: int, future: "Future[_Smoothed]") -> None:
         """Go on from the thread's result, if it is there; the keyframes that the lag has passed since are filtered."""
         if not self.patient and not future.done():
             return
         began = host.perf_counter()
-        known = future.result()
+        known, shown = future.result()
         self.waited += host.perf_counter() - began
         oldest, gates = engine.oldest().interval.index, dict[str, float]()
         waiting = (mark.interval for mark in engine.marks if mark.interval.index <= oldest)
@@ -96,7 +127,7 @@ class Reinitialisations:
         before = next((mark for mark in engine.marks if mark.interval.index == newest), None)
         if engine.adopt(newest, known) and before is not None:
             after, filtered = (engine.trajectory([before.interval], [one]) for one in (known, before.known))
-            self.moved = after, filtered
+            self.adopted = Adopted(after, filtered, shown)
         self._due.pop(0)
         self._running = None
         if not self._due:
@@ -107,7 +138,22 @@ def _keyframe(snapshot: FilterSnapshot) -> Keyframe:
     return snapshot.interval, snapshot.known.x, snapshot.known.c
 
 
-def _smoothed(engine: FilterEngine, keyframes: Sequence[Keyframe]) -> Gaussian:
-    """The newest of some keyframes, from all data so far."""
+def _smoothed(engine: FilterEngine, keyframes: Sequence[Keyframe]) -> _Smoothed:
+    """The newest of some keyframes, from all data so far, and what these show."""
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
-    return reinitialised(engine, [interval for interval, _, _ in keyframes], states)[0]
+    known, best = reinitialised(engine, [interval for interval, _, _ in keyframes], states)
+    return known, _shown(best, engine.initial)
+
+
+def _shown(best: Optimum, initial: InitialConditions) -> list[Statistic]:
+    """What is held wrongly, or not stated, by the smoothed dive so far."""
+    begin, end = best.intervals[0].time, best.intervals[-1].time
+    if end - begin < EXAMINED_FROM_S:
+        return []
+    v_sd = float(np.sqrt(np.mean(np.diag(best.newest_covariance())[COLUMNS[VELOCITY]])))
+    try:
+        held = list(held_in(as_chain(best, initial), initial.config, v_sd, begin, end))
+        noise = unstated(best, initial.config, find_alarms(held, begin)) if isinstance(best, ChainOptimum) else ()
+        return [*held, *noise]
+    except InputError:  # what the dive does not determine shows nothing either
+        return []

@@ -6,6 +6,7 @@ import numpy as np
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
+from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import Released, as_chain, release
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
@@ -98,11 +99,15 @@ def _moved(begin: float, end: float, sensor: str, figure: float, cause: str, rem
 
 def held(evidence: Evidence) -> Iterator[Statistic]:
     """Constants that are held, released one by one: the score test of `rovgraph.engine.released`."""
-    if evidence.optimum is None:
-        return
-    best = as_chain(evidence.optimum, evidence.initial)
-    v, v_sd = evidence.main.trajectory.v_n, evidence.main.trajectory.v_sd
-    moving = np.sqrt(np.mean(v**2)) > MOVING * np.sqrt(np.median(v_sd**2))
+    if evidence.optimum is not None:
+        best = as_chain(evidence.optimum, evidence.initial)
+        v_sd = np.median(evidence.main.trajectory.v_sd)
+        yield from held_in(best, evidence.initial.config, float(v_sd), evidence.start, evidence.end)
+
+
+def held_in(best: ChainOptimum, config: Config, v_sd: float, start: float, end: float) -> Iterator[Statistic]:
+    """The same of an optimum from ``start`` to ``end``, in which the velocity is known to ``v_sd`` in the median."""
+    moving = np.sqrt(np.mean(best.state.v_n**2)) > MOVING * v_sd
     for r in release(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]
         if r.sd > SHOWN_OF.get(r.name, SHOWN) * variable.sd:
@@ -113,14 +118,14 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
         yield Statistic(
             "held",
             _sensor_of(r.name),
-            evidence.start,
-            evidence.end,
+            start,
+            end,
             abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
             HELD,
             FAR_MOVED if belief.considered else HELD_FAR_OFF,  # the prior's sd is all that the track's sd has of it
             f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements shift it "
             f"by {factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)}",
-            _remedy_of_held(r, evidence.initial.config),
+            _remedy_of_held(r, config),
         )
 
 
@@ -215,9 +220,10 @@ def _remedy_of_held(r: Released, config: Config) -> str:
         )
     if r.name in TIME_OFFSETS:
         sensor, known = _sensor_of(r.name), config.delay_s.get(_sensor_of(r.name), 0.0)
+        arm = ", or correct fix.lever_arm_m" if sensor == "fix" else ""  # under way the two look alike
         return (
             f"stamps of {sensor} are late (early if negative): state delay_s: {{{sensor}: {known + r.step:.2g}}}, "
-            f"or estimate calibration.{r.name}"
+            f"or estimate calibration.{r.name}{arm}"
         )
     if r.name == "gyr_scale":
         return "estimate calibration.gyr_scale, or calibrate the gyro"

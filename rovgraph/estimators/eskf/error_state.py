@@ -142,7 +142,8 @@ class ErrorStateFilter:
         if self._due and self.intervals[-1].time - self.intervals[0].time >= self._due[0]:
             self._due.pop(0)
             so_far = self._rows and self._rows.upto(len(self.intervals))
-            self.known, self._smoothed = reinitialised(self.engine, self.intervals, self.states(), so_far)
+            self.known, best = reinitialised(self.engine, self.intervals, self.states(), so_far)
+            self._smoothed = best.state
             self.history.replace_last(self.known)
 
     def solve(self) -> Estimate:

@@ -18,7 +18,7 @@ from rovgraph.state import PLACE_DIM, State
 
 def reinitialised(
     engine: FilterEngine, intervals: Sequence[KeyframeInterval], states: State, rows: DiveRows | None = None
-) -> tuple[Gaussian, State]:
+) -> tuple[Gaussian, Optimum]:
     """The newest keyframe, with every factor of the dive linearised at the optimum.
 
     Parameters
@@ -31,7 +31,7 @@ def reinitialised(
     Returns
     -------
     Gaussian : of the newest keyframe
-    State : of all keyframes, to begin with the next time
+    Optimum : of the dive so far
     """
     initial, layout = engine.initial, engine.layout
     calibration = {name: value if value.ndim == 1 else value[-1] for name, value in states.calibration.items()}
@@ -51,7 +51,7 @@ def reinitialised(
     state = best.state.at([len(intervals) - 1])
     calibration = {name: value.reshape(-1) for name, value in state.calibration.items()}
     newest = State(state.R_nb, state.p_n, state.v_n, state.bias, calibration)
-    return replace(Gaussian.of(newest, joint[own, own] - B @ B.T, places), B=B, L=L), best.state
+    return replace(Gaussian.of(newest, joint[own, own] - B @ B.T, places), B=B, L=L), best
 
 
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:
