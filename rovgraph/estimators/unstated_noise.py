@@ -61,7 +61,7 @@ class UnstatedNoise:
     @property
     def remedy(self) -> str:
         """What states it in a configuration."""
-        return f"if it lasts, state {self.key}: {_as_yaml(self.values)}"
+        return f"state {self.key}: {_as_yaml(self.values)}"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -108,7 +108,7 @@ def _as_yaml(values: Any) -> str:
         return "{" + ", ".join(f"{key}: {_as_yaml(value)}" for key, value in values.items()) + "}"
     if isinstance(values, tuple):
         return "[" + ", ".join(map(_as_yaml, values)) + "]"
-    return str(values).lower() if isinstance(values, bool) else f"{values:.2g}"
+    return str(values).lower() if isinstance(values, bool) else f"{float(f'{values:.2g}'):g}"
 
 
 def changed(config: Config, found: Sequence[UnstatedNoise]) -> Config:

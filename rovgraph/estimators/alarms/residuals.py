@@ -230,8 +230,8 @@ def _remedy_of_lasting(sensor: str) -> str:
         )
     if sensor == "fix":
         return (
-            "the fixes are all off there: remove them from the log, raise fix.sd_m, or, if their errors are "
-            "correlated, estimate calibration.fix_error"
+            "the fixes are all off there: check fix.lever_arm_m and its clock (rovgraph check), remove them from the "
+            "log, raise fix.sd_m, or, if their errors are correlated, estimate calibration.fix_error"
         )
     if sensor == "depth":
         return "the depth contradicts the DVL's vertical velocity: check depth, dvl.mount_rpy_deg and imu.mount_rpy_deg"
