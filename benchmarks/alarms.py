@@ -2,6 +2,7 @@
 
 python benchmarks/alarms.py --seeds 2
 python benchmarks/alarms.py --margins
+python benchmarks/alarms.py --online --seeds 1
 """
 
 import argparse
@@ -10,9 +11,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from online import messages
 
 from rovgraph.config import Config
+from rovgraph.estimators.alarms import verdict_of
 from rovgraph.estimators.dive import smooth
+from rovgraph.live.clocks import Clocks
+from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log
 from rovgraph.simulate import NAMES, Choices, Style, Truth, Waves, scenario, simulate, simulated
 from rovgraph.simulate.named import falcon
@@ -53,14 +58,32 @@ def healthy(seeds: int) -> Iterator[tuple[str, Log, Config]]:
                 yield f"{path} {grade} {sensors} {seed}", Log.from_frame(dive.log_frame), config
 
 
+def online(log: Log, config: Config) -> tuple[str, list[str]]:
+    """The worst verdict while a dive goes on, and what is said of it beside its start."""
+    navigator = Navigator(config, patient=True, clocks=Clocks(trust=True))
+    for message in messages(log):
+        navigator.take(message)
+    navigator.finish()
+    last = navigator.solution()
+    events = () if last is None else last.events
+    said = [f"{e.time:.0f} s: {e.source} {e.kind}: {e.text}" for e in events if e.source != "start"]
+    return verdict_of(navigator.alarms.history.values()), said
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--margins", action="store_true", help="how near its limit each kind of alarm came")
+    parser.add_argument("--online", action="store_true", help="while the dives go on, instead of smoothed")
     given = parser.parse_args()
     verdicts: Counter[str] = Counter()
     nearest: dict[tuple[str, str], tuple[float, str]] = {}
     for name, log, config in healthy(given.seeds):
+        if given.online:
+            verdict, said = online(log, config)
+            verdicts[verdict] += 1
+            print("\n".join(f"{name}: {verdict}: {line}" for line in said), end="\n" if said else "", flush=True)
+            continue
         dive = smooth(log, config)
         verdict = dive.verdict
         verdicts[verdict] += 1

@@ -12,8 +12,10 @@ from rovgraph.config import parse_config
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.lasting import LASTING, _Baseline, find_lasting, unity
 from rovgraph.engine.linear_constants import LinearConstants
+from rovgraph.estimators.alarms import find_alarms
 from rovgraph.estimators.dive import smooth
-from rovgraph.estimators.unstated_noise import noise_factor
+from rovgraph.estimators.unstated_noise import changed as with_noise
+from rovgraph.estimators.unstated_noise import find_noise, noise_factor, unstated
 from rovgraph.gauss_markov import stationary_walk
 from rovgraph.simulate.files import known
 from rovgraph.state import POSE
@@ -74,6 +76,22 @@ def test_fixes_whose_errors_last_are_found_and_believed_so(correlated, found):
     assert "fix: its errors are correlated over" in found.assumptions[0]
     for kind in ("smoothed", "filtered"):
         assert nees(correlated[0], found, kind) < 2.0, kind
+
+
+@pytest.mark.parametrize("lasts", [True, False])
+def test_an_estimate_that_goes_on_without_it_raises_an_alarm_with_the_keys_that_state_it(correlated, lasts):
+    case, config = correlated if lasts else with_fixes(seed=3)
+    config = unsaid(config) if lasts else changed(config, fix={"sd_m": 0.1})
+    best = batch(case.log, config).optimum()
+    (alarm,) = find_alarms([*unstated(best, config, [])], 0.0)
+    key, _, value = alarm.text.split("; state ")[1].partition(": ")
+    section, _, name = key.partition(".")
+    stated, expected = parse_config(f"{section}: {{{name}: {value}}}"), with_noise(config, find_noise(best, config, []))
+    assert (alarm.kind, alarm.sensor, key) == ("unstated", "fix", "calibration.fix_error" if lasts else "fix.sd_m")
+    assert stated.fix.sd_m == pytest.approx(expected.fix.sd_m, rel=0.05) or lasts
+    own, theirs = stated.calibration.fix_error, expected.calibration.fix_error
+    assert (own.estimate, own.sd) == (theirs.estimate, pytest.approx(theirs.sd, rel=0.05))
+    assert own.time_constant_s == pytest.approx(theirs.time_constant_s, rel=0.05)
 
 
 def test_what_the_configuration_says_of_an_error_stands(correlated):
