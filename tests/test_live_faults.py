@@ -1,6 +1,7 @@
 """Sensors that fail while they go on talking, or fall silent: found, said once, and their return too."""
 
 import numpy as np
+import pytest
 
 from rovgraph.live.faults import FROZEN, Faults, Verdict
 from rovgraph.log import Measurement
@@ -63,15 +64,16 @@ def depth(time: float, metres: float) -> Measurement:
     return Measurement(time, "depth", np.array([metres]), 0)
 
 
-def depths_used(values: list[float]) -> tuple[list[bool], Faults]:
-    """Which depths of 5 Hz are used, beside an IMU that works."""
+def depths_used(values: list[float], rate: float = 5.0) -> tuple[list[bool], Faults]:
+    """Which depths are used, beside an IMU that works."""
     faults, used = Faults(), []
     for k, metres in enumerate(values):
-        faults.look(sample(0.2 * k))
-        verdict = faults.look(depth(0.2 * k, metres))
+        faults.look(sample(k / rate))
+        verdict = faults.look(depth(k / rate, metres))
         used.append(verdict.use)
         if verdict.retract_since is not None:
-            used[round(verdict.retract_since / 0.2) :] = [False] * (k + 1 - round(verdict.retract_since / 0.2))
+            first = round(verdict.retract_since * rate)
+            used[first:] = [False] * (k + 1 - first)
     return used, faults
 
 
@@ -85,6 +87,19 @@ def test_a_depth_that_loses_its_noise_is_left_out_from_its_first_repetition():
 def test_a_coarse_depth_may_stand_still():
     coarse = np.round(np.linspace(5.0, 6.0, 60), 1)  # each value is held for a second
     used, faults = depths_used([*coarse.tolist(), *[6.0] * 100])
+    assert all(used) and faults.events == []
+
+
+@pytest.mark.parametrize(("step", "rate", "speed"), [(0.1, 1.0, 0.5), (0.05, 4.0, 0.4), (0.01, 5.0, 0.3)])
+def test_a_coarse_depth_may_stand_still_after_a_dive_in_which_it_never_repeated(step, rate, speed):
+    at = np.arange(0.0, 145.0, 1.0 / rate)
+    true = speed * np.minimum(at, 25.0) + 0.003 * RNG.standard_normal(len(at))
+    used, faults = depths_used((step * np.round(true / step)).tolist(), rate)
+    assert all(used) and faults.events == []
+
+
+def test_a_depth_that_says_nothing_is_not_frozen():
+    used, faults = depths_used([*(5.0 + 0.02 * RNG.standard_normal(50)).tolist(), *[np.nan] * 50])
     assert all(used) and faults.events == []
 
 

@@ -6,7 +6,8 @@ of some minutes, since D drifts. Fixes of swapped north and east fit the conjuga
 fits better with the conjugate velocity. A cause is named where it explains the fixes beyond what chance does.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,16 +15,17 @@ from numpy.typing import NDArray
 
 from rovgraph.check.findings import Finding, repeats, since, valid_pings
 from rovgraph.check.inertial import in_gap
-from rovgraph.config import Config, mount_matrix
+from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, matrix_from_rpy, rotate
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log
+from rovgraph.sensors import SENSORS
 
 MIN_FIXES = 15
 STRETCH = 300.0  # over which the DVL's track drifts less than fixes scatter [s]
 LONGEST_GAP = 5.0  # between pings, in which the track is lost [s]
 ENOUGH_DISTANCE = 10.0  # spread of the fixes [m]
-MISALIGNED = np.deg2rad(15.0)
+MISALIGNED, BELIEVED_SDS = np.deg2rad(15.0), 3.0
 LARGEST_LAG = 60.0  # [s]
 LAG_STEP = 0.25  # [s]
 LAG_WARNING = 0.5  # [s]
@@ -116,7 +118,7 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             text = f"velocities do not fit the fixes (agreement {as_is.agreement:.2f}); check mounting and heading"
             yield Finding("dvl", "warning", text)
     else:
-        yield _turned(config, as_is, unlike)
+        yield _turned(config, heading_sources(config, log.sensors), as_is, unlike)
         if late:
             sense = "late" if lag > 0.0 else "early"
             text = f"fixes come {abs(lag):.1f} s {sense} relative to the DVL's track (sd {lag_sd:.1f} s)"
@@ -131,9 +133,17 @@ def _better(one: _Line, other: _Line) -> bool:
     return one.error + EVIDENCE < other.error and one.error * 1.5 < other.error
 
 
-def _turned(config: Config, as_is: _Line, unlike: _Line) -> Finding:
+def _believed(config: Config, sources: Sequence[str]) -> float:
+    """How far heading and mounting may be off by what is believed of them [rad]."""
+    priors = beliefs(config)
+    offsets = (SENSORS[source].linear_in for source in sources)
+    names = ["dvl_yaw", *(name for name in offsets if name)]
+    return BELIEVED_SDS * math.hypot(*(priors[name].sd for name in names if priors[name].estimate))
+
+
+def _turned(config: Config, sources: Sequence[str], as_is: _Line, unlike: _Line) -> Finding:
     angle, scale = float(np.angle(as_is.c)), float(abs(as_is.c))
-    wrong = abs(angle) > MISALIGNED + SURE * as_is.sd or (
+    wrong = abs(angle) > max(MISALIGNED, _believed(config, sources)) + SURE * as_is.sd or (
         not 0.8 < scale < 1.25 and abs(np.log(scale)) > SURE * as_is.sd + 0.2
     )
     tail = "; heading or mounting is off: check declination, compass offset and dvl.mount_rpy_deg" if wrong else ""

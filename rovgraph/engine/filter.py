@@ -191,6 +191,19 @@ class FilterEngine:
             H.append(own_H)
         return np.concatenate(r), np.vstack(H)
 
+    def considered_share(self, known: Gaussian, measurement: KeyframeMeasurement) -> Array:
+        """Variance that what is considered adds to an innovation, in units of the rest of it; shape (dim,).
+
+        Gates and gains depend on P alone, so innovations of a consistent filter vary by as much more.
+        """
+        if not len(known.L):
+            return np.zeros(self.initial.instruments[measurement.sensor].model.dim)
+        _, H = self.linearize(known, [measurement])
+        own, considered = H[:, : self.layout.size], H[:, self.layout.size : self.layout.width]
+        B, P = known.B[: self.layout.size], known.P[: self.layout.size, : self.layout.size]
+        by_considered = own @ B + considered @ known.L
+        return np.asarray(np.sum(by_considered**2, axis=1) / (np.sum(own @ P * own, axis=1) + 1.0))
+
     def knows(self, sensor: str) -> bool:
         """Whether the kernels know a sensor's equation."""
         return sensor not in self._given

@@ -36,7 +36,7 @@ def unchecked(
         if "dvl" in {*present, *expected}:
             scale = _held_by(priors["dvl_scale"])
             lines.append(f"no fix{so_far} shows a constant error of the DVL's scale, which rests on {scale}")
-    if "depth" in {*present, *expected} and start.down_m is None:
+    if "depth" in present and start.down_m is None:
         lines.append(f"nothing shows a constant error of the depth, which rests on {_held_by(priors['depth_offset'])}")
     return lines
 

@@ -99,7 +99,18 @@ def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Ite
     """The same as alarms, of an estimate that goes on without it; parameters are those of `find_noise`."""
     begin, end = best.intervals[0].time, best.intervals[-1].time
     for one in find_noise(best, config, alarms):
-        yield Statistic("unstated", one.sensor, begin, end, 1.0, 0.0, np.inf, one.cause, one.remedy)
+        if not _is_allowed_for(one, best):
+            yield Statistic("unstated", one.sensor, begin, end, 1.0, 0.0, np.inf, one.cause, one.remedy)
+
+
+def _is_allowed_for(one: UnstatedNoise, best: ChainOptimum) -> bool:
+    """Whether it is a constant that is considered, and no larger than believed."""
+    name = one.key.removeprefix("calibration.")
+    if name not in best.unknowns.considered or "time_constant_s" in one.values:
+        return False
+    factor, _ = shown(TABLE[name].unit)
+    sd: float = max(one.values.get("sd", 0.0), one.values.get("sd_deg", 0.0))
+    return sd <= 1.01 * factor * best.beliefs[name].sd
 
 
 def _as_yaml(values: Any) -> str:

@@ -31,6 +31,7 @@ from rovgraph.estimators.alarms.sensors import frozen_for
 from rovgraph.estimators.alarms.stretches import taken_out_in
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
 from rovgraph.estimators.estimate import CalibrationEstimate
+from rovgraph.geometry import Array
 from rovgraph.live.faults import Watch
 from rovgraph.live.reinitialisations import Adopted
 from rovgraph.live.solution import Event
@@ -39,6 +40,7 @@ from rovgraph.state import BIAS, PLACE
 EVERY_S = 5.0  # between looks
 LASTING_EVERY_S = 20.0  # between looks at what lasts, which cost more
 LASTING_FROM_S = 60.0  # after the start: innovations wander while the calibration settles
+ALLOWED_SDS = 2.0  # by which what is considered may be off: one constant moves all innovations
 OVER_S = 30.0  # within its limits, after which an alarm is over
 
 
@@ -46,6 +48,7 @@ OVER_S = 30.0  # within its limits, after which an alarm is over
 class _Count:
     """Of one sensor in the time between two looks."""
 
+    share: Array  # of its first innovation's variance, what is considered at `ALLOWED_SDS`, in units of the rest
     used: int = 0
     rejected: int = 0
     nis: float = 0.0  # sum of those that were used
@@ -67,7 +70,8 @@ class LiveAlarms:
     Attributes
     ----------
     events : since it was last emptied
-    history : every alarm of the run as it was at its worst, in the order in which they began
+    history : every alarm of the run as it was at its worst, those by the smoothed dive as they were last, in the order
+        in which they began
     """
 
     events: list[Event] = field(default_factory=list)
@@ -76,7 +80,7 @@ class LiveAlarms:
     def __post_init__(self) -> None:
         self._start = self._due = self._due_lasting = np.nan
         self._counts: deque[dict[str, _Count]] = deque([{}], maxlen=round(MINUTE / EVERY_S))
-        self._samples: dict[str, list[ProcessedMeasurement]] = {}
+        self._samples: dict[str, list[tuple[ProcessedMeasurement, Array]]] = {}  # with the share of its count
         self._pieces: deque[dict[str, SensorResiduals]] = deque(maxlen=round(MINUTE / LASTING_EVERY_S))
         self._lasting: list[Statistic] = []
         self._told: list[tuple[float, Statistic]] = []
@@ -114,7 +118,8 @@ class LiveAlarms:
             sensor = one.measurement.sensor
             count = counts.get(sensor)
             if count is None:
-                count = counts[sensor] = _Count()
+                share = ALLOWED_SDS**2 * engine.considered_share(mark.known, one.measurement)
+                count = counts[sensor] = _Count(share)
             if one.weight > 0.0:
                 count.used += 1
                 count.nis += one.nis
@@ -122,7 +127,7 @@ class LiveAlarms:
                 count.rejected += 1
             if count.keyframe != index and time >= self._start + LASTING_FROM_S:
                 count.keyframe = index
-                self._samples.setdefault(sensor, []).append(one)
+                self._samples.setdefault(sensor, []).append((one, count.share))
         if time >= self._due_lasting:
             self._due_lasting += LASTING_EVERY_S * np.ceil((time - self._due_lasting + 1e-6) / LASTING_EVERY_S)
             self._lasting = list(self._look_at_lasting(engine, time))
@@ -137,6 +142,10 @@ class LiveAlarms:
         if not np.isnan(self._start):
             self._told += [(time, one) for one in apart(adopted.smoothed, adopted.filtered, self._start)]
         self._shown = adopted.shown
+
+    def forget_smoothed(self) -> None:
+        """Another filter goes on: what the smoothed dive has shown is not of its sensors and priors."""
+        self._shown = []
 
     def taken_out(self, stretch: Stretch) -> None:
         """A sensor is left out for some time."""
@@ -155,8 +164,8 @@ class LiveAlarms:
                 yield rejected_in(sensor, begin, time, float(share), self._start)
             if used >= ENOUGH:
                 dim = engine.initial.instruments[sensor].model.dim
-                square = sum(c.nis for c in of) / (used * dim)
-                yield too_large_in(sensor, begin, time, square, used * dim, self._start)
+                square, share = sum(c.nis for c in of) / (used * dim), float(np.mean([c.share for c in of]))
+                yield too_large_in(sensor, begin, time, square / (1.0 + share), used * dim, self._start)
                 yield too_small_in(sensor, begin, time, square)
         yield from self._constants(known, engine, time)
         for sensor, watch in watches.items():
@@ -188,7 +197,8 @@ class LiveAlarms:
         begin = self._due_lasting - LASTING_EVERY_S * (1 + len(self._pieces))
         for sensor in self._pieces[-1]:
             own = [piece[sensor] for piece in self._pieces if sensor in piece]
-            arrays = (np.concatenate([getattr(one, name) for one in own]) for name in ("time", "normalised", "weight"))
+            names = "time", "normalised", "weight", "shared"
+            arrays = (np.concatenate([getattr(one, name) for one in own]) for name in names)
             yield from lasting_in(SensorResiduals(sensor, own[0].components, *arrays), begin, time, self._start)
 
     def _look(self, statistics: list[Statistic], time: float) -> None:
@@ -202,22 +212,35 @@ class LiveAlarms:
                 self._raised[key] = _Raised(alarm, time)
                 self._say(time, alarm.sensor, alarm.severity, alarm.text)
             else:
-                raised.last, raised.alarm = time, replace(raised.alarm, end=time)
+                raised.last, raised.alarm = time, self._renewed(raised.alarm, alarm, time)
             self.history[(*key, self._raised[key].alarm.begin)] = self._raised[key].alarm
         for key, raised in list(self._raised.items()):
             if time - raised.last >= OVER_S:
                 del self._raised[key]
                 self._say(time, key[1], "over", f"{key[1]}: {key[0]}: within its limits for {OVER_S:g} s")
 
+    def _renewed(self, before: Alarm, now: Alarm, time: float) -> Alarm:
+        """An alarm that goes on: as it was at its worst, or with the figures that the smoothed dive has now."""
+        if now.kind in ("held", "unstated"):
+            if now.text != before.text:
+                self._say(time, now.sensor, now.severity, now.text)
+        elif now.figure <= before.figure or now.severity != before.severity:
+            now = before
+        return replace(now, begin=before.begin, end=time)
+
     def _say(self, time: float, sensor: str, kind: str, text: str) -> None:
         self.events.append(Event(time, sensor, kind, text))
 
 
-def _innovations(engine: FilterEngine, sensor: str, met: list[ProcessedMeasurement]) -> SensorResiduals:
+def _innovations(
+    engine: FilterEngine, sensor: str, samples: list[tuple[ProcessedMeasurement, Array]]
+) -> SensorResiduals:
     """Innovations in units of their sd: along those in units of the noise, and as long as the NIS says."""
+    met = [one for one, _ in samples]
     block = engine.block([one.measurement for one in met])
     r = block.normalised(stack_states(met))
     length = np.sqrt(np.array([one.nis for one in met]))[:, None]
     r *= length / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), 1e-12)
     weight = np.array([one.weight for one in met])
-    return SensorResiduals(sensor, tuple(block.instrument.components), block.time, r, weight)
+    shared = np.array([share for _, share in samples])
+    return SensorResiduals(sensor, tuple(block.instrument.components), block.time, r, weight, shared)

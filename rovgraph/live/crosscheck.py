@@ -14,6 +14,7 @@ from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding
 from rovgraph.check.fixes import track
 from rovgraph.config import Config
+from rovgraph.instruments import HEADING_STREAMS, heading_sources
 from rovgraph.live.solution import Event
 from rovgraph.log import Log, Measurement, Stream, gathered
 from rovgraph.log.streams import joined
@@ -88,12 +89,11 @@ class Crosscheck:
         log = Log("the last minutes", self._window, None)
         now = float(log["imu"].time[-1])
         start = min(float(stream.time[0]) for stream in log.streams.values())
-        found = {
-            (f.sensor, f.clock or check.__name__): f
-            for check in CHECKS
-            for f in check(log, self.config)
-            if f.level != "ok"
-        }
+        used, found = heading_sources(self.config, log.sensors), dict[tuple[str, str], Finding]()
+        for check in CHECKS:
+            for f in check(log, self.config):
+                if f.level != "ok" and (f.clock or f.sensor in used or f.sensor not in HEADING_STREAMS):
+                    found.setdefault((f.sensor, f.clock or check.__name__), f)
         if any(f.clock == "jump" for f in found.values()):  # a lag before and after is the mean of two
             found = {key: f for key, f in found.items() if f.clock == "jump"}
         late = {f.sensor for f in found.values() if f.clock}  # which explains what else disagrees

@@ -16,7 +16,7 @@ import numpy as np
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.live.solution import Event
 from rovgraph.log import Measurement
-from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, NEVER_REPEATS
+from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, shows_noise
 
 SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
 SILENT_AT_FIRST_S = 30.0  # after a first measurement, as long as the period is not known
@@ -25,7 +25,7 @@ RECENT_S = 5.0
 TELL_S = 2.0  # a ping without bottom lock is not worth an event
 FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
 NOISY = {"mag", "depth", "dvl_water"}  # sensors whose noise may show, so that values hardly ever repeat
-ENOUGH_VALUES = 20  # different ones, that show it
+ENOUGH_VALUES, RECENT_VALUES = 20, 100  # different ones, that show it, and that are looked at
 TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
 LONGEST_STEP_S = 1.0  # of the gyro, over which a turn is reckoned
 OCCASIONAL = {"place"}  # sensors that speak when there is something to be seen
@@ -69,10 +69,21 @@ class Watch:
     values: bytes = b""
     since: float = 0.0  # of the first of equal values
     equal: int = 0
-    values_seen: int = 0  # different ones, of which no more than a few in a row were equal,
-    measured: int = 0  # and how many measurements they were
+    first: float = math.nan  # component of theirs
+    recent: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=RECENT_VALUES))  # the same of others
     turned: tuple[float, ...] = (0.0, 0.0, 0.0)  # how far the vehicle had by then [rad]
     by_hand: bool = False  # no sensor has measured yet: nothing is late
+
+    def count(self, first: float) -> None:
+        """Note that other values follow the equal ones so far."""
+        if 0 < self.equal < MIN_REPEATS:
+            self.recent.append((self.first, self.equal))
+        self.first = first
+
+    @property
+    def shows_noise(self) -> bool:
+        """Whether its values lately were other ones each time, as noise makes them."""
+        return len(self.recent) >= ENOUGH_VALUES and shows_noise(*np.array(self.recent).T)
 
 
 @dataclass
@@ -100,8 +111,8 @@ class Faults:
         if values == watch.values:
             watch.equal += 1
         else:
-            if watch.equal < MIN_REPEATS:
-                watch.values_seen, watch.measured = watch.values_seen + 1, watch.measured + watch.equal
+            if m.sensor in NOISY:
+                watch.count(m.values.item(0))
             watch.equal, watch.since, watch.turned = 1, m.time, self._turned
         if watch.time > -np.inf:
             step = m.time - watch.time
@@ -135,9 +146,9 @@ class Faults:
         return (
             watch.equal >= MIN_REPEATS
             and m.time - watch.since >= MIN_SECONDS
-            and watch.values_seen >= ENOUGH_VALUES
-            and watch.measured <= NEVER_REPEATS * watch.values_seen
             and bool(m.values[:3].any())
+            and bool(np.isfinite(m.values[:3]).all())
+            and watch.shows_noise
             and imu is not None
             and imu.state == "ok"
         )

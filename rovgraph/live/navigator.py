@@ -349,6 +349,7 @@ class Navigator:
     def _go_on_with(self, engine: FixedLag) -> FixedLag:
         self.engine = engine
         self._incoherence.forget()
+        self.alarms.forget_smoothed()
         if self._reinitialisations is not None:
             self._reinitialisations.again()
         return engine

@@ -7,6 +7,7 @@ examined as `rovgraph smooth` examines a whole dive, for alarms.
 import time as host
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,13 +22,13 @@ from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.released import as_chain
 from rovgraph.errors import InputError
 from rovgraph.estimators.alarms import Statistic, find_alarms
-from rovgraph.estimators.alarms.constants import held_in
+from rovgraph.estimators.alarms.constants import earth_rate_of, held_in
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.estimators.eskf.reinitialisation import reinitialised
 from rovgraph.estimators.unstated_noise import unstated
 from rovgraph.geometry import Array
-from rovgraph.state import VELOCITY
+from rovgraph.state import BIAS, VELOCITY
 from rovgraph.trajectory import Trajectory
 
 Keyframe = tuple[KeyframeInterval, Array, Array]  # its interval, state vector and calibration vector
@@ -150,10 +151,17 @@ def _shown(best: Optimum, initial: InitialConditions) -> list[Statistic]:
     begin, end = best.intervals[0].time, best.intervals[-1].time
     if end - begin < EXAMINED_FROM_S:
         return []
-    v_sd = float(np.sqrt(np.mean(np.diag(best.newest_covariance())[COLUMNS[VELOCITY]])))
-    try:
-        held = list(held_in(as_chain(best, initial), initial.config, v_sd, begin, end))
-        noise = unstated(best, initial.config, find_alarms(held, begin)) if isinstance(best, ChainOptimum) else ()
-        return [*held, *noise]
-    except InputError:  # what the dive does not determine shows nothing either
-        return []
+    config, variance = initial.config, np.diag(best.newest_covariance())
+    v_sd = float(np.sqrt(np.median(variance[COLUMNS[VELOCITY]])))
+    bias_sd = float(np.sqrt(variance[COLUMNS[BIAS]][3:].min()))
+    held: list[Statistic] = []
+    noise: list[Statistic] = []
+    # what the dive does not determine shows nothing either, and an examination that fails is no reason to stop
+    with suppress(InputError, np.linalg.LinAlgError):
+        held += held_in(as_chain(best, initial), config, v_sd, begin, end)
+    with suppress(InputError, np.linalg.LinAlgError):
+        if config.graph.find_noise and isinstance(best, ChainOptimum):
+            rivals = [*held] if config.environment.earth_rotation else [*held, earth_rate_of(bias_sd, begin, end)]
+            noise += unstated(best, config, find_alarms(rivals, begin))
+    found = {one.sensor for one in noise}  # likelier than what is held
+    return [*(one for one in held if one.sensor not in found), *noise]

@@ -19,6 +19,8 @@ from rovgraph.log.streams import Stream
 MIN_REPEATS = 5  # measurements, times as many as the sensor usually repeats
 MIN_SECONDS = 3.0
 NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
+ROUNDING = 1e-9  # relative, of numbers that are converted
+NOISE_STEPS = 4.0  # of a sensor's resolution, that its second differences exceed if its noise hides it
 ALIVE = 1e-6  # spread of an IMU's signals that are more than rounding [m/s^2, rad/s]
 ABRUPT_SPEED = 0.1  # of the pings just before or after zeros [m/s]
 AROUND = 3  # that many pings
@@ -180,10 +182,23 @@ def _held_depth(log: Log, config: Config) -> Iterator[FrozenStretch]:
 
 
 def _shows_noise(values: Array, long: list[tuple[int, int]]) -> bool:
-    """Whether values hardly ever repeat outside some runs."""
-    counts = np.diff(equal_runs(values), axis=1)[:, 0] + 1
-    others = counts[~np.isin(counts, [b - a + 1 for a, b in long])]
-    return len(others) > 0 and float(others.mean()) < NEVER_REPEATS
+    """Whether values show noise outside some runs."""
+    runs = equal_runs(values)
+    counts = np.diff(runs, axis=1)[:, 0] + 1
+    others = ~np.isin(counts, [b - a + 1 for a, b in long])
+    return shows_noise(values[runs[others, 0], 0], counts[others])
+
+
+def shows_noise(values: Array, counts: Array) -> bool:
+    """Whether n values, each measured ``counts`` times in a row, hardly ever repeat, and not for their resolution only.
+
+    A coarse depth does not repeat in a dive either, but its second differences are within a few of its steps.
+    """
+    second = np.abs(np.diff(values, 2))
+    steps = second[second > ROUNDING * np.abs(values).max(initial=0.0)]
+    if not len(steps) or float(counts.mean()) >= NEVER_REPEATS:
+        return False
+    return bool(np.median(second) >= NOISE_STEPS * steps.min())
 
 
 def _most_dived(time: Array, down: Array, way: Array) -> float:

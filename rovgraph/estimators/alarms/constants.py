@@ -106,7 +106,7 @@ def held(evidence: Evidence) -> Iterator[Statistic]:
 
 
 def held_in(best: ChainOptimum, config: Config, v_sd: float, start: float, end: float) -> Iterator[Statistic]:
-    """The same of an optimum from ``start`` to ``end``, in which the velocity is known to ``v_sd`` in the median."""
+    """The same of an optimum from ``start`` to ``end`` [s], whose velocity is known to ``v_sd`` [m/s]."""
     moving = np.sqrt(np.mean(best.state.v_n**2)) > MOVING * v_sd
     for r in release(best, [name for name in RELEASED if moving or not name.startswith("dvl")]):
         variable = TABLE[r.name]

@@ -28,6 +28,8 @@ class SensorResiduals:
     time : ndarray, shape (n,) [s]
     normalised : ndarray, shape (n, k), innovations in units of their sd
     weight : ndarray, shape (n,), 0 where it was rejected
+    shared : ndarray, shape (n, k), variance of an error that successive ones share and that is allowed for, in units
+        of their own; None = there is none
     """
 
     sensor: str
@@ -35,6 +37,7 @@ class SensorResiduals:
     time: Array
     normalised: Array
     weight: Array
+    shared: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -206,7 +206,7 @@ def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, 
         full = count >= max(3.0, 0.3 * usual)
         for component in range(r.normalised.shape[1]) if full.any() else ():
             sums = np.bincount(window, r.normalised[used, component])
-            square = (sums**2 / np.maximum(count, 1))[full]
+            square = (sums**2 / np.maximum(count, 1) / _allowed(r, used, window, component))[full]
             k = int(np.argmax(square))
             begin = start + float(np.flatnonzero(full)[k]) * seconds
             # all windows together, and the largest of them
@@ -214,6 +214,12 @@ def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, 
             out.append((seconds, component, float(square.mean()), float(chdtri(n, CHANCE)) / n, begin))
             out.append((seconds, component, float(square[k]) / OF_ONE, float(chdtri(1, CHANCE / n)) / OF_ONE, begin))
     return max(out, key=lambda one: one[2] / max(LASTING, one[3]), default=None)
+
+
+def _allowed(r: SensorResiduals, used: NDArray[np.bool_], window: Array, component: int) -> Array:
+    """Variance of the means of windows, times their counts, if what is shared within one is constant in it."""
+    shared = np.zeros(len(window)) if r.shared is None else r.shared[used, component]
+    return np.asarray(1.0 + np.bincount(window, shared))
 
 
 def _remedy_of_lasting(sensor: str) -> str:
