@@ -73,7 +73,7 @@ def online(log: Log, config: Config) -> tuple[str, list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--margins", action="store_true", help="how near its limit each kind of alarm came")
+    parser.add_argument("--margins", action="store_true", help="how near its limit each kind of alarm came, smoothed")
     parser.add_argument("--online", action="store_true", help="while the dives go on, instead of smoothed")
     given = parser.parse_args()
     verdicts: Counter[str] = Counter()

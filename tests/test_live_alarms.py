@@ -80,6 +80,17 @@ def test_an_alarm_is_said_once_when_it_begins_and_once_when_it_is_over(case):
     assert [a.kind for a in nav.alarms.history.values()] == ["frozen"]
 
 
+def test_what_the_smoothed_dive_shows_is_said_with_its_newest_figures_and_unless_nobody_asks():
+    noisy = BROKEN["DVL noise three times as stated"]
+    for find in (True, False):
+        case = simulated(falcon(graph={"find_noise": find}), 180.0, 1, imu_rate=50.0, dvl_rate=4.0)
+        nav, events, _ = dived(case, noisy.breaks(case.log))
+        said = [e.text.split("; state ")[1] for e in events if "its noise is" in e.text]
+        assert bool(said) == find and all(text.startswith("dvl.velocity_sd_mps: [") for text in said)
+        newest = [a.text.split("; state ")[1] for a in nav.alarms.history.values() if a.kind == "unstated"]
+        assert newest == said[-1:]
+
+
 def test_line_and_status_carry_the_verdict_and_what_it_comes_of(case):
     _, _, last = dived(case, BROKEN["DVL noise three times as stated"].breaks(case.log))
     line = json.loads(json_line(last))
