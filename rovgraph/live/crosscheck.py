@@ -1,7 +1,7 @@
 """The motion of the last minutes, as each sensor shows it: whose stamps are late, and whose axes or heading are wrong.
 
 What was received goes through the comparisons of `rovgraph check` again and again: acceleration by DVL and IMU,
-turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What two windows in a row say
+turning by compasses and gyro, the DVL's way and fixes, its vertical velocity and depth. What some windows in a row say
 is said, and again after half an hour if it lasts, with the figures that it then has.
 """
 
@@ -22,6 +22,8 @@ from rovgraph.log.streams import joined
 WINDOW_S = 300.0  # of motion that is compared
 FIRST_S = 60.0  # of motion, before which nothing is compared
 EVERY_S = (20.0, 120.0)  # between comparisons: a quarter of the window's motion, within these
+# what `vertical` says of scales is for whole dives: in a short window slow pings of waves have another
+IN_A_ROW = {"clock": 2, "check": 3}  # windows that say so
 AGAIN_S = 1800.0  # after which what lasts is said again
 STEP_S = 0.01  # samples of the IMU that come faster are averaged over so long: the comparisons need no more
 CHECKS: tuple[Callable[[Log, Config], Iterator[Finding]], ...] = (dvl_and_imu, headings, vertical, track)
@@ -41,7 +43,7 @@ class Crosscheck:
     _newest: list[Measurement] = field(default_factory=list)  # since the last comparison
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
     _next: float = math.inf
-    _suspected: set[tuple[str, str]] = field(default_factory=set)
+    _suspected: dict[tuple[str, str], int] = field(default_factory=dict)  # in how many windows in a row
     _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
     def add(self, m: Measurement) -> list[Event]:
@@ -92,16 +94,18 @@ class Crosscheck:
         used, found = heading_sources(self.config, log.sensors), dict[tuple[str, str], Finding]()
         for check in CHECKS:
             for f in check(log, self.config):
-                if f.level != "ok" and (f.clock or f.sensor in used or f.sensor not in HEADING_STREAMS):
+                whole = check is not vertical and (f.sensor in used or f.sensor not in HEADING_STREAMS)
+                if f.level != "ok" and (f.clock or whole):
                     found.setdefault((f.sensor, f.clock or check.__name__), f)
         if any(f.clock == "jump" for f in found.values()):  # a lag before and after is the mean of two
             found = {key: f for key, f in found.items() if f.clock == "jump"}
         late = {f.sensor for f in found.values() if f.clock}  # which explains what else disagrees
         found = {key: f for key, f in found.items() if f.clock or f.sensor not in late}
+        suspected = {key: self._suspected.get(key, 0) + 1 for key in found}
         for key, finding in found.items():
-            if key in self._suspected and now - self._said.get(key, -math.inf) > AGAIN_S:
+            kind = "clock" if finding.clock else "check"
+            if suspected[key] >= IN_A_ROW[kind] and now - self._said.get(key, -math.inf) > AGAIN_S:
                 self._said[key] = now
                 zero = f"; 0 s is {start:.1f} s" if finding.clock == "jump" else ""
-                kind = "clock" if finding.clock else "check"
                 yield Event(now, finding.sensor, kind, f"{finding.text}{zero}")
-        self._suspected = {*found}
+        self._suspected = suspected
