@@ -354,6 +354,17 @@ def test_a_dvls_arm_that_is_off_is_named_and_estimated_not_taken_for_an_error_th
     assert result.nees["smoothed"]["dvl_yaw"] < 2.0  # 3.3
 
 
+def test_online_ignores_a_depth_that_is_stuck_while_the_vehicle_dives():
+    result = run_case(CASES["depth stuck"], 0, online=True)
+    assert max(result.nees["online"].values()) < 2.0  # of the depth 765 where it was used
+    assert any(line.startswith("online: ") and "depth: frozen" in line for line in result.said)
+
+
+def test_online_names_correlated_fixes_with_the_keys_that_state_them():
+    result = run_case(CASES["fixes correlated"], 0, online=True)
+    assert any("correlated over" in line and "state calibration.fix_error: {" in line for line in result.said)
+
+
 @pytest.mark.slow
 def test_a_campaign_of_two_cases_prints_their_rows():
     """A clock of another epoch is refused with its cause; the dive without the fault is estimated."""
