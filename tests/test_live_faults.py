@@ -98,6 +98,15 @@ def test_a_coarse_depth_may_stand_still_after_a_dive_in_which_it_never_repeated(
     assert all(used) and faults.events == []
 
 
+def test_a_depth_that_was_stuck_before_a_crash_is_left_out_after_it():
+    _, before = depths_used([*(5.0 + 0.02 * RNG.standard_normal(50)).tolist(), *[5.0] * 50])
+    after = Faults()
+    after.restore(before.state())
+    after.look(sample(20.0))
+    assert not after.look(depth(20.0, 5.0)).use and after.look(depth(20.2, 5.01)).use
+    assert kinds(after) == ["frozen", "back"]
+
+
 def test_a_depth_that_says_nothing_is_not_frozen():
     used, faults = depths_used([*(5.0 + 0.02 * RNG.standard_normal(50)).tolist(), *[np.nan] * 50])
     assert all(used) and faults.events == []

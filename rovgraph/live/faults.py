@@ -9,7 +9,9 @@ reject.
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -152,6 +154,29 @@ class Faults:
             and imu is not None
             and imu.state == "ok"
         )
+
+    def state(self) -> dict[str, dict[str, Any]]:
+        """What is remembered of sensors whose noise shows, as plain values and arrays."""
+        return {
+            sensor: {
+                "time": watch.time,
+                "values": np.frombuffer(watch.values),
+                "since": watch.since,
+                "equal": watch.equal,
+                "recent": np.array(watch.recent).reshape(-1, 2),
+            }
+            for sensor, watch in self.watches.items()
+            if sensor in NOISY and watch.values
+        }
+
+    def restore(self, state: Mapping[str, Mapping[str, Any]]) -> None:
+        """Go on from where another stood."""
+        for sensor, known in state.items():
+            values = np.asarray(known["values"])
+            watch = Watch(values=values.tobytes(), since=known["since"], equal=known["equal"], first=values.item(0))
+            watch.time = watch.heard = known["time"]
+            watch.recent.extend((first, int(count)) for first, count in known["recent"].tolist())
+            self.watches[sensor] = watch
 
     def accept(self, m: Measurement) -> Verdict:
         """Take a measurement that a person gives, as it is; a sensor that gives the like is not said to have spoken."""

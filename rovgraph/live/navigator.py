@@ -241,6 +241,7 @@ class Navigator:
             "used": dict(self.health.used),
             "rejected": dict(self.health.rejected),
             "incoherence": np.array(self._incoherence.state()),
+            "faults": self.faults.state(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -253,6 +254,7 @@ class Navigator:
         self.time = state["engine"]["keyframe"][1]  # what was received since is read again
         self._distance, self._here = state["travelled"][0], np.array(state["travelled"][1:])
         self._incoherence.restore(state["incoherence"].tolist())
+        self.faults.restore(state["faults"])
         self.health.used.update(state["used"])
         self.health.rejected.update(state["rejected"])
         self._located |= self.health.used["fix"] + self.health.rejected["fix"] > 0
