@@ -35,6 +35,7 @@ Keyframe = tuple[KeyframeInterval, Array, Array]  # its interval, state vector a
 _Smoothed = tuple[Gaussian, list[Statistic]]
 
 EXAMINED_FROM_S = 60.0  # of the dive: what was held wrongly for less shows little
+SEARCHED_UNTIL_S = 1000.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class Reinitialisations:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="reinitialisation")
         self._due = list(REINITIALISE_AT_S)
         self._passed: list[Keyframe] = []
+        self._shown: list[Statistic] = []  # by the newest smoothed dive
         self._running: tuple[int, Future[_Smoothed]] | None = None
 
     def take(self, snapshot: FilterSnapshot) -> None:
@@ -110,14 +112,14 @@ class Reinitialisations:
             return
         waiting = [_keyframe(mark) for mark in engine.marks if mark.interval.index <= oldest.interval.index]
         keyframes = [*self._passed, *waiting]
-        self._running = oldest.interval.index, self._thread.submit(_smoothed, engine.filter, keyframes)
+        self._running = oldest.interval.index, self._thread.submit(_smoothed, engine.filter, keyframes, self._shown)
 
     def _adopt(self, engine: FixedLag, index: int, future: "Future[_Smoothed]") -> None:
         """Go on from the thread's result, if it is there; the keyframes that the lag has passed since are filtered."""
         if not self.patient and not future.done():
             return
         began = host.perf_counter()
-        known, shown = future.result()
+        known, self._shown = future.result()
         self.waited += host.perf_counter() - began
         oldest, gates = engine.oldest().interval.index, dict[str, float]()
         waiting = (mark.interval for mark in engine.marks if mark.interval.index <= oldest)
@@ -128,7 +130,7 @@ class Reinitialisations:
         before = next((mark for mark in engine.marks if mark.interval.index == newest), None)
         if engine.adopt(newest, known) and before is not None:
             after, filtered = (engine.trajectory([before.interval], [one]) for one in (known, before.known))
-            self.adopted = Adopted(after, filtered, shown)
+            self.adopted = Adopted(after, filtered, self._shown)
         self._due.pop(0)
         self._running = None
         if not self._due:
@@ -139,14 +141,14 @@ def _keyframe(snapshot: FilterSnapshot) -> Keyframe:
     return snapshot.interval, snapshot.known.x, snapshot.known.c
 
 
-def _smoothed(engine: FilterEngine, keyframes: Sequence[Keyframe]) -> _Smoothed:
-    """The newest of some keyframes, from all data so far, and what these show."""
+def _smoothed(engine: FilterEngine, keyframes: Sequence[Keyframe], before: list[Statistic]) -> _Smoothed:
+    """The newest of some keyframes, from all data so far, and what these show; ``before`` is what fewer have shown."""
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
     known, best = reinitialised(engine, [interval for interval, _, _ in keyframes], states)
-    return known, _shown(best, engine.initial)
+    return known, _shown(best, engine.initial, before)
 
 
-def _shown(best: Optimum, initial: InitialConditions) -> list[Statistic]:
+def _shown(best: Optimum, initial: InitialConditions, before: list[Statistic]) -> list[Statistic]:
     """What is held wrongly, or not stated, by the smoothed dive so far."""
     begin, end = best.intervals[0].time, best.intervals[-1].time
     if end - begin < EXAMINED_FROM_S:
@@ -160,7 +162,9 @@ def _shown(best: Optimum, initial: InitialConditions) -> list[Statistic]:
     with suppress(InputError, np.linalg.LinAlgError):
         held += held_in(as_chain(best, initial), config, v_sd, begin, end)
     with suppress(InputError, np.linalg.LinAlgError):
-        if config.graph.find_noise and isinstance(best, ChainOptimum):
+        if end - begin > SEARCHED_UNTIL_S:
+            noise += [one for one in before if one.kind == "unstated"]
+        elif config.graph.find_noise and isinstance(best, ChainOptimum):
             rivals = [*held] if config.environment.earth_rotation else [*held, earth_rate_of(bias_sd, begin, end)]
             noise += unstated(best, config, find_alarms(rivals, begin))
     found = {one.sensor for one in noise}  # likelier than what is held
