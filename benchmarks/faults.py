@@ -22,9 +22,11 @@ from fault_campaign.judge import HONEST_NEES, WORST_FIRST, honest_nees
 
 from rovgraph.workers import cores
 
-READING = """# Faults: when the configuration is wrong
+PAGE, ONLINE_PAGE = "faults.md", "faults-online.md"  # in docs
 
-`python benchmarks/faults.py --seeds {seeds} --markdown docs/faults.md` makes this page{version}.
+READING = """# Faults{title}: when the configuration is wrong
+
+`python benchmarks/faults.py --seeds {seeds}{option} --markdown docs/{page}` makes this page{version}.
 
 An independent simulator (`benchmarks/fault_campaign`) makes the dives, with WGS-84, the Earth's rate, IMU samples \
 averaged over their period, and its own frames and equations. Each case has one fault that the configuration does \
@@ -65,7 +67,7 @@ def main() -> int:
     parser.add_argument("--online", action="store_true", help="replay through rovgraph online too")
     parser.add_argument("--keep", type=Path, help="keep every dive in this file, and run only those that it lacks")
     parser.add_argument("--json", type=Path, help="write all figures")
-    parser.add_argument("--markdown", type=Path, help="write the page docs/faults.md")
+    parser.add_argument("--markdown", type=Path, help="write the page: docs/faults.md, or docs/faults-online.md")
     parser.add_argument("--version", help="what was measured, for the page")
     parser.add_argument("--list", action="store_true", help="list the cases")
     arguments = parser.parse_args()
@@ -88,7 +90,9 @@ def page(cases: list[Case], outcomes: dict[str, Outcome], arguments: argparse.Na
     """docs/faults.md."""
     version = f", here at {arguments.version}" if arguments.version else ""
     online = " and `rovgraph online`" if arguments.online else ""
-    parts = [READING.format(seeds=arguments.seeds, version=version, online=online, limit=_limit(arguments.seeds))]
+    title, option, name = (" online", " --online", ONLINE_PAGE) if arguments.online else ("", "", PAGE)
+    words = {"title": title, "option": option, "page": name, "version": version, "online": online}
+    parts = [READING.format(seeds=arguments.seeds, limit=_limit(arguments.seeds), **words)]
     for title, healthy in (("Healthy dives", True), ("Faults", False)):
         some = [case for case in cases if case.healthy == healthy]
         if some:
