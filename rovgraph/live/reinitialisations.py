@@ -35,7 +35,7 @@ Keyframe = tuple[KeyframeInterval, Array, Array]  # its interval, state vector a
 _Smoothed = tuple[Gaussian, list[Statistic]]
 
 EXAMINED_FROM_S = 60.0  # of the dive: what was held wrongly for less shows little
-SEARCHED_UNTIL_S = 1000.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
+SEARCHED_UNTIL_S = 500.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
 
 
 @dataclass(frozen=True)
