@@ -17,6 +17,8 @@ from rovgraph.live.outputs.lines import json_line
 from rovgraph.live.solution import Event, Solution
 from rovgraph.log import Log
 from rovgraph.report.status import status
+from rovgraph.simulate import Choices
+from rovgraph.simulate import simulated as named
 
 SECONDS = 120.0
 LASTS = "depth: residuals of down do not average out"
@@ -89,6 +91,16 @@ def test_what_the_smoothed_dive_shows_is_said_with_its_newest_figures_and_unless
         assert bool(said) == find and all(text.startswith("dvl.velocity_sd_mps: [") for text in said)
         newest = [a.text.split("; state ")[1] for a in nav.alarms.history.values() if a.kind == "unstated"]
         assert newest == said[-1:]
+
+
+def test_a_dive_whose_constants_are_off_by_what_is_believed_of_them_is_trusted():
+    dive, config = named("falcon", 1, None, Choices(disturbances=False))
+    log = Log.from_frame(dive.between(0.0, dive.log_frame["time"].iloc[0] + 250.0).log_frame)
+    nav = Navigator(config, patient=True, clocks=Clocks(trust=True))
+    for m in log.measurements():
+        nav.take(message(m))
+    nav.finish()
+    assert nav.alarms.history == {}
 
 
 def test_line_and_status_carry_the_verdict_and_what_it_comes_of(case):

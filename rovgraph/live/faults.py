@@ -1,10 +1,10 @@
 """Sensors that fail while they go on talking, or fall silent.
 
 What is wrong is told from a sensor's own values and the IMU's: a DVL that reports exact
-zeros although it moved a moment ago, or turns; values that repeat exactly though they never
-did; a compass that stands still while the vehicle turns. A measurement that is part of such
-a failure is kept out, and those before it that were, taken back. What disagrees with the estimate is the filter's to
-reject.
+zeros although it moved a moment ago, or turns; values that repeat exactly though they hardly
+ever did; a compass that stands still while the vehicle turns. A measurement that is part of
+such a failure is kept out, and those before it that were, taken back. What disagrees with the
+estimate is the filter's to reject.
 """
 
 import math
@@ -73,6 +73,7 @@ class Watch:
     equal: int = 0
     first: float = math.nan  # component of theirs
     recent: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=RECENT_VALUES))  # the same of others
+    noisy: bool | None = None  # what `shows_noise` found, as long as values stay equal
     turned: tuple[float, ...] = (0.0, 0.0, 0.0)  # how far the vehicle had by then [rad]
     by_hand: bool = False  # no sensor has measured yet: nothing is late
 
@@ -80,12 +81,14 @@ class Watch:
         """Note that other values follow the equal ones so far."""
         if 0 < self.equal < MIN_REPEATS:
             self.recent.append((self.first, self.equal))
-        self.first = first
+        self.first, self.noisy = first, None
 
     @property
     def shows_noise(self) -> bool:
         """Whether its values lately were other ones each time, as noise makes them."""
-        return len(self.recent) >= ENOUGH_VALUES and shows_noise(*np.array(self.recent).T)
+        if self.noisy is None:
+            self.noisy = len(self.recent) >= ENOUGH_VALUES and shows_noise(*np.array(self.recent).T)
+        return self.noisy
 
 
 @dataclass
