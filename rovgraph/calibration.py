@@ -454,6 +454,8 @@ class Belief:
     walk : random walk [unit per root second], 0 = constant over the dive
     considered : held at the mean, but its uncertainty is in that of all else (Schmidt); False where it is estimated
     time_constant : time in which what has walked returns to the mean [s]; infinite = it does not
+    score : ndarray, shape (dim,), derivative of the log likelihood that the measurements lack, by
+        `rovgraph.engine.rate_noise` [1/unit]
     """
 
     variable: Variable
@@ -463,3 +465,4 @@ class Belief:
     walk: float = 0.0
     considered: bool = False
     time_constant: float = np.inf
+    score: Array | float = 0.0

@@ -185,6 +185,7 @@ class Chain:
             cost = 0.5 * float(np.vdot(motions, motions))
             cost += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
             cost += 0.5 * float(np.sum(self.walk_residuals(point) ** 2))
+            cost -= self._lacking(point)
             known = _PointCosts(ref(point), cost, self._squared_lengths(point))
             self._newest.append(known)
         return known
@@ -265,6 +266,14 @@ class Chain:
             for name in self.unknowns.estimated
         ]
         return self._prior_weight @ np.concatenate(parts), np.concatenate([np.empty(0), *own])
+
+    def _lacking(self, point: State) -> float:
+        """Log likelihood by the scores that measurements lack of constants."""
+        return sum(
+            float(np.sum(self.beliefs[name].score * (point.calibration[name] - self.beliefs[name].mean)))
+            for name, (border, _) in self.layout.places.items()
+            if border
+        )
 
     @cached_property
     def _prior_weight(self) -> Array:
@@ -380,5 +389,5 @@ class Chain:
             if border:
                 belief = self.beliefs[name]
                 out[part, part] = np.eye(belief.variable.dim) / belief.sd
-                out[part, -1] = (belief.mean - point.calibration[name]) / belief.sd
+                out[part, -1] = (belief.mean - point.calibration[name]) / belief.sd + belief.score * belief.sd
         return out

@@ -148,6 +148,12 @@ class ChainOptimum:
         newest = self._end.newest_covariance(self._end.border_covariance(self._believed))
         return np.asarray(newest[np.ix_(chosen, chosen)])
 
+    @cached_property
+    def newest_of_known_constants(self) -> Array:
+        """Covariance of the newest keyframe, were the border's constants known, shape (15, 15)."""
+        none = np.zeros((len(self._end.border),) * 2)
+        return self._end.newest_covariance(none)[:MOTION, :MOTION]
+
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
         return self._knowledge_at(self.state, keyframes)

@@ -30,6 +30,7 @@ from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import Solution, minimise
 from rovgraph.engine.linear_constants import LinearConstants
 from rovgraph.engine.measurements import Block
+from rovgraph.engine.rate_noise import ARM, noise_moves_arm
 from rovgraph.engine.widened_chain import begin_at, with_lasting
 from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
@@ -192,6 +193,8 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
     unknowns = now.chain.unknowns
     own = [n for n in unknowns.considered if error.sensor in TABLE[n].sensors and not TABLE[n].time_offset]
+    if ARM in own and _noise_moves_arm(now):
+        own.remove(ARM)
     known = [n for n, walk in unknowns.walks.items() if walk == 0.0]
     rivals = [error.variable, *known]
     constants = LinearConstants.of(now.chain, now.solution, [*own, *rivals])
@@ -199,6 +202,12 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     if constant.gain >= max(gain, CLEAR):
         return constant, held
     return replace(error, gain=gain - _as_constant(now, error, rivals, constants)[0].gain), fitted
+
+
+def _noise_moves_arm(now: _Baseline) -> bool:
+    """Whether the gyro's noise would move the DVL's arm, were it estimated."""
+    best = ChainOptimum(now.chain, now.solution)
+    return noise_moves_arm(best, best.relative_sd()[ARM] * best.beliefs[ARM].sd)
 
 
 def _as_constant(

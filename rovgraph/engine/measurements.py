@@ -51,6 +51,7 @@ class Block:
     z : ndarray, shape (n, dim)
     W : ndarray, shape (n, dim, dim), square-root information, lower triangular
     rate_b : ndarray, shape (n, 3), measured rate, bias still in it [rad/s]
+    rate_sd : ndarray, shape (n,), its noise [rad/s]
     motion : Delta, n, from the keyframe to the measurement
     gravity : [m/s^2]
     unknowns : the calibration variables that are estimated, of those that the instrument has
@@ -68,6 +69,7 @@ class Block:
     z: Array
     W: Array
     rate_b: Array
+    rate_sd: Array
     motion: Delta
     gravity: float
     unknowns: Unknowns
@@ -183,7 +185,7 @@ class Block:
         return replace(self, **arrays, motion=motion, window=window, scale_to_bias=scale_to_bias)
 
 
-_PER_MEASUREMENT = ("keyframe", "segment", "time", "line", "z", "W", "rate_b", "place", "believed")
+_PER_MEASUREMENT = ("keyframe", "segment", "time", "line", "z", "W", "rate_b", "rate_sd", "place", "believed")
 
 
 def make_block(
@@ -196,10 +198,11 @@ def make_block(
 
     dim, rows = instrument.model.dim, np.array([m.row for m in attached])
     sd = rows[:, sd_of(dim) : sd_of(dim) + dim]
-    W = whitening(instrument, sd, rows[:, at.RATE_SD])
+    rate_sd = rows[:, at.RATE_SD]
+    W = whitening(instrument, sd, rate_sd)
     where = np.array([(m.keyframe, m.segment, m.line) for m in attached]).T
     z, rate_b = rows[:, at.Z : at.Z + dim], rows[:, at.RATE : at.RATE + 3]
-    arrays = (where[0], where[1], rows[:, at.TIME], where[2], z, W, rate_b)
+    arrays = (where[0], where[1], rows[:, at.TIME], where[2], z, W, rate_b, rate_sd)
     windows = [a.window for a in attached if a.window is not None]
     window = LateStampWindow.stack(windows) if windows else None
     scaled = attached[0].scale_to_bias is not None

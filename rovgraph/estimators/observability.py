@@ -8,7 +8,8 @@ trembles in the estimate, the graph takes the trembling for accelerations, and t
 show the DVL's misalignment and scale: along a straight line it claims to know what cannot be
 known. What noise adds is found by adding as much again (simulation extrapolation; Cook and
 Stefanski 1994): noise of the states is drawn from the graph's own posterior, put onto the
-estimate with both signs, and what the information gains by that is taken off once.
+estimate with both signs, and what the information gains by that is taken off once. Noise of the gyro in the DVL's lever
+arm is taken off by its equation (`rovgraph.engine.rate_noise`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd
+from rovgraph.engine.rate_noise import ARM, feigned, noise_moves_arm
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
 
@@ -92,12 +94,15 @@ def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) ->
     dict : name -> ndarray, shape (dim,)
     """
     ratio = {name: sd / prior[name] for name, sd in _sds(covariance, prior).items()}
+    if ARM in ratio:
+        ratio[ARM] = np.minimum(feigned(best).sd(ratio[ARM] * prior[ARM]) / prior[ARM], 1.0)
     at_stake = [r for name in SPURIOUSLY_OBSERVABLE if name in ratio for r in ratio[name]]
     if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
     end, before = [len(best.intervals) - 1], np.concatenate([prior[name] for name in ratio])
     seen = data_information(covariance[None], before)
-    return _sds(relative_covariance(without_spurious_information(best, end, seen, before[None]))[0], prior)
+    without = _sds(relative_covariance(without_spurious_information(best, end, seen, before[None]))[0], prior)
+    return without | {name: ratio[name] for name in ratio if name == ARM}
 
 
 def shown(best: Optimum) -> list[str]:
@@ -107,7 +112,10 @@ def shown(best: Optimum) -> list[str]:
     limit = dict.fromkeys(SPURIOUSLY_OBSERVABLE, DOUBTFUL_ABOVE)
     if "fix" in best.blocks:
         limit["dvl_scale"] = OBSERVABLE_BELOW  # fixes show it, which noise does not feign
-    return [name for name, ratio in best.relative_sd().items() if (ratio < limit.get(name, OBSERVABLE_BELOW)).all()]
+    relative = best.relative_sd()
+    if ARM in relative and noise_moves_arm(best, relative[ARM] * best.beliefs[ARM].sd):
+        del relative[ARM]
+    return [name for name, ratio in relative.items() if (ratio < limit.get(name, OBSERVABLE_BELOW)).all()]
 
 
 def spuriously_observable(unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
@@ -139,6 +147,8 @@ def without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
     relative = relative_sd(best, covariance, before)
     claimed = {name: sd / before[name] for name, sd in _sds(covariance, before).items()}
     held = spuriously_observable(best.unknowns, claimed, relative)
+    if ARM in before and not best.unknowns.walks[ARM] and noise_moves_arm(best, claimed[ARM] * before[ARM]):
+        held.append(ARM)
     return (best.considering(held) if held else best), relative
 
 

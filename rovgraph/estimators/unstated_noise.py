@@ -1,6 +1,7 @@
 """Noise that the configuration does not state, found in the residuals: larger than stated, or errors that last.
 
-Both come back as keys of the configuration, with which the dive is solved again, filter and smoother alike. A
+Both come back as keys of the configuration, with which the dive is solved again, filter and smoother alike. So does
+the place of a DVL that is elsewhere than believed, where the gyro's noise would move it if it were estimated. A
 constant that is held wrongly makes residuals that look like either, so where alarms name one nothing is found. Late
 stamps of the same sensor are a rival: an error that lasts must make the dive likelier than these do.
 
@@ -23,7 +24,10 @@ from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
+from rovgraph.engine.rate_noise import ARM
+from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Alarm, Statistic
+from rovgraph.estimators.alarms.constants import RELEASED
 from rovgraph.estimators.alarms.residuals import SD_KEY
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
@@ -32,6 +36,8 @@ NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another caus
 ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
 LARGER = 1.5  # factor of the noise that is not as stated
 ENOUGH = 50  # differences
+PLACED = 5.0  # sds from which a DVL is elsewhere
+UNLIKELY = 2.0  # sds of what is believed of its place
 OWN_SD = 0.05  # relative difference to the configuration's that makes it the log's own
 
 
@@ -69,8 +75,8 @@ class UnstatedNoise:
 
     @property
     def lasts(self) -> bool:
-        """An error that lasts; those are found all at once, after all white noise."""
-        return self.key.startswith("calibration.")
+        """An error that lasts; those are found all at once, after all else."""
+        return isinstance(self.values, Mapping) and "estimate" in self.values
 
 
 def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> list[UnstatedNoise]:
@@ -83,6 +89,9 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
     alarms : of the same dive
     """
     named = [alarm for alarm in alarms if alarm.kind in NAMED]
+    elsewhere = None if any(one.kind in ("axes", "clock") for one in named) else _elsewhere(best)
+    if elsewhere is not None and elsewhere.size > 1.0:
+        return [elsewhere.found]
     late = {alarm.sensor: alarm.figure for alarm in named if alarm.kind == "held" and alarm.sensor in ALONE}
     if len(late) < len(named):
         return []
@@ -91,8 +100,35 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
         return larger
     stated = [name for name in LASTING.values() if getattr(config.calibration, name).estimate != AUTO]
     errors = find_lasting(best, stated)
+    if elsewhere is not None and any(error.sensor == "dvl" for error in errors):
+        return [elsewhere.found]
     # a score test's figure z is worth z^2 / 2 of log likelihood
     return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
+
+
+@dataclass(frozen=True)
+class _Elsewhere:
+    """A DVL's place, and its distance from what is believed in sds of that."""
+
+    found: UnstatedNoise
+    size: float
+
+
+def _elsewhere(best: ChainOptimum) -> _Elsewhere | None:
+    """The place of a DVL that is considered, where it is another and no other constant is further off."""
+    if ARM not in best.unknowns.considered:
+        return None
+    belief, released = best.beliefs[ARM], release(best, RELEASED)
+    steps = {one.label: one.step for one in released if one.name == ARM and one.significance > PLACED}
+    furthest = max(released, key=lambda one: one.significance)
+    if not steps or furthest.name != ARM:
+        return None
+    off = np.array([steps.get(label, 0.0) for label in belief.variable.labels])
+    where = ", ".join(f"{label[-1]} {step:+.2g} m" for label, step in steps.items())
+    cause = f"the vehicle's rates show it elsewhere than dvl.lever_arm_m less imu.lever_arm_m, {where}"
+    key, mean = f"calibration.{ARM}", tuple((belief.mean + off).tolist())
+    found = UnstatedNoise("dvl", key, {"mean": mean}, cause, f"that is used ({key})")
+    return _Elsewhere(found, float(np.abs(off).max() / belief.sd))
 
 
 def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Iterator[Statistic]:
@@ -106,6 +142,9 @@ def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Ite
 def _is_allowed_for(one: UnstatedNoise, best: ChainOptimum) -> bool:
     """Whether it is a constant that is considered, and no larger than believed."""
     name = one.key.removeprefix("calibration.")
+    if name == ARM and "mean" in one.values:
+        belief = best.beliefs[ARM]
+        return bool(np.abs(np.array(one.values["mean"]) - belief.mean).max() < UNLIKELY * belief.sd)
     if name not in best.unknowns.considered or "time_constant_s" in one.values:
         return False
     factor, _ = shown(TABLE[name].unit)

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from rovgraph.calibration import TABLE
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.engine.chain_optimum import ChainOptimum
+from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import Released, as_chain, release
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
@@ -24,7 +25,7 @@ SHOWN_OF = {"fix_time_offset": 1.0}  # the velocity that makes a late fix wrong 
 MOVING = 20.0  # and what turns or scales the DVL's velocity where that is less than so many sds
 FEIGNED = {
     "dvl_scale": 1.5e-3,
-    "dvl_lever_arm": 0.05,
+    "dvl_lever_arm": 0.01,
     "gyr_scale": 5e-4,
     "ahrs_time_offset": 0.01,
     "mag_time_offset": 5e-3,
@@ -201,7 +202,7 @@ def _key_of(name: str) -> str:
     """What to look at in the configuration where a calibration variable is far off."""
     if name in ("dvl_roll", "dvl_pitch", "dvl_yaw"):
         return "dvl.mount_rpy_deg and the signs of the DVL's axes (rovgraph check names them)"
-    if name == "dvl_lever_arm":
+    if name == ARM:
         return "dvl.lever_arm_m and imu.lever_arm_m"
     if name in TIME_OFFSETS:
         return f"the clock that stamps {_sensor_of(name)}"
@@ -227,6 +228,10 @@ def _remedy_of_held(r: Released, config: Config) -> str:
         )
     if r.name == "gyr_scale":
         return "estimate calibration.gyr_scale, or calibrate the gyro"
+    if r.name == ARM:
+        off = [r.step * (label == r.label) for label in TABLE[ARM].labels]
+        mean = ", ".join(f"{value:.2g}" for value in beliefs(config)[ARM].mean + np.array(off))
+        return f"check {_key_of(ARM)}, or state calibration.{ARM}: {{mean: [{mean}]}}"
     if r.name == "dvl_yaw":
         return f"check {_key_of(r.name)}, or estimate calibration.dvl_yaw"
     if r.name in ("dvl_roll", "dvl_pitch"):
