@@ -454,8 +454,8 @@ class Belief:
     walk : random walk [unit per root second], 0 = constant over the dive
     considered : held at the mean, but its uncertainty is in that of all else (Schmidt); False where it is estimated
     time_constant : time in which what has walked returns to the mean [s]; infinite = it does not
-    score : ndarray, shape (dim,), derivative of the log likelihood that the measurements lack, by
-        `rovgraph.engine.rate_noise` [1/unit]
+    score : ndarray, shape (dim,), derivative of the log likelihood that noise has taken from the measurements
+        (`rovgraph.engine.rate_noise`) [1/unit]
     """
 
     variable: Variable

@@ -455,6 +455,8 @@ HEALTHY: tuple[Case, ...] = (
     Case("survey", "nothing"),
     Case("survey, waves", "nothing", scenario=WAVES),
     Case("long survey", "nothing", scenario="long survey"),
+    Case("survey of 20 minutes", "nothing", scenario="survey of 20 minutes"),
+    Case("survey of 20 minutes, waves", "nothing", scenario="survey of 20 minutes, waves"),
     Case("dives", "nothing", scenario="dives"),
     Case("hover", "nothing", scenario="hover"),
     Case("transit", "nothing", scenario="transit"),
@@ -498,6 +500,8 @@ FAULTS: tuple[Case, ...] = (
     Case("dvl tilted", "2 degrees between IMU and DVL", r"tilt|dvl_roll|dvl_pitch|mount",
          on_vehicle=change("dvl", mount_rpy_deg=(181.5, 1.5, -45.0))),
     Case("dvl arm", "15 cm off", r"arm", on_vehicle=change("dvl", arm=(0.35, 0.1, 0.3))),
+    Case("dvl arm, 20 minutes", "15 cm off", r"arm", scenario="survey of 20 minutes",
+         on_vehicle=change("dvl", arm=(0.35, 0.1, 0.3))),
     # clocks
     Case("dvl 0.1 s late", "stamps", CLOCK, scenario=WAVES, on_log=later("dvl", 0.1)),
     Case("dvl 0.087 s late", "as an A50 stamped on arrival", CLOCK, scenario=WAVES, on_log=later("dvl", 0.087)),

@@ -70,6 +70,7 @@ def _motion(
 SCENARIOS: dict[str, Builder] = {
     "survey": _survey,
     "long survey": lambda: _survey(360.0),
+    "survey of 20 minutes": lambda: _survey(1200.0),
     "eights": _eights,
     "transit": _transit,
     "long transit": lambda: _transit(360.0),

@@ -171,7 +171,9 @@ class ChainOptimum:
 
     def considering(self, names: Sequence[str]) -> "ChainOptimum":
         """As `rovgraph.engine.optimum.Optimum`."""
-        without = replace(self.chain, unknowns=self.unknowns.considering(names))
+        held = {name: replace(self.beliefs[name], score=0.0) for name in names}
+        unknowns = self.unknowns.considering(names)
+        without = replace(self.chain, unknowns=unknowns, beliefs={**self.beliefs, **held})
         begin = replace(self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}})
         return ChainOptimum(without, resume(without, begin, self.solution))
 

@@ -4,8 +4,8 @@ A constant that is held (the DVL's scale, the tilt of its mounting, the gyro's s
 together with what is estimated, in one Gauss-Newton step from the optimum: the Lagrange multiplier or score test
 (Rao 1948; Engle 1984). Where the configuration is right, the step over its sd is a standard normal number, so a step
 of many sds says that the constant is not what it is held at, and the step says what it is instead. Each is released by
-itself: two that move the same measurements would hide each other. What the gyro's noise feigns of the DVL's arm is
-taken off (`rovgraph.engine.rate_noise`).
+itself: two that move the same measurements would hide each other. Spurious information
+of the DVL's arm is taken off (`rovgraph.engine.rate_noise`).
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.optimum import Optimum
-from rovgraph.engine.rate_noise import ARM, feigned
+from rovgraph.engine.rate_noise import ARM, spurious_information
 from rovgraph.engine.widened_chain import widened
 from rovgraph.state import PLACE
 
@@ -90,12 +90,12 @@ def release(best: ChainOptimum, names: Iterable[str], gates: Gates | None = None
 
 
 def _without_rate_noise(best: ChainOptimum, released: list[Released]) -> list[Released]:
-    """The DVL's arm without what the gyro's noise feigns of it; what is all feigned left out."""
+    """The DVL's arm without spurious information; left out where little else is known of it."""
     arm = [one for one in released if one.name == ARM]
     if not arm:
         return released
     step, sd = np.array([(one.step, one.sd) for one in arm]).T
-    noise = feigned(best)
-    steps, sds = noise.step(step, sd), noise.sd(sd)
+    spurious = spurious_information(best)
+    steps, sds = spurious.step(step, sd), spurious.sd(sd)
     shown = [replace(one, step=float(a), sd=float(b)) for one, a, b in zip(arm, steps, sds, strict=True) if b < np.inf]
     return [one for one in released if one.name != ARM] + shown

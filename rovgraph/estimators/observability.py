@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd
-from rovgraph.engine.rate_noise import ARM, feigned, noise_moves_arm
+from rovgraph.engine.rate_noise import ARM, noise_moves_arm, spurious_information
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
 
@@ -94,8 +94,8 @@ def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) ->
     dict : name -> ndarray, shape (dim,)
     """
     ratio = {name: sd / prior[name] for name, sd in _sds(covariance, prior).items()}
-    if ARM in ratio:
-        ratio[ARM] = np.minimum(feigned(best).sd(ratio[ARM] * prior[ARM]) / prior[ARM], 1.0)
+    if best.unknowns.walks.get(ARM) == 0.0:
+        ratio[ARM] = np.minimum(spurious_information(best).sd(ratio[ARM] * prior[ARM]) / prior[ARM], 1.0)
     at_stake = [r for name in SPURIOUSLY_OBSERVABLE if name in ratio for r in ratio[name]]
     if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
@@ -147,8 +147,6 @@ def without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
     relative = relative_sd(best, covariance, before)
     claimed = {name: sd / before[name] for name, sd in _sds(covariance, before).items()}
     held = spuriously_observable(best.unknowns, claimed, relative)
-    if ARM in before and not best.unknowns.walks[ARM] and noise_moves_arm(best, claimed[ARM] * before[ARM]):
-        held.append(ARM)
     return (best.considering(held) if held else best), relative
 
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
-from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
+from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
-from rovgraph.engine.rate_noise import with_arm_undrawn
+from rovgraph.engine.rate_noise import with_arm_of_rates
 from rovgraph.engine.stretches import Searches
 from rovgraph.estimators.observability import shown
 from rovgraph.estimators.without_imu import unseen
@@ -47,5 +47,4 @@ def optimum(
         best = smooth_chain(intervals, initial, states, calibration, rows, searches)
     hidden = unseen(best.blocks) if has_constant_velocity(initial.config) else []
     seen = [name for name in shown(best) if name not in hidden]
-    best = best.estimating(seen) if seen else best
-    return with_arm_undrawn(best) if isinstance(best, ChainOptimum) else best
+    return with_arm_of_rates(best.estimating(seen) if seen else best)

@@ -92,7 +92,8 @@ def calibration_estimates(
                 float(belief.mean[k]),
                 belief.sd if estimated or considered else 0.0,
             )
-            ratio = float(sd[k]) / belief.sd if relative_sd is None or not estimated else float(relative_sd[name][k])
+            better = relative_sd.get(name) if relative_sd and estimated else None
+            ratio = float(sd[k]) / belief.sd if better is None else float(better[k])
             known = verdict(ratio) if estimated else CONSIDERED if considered else ""
             out.append(CalibrationEstimate(label, v.unit, v.about, estimated, *numbers, known))
     return out

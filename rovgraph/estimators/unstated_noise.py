@@ -27,7 +27,7 @@ from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Alarm, Statistic
-from rovgraph.estimators.alarms.constants import RELEASED
+from rovgraph.estimators.alarms.constants import FEIGNED, RELEASED
 from rovgraph.estimators.alarms.residuals import SD_KEY
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
@@ -37,13 +37,13 @@ ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be hel
 LARGER = 1.5  # factor of the noise that is not as stated
 ENOUGH = 50  # differences
 PLACED = 5.0  # sds from which a DVL is elsewhere
-UNLIKELY = 2.0  # sds of what is believed of its place
+LIKELY, UNLIKELY = 1.0, 2.0  # sds of what is believed of its place: what is used by itself, and what is worth an alarm
 OWN_SD = 0.05  # relative difference to the configuration's that makes it the log's own
 
 
 @dataclass(frozen=True)
 class UnstatedNoise:
-    """Noise that was found.
+    """Noise that was found, or the DVL's place.
 
     Attributes
     ----------
@@ -79,7 +79,9 @@ class UnstatedNoise:
         return isinstance(self.values, Mapping) and "estimate" in self.values
 
 
-def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> list[UnstatedNoise]:
+def find_noise(
+    best: ChainOptimum, config: Config, alarms: Iterable[Alarm], likely: float = LIKELY
+) -> list[UnstatedNoise]:
     """What the residuals of a dive say of its noise; white noise goes first, as errors that last stand out of it.
 
     Parameters
@@ -87,11 +89,12 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
     best : the optimum
     config : with which it was solved
     alarms : of the same dive
+    likely : sds of what is believed of the DVL's place, up to which another is left to chance
     """
     named = [alarm for alarm in alarms if alarm.kind in NAMED]
-    elsewhere = None if any(one.kind in ("axes", "clock") for one in named) else _elsewhere(best)
-    if elsewhere is not None and elsewhere.size > 1.0:
-        return [elsewhere.found]
+    place = None if any(one.kind in ("axes", "clock") for one in named) else _other_place(best)
+    if place is not None and place.size > likely:
+        return [place.found]
     late = {alarm.sensor: alarm.figure for alarm in named if alarm.kind == "held" and alarm.sensor in ALONE}
     if len(late) < len(named):
         return []
@@ -100,41 +103,45 @@ def find_noise(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> l
         return larger
     stated = [name for name in LASTING.values() if getattr(config.calibration, name).estimate != AUTO]
     errors = find_lasting(best, stated)
-    if elsewhere is not None and any(error.sensor == "dvl" for error in errors):
-        return [elsewhere.found]
+    if place is not None and any(error.sensor == "dvl" for error in errors):
+        return [place.found]
     # a score test's figure z is worth z^2 / 2 of log likelihood
     return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
 
 
 @dataclass(frozen=True)
-class _Elsewhere:
-    """A DVL's place, and its distance from what is believed in sds of that."""
+class _Place:
+    """A DVL's place, and its distance from where it is believed, in sds of that."""
 
     found: UnstatedNoise
     size: float
 
 
-def _elsewhere(best: ChainOptimum) -> _Elsewhere | None:
-    """The place of a DVL that is considered, where it is another and no other constant is further off."""
+def _other_place(best: ChainOptimum) -> _Place | None:
+    """The place of a DVL that is considered, where it is another and no other constant of it is further off."""
     if ARM not in best.unknowns.considered:
         return None
     belief, released = best.beliefs[ARM], release(best, RELEASED)
-    steps = {one.label: one.step for one in released if one.name == ARM and one.significance > PLACED}
-    furthest = max(released, key=lambda one: one.significance)
-    if not steps or furthest.name != ARM:
+    furthest = max(released, key=lambda one: one.significance, default=None)
+    arm = [one for one in released if one.name == ARM and abs(one.step) > PLACED * np.hypot(one.sd, FEIGNED[ARM])]
+    if furthest not in arm:
         return None
+    steps = {one.label: one.step for one in arm}
     off = np.array([steps.get(label, 0.0) for label in belief.variable.labels])
     where = ", ".join(f"{label[-1]} {step:+.2g} m" for label, step in steps.items())
-    cause = f"the vehicle's rates show it elsewhere than dvl.lever_arm_m less imu.lever_arm_m, {where}"
+    cause = (
+        f"the vehicle's rates show it elsewhere, {where} from where dvl.lever_arm_m, imu.lever_arm_m and "
+        f"calibration.{ARM}.mean have it"
+    )
     key, mean = f"calibration.{ARM}", tuple((belief.mean + off).tolist())
     found = UnstatedNoise("dvl", key, {"mean": mean}, cause, f"that is used ({key})")
-    return _Elsewhere(found, float(np.abs(off).max() / belief.sd))
+    return _Place(found, float(np.abs(off).max() / belief.sd))
 
 
 def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Iterator[Statistic]:
     """The same as alarms, of an estimate that goes on without it; parameters are those of `find_noise`."""
     begin, end = best.intervals[0].time, best.intervals[-1].time
-    for one in find_noise(best, config, alarms):
+    for one in find_noise(best, config, alarms, UNLIKELY):
         if not _is_allowed_for(one, best):
             yield Statistic("unstated", one.sensor, begin, end, 1.0, 0.0, np.inf, one.cause, one.remedy)
 
@@ -142,10 +149,7 @@ def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Ite
 def _is_allowed_for(one: UnstatedNoise, best: ChainOptimum) -> bool:
     """Whether it is a constant that is considered, and no larger than believed."""
     name = one.key.removeprefix("calibration.")
-    if name == ARM and "mean" in one.values:
-        belief = best.beliefs[ARM]
-        return bool(np.abs(np.array(one.values["mean"]) - belief.mean).max() < UNLIKELY * belief.sd)
-    if name not in best.unknowns.considered or "time_constant_s" in one.values:
+    if name not in best.unknowns.considered or "time_constant_s" in one.values or "mean" in one.values:
         return False
     factor, _ = shown(TABLE[name].unit)
     sd: float = max(one.values.get("sd", 0.0), one.values.get("sd_deg", 0.0))
