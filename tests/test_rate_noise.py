@@ -9,11 +9,13 @@ from dives import batch, falcon, interrupted, simulated, started
 
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import COARSE
+from rovgraph.engine.optimum import NEWEST, estimated_parts
 from rovgraph.engine.rate_noise import ARM, noise_moves_arm, spurious_information
 from rovgraph.engine.released import release
 from rovgraph.estimators.dive import Dive, smooth
 from rovgraph.estimators.observability import OBSERVABLE_BELOW, relative_sd
 from rovgraph.simulate.path import Style
+from rovgraph.studies.observability import observe
 
 CALM = Style()  # no waves
 SEEDS = range(1, 9)
@@ -66,10 +68,7 @@ def test_an_estimated_arm_is_right_where_least_squares_is_off():
         best = batch(case.log, started(case)).optimum()
         assert isinstance(best, ChainOptimum) and ARM in best.unknowns.estimated
         plain = replace(best.chain, beliefs={**best.beliefs, ARM: replace(best.beliefs[ARM], score=0.0)})
-        first = 15 + sum(
-            best.beliefs[n].variable.dim for n in best.unknowns.estimated[: best.unknowns.estimated.index(ARM)]
-        )
-        sd = np.sqrt(np.diag(best.newest_covariance())[first : first + 3])
+        sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:][estimated_parts(best)[ARM]])
         drawn = plain.moved(best.state, plain.step(best.state, best.solution.gates), 1.0).calibration[ARM]
         off.append((best.state.calibration[ARM] - truth) / sd)
         least_squares.append((drawn - truth) / sd)
@@ -125,6 +124,14 @@ def test_the_verdict_on_an_arm_knows_what_is_spurious():
     prior, sd = {ARM: np.full(3, best.beliefs[ARM].sd)}, least_squares_sd(best)
     ratio = relative_sd(best.estimating([ARM]), np.diag(sd**2), prior)[ARM]
     assert (ratio > 0.9).any() and (sd / prior[ARM] < 0.5).all()
+
+
+def test_observe_knows_what_is_spurious():
+    config = falcon(imu={"noise": {"gyr": NOISY}})
+    case = simulated(config, 60.0, seed=1, style=CALM, calibration={ARM: [0.0, 0.0, 0.0]})
+    seen = observe(case.log, started(case), also=[ARM])
+    sds = {label: seen.relative[-1, k] for k, label in enumerate(seen.labels) if label.startswith(ARM)}
+    assert len(sds) == 3 and sds["dvl_lever_arm_z"] > 0.7
 
 
 def moved_by_noise(offset: float, estimate: bool | str = "considered") -> Dive:

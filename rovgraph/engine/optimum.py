@@ -125,6 +125,13 @@ def residual_state(optimum: Optimum, block: Block) -> State:
     return block.with_places(optimum.state.at(block.keyframe), optimum.places)
 
 
+def estimated_parts(optimum: Optimum) -> dict[str, slice]:
+    """Name -> where it stands among all that is estimated."""
+    dims = [optimum.beliefs[name].variable.dim for name in optimum.unknowns.estimated]
+    ends = np.cumsum(dims).tolist()
+    return {n: slice(end - dim, end) for n, dim, end in zip(optimum.unknowns.estimated, dims, ends, strict=True)}
+
+
 def joint_prior_sd(optimum: Optimum, keyframe: int) -> dict[str, Array]:
     """sd of the estimated calibration before any data, at a keyframe to which what walks has walked.
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.optimum import NEWEST, Optimum
+from rovgraph.engine.optimum import NEWEST, Optimum, estimated_parts
 from rovgraph.engine.stretches import resume
 from rovgraph.geometry import Array
 from rovgraph.sensors.dvl import DvlVelocity, dvl_mounting
@@ -106,7 +106,8 @@ def with_arm_of_rates(best: Optimum) -> Optimum:
     """The optimum with an estimated arm as the vehicle's own rates show it; considered, where these show too little."""
     if best.unknowns.walks.get(ARM) != 0.0:
         return best
-    if noise_moves_arm(best, _arm_sd(best)):
+    sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:])
+    if noise_moves_arm(best, sd[estimated_parts(best)[ARM]]):
         return best.considering([ARM])
     if isinstance(best, ChainOptimum):
         for _ in range(ROUNDS):
@@ -114,13 +115,3 @@ def with_arm_of_rates(best: Optimum) -> Optimum:
             chain = replace(best.chain, beliefs={**best.beliefs, ARM: belief})
             best = ChainOptimum(chain, resume(chain, best.state, best.solution))
     return best
-
-
-def _arm_sd(best: Optimum) -> Array:
-    """sd of an estimated arm by least squares, shape (3,) [m]."""
-    first = NEWEST
-    for name in best.unknowns.estimated:
-        if name == ARM:
-            break
-        first += best.beliefs[name].variable.dim
-    return np.asarray(np.sqrt(np.diag(best.newest_covariance())[first : first + 3]))

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd
+from rovgraph.engine.optimum import NEWEST, Optimum, estimated_parts, joint_prior_sd
 from rovgraph.engine.rate_noise import ARM, noise_moves_arm, spurious_information
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
@@ -74,8 +74,18 @@ def without_spurious_information(best: Optimum, keyframes: Sequence[int], inform
     more = np.zeros_like(information)
     for noisier in best.noisier(keyframes):
         more += 0.5 * np.array([data_information(P, s) for P, s in zip(noisier.calibration, sd, strict=True)])
-    value, axes = np.linalg.eigh(2.0 * information - more)
+    value, axes = np.linalg.eigh(2.0 * information - more - _by_rate_noise(best, keyframes, sd))
     return np.asarray((axes * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
+
+
+def _by_rate_noise(best: Optimum, keyframes: Sequence[int], sd: Array) -> Array:
+    """Spurious information of the DVL's arm, which grows with the dive, shape (m, c, c)."""
+    out = np.zeros((*sd.shape, sd.shape[1]))
+    if best.unknowns.walks.get(ARM) == 0.0:
+        own = np.r_[estimated_parts(best)[ARM]]
+        until = (np.array(keyframes) + 1.0) / len(best.intervals)
+        out[:, own, own] = until[:, None] * spurious_information(best).information * sd[:, own] ** 2
+    return out
 
 
 def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) -> dict[str, Array]:

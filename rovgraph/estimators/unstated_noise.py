@@ -27,7 +27,7 @@ from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Alarm, Statistic
-from rovgraph.estimators.alarms.constants import FEIGNED, RELEASED
+from rovgraph.estimators.alarms.constants import FEIGNED, MOVED, RELEASED
 from rovgraph.estimators.alarms.residuals import SD_KEY
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
@@ -119,7 +119,7 @@ class _Place:
 
 def _other_place(best: ChainOptimum) -> _Place | None:
     """The place of a DVL that is considered, where it is another and no other constant of it is further off."""
-    if ARM not in best.unknowns.considered:
+    if ARM not in best.unknowns.considered or _is_moved(best):
         return None
     belief, released = best.beliefs[ARM], release(best, RELEASED)
     furthest = max(released, key=lambda one: one.significance, default=None)
@@ -136,6 +136,13 @@ def _other_place(best: ChainOptimum) -> _Place | None:
     key, mean = f"calibration.{ARM}", tuple((belief.mean + off).tolist())
     found = UnstatedNoise("dvl", key, {"mean": mean}, cause, f"that is used ({key})")
     return _Place(found, float(np.abs(off).max() / belief.sd))
+
+
+def _is_moved(best: ChainOptimum) -> bool:
+    """Whether a constant of the DVL that is estimated is far from its prior, as its axes' wrong names make its yaw."""
+    own = [best.beliefs[name] for name in best.unknowns.estimated if "dvl" in best.beliefs[name].variable.sensors]
+    off = [np.abs(best.state.calibration[b.variable.name] - b.mean).max() / b.sd for b in own]
+    return max(off, default=0.0) > MOVED
 
 
 def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Iterator[Statistic]:

@@ -174,6 +174,9 @@ def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimu
             f"{FEWEST_KEYFRAMES} are the fewest; take a longer log"
         )
     dive = batch.optimum()
+    # what is not estimated because noise would move it is what is to be looked at
+    moved = [name for name in dive.unknowns.considered if dive.beliefs[name].estimate]
+    dive = dive.estimating(moved) if moved else dive
     if not dive.unknowns.estimated:
         raise InputError(
             f"{log.source}: no calibration variable is estimated; give --estimate, or estimate: true in calibration"
