@@ -346,7 +346,7 @@ def test_perfect_instruments_give_the_true_track():
     assert result.rms["filtered"] < 0.1
 
 
-def test_a_dvls_arm_that_is_off_is_named_and_estimated_not_taken_for_an_error_that_lasts():
+def test_a_dvls_arm_that_is_off_is_named_and_used_not_taken_for_an_error_that_lasts():
     result = run_case(CASES["dvl arm"], 0)
     told = [text for text in result.said if "calibration.dvl" in text]
     assert len(told) == 1 and "(calibration.dvl_lever_arm)" in told[0]

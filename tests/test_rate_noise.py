@@ -10,25 +10,26 @@ from dives import batch, falcon, interrupted, simulated, started
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import COARSE
 from rovgraph.engine.optimum import NEWEST, estimated_parts
-from rovgraph.engine.rate_noise import ARM, noise_moves_arm, spurious_information
+from rovgraph.engine.rate_noise import ARM, spurious_information
 from rovgraph.engine.released import release
 from rovgraph.estimators.dive import Dive, smooth
-from rovgraph.estimators.observability import OBSERVABLE_BELOW, relative_sd
+from rovgraph.estimators.observability import OBSERVABLE_BELOW, relative_sd, shown
 from rovgraph.simulate.path import Style
 from rovgraph.studies.observability import observe
 
 CALM = Style()  # no waves
 SEEDS = range(1, 9)
-FAR = 26.1 / 8.0  # mean square of eight normal numbers that one in a thousand exceeds
-CONSIDERED = {ARM: {"estimate": "considered"}}
+NEAR, FAR = 0.86 / 8.0, 26.1 / 8.0  # between them is the mean square of eight normal numbers but once in 500
 USUAL, NOISY = 7e-4, 2e-3  # of the gyro: an MTi's, and three times that [rad/s/rtHz]
 
 
-def optimum(seed: int, gyr: float = USUAL, estimate: bool | str = "considered", silent_s: float = 0.0) -> ChainOptimum:
-    """A calm minute, its DVL where it is believed to be, and silent at the end."""
+def optimum(
+    seed: int, gyr: float = USUAL, estimate: bool | str = "considered", silent_s: float = 0.0, seconds: float = 60.0
+) -> ChainOptimum:
+    """A calm dive, its DVL where it is believed to be, and silent at the end."""
     config = falcon(calibration={ARM: {"estimate": estimate}}, imu={"noise": {"gyr": gyr}})
-    case = simulated(config, 60.0, seed=seed, style=CALM, calibration={ARM: [0.0, 0.0, 0.0]})
-    log = interrupted(case.log, 60.0 - silent_s, silent_s + 1.0, "dvl") if silent_s else case.log
+    case = simulated(config, seconds, seed=seed, style=CALM, calibration={ARM: [0.0, 0.0, 0.0]})
+    log = interrupted(case.log, seconds - silent_s, silent_s + 1.0, "dvl") if silent_s else case.log
     best = batch(log, started(case)).optimum()
     assert isinstance(best, ChainOptimum)
     return best
@@ -57,7 +58,7 @@ def test_a_released_arm_is_right_without_what_is_spurious():
         for one in release(calm(seed), [ARM]):
             steps[one.label].append(one.step / one.sd)
     for values in steps.values():
-        assert len(values) == len(SEEDS) and np.mean(np.square(values)) < FAR
+        assert len(values) == len(SEEDS) and NEAR < np.mean(np.square(values)) < FAR
 
 
 def test_an_estimated_arm_is_right_where_least_squares_is_off():
@@ -102,9 +103,9 @@ def test_nothing_is_said_of_an_arm_whose_information_is_mostly_spurious():
 
 
 def test_an_arm_that_noise_moves_stays_considered_though_least_squares_shows_it():
-    best = optimum(1, 2.0 * NOISY)
-    assert (best.relative_sd()[ARM] < 1.2 * OBSERVABLE_BELOW).all()
-    assert noise_moves_arm(best, least_squares_sd(best)) and ARM in best.unknowns.considered
+    best = optimum(1, NOISY, seconds=120.0)
+    assert (best.relative_sd()[ARM] < OBSERVABLE_BELOW).all() and ARM in best.unknowns.considered
+    assert ARM not in shown(best)
 
 
 def test_an_arm_that_noise_moves_is_considered_though_it_is_to_be_estimated():

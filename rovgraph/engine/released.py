@@ -4,8 +4,8 @@ A constant that is held (the DVL's scale, the tilt of its mounting, the gyro's s
 together with what is estimated, in one Gauss-Newton step from the optimum: the Lagrange multiplier or score test
 (Rao 1948; Engle 1984). Where the configuration is right, the step over its sd is a standard normal number, so a step
 of many sds says that the constant is not what it is held at, and the step says what it is instead. Each is released by
-itself: two that move the same measurements would hide each other. Spurious information
-of the DVL's arm is taken off (`rovgraph.engine.rate_noise`).
+itself: two that move the same measurements would hide each other. Spurious information of the DVL's arm is taken off
+(`rovgraph.engine.rate_noise`).
 """
 
 from collections.abc import Iterable

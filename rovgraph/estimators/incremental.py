@@ -25,6 +25,7 @@ from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMe
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.rate_noise import with_arm_of_rates
 from rovgraph.engine.stretches import Searches
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.estimate import Estimate
@@ -198,9 +199,9 @@ class IncrementalEstimator:
         best = associated_optimum(resolved_associations(self.intervals), *given)
         block = best.blocks[PLACE]
         if not (out := block.time[block.believed & ~best.solution.gates[PLACE]]).size:
-            return best
+            return with_arm_of_rates(best)
         apart = [apart_from(interval, {t: self._own_places[t] for t in out.tolist()}) for interval in self.intervals]
-        return associated_optimum(resolved_associations(apart), *given)
+        return with_arm_of_rates(associated_optimum(resolved_associations(apart), *given))
 
     def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
         for interval in intervals:

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel
 from scipy.special import chdtri
 
-from rovgraph.calibration import AUTO, TABLE
+from rovgraph.calibration import AUTO, MOUNT, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
@@ -118,15 +118,17 @@ class _Place:
 
 
 def _other_place(best: ChainOptimum) -> _Place | None:
-    """The place of a DVL that is considered, where it is another and no other constant of it is further off."""
-    if ARM not in best.unknowns.considered or _is_moved(best):
+    """The place of a DVL that is considered, where it is another and no constant that is held is further off."""
+    if ARM not in best.unknowns.considered or _is_turned(best):
         return None
     belief, released = best.beliefs[ARM], release(best, RELEASED)
-    furthest = max(released, key=lambda one: one.significance, default=None)
-    arm = [one for one in released if one.name == ARM and abs(one.step) > PLACED * np.hypot(one.sd, FEIGNED[ARM])]
-    if furthest not in arm:
+    spread = {o.label: np.hypot(o.sd, FEIGNED.get(o.name, 0.0)) for o in released}
+    arm = [o for o in released if o.name == ARM and abs(o.step) > PLACED * spread[o.label]]
+    # a place that is off makes stamps seem late: the arm is compared without what errors in variables allow for
+    others = [abs(o.step) / spread[o.label] for o in released if o.name != ARM]
+    if not arm or max(o.significance for o in arm) < max(others, default=0.0):
         return None
-    steps = {one.label: one.step for one in arm}
+    steps = {o.label: o.step for o in arm}
     off = np.array([steps.get(label, 0.0) for label in belief.variable.labels])
     where = ", ".join(f"{label[-1]} {step:+.2g} m" for label, step in steps.items())
     cause = (
@@ -134,15 +136,15 @@ def _other_place(best: ChainOptimum) -> _Place | None:
         f"calibration.{ARM}.mean have it"
     )
     key, mean = f"calibration.{ARM}", tuple((belief.mean + off).tolist())
-    found = UnstatedNoise("dvl", key, {"mean": mean}, cause, f"that is used ({key})")
+    sd = max(belief.sd, *(float(spread[o.label]) for o in arm))
+    found = UnstatedNoise("dvl", key, {"mean": mean, "sd": sd}, cause, f"that is used ({key})")
     return _Place(found, float(np.abs(off).max() / belief.sd))
 
 
-def _is_moved(best: ChainOptimum) -> bool:
-    """Whether a constant of the DVL that is estimated is far from its prior, as its axes' wrong names make its yaw."""
-    own = [best.beliefs[name] for name in best.unknowns.estimated if "dvl" in best.beliefs[name].variable.sensors]
-    off = [np.abs(best.state.calibration[b.variable.name] - b.mean).max() / b.sd for b in own]
-    return max(off, default=0.0) > MOVED
+def _is_turned(best: ChainOptimum) -> bool:
+    """Whether the DVL's mounting is estimated far from its prior, as it is where axes are named wrongly."""
+    own = [best.beliefs[name] for name in MOUNT if best.unknowns.walks.get(name) == 0.0]
+    return any(abs(float(best.state.calibration[b.variable.name][0] - b.mean[0])) > MOVED * b.sd for b in own)
 
 
 def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Iterator[Statistic]:

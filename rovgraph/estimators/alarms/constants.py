@@ -115,7 +115,8 @@ def held_in(best: ChainOptimum, config: Config, v_sd: float, start: float, end: 
             continue
         factor, unit = shown(variable.unit)
         belief = best.beliefs[r.name]
-        mean, allowed = belief.mean[variable.labels.index(r.label)], belief.sd if belief.considered else 0.0
+        considered = r.name in best.unknowns.considered
+        mean, allowed = belief.mean[variable.labels.index(r.label)], belief.sd if considered else 0.0
         yield Statistic(
             "held",
             _sensor_of(r.name),
@@ -123,7 +124,7 @@ def held_in(best: ChainOptimum, config: Config, v_sd: float, start: float, end: 
             end,
             abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
             HELD,
-            FAR_MOVED if belief.considered else HELD_FAR_OFF,  # the prior's sd is all that the track's sd has of it
+            FAR_MOVED if considered else HELD_FAR_OFF,  # the prior's sd is all that the track's sd has of it
             f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements shift it "
             f"by {factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)}",
             _remedy_of_held(r, config),
