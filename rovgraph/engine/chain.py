@@ -268,7 +268,7 @@ class Chain:
         return self._prior_weight @ np.concatenate(parts), np.concatenate([np.empty(0), *own])
 
     def _lacking(self, point: State) -> float:
-        """Log likelihood by the scores that measurements lack of constants."""
+        """Log likelihood that noise has taken from the border's constants, by `Belief.score`."""
         return sum(
             float(np.sum(self.beliefs[name].score * (point.calibration[name] - self.beliefs[name].mean)))
             for name, (border, _) in self.layout.places.items()

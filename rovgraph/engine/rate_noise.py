@@ -33,7 +33,7 @@ BRIDGED = 3.0  # times the usual noise of the rate, in gaps of the IMU: that is 
 
 @dataclass(frozen=True)
 class SpuriousInformation:
-    """What the rate's noise adds to the arm's three components, each by itself.
+    """What the rate's noise adds to the arm's three components along b, each by itself.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class SpuriousInformation:
 
 
 def spurious_information(best: Optimum) -> SpuriousInformation:
-    """That of the arm in a dive."""
+    """That of the arm in a dive, F and F l of above; of the measurements that are let in, with their weights."""
     information, score, followed = np.zeros(3), np.zeros(3), _followed(best)
     for sensor, block in best.blocks.items():
         model = block.instrument.model
@@ -103,7 +103,12 @@ def noise_moves_arm(best: Optimum, sd: Array) -> bool:
 
 
 def with_arm_of_rates(best: Optimum) -> Optimum:
-    """The optimum with an estimated arm as the vehicle's own rates show it; considered, where these show too little."""
+    """The optimum with an estimated arm as the vehicle's own rates show it; considered, where these show too little.
+
+    Raises
+    ------
+    InputError : the data do not determine some variable, which is named
+    """
     if best.unknowns.walks.get(ARM) != 0.0:
         return best
     sd = np.sqrt(np.diag(best.newest_covariance())[NEWEST:])
