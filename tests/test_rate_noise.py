@@ -110,7 +110,7 @@ def test_an_arm_that_noise_moves_stays_considered_though_least_squares_shows_it(
 
 def test_an_arm_that_noise_moves_is_considered_though_it_is_to_be_estimated():
     best = calm(1, NOISY, True)
-    assert ARM in best.unknowns.considered
+    assert ARM in best.unknowns.considered and np.all(best.beliefs[ARM].score == 0.0)
     assert np.array_equal(best.state.calibration[ARM], best.beliefs[ARM].mean)
 
 
