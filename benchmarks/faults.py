@@ -53,8 +53,8 @@ nothing checks heading and depth, `smooth` prints what they rest on, with the pr
 it does so, and only for the quantities of that reason: every other quantity must be right.
 
 Run the campaign whenever the estimator changes. `--cases` selects some of them, `--jobs` sets the number of \
-processes, `--json` writes all figures, `--keep` continues an interrupted campaign, `--online` also replays each log \
-through `rovgraph online`.
+processes, `--json` writes all figures, `--online` also replays each log through `rovgraph online`. `--keep` continues \
+an interrupted campaign, or takes this page from the dives of one with `--online`.
 """
 
 

@@ -324,6 +324,18 @@ def test_dives_that_were_kept_are_read_again(tmp_path):
     assert list(found["survey", 3, False].said) == list(NAMED)
 
 
+def test_a_dive_that_was_replayed_too_counts_for_smooth_alone_without_what_the_replay_added(tmp_path):
+    both, sizes = {"smoothed": {"position": 1.0}, "online": {"position": 9.0}}, {"smoothed": 1.0, "online": 3.0}
+    said = (*NAMED, f"online: {NAMED[0]}")
+    keep_dive(tmp_path / "dives.jsonl", ("survey", 3, True), Result(both, sizes, sizes, said))
+    alone = Result({"online": {"position": 1.0}}, {"online": 1.0}, {"online": 1.0}, ("online: late",))
+    keep_dive(tmp_path / "dives.jsonl", ("two files, online", 0, True), alone)
+    found = read_dives(tmp_path / "dives.jsonl")
+    assert [found["survey", 3, False]] == dives(1.0, 1, said=NAMED)
+    assert found["survey", 3, True].nees == both
+    assert found["two files, online", 0, False].nees == alone.nees  # which no other command estimates
+
+
 # --- through the command ----------------------------------------------------------------------------
 
 

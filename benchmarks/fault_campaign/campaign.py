@@ -88,11 +88,13 @@ def run_named(name: str, seed: int, online: bool) -> Result:
 
 
 def read_dives(path: Path | None) -> dict[Task, Result]:
-    """Dives of a file of JSON lines; none where there is no file."""
+    """Dives of a file of JSON lines, those that were replayed also without that; none where there is no file."""
     if path is None or not path.exists():
         return {}
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return {(row["case"], row["seed"], row["online"]): Result(**row["result"]) for row in rows}
+    dives = {(row["case"], row["seed"], row["online"]): Result(**row["result"]) for row in rows}
+    alone = {(n, seed, False): r.without_replay() for (n, seed, online), r in dives.items() if online}
+    return alone | dives
 
 
 def keep_dive(path: Path | None, task: Task, result: Result) -> None:

@@ -29,6 +29,7 @@ NAMED_IN = 0.95  # of the seeds, for a fault to count as named
 SETTLED_S = 10.0
 COMMANDS = {"smooth": ("smoothed", "filtered"), "online": ("online",)}  # and their estimates
 WORST_FIRST = ("lie", "no trace", "loud", "wide", "right")
+ONLINE = "online: "  # begins a line that the replay said
 QUANTITIES = ("position", "depth", "heading", "dvl_yaw", "dvl_scale")
 
 
@@ -57,6 +58,13 @@ class Result:
     sd: dict[str, float] = field(default_factory=dict)
     said: tuple[str, ...] = ()
     refused: bool = False
+
+    def without_replay(self) -> "Result":
+        """What `rovgraph smooth` made of the same dive; all of one that goes through `rovgraph online` alone."""
+        if "smoothed" not in self.nees:
+            return self
+        nees, rms, sd = ({k: v for k, v in of.items() if k != "online"} for of in (self.nees, self.rms, self.sd))
+        return replace(self, nees=nees, rms=rms, sd=sd, said=tuple(s for s in self.said if not s.startswith(ONLINE)))
 
 
 @dataclass(frozen=True)
@@ -164,7 +172,7 @@ def _online(folder: Path, dive: Dive, result: Result) -> Result:
     options = ["--config", str(folder / "vehicle.yaml"), "--out", str(folder / "live")]
     options += ["--speed", "max", "--no-refine", "--output", "udp://127.0.0.1:9"]  # port 9 is for what nobody reads
     code, errors = run_command(["online", *files, *options])
-    said = (*result.said, *(f"online: {line}" for line in errors.splitlines()))
+    said = (*result.said, *(f"{ONLINE}{line}" for line in errors.splitlines()))
     track = folder / "live" / "trajectory_filtered.csv"
     if code != 0 or not track.exists():
         return replace(result, said=said)
@@ -330,7 +338,7 @@ def _right(result: Result, kinds: Sequence[str]) -> bool:
 
 def _lines_of(command: str, messages: Sequence[Sequence[str]]) -> list[list[str]]:
     """Of each dive's messages those of one command."""
-    return [[line for line in lines if line.startswith("online: ") == (command == "online")] for lines in messages]
+    return [[line for line in lines if line.startswith(ONLINE) == (command == "online")] for lines in messages]
 
 
 def _naming(says: str, messages: Sequence[Sequence[str]]) -> list[bool]:
