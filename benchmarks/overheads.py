@@ -195,7 +195,7 @@ def alarms(folder: Path) -> list[Pair]:
     smoother.take(log)
     best = smoother.optimum()
     assert isinstance(best, ChainOptimum)
-    evidence = Evidence(smoother.initial, [smoothed(best, smoother.initial)], best.intervals, best, [])
+    evidence = Evidence(smoother.initial, [smoothed(best, smoother.initial)], best.intervals, best, [], log)
     messages = [Message("log", m.time, m.time, (Reading(m.sensor, m.values),)) for m in log.measurements()]
     keyframes: list[tuple[Any, ...]] = []
 

@@ -366,6 +366,26 @@ def test_a_dvls_arm_that_is_off_is_named_and_used_not_taken_for_an_error_that_la
     assert result.nees["smoothed"]["dvl_yaw"] < 2.0  # 3.3
 
 
+@pytest.mark.parametrize(
+    ("case", "remedy"),
+    [
+        ("dvl y flipped", "units: {dvl_vy: -m/s}"),  # its wrong estimate has a turn of 90 degrees in its place
+        ("dvl y and z flipped", "dvl.mount_rpy_deg: [0.0, 0.0, -45.0]"),
+        ("dvl 3.2 s late", "mean: 3.188"),
+    ],
+)
+def test_an_alarm_on_a_dvls_axes_or_clock_gives_the_remedy_of_the_check(case, remedy):
+    told = [text for text in run_case(CASES[case], 0).said if text.startswith("alarm: dvl: its ") and "IMU" in text]
+    assert len(told) == 1 and remedy in told[0] and "until that is mended the track is wrong" in told[0]
+
+
+def test_online_a_dvl_whose_clock_is_late_is_not_said_to_be_elsewhere():
+    result = run_case(CASES["dvl 3.2 s late"], 0, online=True)
+    told = [text for text in result.said if text.startswith("online: ") and "dvl: " in text]
+    assert any("its stamps are 3.1" in text for text in told)
+    assert not any("elsewhere" in text for text in told)
+
+
 def test_online_ignores_a_depth_that_is_stuck_while_the_vehicle_dives():
     result = run_case(CASES["depth stuck"], 0, online=True)
     assert max(result.nees["online"].values()) < 2.0  # of the depth 765 where it was used

@@ -196,7 +196,7 @@ def reinitialised(
         if engine.marks and engine.marks[-1].interval.index > newest:
             newest = engine.marks[-1].interval.index
             at(engine.marks[-1].interval.time - measurements[0].time)
-            thread.step(engine)
+            thread.step(engine, False)
     engine.finish()
     thread.close()
     return known

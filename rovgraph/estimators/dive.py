@@ -156,7 +156,7 @@ def _solve(
             estimates.insert(0, smoothed(best, initial))
             give_back()
     intervals = batch.intervals if best is None else best.intervals
-    numbers = statistics(Evidence(initial, estimates, intervals, best, frozen, gaps))
+    numbers = statistics(Evidence(initial, estimates, intervals, best, frozen, log, gaps))
     left_out = _left_out(batch, frozen, gaps)
     return Dive([*estimates, batch.dead_reckoning()], initial, left_out, frozen, numbers), best
 

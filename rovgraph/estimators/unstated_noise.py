@@ -20,15 +20,14 @@ import numpy as np
 from pydantic import BaseModel
 from scipy.special import chdtri
 
-from rovgraph.calibration import AUTO, MOUNT, TABLE
+from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
 from rovgraph.engine.rate_noise import ARM
-from rovgraph.engine.released import release
 from rovgraph.estimators.alarms import Alarm, Statistic
-from rovgraph.estimators.alarms.constants import FEIGNED, MOVED, RELEASED
 from rovgraph.estimators.alarms.residuals import SD_KEY
+from rovgraph.estimators.dvl_place import DvlPlace, other_place
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
 
@@ -36,7 +35,6 @@ NAMED = ("axes", "clock", "held", "earth rate")  # alarms that name another caus
 ALONE = ("fix", "ahrs")  # sensors of which nothing but a time offset can be held wrongly
 LARGER = 1.5  # factor of the noise that is not as stated
 ENOUGH = 50  # differences
-PLACED = 5.0  # sds from which a DVL is elsewhere
 LIKELY, UNLIKELY = 1.0, 2.0  # sds of what is believed of its place: what is used by itself, and what is worth an alarm
 OWN_SD = 0.05  # relative difference to the configuration's that makes it the log's own
 
@@ -92,9 +90,9 @@ def find_noise(
     likely : sds of what is believed of the DVL's place, up to which another is left to chance
     """
     named = [alarm for alarm in alarms if alarm.kind in NAMED]
-    place = None if any(one.kind in ("axes", "clock") for one in named) else _other_place(best)
+    place = None if any(one.kind in ("axes", "clock") for one in named) else other_place(best)
     if place is not None and place.size > likely:
-        return [place.found]
+        return [_placed(place)]
     late = {alarm.sensor: alarm.figure for alarm in named if alarm.kind == "held" and alarm.sensor in ALONE}
     if len(late) < len(named):
         return []
@@ -104,47 +102,15 @@ def find_noise(
     stated = [name for name in LASTING.values() if getattr(config.calibration, name).estimate != AUTO]
     errors = find_lasting(best, stated)
     if place is not None and any(error.sensor == "dvl" for error in errors):
-        return [place.found]
+        return [_placed(place)]
     # a score test's figure z is worth z^2 / 2 of log likelihood
     return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
 
 
-@dataclass(frozen=True)
-class _Place:
-    """A DVL's place, and its distance from where it is believed, in sds of that."""
-
-    found: UnstatedNoise
-    size: float
-
-
-def _other_place(best: ChainOptimum) -> _Place | None:
-    """The place of a DVL that is considered, where it is another and no constant that is held is further off."""
-    if ARM not in best.unknowns.considered or _is_turned(best):
-        return None
-    belief, released = best.beliefs[ARM], release(best, RELEASED)
-    spread = {o.label: np.hypot(o.sd, FEIGNED.get(o.name, 0.0)) for o in released}
-    arm = [o for o in released if o.name == ARM and abs(o.step) > PLACED * spread[o.label]]
-    # a place that is off makes stamps seem late: the arm is compared without what errors in variables allow for
-    others = [abs(o.step) / spread[o.label] for o in released if o.name != ARM]
-    if not arm or max(o.significance for o in arm) < max(others, default=0.0):
-        return None
-    steps = {o.label: o.step for o in arm}
-    off = np.array([steps.get(label, 0.0) for label in belief.variable.labels])
-    where = ", ".join(f"{label[-1]} {step:+.2g} m" for label, step in steps.items())
-    cause = (
-        f"the vehicle's rates show it elsewhere, {where} from where dvl.lever_arm_m, imu.lever_arm_m and "
-        f"calibration.{ARM}.mean have it"
-    )
-    key, mean = f"calibration.{ARM}", tuple((belief.mean + off).tolist())
-    sd = max(belief.sd, *(float(spread[o.label]) for o in arm))
-    found = UnstatedNoise("dvl", key, {"mean": mean, "sd": sd}, cause, f"that is used ({key})")
-    return _Place(found, float(np.abs(off).max() / belief.sd))
-
-
-def _is_turned(best: ChainOptimum) -> bool:
-    """Whether the DVL's mounting is estimated far from its prior, as it is where axes are named wrongly."""
-    own = [best.beliefs[name] for name in MOUNT if best.unknowns.walks.get(name) == 0.0]
-    return any(abs(float(best.state.calibration[b.variable.name][0] - b.mean[0])) > MOVED * b.sd for b in own)
+def _placed(place: DvlPlace) -> UnstatedNoise:
+    key = f"calibration.{ARM}"
+    values = {"mean": tuple(place.mean.tolist()), "sd": place.sd}
+    return UnstatedNoise("dvl", key, values, place.cause, f"that is used ({key})")
 
 
 def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Iterator[Statistic]:

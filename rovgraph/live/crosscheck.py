@@ -36,9 +36,11 @@ class Crosscheck:
     Attributes
     ----------
     config : what is believed of mountings and of stamps that are known to be late
+    dvl_misread : the newest windows show that the DVL's axes or clock are wrong
     """
 
     config: Config
+    dvl_misread: bool = False
     _window: dict[str, Stream] = field(default_factory=dict)
     _newest: list[Measurement] = field(default_factory=list)  # since the last comparison
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
@@ -102,10 +104,12 @@ class Crosscheck:
         late = {f.sensor for f in found.values() if f.clock}  # which explains what else disagrees
         found = {key: f for key, f in found.items() if f.clock or f.sensor not in late}
         suspected = {key: self._suspected.get(key, 0) + 1 for key in found}
-        for key, finding in found.items():
-            kind = "clock" if finding.clock else "check"
-            if suspected[key] >= IN_A_ROW[kind] and now - self._said.get(key, -math.inf) > AGAIN_S:
-                self._said[key] = now
+        kinds = {key: "clock" if finding.clock else "check" for key, finding in found.items()}
+        sure = [key for key, kind in kinds.items() if suspected[key] >= IN_A_ROW[kind]]
+        self.dvl_misread = any(sensor == "dvl" for sensor, _ in sure)
+        for key in sure:
+            if now - self._said.get(key, -math.inf) > AGAIN_S:
+                self._said[key], finding, kind = now, found[key], kinds[key]
                 zero = f"; 0 s is {start:.1f} s" if finding.clock == "jump" else ""
                 yield Event(now, finding.sensor, kind, f"{finding.text}{zero}")
         self._suspected = suspected

@@ -6,19 +6,23 @@ two pings,
     v_b(t) - R_b(t)b(t-T) v_b(t-T) = R_b(t)n (integral of R_nb f_b + g),  v_b = R_bs H z - w x l
 
 holds for the right signed permutation H of the DVL's axes and the right shift of its stamps. Only turns between the
-pings and the vertical enter, so it does not matter how wrong the heading is.
+pings and the vertical enter, so it does not matter how wrong the heading is. But the estimate is of the wrong DVL, too:
+that something is wrong is certain, what it is the check of the log tells better, which compares without an estimate.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.config import mount_matrix
+from rovgraph.check.dvl import dvl_and_imu
+from rovgraph.config import Config, mount_matrix
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.alarms.alarm import Statistic
 from rovgraph.estimators.alarms.evidence import Evidence
 from rovgraph.geometry import Array, cross, rotate, signed_permutations, transpose
+from rovgraph.log import Log
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 
 SUSPICIOUS = 0.1  # share of rejected pings from which on it is worth a look
@@ -27,17 +31,18 @@ SHIFTS_S = np.arange(-2.0, 2.01, 0.05)
 CLIPPED = 3.0  # times the median error, beyond which an error counts no more
 BETTER = 1.15  # times smaller an error than as configured
 ENOUGH = 50  # pings
+UNTIL_THEN = "until that is mended the track is wrong"
 
 
 def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
     """The axes or the clock that would make the DVL agree with the IMU, where many pings were rejected."""
-    best, seen = evidence.optimum, evidence.residuals.get("dvl")
-    if best is None or seen is None or np.mean(seen.weight <= 0.0) < SUSPICIOUS:
+    best, config = evidence.optimum, evidence.initial.config
+    if best is None or "dvl" not in best.blocks or np.mean(best.weights["dvl"] <= 0.0) < SUSPICIOUS:
         return
     compared = _Compared.of(best, best.blocks["dvl"])
     if compared is None:
         return
-    R_bs = mount_matrix(evidence.initial.config.dvl.mount_rpy_deg)
+    R_bs = mount_matrix(config.dvl.mount_rpy_deg)
     as_configured = compared.error(np.eye(3), R_bs, 0.0)
     orientations = signed_permutations()
     turned = [compared.error(H, R_bs, 0.0) for H in orientations]
@@ -53,7 +58,16 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
         remedy = f"correct the clock, or state calibration.dvl_time_offset: {entry}"
         figure, kind = as_configured / shifted[shift], "clock"
     text = f"{cause}; corrected, it agrees {figure:.1f} times better with the IMU"
-    yield Statistic(kind, "dvl", evidence.start, evidence.end, figure, BETTER, BETTER, text, remedy)
+    found = Statistic(kind, "dvl", evidence.start, evidence.end, figure, BETTER, BETTER, text, remedy)
+    yield _as_checked(found, evidence.log, config) if found.severity else found
+
+
+def _as_checked(found: Statistic, log: Log, config: Config) -> Statistic:
+    """With the line of the check, where it finds something."""
+    finding = next((finding for finding in dvl_and_imu(log, config) if finding.level != "ok"), None)
+    if finding is None:
+        return found
+    return replace(found, kind="clock" if finding.clock else "axes", cause=finding.text, remedy=UNTIL_THEN)
 
 
 class _Compared:

@@ -13,6 +13,7 @@ from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.attitude_gaps import AttitudeGap
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
+from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch
 
 MINUTE = 60.0  # [s]
@@ -51,6 +52,7 @@ class Evidence:
     intervals : of the estimates' keyframes
     optimum : of the smoothed estimate, where a batch solver found it
     frozen : what was left out since a sensor repeated itself
+    log : of the dive
     attitude_gaps : times without heading or tilt, of a dive without an IMU
     """
 
@@ -59,6 +61,7 @@ class Evidence:
     intervals: Sequence[KeyframeInterval]
     optimum: Optimum | None
     frozen: Sequence[FrozenStretch]
+    log: Log
     attitude_gaps: Sequence[AttitudeGap] = ()
 
     def estimate(self, kind: str) -> Estimate | None:
