@@ -397,6 +397,41 @@ def test_short_or_slow_zeros_are_a_standstill(sound):
     assert dvl_frozen_intervals(resting) == []
 
 
+@pytest.mark.parametrize("sensor", ["ahrs", "dvl", "dvl_heading"])
+def test_a_sensor_that_freezes_is_only_said_to_be_frozen(sensor):
+    """Neither that it disagrees with others, nor that it is logged faster than it measures."""
+
+    def freeze(data, time):
+        held = (time >= 40) & (time <= 140)
+        data[held] = data[held][0]
+
+    (said,) = messages(changed(dive(180.0, turning=0.3), sensor, freeze), sensor=sensor).split("\n")
+    assert said.startswith("exactly the same value for ")
+
+
+def test_a_dvl_that_repeats_each_ping_is_logged_too_fast(sound):
+    def repeat(data, time):
+        data[1::2] = data[: len(data[1::2]) * 2 : 2]
+
+    assert "50% of the measurements repeat the previous one exactly" in messages(changed(sound, "dvl", repeat))
+
+
+def test_bursts_are_said_to_be_bursts_and_have_no_gaps_in_between(sound):
+    """A serial buffer that is read once a second: five pings a millisecond apart."""
+    s = sound["dvl"]
+    late = np.ceil(s.time) + 1e-3 * (np.arange(len(s)) % 5)
+    log = replace(sound, streams={**sound.streams, "dvl": replace(s, time=np.sort(late))})
+    said = messages(log, sensor="dvl").split("\n")
+    assert sum("in bursts, most 0.001 s apart: they may be times of arrival" in line for line in said) == 1
+    assert not any("gap" in line or "time is not in seconds" in line for line in said)
+
+
+def test_spikes_of_the_depth_say_nothing_of_the_dvl(sound):
+    spikes = changed(sound, "depth", lambda data, _: data.__setitem__((slice(7, None, 13), 0), 65.536))
+    assert messages(spikes, sensor="dvl") == ""
+    assert "vertical velocity agrees with the change of depth (slope 1" in messages(spikes, level="ok")
+
+
 def test_invalid_zeros_are_not_frozen(sound):
     def lose(data, time):
         data[(time >= 100) & (time <= 120), :4] = 0.0

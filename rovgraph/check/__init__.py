@@ -23,6 +23,7 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
 from rovgraph.log import Log
+from rovgraph.log.frozen import without_frozen
 from rovgraph.sensors import Level
 
 __all__ = ["Finding", "Level", "Report", "Timing", "bridge_jumps", "examine", "warn"]
@@ -47,6 +48,7 @@ CHECKS: tuple[Check, ...] = (
     places,
     plan,
 )
+OF_MOTION = (headings, vertical, track)  # compare sensors where none is frozen
 
 
 def examine(log: Log, config: Config | None = None, examined: Examined | None = None) -> Report:
@@ -61,7 +63,8 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     config = Config() if config is None else config
     once = partial(dvl_and_imu, examined=examined)
     checks = [once if check is dvl_and_imu else check for check in CHECKS]
-    findings = [finding for check in checks for finding in check(log, config)]
+    moving, _ = without_frozen(log, config)
+    findings = [f for check in checks for f in check(moving if check in OF_MOTION else log, config)]
     return Report(log.source, [timing(stream) for stream in log.streams.values()], findings)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.check.correlation import Correlator
+from rovgraph.check.findings import without_spikes
 from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, exp_rotation, rotate, signed_permutations
@@ -29,8 +30,6 @@ LONGEST_PING_GAP = 2.5  # periods that are interpolated
 ENOUGH = 150  # even times
 ENOUGH_PINGS = 30
 BURST = 5  # pings that a serial buffer may hold back
-SPIKE = 6.0  # times the usual distance from the median of five pings
-LEAST_SPIKE = 0.1  # [m/s]
 CLIPPED = 4.0  # times the median difference, which counts no more
 PARTS = 10  # of the dive, each left out once to see how much a fit depends on it
 ITERATIONS = 4
@@ -334,13 +333,3 @@ def _all_within(flags: NDArray[np.bool_], half: int) -> NDArray[np.bool_]:
     out = np.zeros(len(flags), dtype=bool)
     out[half : len(flags) - half] = sums[2 * half + 1 :] - sums[: -2 * half - 1] == 2 * half + 1
     return out
-
-
-def without_spikes(pings: Stream) -> Stream:
-    """Pings that are near the median of the five around them."""
-    if len(pings) < 5:
-        return pings
-    padded = np.pad(pings.data[:, :3], ((2, 2), (0, 0)), mode="edge")
-    off = np.abs(pings.data[:, :3] - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1))
-    limit = np.maximum(LEAST_SPIKE, SPIKE * np.median(off, axis=0))
-    return pings.take(np.asarray((off <= limit).all(axis=1)))

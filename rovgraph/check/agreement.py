@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import Finding, integral, valid_pings
+from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
 from rovgraph.check.inertial import inertial_motion
 from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.config import Config, mount_matrix
@@ -216,7 +216,8 @@ def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Sign
     """Depth, the way downwards by a DVL with a mounting, and the window over which the two are compared [s]."""
     way = integral(pings, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
     window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
-    return Signal(log["depth"].time, log["depth"]["depth"]), Signal(pings.time, way), window
+    depth = without_spikes(log["depth"])
+    return Signal(depth.time, depth["depth"]), Signal(pings.time, way), window
 
 
 def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:

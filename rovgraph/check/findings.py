@@ -11,6 +11,9 @@ from rovgraph.geometry import Array
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import Level
 
+SPIKE = 6.0  # times the usual distance from the median of five
+LEAST_SPIKE = 0.1  # [m/s, m]
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -106,6 +109,17 @@ def told(stream: Stream) -> Array:
 def valid_pings(stream: Stream) -> Stream:
     """Pings with bottom lock."""
     return stream.take(stream["dvl_valid"] == 1.0)
+
+
+def without_spikes(stream: Stream) -> Stream:
+    """What is near the median of the five around it, in each of the first three columns."""
+    if len(stream) < 5:
+        return stream
+    padded = np.pad(stream.data[:, :3], ((2, 2), (0, 0)), mode="edge")
+    five = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
+    off = np.abs(stream.data[:, :3] - np.median(five, axis=-1))
+    limit = np.maximum(LEAST_SPIKE, SPIKE * np.median(off, axis=0))
+    return stream.take(np.asarray((off <= limit).all(axis=1)))
 
 
 def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

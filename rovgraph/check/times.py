@@ -10,6 +10,7 @@ from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import motion_model
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
+from rovgraph.log.frozen import MIN_SECONDS, equal_runs
 from rovgraph.sensors import SENSORS
 
 GAP_PERIODS = 5.0  # longer than this many periods is a gap
@@ -87,28 +88,43 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding(sensor, "warning", "only one measurement")
             continue
         low, high = SENSORS[sensor].usual_rates
-        if not low <= t.rate <= high:
+        mean, period = (t.count - 1) / (t.last - t.first), 1.0 / t.rate
+        if t.rate > high >= mean >= low:
+            bursts = f"{mean:.3g} Hz, but in bursts, most {period:.2g} s apart"
+            yield Finding(sensor, "warning", f"{bursts}: they may be times of arrival; log times of measurement")
+            periods = np.diff(stream.time)
+            period = float(np.median(periods[periods > 1.0 / mean]))
+        elif not low <= t.rate <= high:
             yield Finding(
                 sensor,
                 "warning",
                 f"{t.rate:.4g} Hz, expected {low:g} to {high:g}; "
                 "if time is not in seconds, state its unit, such as units: {time: ms}",
             )
-        yield from _gaps(log, config, t)
+        yield from _gaps(log, config, t, period)
         if sensor == "imu" and t.jitter * t.rate > 0.5:
             yield Finding(
                 sensor,
                 "warning",
-                f"times jitter by {t.jitter:.3g} s around a period of {1 / t.rate:.3g} s: "
+                f"times jitter by {t.jitter:.3g} s around a period of {period:.3g} s: "
                 "they may be times of arrival; log times of measurement",
             )
-        if sensor in ("imu", "mag", "dvl") and t.repeats > REPEATED * t.count and _moves(stream):
+        again = _repeated_for_a_moment(stream) / t.count if sensor in ("imu", "mag", "dvl") else 0.0
+        if again > REPEATED and _moves(stream):
             yield Finding(
                 sensor,
                 "warning",
-                f"{t.repeats / t.count:.0%} of the measurements repeat the previous one exactly: "
+                f"{again:.0%} of the measurements repeat the previous one exactly: "
                 "the log is written faster than the sensor measures; log each measurement once",
             )
+
+
+def _repeated_for_a_moment(stream: Stream) -> int:
+    """Measurements that repeat the one before, but for those of times in which the sensor may be frozen."""
+    values = told(stream)
+    first, last = equal_runs(values).T
+    known = ~np.isnan(values[first]).all(axis=1)
+    return int((last - first)[known & (stream.time[last] - stream.time[first] < MIN_SECONDS)].sum())
 
 
 def _moves(stream: Stream) -> bool:
@@ -116,11 +132,11 @@ def _moves(stream: Stream) -> bool:
     return bool((np.nanstd(values, axis=0) > 0).any()) if np.isfinite(values).any() else False
 
 
-def _gaps(log: Log, config: Config, t: Timing) -> Iterator[Finding]:
-    """Silences of sensors that sample all the time."""
+def _gaps(log: Log, config: Config, t: Timing, period: float) -> Iterator[Finding]:
+    """Silences of sensors that sample all the time, with a period [s], or a burst each."""
     if SENSORS[t.sensor].occasional or t.count < 3:
         return
-    limit = GAP_PERIODS / t.rate
+    limit = GAP_PERIODS * period
     periods = np.diff(log[t.sensor].time)
     longer = int((periods > limit).sum())
     if not longer:
