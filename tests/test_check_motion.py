@@ -91,6 +91,23 @@ def test_flipped_axes_are_said_to_be_no_mounting(k):
     assert "left-handed" in said(renamed(case.log, ORIENTATIONS[k]), case.config, "dvl")
 
 
+@pytest.mark.parametrize("sense", ["down", "up"])
+@pytest.mark.parametrize("bias", [0.0, 0.03])
+def test_earths_axes_are_named_whatever_the_bias_of_the_gyro(dive, sense, bias):
+    """North, east and down, or east, north and up; the bias turns the gyro's axes by up to 500 degrees."""
+    log, config = dive
+    motion = inertial_motion(log, config)
+    up_s = transpose(mount_matrix(config.imu.mount_rpy_deg)[None])[0] @ (0.0, 0.0, -1.0)
+    imu = log["imu"].data.copy()
+    imu[:, 3:] += bias * up_s
+    k = np.searchsorted(motion.time, log["dvl"].time).clip(max=len(motion.time) - 1)
+    along = rotate(motion.R_gb[k], rotate(mount_matrix(config.dvl.mount_rpy_deg), log["dvl"].data[:, :3]))
+    pings = log["dvl"].data.copy()
+    pings[:, :3] = along if sense == "down" else along[:, [1, 0, 2]] * (1.0, 1.0, -1.0)
+    told = said(altered(altered(log, "dvl", pings), "imu", imu), config, "dvl")
+    assert f"do not turn with the vehicle, {sense} being the third: Earth's" in told
+
+
 @pytest.mark.parametrize("seconds", [-0.5, 0.3, 3.2, 40.0])
 def test_a_dvl_that_is_stamped_late_is_measured_against_the_imu(dive, seconds):
     log, config = dive

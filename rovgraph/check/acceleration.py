@@ -36,6 +36,8 @@ ITERATIONS = 4
 SETTLED = 2e-3  # step that ends it [s, rad]
 LARGEST_STEP = 1.0  # that a fit leads away from where it began [s]
 ALWAYS = (-np.inf, np.inf)
+UNTURNED_SECONDS = 1200.0  # of a dive, that show whether the axes turn with the vehicle
+LARGEST_DRIFT = np.deg2rad(3.0)  # of the gyro about the vertical [rad/s]
 # priors of what `refine` fits: lag [s], rotation [rad], scale, lever arm [m], the accelerometer's bias [m/s^2]
 PRIOR_SD = np.array([10.0, 0.3, 0.3, 0.3, 0.05, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
 
@@ -85,6 +87,20 @@ class Fit:
     agreement: float
     error: float
     count: float
+
+
+@dataclass(frozen=True)
+class Unturned:
+    """Velocities along level axes that do not turn with the vehicle.
+
+    Attributes
+    ----------
+    agreement : as in `Search`, of their horizontal components
+    up : their z axis points up
+    """
+
+    agreement: float
+    up: bool
 
 
 @dataclass(frozen=True)
@@ -201,6 +217,31 @@ class Comparison:
         total = float((_square(measured) + _square(measured - left)).mean())
         return Fit(guess.lag, float(sd[0]), guess.R_bs, sd[1:4], 1.0 - error / total, error, len(left) / self.apart)
 
+    def unturned(self) -> Unturned | None:
+        """The velocities as if along level axes that do not turn with the vehicle; None if there is too little.
+
+        Heading of these axes, and how fast the gyro's turn by its bias, are what fits best.
+        """
+        i, j, seconds, middle = self._pairs(0.0)
+        usable = self._usable(i, j, 0.0, (-np.inf, self.pings.time[0] + UNTURNED_SECONDS))
+        if np.count_nonzero(usable) < ENOUGH_PINGS:
+            return None
+        R_gb, rate_b, way_g = self._inertial(self.pings.time)
+        arm_g = rotate(R_gb, cross(rate_b, np.broadcast_to(self.arm_b, rate_b.shape)))
+        swing, seen = ((v[j] - v[i]) / seconds for v in (arm_g, self.pings.data[:, :3]))
+        measured = (way_g[j] - way_g[i]) / seconds + swing - self._slow(middle, swing)
+        seen = seen - self._slow(middle, seen)
+        down_g = rotate(self.motion.R_gb, self.motion.down_b).mean(axis=0)
+        starboard_g = cross(down_g, np.eye(3)[0])
+        level = measured[usable] @ np.column_stack([cross(starboard_g, down_g), starboard_g]) @ (1.0, 1.0j)
+        horizontal, time = seen[usable, :2] @ (1.0, 1.0j), middle[usable] - middle[0]
+        rates = np.arange(-LARGEST_DRIFT, LARGEST_DRIFT, 1.0 / max(time[-1], 1.0))
+        turned = level * np.exp(1.0j * np.outer(rates, time))
+        shared = {up: np.abs(turned @ (horizontal if up else horizontal.conj())).max() for up in (False, True)}
+        up = bool(shared[True] > shared[False])
+        total = np.vdot(level, level).real + np.vdot(horizontal, horizontal).real
+        return Unturned(float(2.0 * shared[up] / max(total, 1e-12)), up)
+
     def _differences(
         self, guess: "_Guess", during: tuple[float, float]
     ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
@@ -217,9 +258,7 @@ class Comparison:
         usable : ndarray of bool, shape (m,)
         """
         stamps = self.pings.time
-        i = np.arange(len(stamps) - self.apart)
-        j = i + self.apart
-        seconds = (stamps[j] - stamps[i])[:, None]
+        i, j, seconds, _ = self._pairs(guess.lag)
         z = guess.scale * rotate(guess.R_bs, self.pings.data[:, :3])
         arms = np.broadcast_to(self.arm_b + guess.arm_b, z.shape)
 
@@ -244,10 +283,24 @@ class Comparison:
         J = np.stack([later, *turned, change(rotate(R_gb, z)), *swing], axis=2)
         left, measured = difference(guess.lag)
         left = left - rotate(biased, guess.bias_b)
-        known = self._known(when)
-        usable = known[i] & known[j] & (stamps[i] >= during[0]) & (stamps[j] <= during[1])
-        usable &= seconds[:, 0] < self.apart * self.period + self.longest
+        usable = self._usable(i, j, guess.lag, during)
         return left, np.concatenate([J, biased], axis=2), measured, usable
+
+    def _pairs(self, lag: float) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+        """Pings and those after them, the time between, shape (m, 1), and its middle, of stamps that are late [s]."""
+        stamps = self.pings.time
+        i = np.arange(len(stamps) - self.apart)
+        j = i + self.apart
+        return i, j, (stamps[j] - stamps[i])[:, None], 0.5 * (stamps[i] + stamps[j]) - lag
+
+    def _usable(
+        self, i: NDArray[np.int64], j: NDArray[np.int64], lag: float, during: tuple[float, float]
+    ) -> NDArray[np.bool_]:
+        """Which pairs lie within a time, without a gap of either sensor; shape (m,)."""
+        stamps = self.pings.time
+        known = self._known(stamps - lag)
+        within = known[i] & known[j] & (stamps[i] >= during[0]) & (stamps[j] <= during[1])
+        return np.asarray(within & (stamps[j] - stamps[i] < self.apart * self.period + self.longest))
 
     def _solved(self, J: Array, left: Array, guess: "_Guess", prior_sd: Array) -> tuple[Array, Array]:
         """Step and standard deviations (11,), these by leaving out one part after the other."""

@@ -37,6 +37,9 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
     if jump is not None:
         yield jump.finding(log)
         return
+    if (earth := _earth_axes(compared, found)) is not None:
+        yield earth
+        return
     k, m = _explanation(found)
     if found.agreement[k, m] < FOLLOWS:
         yield Finding("dvl", "ok", "too little acceleration to compare its axes and clock with the IMU")
@@ -49,6 +52,19 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
     better = found.error[0, found.now] / found.error[k, m]
     yield _mounting(config, k, fit, f"corrected, its acceleration agrees {better:.1f} times better with the IMU's")
     yield _clock(config, compared, ORIENTATIONS[k], fit, float(found.lags[m]))
+
+
+def _earth_axes(compared: Comparison, found: Search) -> Finding | None:
+    """Whether the velocities are along Earth's axes."""
+    unturned, best = compared.unturned(), float(found.agreement.max())
+    if unturned is None or unturned.agreement < FOLLOWS or 1.0 - best < BETTER * (1.0 - unturned.agreement):
+        return None
+    text = (
+        f"its velocities are along axes that do not turn with the vehicle, {'up' if unturned.up else 'down'} being "
+        f"the third: Earth's; so taken they agree with the IMU's acceleration (agreement {unturned.agreement:.2f}, "
+        f"along the vehicle's {best:.2f}): log the DVL's own axes (instrument or ship coordinates)"
+    )
+    return Finding("dvl", "warning", text)
 
 
 def _explanation(found: Search) -> tuple[int, int]:
