@@ -11,7 +11,7 @@ from rovgraph.check.acceleration import ORIENTATIONS
 from rovgraph.check.inertial import inertial_motion
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import DataWarning
-from rovgraph.geometry import rotate, transpose
+from rovgraph.geometry import matrix_from_rpy, rotate, transpose
 from rovgraph.log import Log
 from rovgraph.simulate import CALM, Style
 
@@ -105,7 +105,15 @@ def test_earths_axes_are_named_whatever_the_bias_of_the_gyro(dive, sense, bias):
     pings = log["dvl"].data.copy()
     pings[:, :3] = along if sense == "down" else along[:, [1, 0, 2]] * (1.0, 1.0, -1.0)
     told = said(altered(altered(log, "dvl", pings), "imu", imu), config, "dvl")
-    assert f"do not turn with the vehicle, {sense} being the third: Earth's" in told
+    assert "along axes that do not turn with the vehicle, as Earth's" in told
+
+
+@pytest.mark.parametrize("scenario", ["straight", "square"])
+def test_a_turned_mounting_is_not_taken_for_earths_axes(scenario):
+    """Where the vehicle hardly turns, axes that turn with it and axes that do not are alike."""
+    case = simulated(falcon(), 120.0, 4, scenario, style=LEVEL)
+    H = matrix_from_rpy(np.array([0.0, 0.0, np.deg2rad(45.0)]))
+    assert "do not turn" not in said(renamed(case.log, H), case.config, "dvl")
 
 
 @pytest.mark.parametrize("seconds", [-0.5, 0.3, 3.2, 40.0])

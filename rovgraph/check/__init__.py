@@ -48,7 +48,7 @@ CHECKS: tuple[Check, ...] = (
     places,
     plan,
 )
-OF_MOTION = (headings, vertical, track)  # compare sensors where none is frozen
+MOTION_CHECKS = (headings, vertical, track)
 
 
 def examine(log: Log, config: Config | None = None, examined: Examined | None = None) -> Report:
@@ -61,11 +61,20 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     examined : what `bridge_jumps` knows of the log with this configuration
     """
     config = Config() if config is None else config
-    once = partial(dvl_and_imu, examined=examined)
-    checks = [once if check is dvl_and_imu else check for check in CHECKS]
-    moving, _ = without_frozen(log, config)
-    findings = [f for check in checks for f in check(moving if check in OF_MOTION else log, config)]
+    unfrozen, frozen = without_frozen(log, config)
+    known: dict[Check, Check] = {
+        dvl_and_imu: partial(dvl_and_imu, examined=examined),
+        standstill: partial(standstill, frozen=frozen),
+        **{check: partial(_of_motion, check, unfrozen) for check in MOTION_CHECKS if frozen},
+    }
+    findings = [finding for check in CHECKS for finding in known.get(check, check)(log, config)]
     return Report(log.source, [timing(stream) for stream in log.streams.values()], findings)
+
+
+def _of_motion(check: Check, unfrozen: Log, log: Log, config: Config) -> Iterator[Finding]:
+    """What a comparison of motions finds without the values that are frozen: a late clock makes values seem so."""
+    found = [*check(log, config)]
+    yield from found if any(f.clock and f.level != "ok" for f in found) else check(unfrozen, config)
 
 
 def warn(log: Log, config: Config | None = None, examined: Examined | None = None) -> None:

@@ -36,7 +36,7 @@ ITERATIONS = 4
 SETTLED = 2e-3  # step that ends it [s, rad]
 LARGEST_STEP = 1.0  # that a fit leads away from where it began [s]
 ALWAYS = (-np.inf, np.inf)
-UNTURNED_SECONDS = 1200.0  # of a dive, that show whether the axes turn with the vehicle
+TURNING_SECONDS = 1200.0  # of a dive, the liveliest, that show whether the axes turn with the vehicle
 LARGEST_DRIFT = np.deg2rad(3.0)  # of the gyro about the vertical [rad/s]
 # priors of what `refine` fits: lag [s], rotation [rad], scale, lever arm [m], the accelerometer's bias [m/s^2]
 PRIOR_SD = np.array([10.0, 0.3, 0.3, 0.3, 0.05, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
@@ -90,17 +90,16 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Unturned:
-    """Velocities along level axes that do not turn with the vehicle.
+class Turning:
+    """Horizontal velocities along axes that turn with the vehicle, and along axes that do not.
 
     Attributes
     ----------
-    agreement : as in `Search`, of their horizontal components
-    up : their z axis points up
+    with_vehicle, not_at_all : agreement as in `Search`
     """
 
-    agreement: float
-    up: bool
+    with_vehicle: float
+    not_at_all: float
 
 
 @dataclass(frozen=True)
@@ -217,30 +216,39 @@ class Comparison:
         total = float((_square(measured) + _square(measured - left)).mean())
         return Fit(guess.lag, float(sd[0]), guess.R_bs, sd[1:4], 1.0 - error / total, error, len(left) / self.apart)
 
-    def unturned(self) -> Unturned | None:
-        """The velocities as if along level axes that do not turn with the vehicle; None if there is too little.
+    def turning(self) -> Turning | None:
+        """Whether the velocities are along axes that turn with the vehicle, by their horizontal components.
 
-        Heading of these axes, and how fast the gyro's turn by its bias, are what fits best.
+        Both ways the heading of the axes, their sense and how fast the gyro's turn by its bias are what fits best.
+        None = there is too little.
         """
         i, j, seconds, middle = self._pairs(0.0)
-        usable = self._usable(i, j, 0.0, (-np.inf, self.pings.time[0] + UNTURNED_SECONDS))
+        usable = self._usable(i, j, 0.0, ALWAYS)
         if np.count_nonzero(usable) < ENOUGH_PINGS:
             return None
         R_gb, rate_b, way_g = self._inertial(self.pings.time)
-        arm_g = rotate(R_gb, cross(rate_b, np.broadcast_to(self.arm_b, rate_b.shape)))
-        swing, seen = ((v[j] - v[i]) / seconds for v in (arm_g, self.pings.data[:, :3]))
-        measured = (way_g[j] - way_g[i]) / seconds + swing - self._slow(middle, swing)
-        seen = seen - self._slow(middle, seen)
-        down_g = rotate(self.motion.R_gb, self.motion.down_b).mean(axis=0)
-        starboard_g = cross(down_g, np.eye(3)[0])
-        level = measured[usable] @ np.column_stack([cross(starboard_g, down_g), starboard_g]) @ (1.0, 1.0j)
-        horizontal, time = seen[usable, :2] @ (1.0, 1.0j), middle[usable] - middle[0]
-        rates = np.arange(-LARGEST_DRIFT, LARGEST_DRIFT, 1.0 / max(time[-1], 1.0))
-        turned = level * np.exp(1.0j * np.outer(rates, time))
-        shared = {up: np.abs(turned @ (horizontal if up else horizontal.conj())).max() for up in (False, True)}
-        up = bool(shared[True] > shared[False])
-        total = np.vdot(level, level).real + np.vdot(horizontal, horizontal).real
-        return Unturned(float(2.0 * shared[up] / max(total, 1e-12)), up)
+        swing_g = rotate(R_gb, cross(rate_b, np.broadcast_to(self.arm_b, rate_b.shape)))
+        along = _level_axes(rotate(self.motion.R_gb, self.motion.down_b).mean(axis=0)) @ (1.0, 1.0j)
+        heading = np.exp(1.0j * np.unwrap(np.angle(R_gb[:, :, 0] @ along)))
+
+        def change(v: Array) -> Array:
+            return np.asarray((v[j] - v[i]) / seconds)
+
+        swing = change(swing_g)
+        measured = (change(way_g) + swing - self._slow(middle, swing)) @ along
+        part = _liveliest(middle, np.abs(measured) ** 2 * usable, TURNING_SECONDS) & usable
+        own, time = measured[part], middle[part] - middle[part][0]
+        gyro = np.exp(1.0j * np.outer(np.arange(-LARGEST_DRIFT, LARGEST_DRIFT, 1.0 / max(time[-1], 1.0)), time))
+
+        def agreement(v: NDArray[np.complexfloating]) -> float:
+            changes = change(np.column_stack([v.real, v.imag]))
+            seen = (changes - self._slow(middle, changes))[part] @ (1.0, 1.0j)
+            total = float(np.vdot(own, own).real + np.vdot(seen, seen).real)
+            return float(2.0 * np.abs((gyro * own) @ seen.conj()).max() / max(total, 1e-12))
+
+        y = self.pings.data[:, 0] + 1.0j * self.pings.data[:, 1]
+        senses = y, y.conj()
+        return Turning(max(agreement(v * heading) for v in senses), max(agreement(v) for v in senses))
 
     def _differences(
         self, guess: "_Guess", during: tuple[float, float]
@@ -361,6 +369,19 @@ class Comparison:
 
     def _averaged(self, values: Array) -> Array:
         return _boxed(values, self.half)
+
+
+def _level_axes(down: Array) -> Array:
+    """Two level axes, the second to starboard of the first, as columns, shape (3, 2)."""
+    other = cross(down, np.eye(3)[np.argmin(np.abs(down))])
+    starboard = other / np.linalg.norm(other)
+    return np.column_stack([cross(starboard, down / np.linalg.norm(down)), starboard])
+
+
+def _liveliest(time: Array, power: Array, seconds: float) -> NDArray[np.bool_]:
+    """Which of n times lie in the piece of a length [s] that has the most power."""
+    piece = ((time - time[0]) // seconds).astype(np.int64)
+    return np.asarray(piece == np.argmax(np.bincount(piece, power)))
 
 
 def _period(time: Array) -> float:

@@ -56,13 +56,16 @@ def dvl_and_imu(log: Log, config: Config, examined: Examined | None = None) -> I
 
 def _earth_axes(compared: Comparison, found: Search) -> Finding | None:
     """Whether the velocities are along Earth's axes."""
-    unturned, best = compared.unturned(), float(found.agreement.max())
-    if unturned is None or unturned.agreement < FOLLOWS or 1.0 - best < BETTER * (1.0 - unturned.agreement):
+    turning, best = compared.turning(), float(found.agreement.max())
+    if turning is None or turning.not_at_all < FOLLOWS:
+        return None
+    best = max(best, turning.with_vehicle)
+    if 1.0 - best < BETTER * (1.0 - turning.not_at_all):
         return None
     text = (
-        f"its velocities are along axes that do not turn with the vehicle, {'up' if unturned.up else 'down'} being "
-        f"the third: Earth's; so taken they agree with the IMU's acceleration (agreement {unturned.agreement:.2f}, "
-        f"along the vehicle's {best:.2f}): log the DVL's own axes (instrument or ship coordinates)"
+        "its velocities are along axes that do not turn with the vehicle, as Earth's: so taken they agree with the "
+        f"IMU's acceleration (agreement {turning.not_at_all:.2f}, {best:.2f} along the vehicle's): log the DVL's own "
+        "axes (instrument or ship coordinates)"
     )
     return Finding("dvl", "warning", text)
 

@@ -1,6 +1,6 @@
 """Sensors that repeat themselves although the vehicle moves: what an estimate leaves out."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from rovgraph.check.findings import Finding, since
 from rovgraph.config import Config
@@ -10,10 +10,10 @@ from rovgraph.log.frozen import FrozenStretch, frozen_stretches
 SHOWN = 5  # of one sensor, one by one
 
 
-def standstill(log: Log, config: Config) -> Iterator[Finding]:
-    """Times in which a sensor repeats itself."""
+def standstill(log: Log, config: Config, frozen: Sequence[FrozenStretch] | None = None) -> Iterator[Finding]:
+    """Times in which a sensor repeats itself; ``frozen`` are those of the log, where they are known."""
     by_sensor: dict[str, list[FrozenStretch]] = {}
-    for stretch in frozen_stretches(log, config):
+    for stretch in frozen_stretches(log, config) if frozen is None else frozen:
         by_sensor.setdefault(stretch.sensor, []).append(stretch)
     for sensor, found in by_sensor.items():
         for s in found[:SHOWN]:

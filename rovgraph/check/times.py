@@ -10,10 +10,14 @@ from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import motion_model
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
-from rovgraph.log.frozen import MIN_SECONDS, equal_runs
+from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, equal_runs
 from rovgraph.sensors import SENSORS
 
 GAP_PERIODS = 5.0  # longer than this many periods is a gap
+BURST = 0.3  # of the mean period, below which most periods lie within bursts
+BURSTS = 0.1  # of all periods, at least, that lie between bursts
+REGULAR = 0.5  # spread of these, as a part of their median
+ENOUGH_PERIODS = 20
 REPEATED = 0.2  # share of repeated samples that a sensor does not produce by itself
 
 
@@ -88,12 +92,11 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding(sensor, "warning", "only one measurement")
             continue
         low, high = SENSORS[sensor].usual_rates
-        mean, period = (t.count - 1) / (t.last - t.first), 1.0 / t.rate
-        if t.rate > high >= mean >= low:
-            bursts = f"{mean:.3g} Hz, but in bursts, most {period:.2g} s apart"
+        period = _burst_period(stream)
+        if period is not None:
+            mean = (t.count - 1) / (t.last - t.first)
+            bursts = f"{mean:.3g} Hz, but in bursts, most {1.0 / t.rate:.2g} s apart"
             yield Finding(sensor, "warning", f"{bursts}: they may be times of arrival; log times of measurement")
-            periods = np.diff(stream.time)
-            period = float(np.median(periods[periods > 1.0 / mean]))
         elif not low <= t.rate <= high:
             yield Finding(
                 sensor,
@@ -101,12 +104,12 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
                 f"{t.rate:.4g} Hz, expected {low:g} to {high:g}; "
                 "if time is not in seconds, state its unit, such as units: {time: ms}",
             )
-        yield from _gaps(log, config, t, period)
-        if sensor == "imu" and t.jitter * t.rate > 0.5:
+        yield from _gaps(log, config, t, period or 1.0 / t.rate)
+        if sensor == "imu" and period is None and t.jitter * t.rate > 0.5:
             yield Finding(
                 sensor,
                 "warning",
-                f"times jitter by {t.jitter:.3g} s around a period of {period:.3g} s: "
+                f"times jitter by {t.jitter:.3g} s around a period of {1 / t.rate:.3g} s: "
                 "they may be times of arrival; log times of measurement",
             )
         again = _repeated_for_a_moment(stream) / t.count if sensor in ("imu", "mag", "dvl") else 0.0
@@ -119,12 +122,27 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
             )
 
 
+def _burst_period(stream: Stream) -> float | None:
+    """Time between bursts of a sensor that samples all the time [s]; None where its measurements come one by one."""
+    periods = np.diff(stream.time)
+    if SENSORS[stream.sensor].occasional or len(periods) < ENOUGH_PERIODS:
+        return None
+    between = periods[periods > periods.mean()]
+    if np.median(periods) > BURST * periods.mean() or len(between) < BURSTS * len(periods):
+        return None
+    low, high = np.percentile(between, [10, 90])
+    usual = float(np.median(between))
+    return usual if high - low < REGULAR * usual else None
+
+
 def _repeated_for_a_moment(stream: Stream) -> int:
     """Measurements that repeat the one before, but for those of times in which the sensor may be frozen."""
     values = told(stream)
     first, last = equal_runs(values).T
     known = ~np.isnan(values[first]).all(axis=1)
-    return int((last - first)[known & (stream.time[last] - stream.time[first] < MIN_SECONDS)].sum())
+    again, seconds = (last - first)[known], (stream.time[last] - stream.time[first])[known]
+    long = (again + 1 >= MIN_REPEATS * np.median(again + 1)) & (seconds >= MIN_SECONDS) if len(again) else again > 0
+    return int(again[~long].sum())
 
 
 def _moves(stream: Stream) -> bool:

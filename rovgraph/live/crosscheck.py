@@ -36,11 +36,11 @@ class Crosscheck:
     Attributes
     ----------
     config : what is believed of mountings and of stamps that are known to be late
-    dvl_misread : the newest windows show that the DVL's axes or clock are wrong
+    dvl_contradicted : the IMU's acceleration contradicts the DVL's axes or clock in the newest window
     """
 
     config: Config
-    dvl_misread: bool = False
+    dvl_contradicted: bool = False
     _window: dict[str, Stream] = field(default_factory=dict)
     _newest: list[Measurement] = field(default_factory=list)  # since the last comparison
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
@@ -94,8 +94,10 @@ class Crosscheck:
         now = float(log["imu"].time[-1])
         start = min(float(stream.time[0]) for stream in log.streams.values())
         used, found = heading_sources(self.config, log.sensors), dict[tuple[str, str], Finding]()
+        self.dvl_contradicted = False
         for check in CHECKS:
             for f in check(log, self.config):
+                self.dvl_contradicted |= check is dvl_and_imu and f.level != "ok"
                 whole = check is not vertical and (f.sensor in used or f.sensor not in HEADING_STREAMS)
                 if f.level != "ok" and (f.clock or whole):
                     found.setdefault((f.sensor, f.clock or check.__name__), f)
@@ -104,12 +106,10 @@ class Crosscheck:
         late = {f.sensor for f in found.values() if f.clock}  # which explains what else disagrees
         found = {key: f for key, f in found.items() if f.clock or f.sensor not in late}
         suspected = {key: self._suspected.get(key, 0) + 1 for key in found}
-        kinds = {key: "clock" if finding.clock else "check" for key, finding in found.items()}
-        sure = [key for key, kind in kinds.items() if suspected[key] >= IN_A_ROW[kind]]
-        self.dvl_misread = any(sensor == "dvl" for sensor, _ in sure)
-        for key in sure:
-            if now - self._said.get(key, -math.inf) > AGAIN_S:
-                self._said[key], finding, kind = now, found[key], kinds[key]
+        for key, finding in found.items():
+            kind = "clock" if finding.clock else "check"
+            if suspected[key] >= IN_A_ROW[kind] and now - self._said.get(key, -math.inf) > AGAIN_S:
+                self._said[key] = now
                 zero = f"; 0 s is {start:.1f} s" if finding.clock == "jump" else ""
                 yield Event(now, finding.sensor, kind, f"{finding.text}{zero}")
         self._suspected = suspected

@@ -316,7 +316,7 @@ class Navigator:
         if engine.marks and engine.marks[-1] is not before:
             waited = 0.0
             if self._reinitialisations is not None:
-                waited = self._reinitialisations.step(engine, self._crosscheck.dvl_misread)
+                waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted)
                 if (adopted := self._reinitialisations.adopted) is not None:
                     self.alarms.reinitialised(adopted)
                     self._reinitialisations.adopted = None

@@ -82,14 +82,14 @@ class Reinitialisations:
         if self._due:
             self._passed.append(_keyframe(snapshot))
 
-    def step(self, engine: FixedLag, dvl_misread: bool) -> float:
+    def step(self, engine: FixedLag, dvl_contradicted: bool) -> float:
         """After a keyframe of the engine; the time waited for the thread, as only a fast replay does [s].
 
-        ``dvl_misread`` is as of `_smoothed`.
+        ``dvl_contradicted`` has the meaning that it has in `_smoothed`.
         """
         before = self.waited
         if self._running is None and self._due:
-            self._begin(engine, dvl_misread)
+            self._begin(engine, dvl_contradicted)
         if self._running is not None:
             try:
                 self._adopt(engine, *self._running)
@@ -107,7 +107,7 @@ class Reinitialisations:
         self._due, self._passed, self._running = [], [], None
         self._thread.shutdown(wait=False, cancel_futures=True)
 
-    def _begin(self, engine: FixedLag, dvl_misread: bool) -> None:
+    def _begin(self, engine: FixedLag, dvl_contradicted: bool) -> None:
         """Have the dive up to the oldest keyframe smoothed that the filter can go on from, if it is time to."""
         oldest = engine.oldest()
         first = self._passed[0][0] if self._passed else engine.marks[0].interval
@@ -115,7 +115,7 @@ class Reinitialisations:
             return
         waiting = [_keyframe(mark) for mark in engine.marks if mark.interval.index <= oldest.interval.index]
         keyframes = [*self._passed, *waiting]
-        work = self._thread.submit(_smoothed, engine.filter, keyframes, self._shown, dvl_misread)
+        work = self._thread.submit(_smoothed, engine.filter, keyframes, self._shown, dvl_contradicted)
         self._running = oldest.interval.index, work
 
     def _adopt(self, engine: FixedLag, index: int, future: "Future[_Smoothed]") -> None:
@@ -146,21 +146,23 @@ def _keyframe(snapshot: FilterSnapshot) -> Keyframe:
 
 
 def _smoothed(
-    engine: FilterEngine, keyframes: Sequence[Keyframe], before: list[Statistic], dvl_misread: bool
+    engine: FilterEngine, keyframes: Sequence[Keyframe], before: list[Statistic], dvl_contradicted: bool
 ) -> _Smoothed:
     """The newest of some keyframes, from all data so far, and what these show.
 
     Parameters
     ----------
     before : what fewer keyframes have shown
-    dvl_misread : the DVL's axes or clock are wrong, which looks like noise, and like another place of it
+    dvl_contradicted : the DVL's axes or clock are wrong, which looks like noise and like another place of the DVL
     """
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
     known, best = reinitialised(engine, [interval for interval, _, _ in keyframes], states)
-    return known, _shown(best, engine.initial, before, dvl_misread)
+    return known, _shown(best, engine.initial, before, dvl_contradicted)
 
 
-def _shown(best: Optimum, initial: InitialConditions, before: list[Statistic], dvl_misread: bool) -> list[Statistic]:
+def _shown(
+    best: Optimum, initial: InitialConditions, before: list[Statistic], dvl_contradicted: bool
+) -> list[Statistic]:
     """What is held wrongly, or not stated, by the smoothed dive so far."""
     begin, end = best.intervals[0].time, best.intervals[-1].time
     if end - begin < EXAMINED_FROM_S:
@@ -176,7 +178,7 @@ def _shown(best: Optimum, initial: InitialConditions, before: list[Statistic], d
     with suppress(InputError, np.linalg.LinAlgError):
         if end - begin > SEARCHED_UNTIL_S:
             noise += [one for one in before if one.kind == "unstated"]
-        elif config.graph.find_noise and isinstance(best, ChainOptimum) and not dvl_misread:
+        elif config.graph.find_noise and isinstance(best, ChainOptimum) and not dvl_contradicted:
             rivals = [*held] if config.environment.earth_rotation else [*held, earth_rate_of(bias_sd, begin, end)]
             noise += unstated(best, config, find_alarms(rivals, begin))
     found = {one.sensor for one in noise}  # likelier than what is held

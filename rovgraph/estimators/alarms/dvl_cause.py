@@ -6,8 +6,8 @@ two pings,
     v_b(t) - R_b(t)b(t-T) v_b(t-T) = R_b(t)n (integral of R_nb f_b + g),  v_b = R_bs H z - w x l
 
 holds for the right signed permutation H of the DVL's axes and the right shift of its stamps. Only turns between the
-pings and the vertical enter, so it does not matter how wrong the heading is. But the estimate is of the wrong DVL, too:
-that something is wrong is certain, what it is the check of the log tells better, which compares without an estimate.
+pings and the vertical enter, so it does not matter how wrong the heading is. But the estimate comes of the wrong DVL.
+The check of the log compares without an estimate, so its line is given where it finds something.
 """
 
 from collections.abc import Iterator
@@ -63,11 +63,12 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
 
 
 def _as_checked(found: Statistic, log: Log, config: Config) -> Statistic:
-    """With the line of the check, where it finds something."""
-    finding = next((finding for finding in dvl_and_imu(log, config) if finding.level != "ok"), None)
-    if finding is None:
+    """With what the check finds, where it finds something."""
+    findings = [finding for finding in dvl_and_imu(log, config) if finding.level != "ok"]
+    if not findings:
         return found
-    return replace(found, kind="clock" if finding.clock else "axes", cause=finding.text, remedy=UNTIL_THEN)
+    kind, cause = "clock" if findings[0].clock else "axes", "; ".join(finding.text for finding in findings)
+    return replace(found, kind=kind, cause=cause, remedy=UNTIL_THEN)
 
 
 class _Compared:
