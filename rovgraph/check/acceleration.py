@@ -236,7 +236,7 @@ class Comparison:
 
         swing = change(swing_g)
         measured = (change(way_g) + swing - self._slow(middle, swing)) @ along
-        part = _liveliest(middle, np.abs(measured) ** 2 * usable, TURNING_SECONDS) & usable
+        part = _liveliest(middle, usable * (1e-12 + np.abs(measured) ** 2), TURNING_SECONDS) & usable
         own, time = measured[part], middle[part] - middle[part][0]
         gyro = np.exp(1.0j * np.outer(np.arange(-LARGEST_DRIFT, LARGEST_DRIFT, 1.0 / max(time[-1], 1.0)), time))
 
