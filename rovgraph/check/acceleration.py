@@ -219,7 +219,8 @@ class Comparison:
     def turning(self) -> Turning | None:
         """Whether the velocities are along axes that turn with the vehicle, by their horizontal components.
 
-        Both ways the heading of the axes, their sense and how fast the gyro's turn by its bias are what fits best.
+        Changes of velocity between pings are compared with the IMU's as in `_differences`, along level axes. Either
+        way the heading of the DVL's axes, their sense and the gyro's drift by its bias are those that fit best.
         None = there is too little.
         """
         i, j, seconds, middle = self._pairs(0.0)

@@ -140,9 +140,11 @@ def _repeated_for_a_moment(stream: Stream) -> int:
     values = told(stream)
     first, last = equal_runs(values).T
     known = ~np.isnan(values[first]).all(axis=1)
-    again, seconds = (last - first)[known], (stream.time[last] - stream.time[first])[known]
-    long = (again + 1 >= MIN_REPEATS * np.median(again + 1)) & (seconds >= MIN_SECONDS) if len(again) else again > 0
-    return int(again[~long].sum())
+    if not known.any():
+        return 0
+    counts, seconds = (last - first + 1)[known], (stream.time[last] - stream.time[first])[known]
+    frozen = (counts >= MIN_REPEATS * np.median(counts)) & (seconds >= MIN_SECONDS)
+    return int((counts - 1)[~frozen].sum())
 
 
 def _moves(stream: Stream) -> bool:
