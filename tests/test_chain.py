@@ -96,6 +96,7 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
     """A dive, solved by both until neither moves any more."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
+        patch.setattr(gauss_newton, "REST", EXACT)
         dive = batch(*SCENARIOS[request.param]())
         b = dive.initial
         states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
@@ -193,6 +194,7 @@ def test_both_move_alike_when_a_constant_is_considered(solved):
     constant = [name for name, walk in chain.unknowns.walks.items() if not walk]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
+        patch.setattr(gauss_newton, "REST", EXACT)
         a, b = (best.considering(constant[:1]) for best in solved)
         again = [one.estimating(constant[:1]) for one in (a, b)]
     assert a.solution.cost == pytest.approx(b.solution.cost, rel=1e-6)

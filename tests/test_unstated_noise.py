@@ -144,7 +144,7 @@ def test_an_error_of_next_to_nothing_explains_nothing_where_the_dive_has_shown_w
     with_error = best.unknowns.with_lasting(replace(known, estimate=True, walk=stationary_walk(1e-5, 30.0)))
     assert {*best.unknowns.estimated} < {*with_error.estimated} and with_error.considered == best.unknowns.considered
     assert find_lasting(best) == []
-    root = best.chain.eliminate(best.state, best.solution.gates)
+    root = best.chain.eliminate(best.linearised_at, best.solution.gates)
     assert best.linear == pytest.approx((root.log_determinant(), root.left), rel=1e-9)
 
 
@@ -197,9 +197,9 @@ def test_times_in_which_everything_was_rejected_do_not_count_as_agreement():
 
 def test_gains_of_constants_by_one_elimination_are_those_of_each_by_itself(correlated):
     best = batch(correlated[0].log, correlated[1]).optimum()
-    chain, solution, now = best.chain, best.solution, _Baseline(best.chain, best.solution, *best.linear)
+    chain, now = best.chain, _Baseline.of(best)
     names = ["dvl_scale", "gyr_scale", *(n for n, walk in chain.unknowns.walks.items() if walk == 0.0)]
-    constants = LinearConstants.of(chain, solution, names)
+    constants = LinearConstants.of(chain, now.solution, names)
     for name in names:
         for sd in (0.5 * chain.beliefs[name].sd, 10.0 * chain.beliefs[name].sd):
             assert constants.gain({name: sd}) == pytest.approx(now.linear_gain(name, sd, np.inf), abs=1e-6)

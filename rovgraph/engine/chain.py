@@ -221,7 +221,7 @@ class Chain:
     def step(self, point: State, gates: Gates) -> ChainStep:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
         root = self.eliminate(point, gates)
-        return ChainStep(*root.solve(), root.explained)
+        return ChainStep(*root.solve(), root.explained())
 
     def promised(self, step: ChainStep) -> float:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""

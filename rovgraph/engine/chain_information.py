@@ -108,16 +108,43 @@ class SquareRoot:
         ndarray, shape (n, d), of the keyframes
         ndarray, shape (c,), of the border
         """
-        free, y = len(self.border) - held, np.zeros((len(self.border), 1))
-        y[:free, 0] = _solve_upper(self.border[:free, :free], self.border[:free, -1])
-        x = self.conditionals[:, :, -1:].copy()
-        chain_posterior.back_substitute(self.conditionals, y, x)
-        return x[..., 0], y[:, 0]
+        free, y = len(self.border) - held, np.zeros(len(self.border))
+        y[:free] = _solve_upper(self.border[:free, :free], self.border[:free, -1])
+        return self.followed(y), y
 
-    @property
-    def explained(self) -> float:
-        """Half of what the minimum takes off the sum of squares; of all conditionals."""
-        z, z_y = self.conditionals[:, :, -1], self.border[:, -1]
+    def followed(self, y: Array) -> Array:
+        """Keyframes where the sum of squares is least with a border of shape (c,), shape (n, d)."""
+        x = self.conditionals[:, :, -1:].copy()
+        chain_posterior.back_substitute(self.conditionals, y[:, None], x)
+        return x[..., 0]
+
+    def border_with(self, free: Index, y: Array, score: Array | None = None) -> Array:
+        """The border where the sum of squares is least.
+
+        Parameters
+        ----------
+        free : components that may move
+        y : ndarray, shape (c,), the others, which are held
+        score : ndarray, shape (c,), log likelihood of a unit of each beyond that of the rows
+        """
+        out, R, z = y.copy(), self.border[:, :-1], self.border[:, -1]
+        out[free] = 0.0
+        Q, own = np.linalg.qr(R[:, free])
+        rest = Q.T @ (z - R @ out)
+        if score is not None:
+            rest += np.linalg.solve(own.T, score[free])
+        out[free] = _solve_upper(own, rest)
+        return out
+
+    def move_to(self, y: Array) -> None:
+        """Count errors from `followed` keyframes and a border y, in place."""
+        self.conditionals[:, :, -1] = 0.0
+        self.border[:, -1] -= self.border[:, :-1] @ y
+
+    def explained(self, held: int = 0) -> float:
+        """Half of what the minimum takes off the sum of squares, the border's last components held; of all
+        conditionals."""
+        z, z_y = self.conditionals[:, :, -1], self.border[: len(self.border) - held, -1]
         return 0.5 * float(np.sum(z * z) + z_y @ z_y)
 
     @cached_property

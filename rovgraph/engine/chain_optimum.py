@@ -8,9 +8,10 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.config import beliefs as beliefs_of
+from rovgraph.engine import gauss_newton
 from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
-from rovgraph.engine.chain_layout import COLUMNS, MOTION
+from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING
 from rovgraph.engine.chain_window import window
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Solution
@@ -18,7 +19,7 @@ from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, weights_of
 from rovgraph.engine.optimum import Knowledge
-from rovgraph.engine.stretches import Searches, resume, solve
+from rovgraph.engine.stretches import Searches, at_rest, resume, solve
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.engine.widened_chain import widened
 from rovgraph.geometry import Array
@@ -33,10 +34,16 @@ class ChainOptimum:
 
     Constants that are considered stand last in the border of what is eliminated here: all of them are known to their
     priors and to nothing better, which is in every covariance.
+
+    Attributes
+    ----------
+    chain, solution : the dive, and its optimum
+    begun : where the last step to it began, of the elimination that all covariances come of; None = there was none
     """
 
     chain: Chain
     solution: Solution[State]
+    begun: State | None = None
 
     @property
     def intervals(self) -> Sequence[KeyframeInterval]:
@@ -67,7 +74,7 @@ class ChainOptimum:
         return {}
 
     @cached_property
-    def _wide(self) -> Chain:
+    def wide(self) -> Chain:
         """The chain with what is considered in its border."""
         names = self.unknowns.considered
         return widened(self.chain, self.state, names) if names else self.chain
@@ -78,16 +85,24 @@ class ChainOptimum:
         beliefs = [self.beliefs[name] for name in self.unknowns.considered]
         return np.diag(np.concatenate([np.empty(0), *(np.full(b.variable.dim, b.sd**2) for b in beliefs)]))
 
+    @property
+    def linearised_at(self) -> State:
+        """Where all factors are linearised."""
+        return self.state if self.begun is None else self.begun
+
+    @cached_property
+    def root(self) -> SquareRoot:
+        """All factors linearised and eliminated, what is considered last in the border; errors count from `state`."""
+        root = self.wide.eliminate(self.linearised_at, self.solution.gates)
+        if self.begun is not None:
+            root.move_to(root.solve(len(self._believed))[1])
+        return root
+
     @cached_property
     def _end(self) -> SquareRoot:
-        """All factors linearised at the optimum and eliminated: the newest keyframe and the border, and of a short
-        dive all the others."""
-        return self._wide.eliminate(self.state, self.solution.gates, kept=None if self._short else 1)
-
-    @property
-    def _short(self) -> bool:
-        """Whether all conditionals may stay in memory."""
-        return len(self.intervals) <= SHORT
+        """The same, of the newest keyframe and the border."""
+        root = self.root
+        return replace(root, conditionals=root.conditionals[-1:].copy())
 
     @cached_property
     def _marginals(self) -> tuple[Array, Array]:
@@ -95,28 +110,65 @@ class ChainOptimum:
 
         What they come of would be the larger part of a long dive.
         """
-        if self._short:
-            P_y = self._end.border_covariance(self._believed)
-            return self._end.covariances(P_y), P_y
-        root = self._wide.eliminate(self.state, self.solution.gates)
-        self.__dict__["linear"] = self._linear(root)  # for nothing, now that it is at hand
-        P_y = root.border_covariance(self._believed)
+        P_y = self._end.border_covariance(self._believed)
+        if len(self.intervals) <= SHORT:
+            return self.root.covariances(P_y), P_y
+        _ = self.linear  # for nothing, while it is at hand
+        root = vars(self).pop("root")
         return root.turn_into_covariances(P_y), P_y
 
     @cached_property
     def linear(self) -> tuple[float, float]:
-        """Log determinant of the information of what is estimated, linearised at the optimum, and its least sum of
-        squares."""
-        root = self._end if self._short else self._wide.eliminate(self.state, self.solution.gates, diagonal=True)
-        return self._linear(root)
-
-    def _linear(self, root: SquareRoot) -> tuple[float, float]:
+        """Log determinant of the information of what is estimated, and its least sum of squares."""
         held = len(self._believed)
-        return root.log_determinant(held), root.least(held)
+        return self.root.log_determinant(held), self.root.least(held)
+
+    def rested(self) -> "ChainOptimum":
+        """The optimum a last step ahead, which the elimination yields that its covariances come of.
+
+        Raises
+        ------
+        InputError : the data do not determine some variable, which is named
+        """
+        held = len(self._believed)
+        promised = self.root.explained(held)
+        if not promised <= gauss_newton.REST:  # it is not as close as it seemed
+            return ChainOptimum(self.chain, resume(self.chain, self.state, self.solution))
+        x, y = self.root.solve(held)
+        solution = self.solution
+        solution = replace(
+            solution,
+            point=self.wide.moved(self.state, ChainStep(x, y), 1.0),
+            cost=solution.cost - promised,
+            iterations=solution.iterations + 1,
+        )
+        rested = ChainOptimum(self.chain, solution, self.state)
+        self.root.move_to(y)
+        vars(rested).update(wide=self.wide, root=vars(self).pop("root"))
+        return rested
+
+    def _other(self, chain: Chain, moved: Mapping[str, Array], score: Array | None = None) -> "ChainOptimum":
+        """The optimum of a chain with other unknowns of these, from where its linear problem has it.
+
+        Parameters
+        ----------
+        moved : constants that are held now, and by how much they move for it
+        score : ndarray, shape (c,), as `SquareRoot.border_with`
+        """
+        places, y = self.wide.layout.places, np.zeros(len(self.root.border))
+        for name, by in moved.items():
+            y[places[name][1]] = by
+        free = [places[name] for name in chain.unknowns.estimated]
+        free_border = np.concatenate([NOTHING, *(np.r_[part] for border, part in free if border)])
+        y = self.root.border_with(free_border, y, score)
+        begin = self.wide.moved(self.state, ChainStep(self.root.followed(y), y), 1.0)
+        vars(self).pop("root")  # of a long dive there is no room for two
+        known = at_rest(chain, begin, self.solution) or resume(chain, begin, self.solution, gauss_newton.REST)
+        return ChainOptimum(chain, known).rested()
 
     def relative_sd(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""
-        P, places = self._end.border_covariance(), self._wide.layout.places
+        P, places = self._end.border_covariance(), self.wide.layout.places
         names = self.unknowns.considered
         return {
             name: np.sqrt(np.diagonal(P[places[name][1], places[name][1]])) / self.beliefs[name].sd for name in names
@@ -124,14 +176,13 @@ class ChainOptimum:
 
     def estimating(self, names: Sequence[str]) -> "ChainOptimum":
         """As `rovgraph.engine.optimum.Optimum`."""
-        more = replace(self.chain, unknowns=self.unknowns.estimating(names))
-        return ChainOptimum(more, resume(more, self.state, self.solution))
+        return self._other(replace(self.chain, unknowns=self.unknowns.estimating(names)), {})
 
     def covariances(self, variable: str) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
         if variable in COLUMNS:
             return np.asarray(self._marginals[0][:, COLUMNS[variable], COLUMNS[variable]])
-        border, part = self._wide.layout.places[variable]
+        border, part = self.wide.layout.places[variable]
         if not border:
             return self._marginals[0][:, part, part]
         P = self._marginals[1][part, part]
@@ -143,7 +194,7 @@ class ChainOptimum:
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
-        layout, names = self._wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
+        layout, names = self.wide.layout, (*self.unknowns.estimated, *self.unknowns.considered)
         chosen = np.concatenate([np.arange(MOTION), *(layout.target(name) for name in names)])
         newest = self._end.newest_covariance(self._end.border_covariance(self._believed))
         return np.asarray(newest[np.ix_(chosen, chosen)])
@@ -162,7 +213,9 @@ class ChainOptimum:
         """As `rovgraph.engine.optimum.Optimum`."""
         held = replace(self.chain, unknowns=self.unknowns.of(()))
         white = np.random.default_rng(seed).standard_normal((len(self.intervals), MOTION))
-        noise = held.eliminate(self.state, self.solution.gates).draw(white)
+        # the border does not touch what the keyframes' own columns are eliminated to
+        own = held.eliminate(self.state, self.solution.gates) if self.wide.layout.walking else self.root
+        noise = own.draw(white)
         more, less = (
             self._knowledge_at(held.moved(self.state, ChainStep(sign * noise, np.empty(0)), 1.0), keyframes)
             for sign in (1.0, -1.0)
@@ -174,11 +227,16 @@ class ChainOptimum:
         held = {name: replace(self.beliefs[name], score=0.0) for name in names}
         unknowns = self.unknowns.considering(names)
         without = replace(self.chain, unknowns=unknowns, beliefs={**self.beliefs, **held})
-        begin = replace(self.state, calibration={**self.state.calibration, **{n: self.beliefs[n].mean for n in names}})
-        return ChainOptimum(without, resume(without, begin, self.solution))
+        return self._other(without, {n: self.beliefs[n].mean - self.state.calibration[n] for n in names})
+
+    def with_score(self, name: str, score: Array) -> "ChainOptimum":
+        """The optimum with another `Belief.score` of an estimated constant."""
+        more, own = np.zeros(len(self.root.border)), replace(self.beliefs[name], score=score)
+        more[self.wide.layout.places[name][1]] = score - self.beliefs[name].score
+        return self._other(replace(self.chain, beliefs={**self.beliefs, name: own}), {}, more)
 
     def _knowledge_at(self, point: State, keyframes: Sequence[int]) -> Knowledge:
-        wide = self._wide
+        wide = self.wide
         root, layout = wide.eliminate(point, self.solution.gates, keyframes, kept=1), wide.layout
         held = [int(k) for name in self.unknowns.considered for k in layout.target(name)]
         P = root.filtered_covariances(held, self._believed)
@@ -215,4 +273,5 @@ def smooth_chain(
     chain = Chain(intervals, initial, beliefs, wanted, rows)
     held = [name for name in wanted.considered if not beliefs[name].variable.time_offset]
     freed = partial(widened, chain, names=tuple(held)) if held else None
-    return ChainOptimum(chain, solve(chain, chain.start(states, calibration), freed, window, searches))
+    solution = solve(chain, chain.start(states, calibration), freed, window, searches, gauss_newton.REST)
+    return ChainOptimum(chain, solution).rested()

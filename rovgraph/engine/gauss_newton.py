@@ -7,9 +7,10 @@ converged, measurements beyond their gate are taken out, those back within it le
 gates rest. A measurement that is out costs what one at its gate costs: the robust cost is a truncated loss, of which
 optima with different gates compare.
 
-It has converged when the decrease that is left is small. Steps that converge by a factor leave a geometric series
-of decreases, so two of them say what is left. A decrease of e is a move of sqrt(2 e) sd in the direction in which
-the data know least about it.
+It has converged when the decrease that is left is small. What a whole step took off the cost beyond what the linear
+problem promised, or less, is the work of what is not linear; that leaves the next step a tenth of it at most, in all
+descents that were looked at. Steps that converge by a factor leave a geometric series of decreases, so two of them say
+what is left, too. A decrease of e is a move of sqrt(2 e) sd in the direction in which the data know least about it.
 """
 
 import math
@@ -27,11 +28,13 @@ MAX_ITERATIONS = 50
 MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
 FINE = 1e-3  # decrease of the cost that is left when the last round stops: 0.045 sd
+REST = 5e-2  # the same where one more step is taken, of the elimination that covariances come of
 COARSE = 1e-2  # the same as a part of the cost, of the rounds before the gates rest
 
 # a parabola with the slope that is promised and the decrease that is found is lower at twice the step from here on
 FALLS_SHORT = 4.0 / 3.0
 LEAST_LEFT = 0.1  # of a step's decrease: after steps that were still far away the next may converge less well
+LEFT_BY_BENDS = 0.1  # of what a whole step took off the cost beyond what was promised, or less
 
 Point = TypeVar("Point")
 Step = TypeVar("Step")
@@ -148,7 +151,7 @@ def minimise(
     while True:
         descent = _descend(problem, descent, gates, tolerance, fine)
         iterations, within = iterations + descent.steps, _without(problem.gates(descent.point), barred)
-        rest = gatings >= MAX_GATINGS or all(np.array_equal(within[s], gates[s]) for s in gates)
+        rest = gatings >= MAX_GATINGS or _same(gates, within)
         if rest and (fine or descent.left <= tolerance):
             cost = descent.cost + _cost_of_rejected(problem, gates, barred)
             return Solution(descent.point, gates, cost, iterations, descent.steps < MAX_ITERATIONS)
@@ -156,6 +159,18 @@ def minimise(
         if not rest:
             gates = within
             descent = _Descent(descent.point, problem.cost(descent.point, gates))
+
+
+def standing(problem: Linearizable[Point, Step], point: Point, gates: Gates, barred: Gates) -> Solution[Point] | None:
+    """A point as it stands, with gates that do not change there; None = they do. Parameters as of `minimise`."""
+    if not _same(gates, _without(problem.gates(point), barred)):
+        return None
+    cost = problem.cost(point, gates) + _cost_of_rejected(problem, gates, barred)
+    return Solution(point, gates, cost, 0, True)
+
+
+def _same(gates: Gates, others: Gates) -> bool:
+    return all(np.array_equal(others[sensor], gates[sensor]) for sensor in gates)
 
 
 def _without(gates: Gates, barred: Gates) -> Gates:
@@ -198,9 +213,10 @@ def _descend(
     now = replace(begin, steps=0)
     for step in range(1, MAX_ITERATIONS + 1):
         tolerance = least if fine else max(least, COARSE * now.cost)
-        point, cost = _search(problem, now.point, gates, now.cost, tolerance)
+        point, cost, promised = _search(problem, now.point, gates, now.cost, tolerance)
         decrease = now.cost - cost
-        now = _Descent(point, cost, decrease, _left(decrease, now.decrease), step)
+        left = min(_left(decrease, now.decrease), LEFT_BY_BENDS * abs(decrease - promised))
+        now = _Descent(point, cost, decrease, left, step)
         if now.left <= (least if fine else max(least, COARSE * cost)):
             return now
     return now
@@ -215,9 +231,16 @@ def _left(decrease: float, before: float) -> float:
 
 def _search(
     problem: Linearizable[Point, Step], point: Point, gates: Gates, cost: float, tolerance: float
-) -> tuple[Point, float]:
-    """The best of 1, 2, 4... times the step, or the first of 1/2, 1/4... that lowers the cost."""
+) -> tuple[Point, float, float]:
+    """The best of 1, 2, 4... times the step, or the first of 1/2, 1/4... that lowers the cost.
+
+    Returns
+    -------
+    Point, float : where it leads, and the cost there
+    float : by how much the cost should have fallen; infinite where it is not the step itself
+    """
     step = problem.step(point, gates)
+    promised = problem.promised(step)
 
     def at(share: float) -> tuple[Point, float]:
         moved = problem.moved(point, step, share)
@@ -225,14 +248,12 @@ def _search(
 
     share, best = 1.0, at(1.0)
     if best[1] < cost:
-        if cost - best[1] <= tolerance:  # it was the last
-            return best
-        if cost - best[1] < FALLS_SHORT * problem.promised(step):
-            return best
+        if cost - best[1] <= tolerance or cost - best[1] < FALLS_SHORT * promised:  # the former was the last
+            return *best, promised
         while (longer := at(2.0 * share))[1] < best[1]:
             share, best = 2.0 * share, longer
-        return best
+        return *best, promised if share == 1.0 else math.inf
     while not best[1] < cost and share > SMALLEST_STEP:
         share *= 0.5
         best = at(share)
-    return best if best[1] < cost else (point, cost)
+    return *(best if best[1] < cost else (point, cost)), math.inf

@@ -90,7 +90,7 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> list[Last
     without : calibration variables that are, too
     """
     found: list[LastingError] = []
-    now, passed = _Baseline(best.chain, best.solution, *best.linear), {*without}
+    now, passed = _Baseline.of(best), {*without}
     while candidates := [_most_likely(now, probe) for probe in _probes(now, passed)]:
         passed |= {c.variable for c in candidates if _implausible(now.chain, c)}  # they have another cause
         candidates = sorted((c for c in candidates if c.variable not in passed), key=lambda c: c.gain, reverse=True)
@@ -109,7 +109,7 @@ class _Baseline:
 
     Attributes
     ----------
-    chain, solution : the dive and its optimum
+    chain, solution : the dive and its optimum; its point is where it is linearised
     log_determinant, least : of the information of the dive linearised there, and its least sum of squares
     """
 
@@ -117,6 +117,11 @@ class _Baseline:
     solution: Solution[State]
     log_determinant: float
     least: float
+
+    @staticmethod
+    def of(best: ChainOptimum) -> "_Baseline":
+        """A dive as it was solved."""
+        return _Baseline(best.chain, replace(best.solution, point=best.linearised_at), *best.linear)
 
     @property
     def minus_log_likelihood(self) -> float:

@@ -11,13 +11,12 @@ for autopilots, nothing is left of the arm's z, however long the dive is. Noise 
 innovation, so M is taken less by the part of a ping's information that goes into its own prediction.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.optimum import NEWEST, Optimum, estimated_parts
-from rovgraph.engine.stretches import resume
 from rovgraph.geometry import Array
 from rovgraph.sensors.dvl import DvlVelocity, dvl_mounting
 
@@ -116,7 +115,5 @@ def with_arm_of_rates(best: Optimum) -> Optimum:
         return best.considering([ARM])
     if isinstance(best, ChainOptimum):
         for _ in range(ROUNDS):
-            belief = replace(best.beliefs[ARM], score=spurious_information(best).score)
-            chain = replace(best.chain, beliefs={**best.beliefs, ARM: belief})
-            best = ChainOptimum(chain, resume(chain, best.state, best.solution))
+            best = best.with_score(ARM, spurious_information(best).score)
     return best

@@ -41,6 +41,7 @@ from rovgraph.engine.gauss_newton import (
     Step,
     Stretch,
     minimise,
+    standing,
 )
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
@@ -127,6 +128,7 @@ def solve(
     freed: Callable[[Point], Linearizable[Point, Step]] | None = None,
     partition: Partition[Point, Step] | None = None,
     searches: Searches | None = None,
+    tolerance: float | None = None,
 ) -> Solution[Point]:
     """The cheapest optimum of a dive: from ``point``, and without stretches in which a sensor contradicts the others.
 
@@ -137,12 +139,13 @@ def solve(
         error that a mounting explains is no stretch's
     partition : makes the parts of a long dive in which stretches are sought; None = they are sought in all of it
     searches : that were made for other solutions of the same dive, as configured the same
+    tolerance : as of `rovgraph.engine.gauss_newton.minimise`
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
-    best = minimise(problem, point)
+    best = minimise(problem, point, tolerance=tolerance)
     if not _bursts(problem.measured(), best):
         return best
 
@@ -150,12 +153,12 @@ def solve(
         if freed is None:
             return _without_stretches(problem, best, partition)
         free = freed(best.point)
-        return _without_stretches(free, minimise(free, best.point, best.gates), partition)
+        return _without_stretches(free, minimise(free, best.point, best.gates, tolerance=TOLERANCE), partition)
 
     found = search() if searches is None else searches.from_optimum(best, search)
     if not found.stretches:
         return replace(best, runner_up=found.runner_up)
-    return resume(problem, found.point if freed is None else best.point, found)
+    return resume(problem, found.point if freed is None else best.point, found, tolerance)
 
 
 def _without_stretches(
@@ -202,20 +205,35 @@ def _without_stretch_in(
     measured = part.problem.measured()
     before = tuple(s for s in best.stretches if s.sensor in measured and _barred(measured, [s])[s.sensor].any())
     own = replace(best, point=part.point(best.point), gates=part.gates(best.gates), stretches=before)
-    found = _without_stretch(part.problem, resume(part.problem, own.point, own), burst)
+    found = _without_stretch(part.problem, resume(part.problem, own.point, own, TOLERANCE), burst)
     if found is None or found.stretches == before:
         return found and replace(best, runner_up=found.runner_up)
     known = replace(
         found, gates=part.with_gates(best.gates, found.gates), stretches=(*best.stretches, found.stretches[-1])
     )
-    whole = resume(problem, best.point, known)
+    whole = resume(problem, best.point, known, TOLERANCE)
     return whole if whole.cost < best.cost else replace(best, runner_up=found.runner_up)
 
 
-def resume(problem: Linearizable[Point, Step], point: Point, known: Solution[Point]) -> Solution[Point]:
+def resume(
+    problem: Linearizable[Point, Step], point: Point, known: Solution[Point], tolerance: float | None = None
+) -> Solution[Point]:
     """The optimum of a problem close to one whose solution is known, with the same stretches taken out."""
     barred = _barred(problem.measured(), known.stretches)
-    solution = minimise(problem, point, known.gates, barred)
+    return _with_stretches(problem, minimise(problem, point, known.gates, barred, tolerance), known)
+
+
+def at_rest(problem: Linearizable[Point, Step], point: Point, known: Solution[Point]) -> Solution[Point] | None:
+    """The same, if it may lie at a point; None = gates change there."""
+    barred = _barred(problem.measured(), known.stretches)
+    stands = standing(problem, point, known.gates, barred)
+    return stands and _with_stretches(problem, stands, known)
+
+
+def _with_stretches(
+    problem: Linearizable[Point, Step], solution: Solution[Point], known: Solution[Point]
+) -> Solution[Point]:
+    """A solution with the stretches of another one, and with what they cost."""
     solution = replace(solution, stretches=known.stretches, runner_up=known.runner_up)
     return replace(solution, cost=solution.cost + _price(problem, solution))
 
