@@ -31,7 +31,7 @@ try:
     from numba import njit
     from numba.extending import register_jitable
 
-    from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler
+    from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler, UncalledKernelCompiler
 except ImportError as error:
     raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61'") from None
 
@@ -77,7 +77,7 @@ def kernel(signature: str, by_address: bool = False) -> Callable[[F], F]:
     InputError : numba cannot compile it
     """
 
-    options = KERNEL if by_address else {**KERNEL, "pipeline_class": KernelCompiler}
+    options = {**KERNEL, "pipeline_class": KernelCompiler if by_address else UncalledKernelCompiler}
 
     def decorate(function: F) -> F:
         folder = cache_folder(function.__module__)

@@ -10,6 +10,7 @@ that its callers have.
 
 from typing import Any, cast
 
+from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
 
@@ -38,6 +39,22 @@ class LinkedLibrary(JITCodeLibrary):
         self._finalized = True
 
 
+class KernelLibrary(JITCodeLibrary):
+    """A kernel's code, which nothing links: what the cache keeps of it is machine code, and the names in it.
+
+    numba would keep LLVM's code beside it, and read it again whenever the kernel is loaded, which takes longer than
+    all else of loading it.
+    """
+
+    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
+        """As numba's, with the kernel and its wrappers in name only: numba asks whether they are there."""
+        name, kind, (machine_code, code) = cast(Any, super()).serialize_using_object_code()
+        own = f"{len(name)}{name}B"  # as mangled
+        names = [f.name for f in parse_bitcode(code).functions if own in f.name and not f.is_declaration]
+        empty = "".join(f'define void @"{each}"() {{ ret void }}\n' for each in names)
+        return name, kind, (machine_code, parse_assembly(empty).as_bitcode())
+
+
 class HelperCompiler(CompilerBase):
     """numba's compiler with such a library, and without wrappers."""
 
@@ -51,9 +68,20 @@ class HelperCompiler(CompilerBase):
 
 
 class KernelCompiler(Compiler):
-    """numba's compiler without a wrapper for C, which only a kernel that is called by its address needs."""
+    """numba's compiler with such a library."""
+
+    def define_pipelines(self) -> Any:
+        """As numba's."""
+        library: Any = KernelLibrary
+        self.state.library = library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library.enable_object_caching()
+        return cast(Any, super()).define_pipelines()
+
+
+class UncalledKernelCompiler(KernelCompiler):
+    """The same without a wrapper for C, which only a kernel that is called by its address needs."""
 
     def define_pipelines(self) -> Any:
         """As numba's."""
         self.state.flags.no_cfunc_wrapper = True
-        return cast(Any, super()).define_pipelines()
+        return super().define_pipelines()
