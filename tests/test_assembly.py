@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rovgraph.config import Config
-from rovgraph.engine import log_assembly
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.keyframes import KeyframeInterval
@@ -33,8 +31,6 @@ def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInte
     offsets = TimeOffsets.of(config, assembler.instruments)
     whole = assemble_log(log, config, assembler.instruments, np.zeros(6), offsets, left_out)
     same(done, whole.intervals)
-    with mock.patch.object(log_assembly, "FEW", 0):  # as a long log, whose measurements stay in columns
-        same(done, assemble_log(log, config, assembler.instruments, np.zeros(6), offsets, Counter()).intervals)
     same(DiveRows.of(done, [*assembler.instruments]), whole.rows)
     assert left_out == assembler.left_out
     return done, assembler

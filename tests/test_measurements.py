@@ -12,6 +12,7 @@ from test_sensors import CONFIG, SENSORS, random_state
 from rovgraph.calibration import TABLE
 from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_rows, sd_of
 from rovgraph.engine.late_stamp_window import KNOT_S, LateStampWindow
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import (
     Block,
     loss_and_weight,
@@ -59,7 +60,7 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         row[at.RATE : at.RATE_SD], row[at.RATE_SD] = rate, 0.01
         row[at.Z : at.Z + len(z)], row[sd_of(len(z)) : sd_of(len(z)) + len(z)] = z, sd
         attached.append(KeyframeMeasurement(sensor, k, k // 2, 10 + k, len(z), row, track, S, seen))
-    return make_block(attached, instrument, 9.81, Unknowns(state.calibration, WALKS)), state
+    return make_block(MeasurementTable.of(attached), instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 
 
 def track_of(motion: Snapshot, bias: Array, rng: np.random.Generator) -> LateStampWindow:
@@ -248,7 +249,8 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     assert set(by_sensor) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
     for sensor, attached in by_sensor.items():
         instrument = smoother.initial.instruments[sensor]
-        block = make_block(attached, instrument, config.environment.gravity_mps2, Unknowns(truth.calibration, {}))
+        gravity, unknowns = config.environment.gravity_mps2, Unknowns(truth.calibration, {})
+        block = make_block(MeasurementTable.of(attached), instrument, gravity, unknowns)
         r = block.normalised(truth.at(block.keyframe))
         # motion from the keyframe is integrated from noisy samples, which adds little
         low, high = chi2.ppf([0.0005, 0.9995], r.size) / r.size

@@ -28,6 +28,7 @@ from scipy.stats import chi2
 from rovgraph.api.online import Online
 from rovgraph.cli.app import main
 from rovgraph.config import Config
+from rovgraph.engine import gauss_newton
 from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.errors import InputError
 from rovgraph.estimators.attitude_gaps import without_attitude_gaps
@@ -349,8 +350,10 @@ def test_a_pd0_file_of_a_real_vehicle_becomes_a_smoothed_track(tmp_path, monkeyp
     assert len(track) > 4000 and np.isfinite(track[["north", "east", "north_sd", "east_sd"]]).all(axis=None)
 
 
-def test_gtsam_finds_the_same_optimum(dive):
+def test_gtsam_finds_the_same_optimum(dive, monkeypatch):
     pytest.importorskip("gtsam")
+    for tolerance in ("FINE", "REST"):
+        monkeypatch.setattr(gauss_newton, tolerance, 1e-11)
     from rovgraph.graph.places import smooth_graph
 
     case, config = dive

@@ -16,6 +16,7 @@ from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.error_state import replay as replay_filter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.log import Log, read_log
+from rovgraph.process import be_frugal
 from rovgraph.simulate import Choices, choices, simulated
 from rovgraph.simulate.files import write_log
 
@@ -30,7 +31,7 @@ def filtered(*files: str) -> float:
     log, config = read(*files)
     batch = assemble(log, initialise(log, config))
     began = processor()
-    replay_filter(batch.intervals, batch.initial, REINITIALISE_AT_S).solve()
+    replay_filter(batch.intervals, batch.initial, REINITIALISE_AT_S, rows=batch.rows).solve()
     return processor() - began
 
 
@@ -81,5 +82,6 @@ def chain(keyframes: str) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    be_frugal()  # as the command does
     measures = {"filter": filtered, "smoother": smoothed, "isam2": isam2, "online": online}
     run({**measures, "simulate": simulate, "chain": chain})

@@ -130,18 +130,16 @@ class ChainOptimum:
         ------
         InputError : the data do not determine some variable, which is named
         """
-        held = len(self._believed)
-        promised = self.root.explained(held)
+        held, known = len(self._believed), self.solution
+        promised, (x, y) = self.root.explained(held), self.root.solve(held)
+        point = self.wide.moved(self.state, ChainStep(x, y), 1.0)
         if not promised <= gauss_newton.REST:  # it is not as close as it seemed
-            return ChainOptimum(self.chain, resume(self.chain, self.state, self.solution))
-        x, y = self.root.solve(held)
-        solution = self.solution
-        solution = replace(
-            solution,
-            point=self.wide.moved(self.state, ChainStep(x, y), 1.0),
-            cost=solution.cost - promised,
-            iterations=solution.iterations + 1,
-        )
+            del vars(self)["root"]  # of a long dive there is no room for two
+            ahead = at_rest(self.chain, point, known)
+            if ahead and ahead.cost < known.cost and known.iterations < gauss_newton.MAX_ITERATIONS:
+                return ChainOptimum(self.chain, replace(ahead, iterations=known.iterations + 1)).rested()
+            return ChainOptimum(self.chain, resume(self.chain, self.state, known))
+        solution = replace(known, point=point, cost=known.cost - promised, iterations=known.iterations + 1)
         rested = ChainOptimum(self.chain, solution, self.state)
         self.root.move_to(y)
         vars(rested).update(wide=self.wide, root=vars(self).pop("root"))
@@ -162,7 +160,7 @@ class ChainOptimum:
         free_border = np.concatenate([NOTHING, *(np.r_[part] for border, part in free if border)])
         y = self.root.border_with(free_border, y, score)
         begin = self.wide.moved(self.state, ChainStep(self.root.followed(y), y), 1.0)
-        vars(self).pop("root")  # of a long dive there is no room for two
+        del vars(self)["root"]
         known = at_rest(chain, begin, self.solution) or resume(chain, begin, self.solution, gauss_newton.REST)
         return ChainOptimum(chain, known).rested()
 

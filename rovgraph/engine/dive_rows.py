@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.scale import SCALES
 from rovgraph.geometry import Array, rotate
 from rovgraph.kernels import measurement_row as measured
@@ -61,18 +62,14 @@ class DiveRows:
             object.__setattr__(interval.motion, "row", motions[k])
         scaled = n > 1 and intervals[1].scale_to_bias is not None
         scales = np.array([i.scale_to_bias for i in intervals[1:]]) if scaled else np.zeros((0, 6, 6))
-        found = [m for interval in intervals for m in interval.measurements]
-        rows = np.zeros((len(found), measured.ROW))
-        for k, m in enumerate(found):
-            rows[k] = m.row[: measured.ROW]
-        row_scales = np.zeros((0, 6, 6))
-        if found and found[0].scale_to_bias is not None:
-            row_scales = np.array([m.scale_to_bias for m in found])
-        which = np.array([index[m.sensor] for m in found], dtype=np.int64)
-        keyframe = np.array([m.keyframe for m in found], dtype=np.int64)
+        found = MeasurementTable.of_dive(intervals)
+        row_scales = np.zeros((0, 6, 6)) if found.scales is None else found.scales
+        number = np.array([index.get(sensor, -1) for sensor in found.sensors], dtype=np.int64)
+        which = number[found.which]
         ends = np.repeat(np.arange(n), [len(i.measurements) for i in intervals])
         time = np.array([i.time for i in intervals])
-        return DiveRows.from_arrays(motions, scales, rows, which, row_scales, keyframe, ends, time, tuple(sensors))
+        own = found.rows, which, row_scales, found.keyframe
+        return DiveRows.from_arrays(motions, scales, *own, ends, time, tuple(sensors))
 
     @staticmethod
     def from_arrays(

@@ -31,6 +31,7 @@ from rovgraph.engine.filter_step import (
 )
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.engine.remembered_places import (
     RememberedPlace,
@@ -44,7 +45,7 @@ from rovgraph.engine.remembered_places import (
     without_oldest,
 )
 from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
-from rovgraph.engine.unknowns import Unknowns, unknowns
+from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.correction import correct
@@ -150,7 +151,10 @@ class FilterEngine:
         taken = filter_intervals(*known, *order, *tables, *limits, *out, *kernels)
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
-        return FilterRun(Gaussian(x, c, P, (), B, before.L), *(a[:taken] for a in out[:-2]), *(a[:m] for a in out[-2:]))
+        interval = np.arange(taken).repeat(np.diff(some.taken[:taken], prepend=0))
+        sensors = [rows.sensors[which] for which in some.which[:m].tolist()]
+        met = sensors, interval, np.arange(m) < some.first[interval], *(a[:m] for a in out[-2:])
+        return FilterRun(before, Gaussian(x, c, P, (), B, before.L), *(a[:taken] for a in out[:-2]), *met)
 
     def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:
         """The next keyframe, from the IMU alone; calibration walks."""
@@ -217,10 +221,11 @@ class FilterEngine:
         layout = self.layout
         return KeyframeRows(rows, which, self._sensors, layout.column, layout.width, scale, self._gravity)
 
-    def block(self, measurements: Sequence[KeyframeMeasurement], unknowns: Unknowns | None = None) -> Block:
-        """Measurements of one sensor; ``unknowns`` are the filter's own unless given."""
-        instrument = self.initial.instruments[measurements[0].sensor]
-        return make_block(measurements, instrument, self._gravity, unknowns or self._wide)
+    def block(self, measured: MeasurementTable | Sequence[KeyframeMeasurement]) -> Block:
+        """Measurements of one sensor, with the filter's unknowns."""
+        table = measured if isinstance(measured, MeasurementTable) else MeasurementTable.of(measured)
+        instrument = self.initial.instruments[table.sensors[int(table.which[0])]]
+        return make_block(table, instrument, self._gravity, self._wide)
 
     def retract(self, known: Gaussian, delta: Array, P: Array, B: Array | None = None) -> Gaussian:
         """The estimate that lies ``delta``, shape (d,), away; P, and B (None = its own), are about the old one."""

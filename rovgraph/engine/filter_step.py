@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.calibration import LAYOUT, calibration_size
 from rovgraph.engine.keyframes import KeyframeMeasurement
@@ -143,13 +144,17 @@ class FilterRun:
 
     Attributes
     ----------
-    known : Gaussian of the last keyframe
+    before, known : Gaussian of the keyframe before them, and of the last one
     x, c : ndarray, shapes (k, 21), (k, C), the keyframes, as of `Gaussian`
     predicted_x, predicted_c : the same, before what was measured at them
     pose, velocity, sd : ndarray, shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
+    sensors : m names, of the measurements
+    interval, between : ndarray of int and of bool, shape (m,), the interval of each, and whether it belongs to the
+        keyframe before that
     nis, weight : ndarray, shape (m,), of the measurements, as of `ProcessedMeasurement`
     """
 
+    before: Gaussian
     known: Gaussian
     x: Array
     c: Array
@@ -158,8 +163,20 @@ class FilterRun:
     pose: Array
     velocity: Array
     sd: Array
+    sensors: Sequence[str]
+    interval: NDArray[np.int64]
+    between: NDArray[np.bool_]
     nis: Array
     weight: Array
 
     def __len__(self) -> int:
         return len(self.x)
+
+    def met(self, places: NDArray[np.int64]) -> tuple[Array, Array]:
+        """x and c of some measurements, as of `ProcessedMeasurement`, shapes (n, 21), (n, C)."""
+        interval, between = self.interval[places], self.between[places]
+        x, c = self.predicted_x[interval], self.predicted_c[interval]
+        former, first = between & (interval > 0), between & (interval == 0)
+        x[former], c[former] = self.x[interval[former] - 1], self.c[interval[former] - 1]
+        x[first], c[first] = self.before.x, self.before.c
+        return x, c

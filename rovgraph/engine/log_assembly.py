@@ -5,7 +5,7 @@ What it does interval by interval is done here for all at once, on arrays: of th
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, cast
 
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.aiding import Aiding
 from rovgraph.engine.dive_rows import DiveRows
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, measurement_rows, sd_of
+from rovgraph.engine.keyframes import KeyframeInterval, measurement_rows, sd_of
 from rovgraph.engine.landmarks import STILL_IN_VIEW, Landmarks
 from rovgraph.engine.late_stamp_window import beyond_samples, window_around
-from rovgraph.engine.log_measurements import Extra, MeasurementsOfInterval, MeasurementTable
+from rovgraph.engine.measurement_table import Extra, MeasurementsOfInterval, MeasurementTable
 from rovgraph.engine.motion import Motion
 from rovgraph.engine.preintegration import preintegration_params
 from rovgraph.engine.samples import HALF_WINDOW_S, knocked, means, rates, surveyed
@@ -39,7 +39,6 @@ from rovgraph.state import PLACE
 
 Index = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-FEW = 50_000  # measurements, of which objects take 12 MB: they are made once, not whenever they are asked for
 _STILL = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])  # a snapshot without motion
 
 
@@ -312,7 +311,7 @@ class _LogAssembly:
             line[own] = stream.row[found.index[own]]
         sensors, scales = [s.sensor for s in streams], dive.row_scales if self.scaled else None
         dims = [self.instruments[s].model.dim if s in self.instruments else 0 for s in sensors]
-        columns = found.which, taken.keyframe, line, self.segment
+        columns = found.which, taken.keyframe, self.segment[taken.keyframe], line
         table = MeasurementTable(sensors, dims, *columns, rows, scales, extras)
         stop, begin = first_stop.tolist(), [0, *dive.taken.tolist()]
         times, parts = self.keys.time.tolist(), zip(self.first.tolist(), self.last.tolist(), strict=True)
@@ -323,7 +322,5 @@ class _LogAssembly:
                 own = stops[stop[k - 1] : stop[k]]
                 motion = Motion(dive.motions[k - 1], self.whole.samples(first, last), times[k - 1], time, own)
                 scale = dive.scales[k - 1] if self.scaled else None
-            here: Sequence[KeyframeMeasurement] = MeasurementsOfInterval(table, begin[k], begin[k + 1])
-            if len(line) <= FEW:
-                here = list(here)
+            here = MeasurementsOfInterval(table, begin[k], begin[k + 1])
             yield KeyframeInterval(k, time, segment[k], self.rate_b[k], rate_sd[k], motion, here, scale)

@@ -8,14 +8,16 @@ gated. The thresholds are where a good measurement of that dimension lies with 9
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from rovgraph.engine.gauss_newton import Gates
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, sd_of
+from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.late_stamp_window import LateStampWindow
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.scale import COLUMNS, SCALES, biased
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, rotate
@@ -188,29 +190,21 @@ class Block:
 _PER_MEASUREMENT = ("keyframe", "segment", "time", "line", "z", "W", "rate_b", "rate_sd", "place", "believed")
 
 
-def make_block(
-    attached: Sequence[KeyframeMeasurement],
-    instrument: Instrument,
-    gravity: float,
-    unknowns: Unknowns,
-) -> Block:
-    """Stack measurements of one sensor; ``unknowns`` are those of the whole graph."""
-
-    dim, rows = instrument.model.dim, np.array([m.row for m in attached])
-    sd = rows[:, sd_of(dim) : sd_of(dim) + dim]
-    rate_sd = rows[:, at.RATE_SD]
-    W = whitening(instrument, sd, rate_sd)
-    where = np.array([(m.keyframe, m.segment, m.line) for m in attached]).T
-    z, rate_b = rows[:, at.Z : at.Z + dim], rows[:, at.RATE : at.RATE + 3]
-    arrays = (where[0], where[1], rows[:, at.TIME], where[2], z, W, rate_b, rate_sd)
-    windows = [a.window for a in attached if a.window is not None]
+def make_block(measured: MeasurementTable, instrument: Instrument, gravity: float, unknowns: Unknowns) -> Block:
+    """The measurements of one sensor; ``unknowns`` are those of the whole graph."""
+    m, dim = measured, instrument.model.dim
+    W = whitening(instrument, m.sd(dim), m.rate_sd)
+    arrays: Any = m.keyframe, m.segment, m.time, m.line, m.z(dim), W, m.rate_b, m.rate_sd, motions_of(m.rows)
+    windows = [extra.window for extra in measured.extras.values() if extra.window is not None]
     window = LateStampWindow.stack(windows) if windows else None
-    scaled = attached[0].scale_to_bias is not None
-    own = unknowns.of((*instrument.calibration, *(SCALES if scaled else ())))
-    place = np.array([-1 if a.landmark is None else a.landmark.number for a in attached])
-    believed = np.array([a.landmark is None or a.landmark.believed for a in attached])
-    scale_to_bias = np.array([m.scale_to_bias for m in attached]) if scaled else None
-    return Block(instrument, *arrays, motions_of(rows), gravity, own, place, believed, window, scale_to_bias)
+    scales = measured.scales
+    own = unknowns.of((*instrument.calibration, *(() if scales is None else SCALES)))
+    place, believed = np.full(len(measured), -1), np.full(len(measured), True)
+    for k, (_, landmark) in measured.extras.items():
+        if landmark is not None:
+            place[k], believed[k] = landmark.number, landmark.believed
+    rest: Any = gravity, own, place, believed, window, scales
+    return Block(instrument, *arrays, *rest)
 
 
 def motions_of(rows: Array) -> Delta:
@@ -312,9 +306,9 @@ def blocks_of(
     unknowns: Unknowns,
 ) -> dict[str, Block]:
     """The measurements of a dive, by sensor, of some sensors."""
-    measured: dict[str, list[KeyframeMeasurement]] = {}
-    for interval in intervals:
-        for m in interval.measurements:
-            if m.sensor in sensors:
-                measured.setdefault(m.sensor, []).append(m)
-    return {sensor: make_block(own, instruments[sensor], gravity, unknowns) for sensor, own in measured.items()}
+    measured = MeasurementTable.of_dive(intervals)
+    return {
+        sensor: make_block(measured.of_sensor(sensor), instruments[sensor], gravity, unknowns)
+        for sensor in measured.used
+        if sensor in sensors
+    }

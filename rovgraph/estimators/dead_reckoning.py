@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import motions_of
 from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
 from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity, rotate, transpose
 from rovgraph.instruments import HEADING_STREAMS
-from rovgraph.kernels import measurement_row
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.kernels.dead_reckoning import reckon_attitude
@@ -45,7 +45,7 @@ class _Epochs:
     assumed : ndarray, shape (m, 6), bias that the motion is for
     bridged, outage : ndarray of bool, shape (m,), samples of the IMU are missing; for so long that it is an outage
     keyframe : ndarray of int, shape (n,), epochs of the keyframes
-    measured : epoch -> measurement
+    measured, epoch : measurements in the order of time, and ndarray of int, the epoch of each
     """
 
     time: Array
@@ -56,12 +56,13 @@ class _Epochs:
     bridged: NDArray[np.bool_]
     outage: NDArray[np.bool_]
     keyframe: NDArray[np.intp]
-    measured: dict[int, KeyframeMeasurement]
+    measured: MeasurementTable
+    epoch: NDArray[np.intp]
 
-    def of(self, sensor: str | None) -> tuple[NDArray[np.intp], list[KeyframeMeasurement]]:
+    def of(self, sensor: str | None) -> tuple[NDArray[np.intp], MeasurementTable]:
         """Epochs and measurements of a sensor."""
-        found = {k: a for k, a in self.measured.items() if a.sensor == sensor}
-        return np.array([*found], dtype=np.intp), [*found.values()]
+        own = self.measured.places_of(sensor)
+        return self.epoch[own], self.measured.at(own)
 
 
 @dataclass(frozen=True)
@@ -126,29 +127,21 @@ def _motions(intervals: Sequence[KeyframeInterval]) -> tuple[Array, Array, Array
 
 def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | None]) -> _Epochs:
     """The epochs of all keyframes and of some sensors."""
-    measured: list[KeyframeMeasurement | None] = []  # None stands for a keyframe
-    number_of: list[int] = []
-    for number, interval in enumerate(intervals):
-        used = [a for a in interval.measurements if a.sensor in sensors]
-        between = sum(a.keyframe != interval.index for a in used)
-        measured += [*used[:between], None, *used[between:]]
-        number_of += [number] * (len(used) + 1)
-    m, of = len(measured), np.array(number_of)
-    keyframe = np.flatnonzero([a is None for a in measured])
-    found = {k: a for k, a in enumerate(measured) if a is not None}
+    every, n = MeasurementTable.of_dive(intervals), len(intervals)
+    wanted = np.isin(every.which, [k for k, sensor in enumerate(every.sensors) if sensor in sensors])
+    found = every.at(np.flatnonzero(wanted))
+    own = np.arange(n).repeat([len(i.measurements) for i in intervals])[wanted]
+    here = found.keyframe == np.array([i.index for i in intervals])[own]
+    # in an interval first what lies between the keyframes, then its own, then what is measured there
+    order = np.argsort(np.concatenate([3 * np.arange(n) + 1, 3 * own + 2 * here]), kind="stable")
+    place = np.empty(len(order), np.intp)
+    place[order] = np.arange(len(order))
+    keyframe, k, of = place[:n], place[n:], np.concatenate([np.arange(n), own])[order]
+    m, motion = len(order), motions_of(found.rows)
     time, dt, dR, dv, assumed = np.empty(m), np.empty(m), np.empty((m, 3, 3)), np.empty((m, 3)), np.empty((m, 6))
     time[keyframe] = [i.time for i in intervals]
     dt[keyframe], dR[keyframe], dv[keyframe], assumed[keyframe] = _motions(intervals)
-    if found:
-        k, rows = np.array([*found]), np.array([a.row[: measurement_row.Z] for a in found.values()])
-        motion = motions_of(rows)
-        time[k], dt[k], dR[k], dv[k], assumed[k] = (
-            rows[:, measurement_row.TIME],
-            motion.dt,
-            motion.dR,
-            motion.dv,
-            motion.bias,
-        )
+    time[k], dt[k], dR[k], dv[k], assumed[k] = found.time, motion.dt, motion.dR, motion.dv, motion.bias
     begin, begin_R, begin_v = np.roll(dt, 1), np.roll(dR, 1, axis=0), np.roll(dv, 1, axis=0)
     first = (keyframe + 1) % m
     begin[first], begin_R[first], begin_v[first] = 0.0, identity(3), 0.0
@@ -162,21 +155,22 @@ def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | Non
         np.array([i.motion is not None and i.motion.coasted for i in intervals])[of],
         keyframe,
         found,
+        k,
     )
 
 
 def _pings(epochs: _Epochs, sensor: str, initial: InitialConditions, calibration: Mapping[str, Array]) -> _Pings:
     k, pings = epochs.of(sensor)
-    if not pings:
+    if not len(k):
         return _Pings(k, np.zeros((0, 3)), np.zeros(0), np.zeros(3))
     still = np.zeros((1, 3))
     R_bs = dvl_mounting(State(np.eye(3)[None], still, still, np.zeros((1, 6)), calibration))[0]
     model: Any = initial.instruments[sensor].model
     arm = model.lever_arm_b + calibration["dvl_lever_arm"]
-    z, sd, rate_b = (np.array([getattr(a, name) for a in pings]) for name in ("z", "sd", "rate_b"))
-    velocity_b = z @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(rate_b, arm)
-    own = 0.5 * (np.sum(sd**2, axis=1) - np.min(sd**2, axis=1))  # the smallest is that of the vertical
-    return _Pings(k, velocity_b, own + np.dot(arm, arm) * np.array([a.rate_sd for a in pings]) ** 2, arm)
+    velocity_b = pings.z(3) @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(pings.rate_b, arm)
+    var = pings.sd(3) ** 2
+    own = 0.5 * (np.sum(var, axis=1) - np.min(var, axis=1))  # the smallest is that of the vertical
+    return _Pings(k, velocity_b, own + np.dot(arm, arm) * pings.rate_sd**2, arm)
 
 
 def _attitudes(
@@ -202,8 +196,9 @@ def _attitudes(
     arguments: Any = (*motion, dvl, turns, reference, *began, numbers, R_nb, gyr)
     reckon_attitude(*arguments)
     k, headings = epochs.of(compass)
-    if headings:
-        instrument, z = initial.instruments[headings[0].sensor], np.array([a.z for a in headings])
+    if compass is not None and len(k):
+        instrument = initial.instruments[compass]
+        z = headings.z(instrument.model.dim)
         turn = solve_turn(instrument, z, R_nb[k], calibration)
         noise = turn_noise(instrument, R_nb[k], turn, calibration, beliefs(config))
         turns[k], reference[:] = np.column_stack([turn, noise.variance, noise.by_tilt]), R_nb
@@ -272,11 +267,10 @@ def _depths(
     calibration: Mapping[str, Array],
 ) -> Array:
     """Depth of the IMU from the pressure sensor, where there is one."""
-    found = [(a.time, a.z[0]) for i in intervals for a in i.measurements if a.sensor == "depth"]
-    if not found:
+    found = MeasurementTable.of_dive(intervals).of_sensor("depth")
+    if not len(found):
         return integrated
-    time, depth = np.array(found).T
     arm = initial.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
-    own = np.interp([i.time for i in intervals], time, depth) - calibration["depth_offset"]
+    own = np.interp([i.time for i in intervals], found.time, found.z(1)[:, 0]) - calibration["depth_offset"]
     own /= 1.0 + calibration["depth_scale"]
     return np.asarray(own - rotate(R_nb, arm)[:, 2])

@@ -24,6 +24,7 @@ from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.estimators.alarms import Alarm, Statistic
 from rovgraph.estimators.alarms.residuals import SD_KEY
@@ -182,7 +183,8 @@ def noise_factor(r: Array) -> float | None:
 def _is_stated(best: ChainOptimum, sensor: str) -> bool:
     """Whether a sensor's noise is the configuration's, and not what the log says of most measurements."""
     believed = best.chain.initial.instruments[sensor].sd
-    sd = np.array([m.sd for interval in best.intervals for m in interval.measurements if m.sensor == sensor])
+    dim = best.blocks[sensor].instrument.model.dim
+    sd = MeasurementTable.of_dive(best.intervals).of_sensor(sensor).sd(dim)
     return bool(np.median(np.abs(sd / believed - 1.0)) < OWN_SD)
 
 

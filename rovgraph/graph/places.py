@@ -29,6 +29,7 @@ from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import Block, make_block
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import Problem, make_problem, make_values, solve
@@ -110,7 +111,8 @@ def recognised(
     again = [a for a in seen if often[_name(a)] > 1]
     if not again:
         return {}
-    where, covariance = _where(make_block(again, instrument, gravity, problem.unknowns), problem, solution)
+    block = make_block(MeasurementTable.of(again), instrument, gravity, problem.unknowns)
+    where, covariance = _where(block, problem, solution)
     return _resolved(again, matched(again, where, covariance, instrument.gate_sd))
 
 

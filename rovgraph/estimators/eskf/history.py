@@ -1,13 +1,15 @@
 """What a filter has found on its way through a dive, and the estimate that comes of it."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterRun, Gaussian, ProcessedMeasurement, stack_states, states_of
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.results import (
@@ -26,6 +28,21 @@ from rovgraph.state import BIAS, POSE, VELOCITY, State
 Columns = tuple[Array, Array, Array, Array, Array]
 
 
+class _Met(NamedTuple):
+    """Measurements of one sensor as the filter met them in a row.
+
+    Attributes
+    ----------
+    states : returns x and c of each, as of `ProcessedMeasurement`, shapes (n, 21), (n, C)
+    nis, weight, places : as of it, of each
+    """
+
+    states: Callable[[], tuple[Array, Array]]
+    nis: Sequence[float]
+    weight: Sequence[float]
+    places: Sequence[Array] = ()
+
+
 class FilterHistory:
     """Keyframes as far as results need them, and the measurements as the filter met them.
 
@@ -41,7 +58,7 @@ class FilterHistory:
     def __init__(self, engine: FilterEngine) -> None:
         self._engine = engine
         self._pieces: list[Columns] = []
-        self._processed: dict[str, list[ProcessedMeasurement]] = {}
+        self._met: dict[str, list[_Met]] = {}
         self.intervals: list[KeyframeInterval] = []
 
     def __len__(self) -> int:
@@ -52,19 +69,17 @@ class FilterHistory:
         self.intervals.append(interval)
         self._pieces.append(self._columns(known))
         for one in processed:
-            self._processed.setdefault(one.measurement.sensor, []).append(one)
+            places = () if one.place is None else (one.place,)
+            met = _Met(partial(_state_of, one), (one.nis,), (one.weight,), places)
+            self._met.setdefault(one.measurement.sensor, []).append(met)
 
     def extend(self, intervals: Sequence[KeyframeInterval], run: FilterRun) -> None:
         """Take the intervals that a filter has run through."""
-        met = zip(run.nis.tolist(), run.weight.tolist(), strict=True)
-        before = self._pieces[-1][0][-1], self._pieces[-1][1][-1]
-        for k, interval in enumerate(intervals):
-            predicted = run.predicted_x[k], run.predicted_c[k]
-            for m in interval.measurements:
-                x, c = before if m.keyframe < interval.index else predicted
-                nis, weight = next(met)
-                self._processed.setdefault(m.sensor, []).append(ProcessedMeasurement(m, x, c, nis, weight))
-            before = run.x[k], run.c[k]
+        sensors = np.array(run.sensors)
+        for sensor in dict.fromkeys(run.sensors):
+            own = np.flatnonzero(sensors == sensor)
+            met = _Met(partial(run.met, own), run.nis[own].tolist(), run.weight[own].tolist())
+            self._met.setdefault(sensor, []).append(met)
         self.intervals += intervals
         if len(intervals):
             self._pieces.append((run.x, run.c, run.pose, run.velocity, run.sd))
@@ -107,7 +122,7 @@ class FilterHistory:
         for name in estimated:
             history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[:, columns[name]])
         final = {name: np.diag(sd[-1, columns[name]] ** 2) for name in estimated}
-        sensors = [s for s in engine.initial.streams if s in {*self._processed, "imu"}]
+        sensors = [s for s in engine.initial.streams if s in {*self._met, "imu"}]
         last = {name: value[-1] for name, value in states.calibration.items()}
         calibration = calibration_estimates(engine.beliefs, sensors, last, final)
         residuals = residual_frame(self._measured(smoothed))
@@ -115,27 +130,38 @@ class FilterHistory:
 
     def _measured(self, smoothed: State | None) -> Iterator[tuple[str, Block, State, Array]]:
         """Each sensor's measurements, the states they are compared with, and their weights."""
-        for sensor, rows in self._processed.items():
-            block = self._engine.block([one.measurement for one in rows])
-            here = stack_states(rows) if smoothed is None else smoothed.at(block.keyframe)
-            places = [one.place for one in rows if one.place is not None]
+        measured = MeasurementTable.of_dive(self.intervals)
+        for sensor, parts in self._met.items():
+            block = self._engine.block(measured.of_sensor(sensor))
+            if smoothed is None:
+                x, c = (np.concatenate(column) for column in zip(*(part.states() for part in parts), strict=True))
+                here = states_of(x, c)
+            else:
+                here = smoothed.at(block.keyframe)
+            places = [place for part in parts for place in part.places]
             if places:
                 here = here.seeing(np.array(places))
-            yield sensor, block, here, np.array([one.weight for one in rows])
+            yield sensor, block, here, np.array([weight for part in parts for weight in part.weight])
 
     def _summary(self) -> dict[str, Any]:
         """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
         nis = {}
-        for sensor, rows in self._processed.items():
-            admitted = [one.nis for one in rows if one.weight > 0.0]
+        for sensor, parts in self._met.items():
+            found, weight = (np.array([v for part in parts for v in getattr(part, name)]) for name in ("nis", "weight"))
+            admitted = found[weight > 0.0]
             nis[sensor] = {
-                "mean": float(np.mean(admitted)) if admitted else None,
+                "mean": float(np.mean(admitted)) if len(admitted) else None,
                 "dim": self._engine.initial.instruments[sensor].model.dim,
                 "count": len(admitted),
-                "rejected": len(rows) - len(admitted),
+                "rejected": len(found) - len(admitted),
             }
         bridged = sum(interval.bridged for interval in self.intervals)
         return {"keyframes": len(self.intervals), "nis": nis, "bridged_intervals": bridged}
+
+
+def _state_of(one: ProcessedMeasurement) -> tuple[Array, Array]:
+    """x and c of one measurement."""
+    return one.x[None], one.c[None]
 
 
 def _joined(pieces: Sequence[Columns]) -> Columns:
