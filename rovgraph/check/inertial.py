@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 
 from rovgraph.check.findings import integral
 from rovgraph.config import Config, mount_matrix
@@ -133,10 +134,10 @@ def smoothed(values: Array, known: NDArray[np.bool_], seconds: float, step: floa
     """Means of (n, k) with raised-cosine weights over some seconds before and after, of what is known."""
     half = max(1, round(seconds / step))
     kernel = 1.0 + np.cos(np.pi * np.arange(-half, half + 1) / half)
-    size = 1 << (len(values) + 2 * half).bit_length()
-    spectrum = np.fft.rfft(kernel, size)[:, None]
+    size = next_fast_len(len(values) + 2 * half, real=True)
+    spectrum = rfft(kernel, size)[:, None]
     data = np.column_stack([values * known[:, None], known])
-    sums = np.fft.irfft(np.fft.rfft(data, size, axis=0) * spectrum, size, axis=0)[half : half + len(values)]
+    sums = irfft(rfft(data, size, axis=0) * spectrum, size, axis=0)[half : half + len(values)]
     return np.asarray(sums[:, :-1] / np.maximum(sums[:, -1:], 1.0))
 
 

@@ -57,7 +57,7 @@ def reinitialised(
 def remembered(best: Optimum, most: int) -> tuple[RememberedPlace, ...]:
     """The places that were seen last, of those that anything says where they are."""
     seen: dict[int, RememberedPlace] = {}
-    for interval in best.intervals:
+    for interval in best.intervals if best.places else ():
         for m in interval.measurements:
             if m.landmark is not None and m.landmark.believed:
                 number = m.landmark.number
