@@ -104,6 +104,15 @@ class ChainOptimum:
         root = self.root
         return replace(root, conditionals=root.conditionals[-1:].copy())
 
+    @property
+    def _short(self) -> bool:
+        """Whether all conditionals may stay in memory."""
+        return len(self.intervals) <= SHORT
+
+    def without_what_is_at_hand(self) -> "ChainOptimum":
+        """The same; of a long dive, what it keeps is large and can be made again."""
+        return self if self._short else ChainOptimum(replace(self.chain), self.solution, self.begun)
+
     @cached_property
     def _marginals(self) -> tuple[Array, Array]:
         """Covariances of the keyframes and of the border.
@@ -111,7 +120,7 @@ class ChainOptimum:
         What they come of would be the larger part of a long dive.
         """
         P_y = self._end.border_covariance(self._believed)
-        if len(self.intervals) <= SHORT:
+        if self._short:
             return self.root.covariances(P_y), P_y
         _ = self.linear  # for nothing, while it is at hand
         root = vars(self).pop("root")
@@ -189,6 +198,8 @@ class ChainOptimum:
     def forget_covariances(self) -> None:
         """As `rovgraph.engine.optimum.Optimum`."""
         vars(self).pop("_marginals", None)
+        if not self._short:
+            vars(self).pop("root", None)
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""

@@ -21,7 +21,6 @@ from rovgraph.engine.chain_layout import COLUMNS, MOTION
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.pieces import pieces
-from rovgraph.engine.widened_chain import widened
 from rovgraph.geometry import Array, transpose
 from rovgraph.kernels import chain_posterior
 from rovgraph.state import State
@@ -38,19 +37,18 @@ def variance_sources(best: ChainOptimum, keyframe: int) -> dict[str, float]:
     ``start velocity`` and ``start bias`` for the priors of the first keyframe, and calibration variables for their
     priors and walks. Their sum is the variance of the estimate, at the IMU.
     """
-    names, chain = best.unknowns.considered, best.chain
-    wide = widened(chain, best.state, names) if names else chain
-    root = wide.eliminate(best.state, best.solution.gates)
+    names, wide, root, point = best.unknowns.considered, best.wide, best.root, best.linearised_at
     held = sum(TABLE[name].dim for name in names)
     u = np.zeros((wide.layout.d, 2))
-    u[POSITION] = best.state.R_nb[keyframe].T[:, :2]
+    u[POSITION] = point.R_nb[keyframe].T[:, :2]
     found: dict[str, float] = {}
     x, y = _covariance_with(root, keyframe, u, held)
     effect = u.T @ _by_held(root, keyframe, held)
     del root
+    best.forget_covariances()  # with what they come of
     for own_x, own_y in zip(np.moveaxis(x, 2, 0), y.T, strict=True):
         step = ChainStep(np.ascontiguousarray(own_x), own_y)
-        for source, variance in [*_of_noise(wide, best.state, step), *_of_measurements(wide, best, step)]:
+        for source, variance in [*_of_noise(wide, point, step), *_of_measurements(wide, best, step)]:
             found[source] = found.get(source, 0.0) + variance
     if held:
         sd = np.concatenate([np.full(TABLE[name].dim, best.beliefs[name].sd) for name in names])
@@ -125,7 +123,7 @@ def _of_measurements(chain: Chain, best: ChainOptimum, step: ChainStep) -> list[
         moved, gate = np.empty(block.z.shape), best.solution.gates[sensor]
         for part in pieces(0, len(block)):
             own = block.at(part)
-            moved[part] = _along(chain, own, own.weighted(best.state.at(own.keyframe), gate[part])[1], step)
+            moved[part] = _along(chain, own, own.weighted(best.linearised_at.at(own.keyframe), gate[part])[1], step)
         out.append((sensor, _squares(moved)))
     return out
 

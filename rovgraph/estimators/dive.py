@@ -103,7 +103,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
         if more[-1].lasts:
             break
     if isinstance(best, ChainOptimum):
-        best = ChainOptimum(replace(best.chain), best.solution)  # without what it keeps at hand, which is large
+        best = best.without_what_is_at_hand()
         give_back()
         dive = _with_main(dive, variance_sources=_sources_where_largest(dive.estimates[0].trajectory, best))
     return _saying(dive, found) if found else dive
