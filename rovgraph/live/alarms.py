@@ -82,6 +82,7 @@ class LiveAlarms:
         self._counts: deque[dict[str, _Count]] = deque([{}], maxlen=round(MINUTE / EVERY_S))
         self._samples: dict[str, list[tuple[ProcessedMeasurement, Array]]] = {}  # with the share of its count
         self._pieces: deque[dict[str, SensorResiduals]] = deque(maxlen=round(MINUTE / LASTING_EVERY_S))
+        self._work: Iterator[list[Statistic]] = iter(())  # looks at the residuals, of one sensor at each keyframe
         self._lasting: list[Statistic] = []
         self._told: list[tuple[float, Statistic]] = []
         self._shown: list[Statistic] = []  # by the smoothed dive, at the newest re-initialisation
@@ -130,7 +131,9 @@ class LiveAlarms:
                 self._samples.setdefault(sensor, []).append((one, count.share))
         if time >= self._due_lasting:
             self._due_lasting += LASTING_EVERY_S * np.ceil((time - self._due_lasting + 1e-6) / LASTING_EVERY_S)
-            self._lasting = list(self._look_at_lasting(engine, time))
+            self._work = self._look_at_lasting(engine, time, self._samples)
+            self._samples = {}
+        self._lasting = next(self._work, self._lasting)
         if time >= self._due:
             self._due += EVERY_S * np.ceil((time - self._due + 1e-6) / EVERY_S)
             self._look([*self._statistics(mark.known, engine, watches, time)], now)
@@ -189,17 +192,20 @@ class LiveAlarms:
         if not engine.initial.config.environment.earth_rotation:
             yield earth_rate_of(float(sd[columns[BIAS]][3:].min()), self._start, time)
 
-    def _look_at_lasting(self, engine: FilterEngine, time: float) -> Iterator[Statistic]:
-        self._pieces.append(
-            {sensor: _innovations(engine, sensor, own) for sensor, own in self._samples.items() if sensor != PLACE}
-        )
-        self._samples = {}
-        begin = self._due_lasting - LASTING_EVERY_S * (1 + len(self._pieces))
-        for sensor in self._pieces[-1]:
+    def _look_at_lasting(
+        self, engine: FilterEngine, time: float, samples: dict[str, list[tuple[ProcessedMeasurement, Array]]]
+    ) -> Iterator[list[Statistic]]:
+        """What residuals of the last minute show, sensor by sensor; before the last one, what is known so far."""
+        self._pieces.append({})
+        begin, found = self._due_lasting - LASTING_EVERY_S * (1 + len(self._pieces)), list[Statistic]()
+        for sensor in [sensor for sensor in samples if sensor != PLACE]:
+            self._pieces[-1][sensor] = _innovations(engine, sensor, samples[sensor])
             own = [piece[sensor] for piece in self._pieces if sensor in piece]
             names = "time", "normalised", "weight", "shared"
             arrays = (np.concatenate([getattr(one, name) for one in own]) for name in names)
-            yield from lasting_in(SensorResiduals(sensor, own[0].components, *arrays), begin, time, self._start)
+            found += lasting_in(SensorResiduals(sensor, own[0].components, *arrays), begin, time, self._start)
+            yield self._lasting
+        yield found
 
     def _look(self, statistics: list[Statistic], time: float) -> None:
         """Begin and end alarms."""

@@ -45,6 +45,7 @@ class Crosscheck:
     _newest: list[Measurement] = field(default_factory=list)  # since the last comparison
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
     _next: float = math.inf
+    _work: Iterator[list[Event]] | None = None  # what is left to compare: a part with each sample of the IMU
     _suspected: dict[tuple[str, str], int] = field(default_factory=dict)  # in how many windows in a row
     _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
@@ -59,17 +60,31 @@ class Crosscheck:
         self._average()
         if self._next == math.inf:
             self._next = m.time + FIRST_S
-        if m.time < self._next:
-            return []
-        self._take_newest(m.time - WINDOW_S)
-        span = m.time - min(float(stream.time[0]) for stream in self._window.values())
-        self._next = m.time + min(max(0.25 * span, EVERY_S[0]), EVERY_S[1])
-        return list(self._compared())
+        if m.time >= self._next:
+            self._take_newest(m.time - WINDOW_S)
+            span = m.time - min(float(stream.time[0]) for stream in self._window.values())
+            self._next, self._work = m.time + min(max(0.25 * span, EVERY_S[0]), EVERY_S[1]), self._compared()
+        elif self._work is not None:
+            return self._go_on()
+        return []
+
+    def _go_on(self) -> list[Event]:
+        """Do the next part of the comparison."""
+        events = None if self._work is None else next(self._work, None)
+        if events is None:
+            self._work = None
+        return events or []
+
+    def _all_of(self, work: Iterator[list[Event]] | None) -> list[Event]:
+        """Do all of a comparison."""
+        self._work = None
+        return [event for events in work or () for event in events]
 
     def finish(self) -> list[Event]:
         """No more measurements: what `add` has not said yet."""
+        events = self._all_of(self._work)
         self._take_newest(-math.inf)
-        return list(self._compared()) if self._suspected else []
+        return events + self._all_of(self._compared() if self._suspected else None)
 
     def _average(self) -> None:
         """One sample of the IMU instead of some."""
@@ -89,18 +104,21 @@ class Crosscheck:
             else:
                 self._window.pop(sensor, None)
 
-    def _compared(self) -> Iterator[Event]:
+    def _compared(self) -> Iterator[list[Event]]:
+        """Compare the window, one check after the other, and say at last what was found."""
         log = Log("the last minutes", self._window, None)
         now = float(log["imu"].time[-1])
         start = min(float(stream.time[0]) for stream in log.streams.values())
         used, found = heading_sources(self.config, log.sensors), dict[tuple[str, str], Finding]()
-        self.dvl_contradicted = False
+        contradicted, events = False, list[Event]()
         for check in CHECKS:
             for f in check(log, self.config):
-                self.dvl_contradicted |= check is dvl_and_imu and f.level != "ok"
+                contradicted |= check is dvl_and_imu and f.level != "ok"
                 whole = check is not vertical and (f.sensor in used or f.sensor not in HEADING_STREAMS)
                 if f.level != "ok" and (f.clock or whole):
                     found.setdefault((f.sensor, f.clock or check.__name__), f)
+            yield []
+        self.dvl_contradicted = contradicted
         if any(f.clock == "jump" for f in found.values()):  # a lag before and after is the mean of two
             found = {key: f for key, f in found.items() if f.clock == "jump"}
         late = {f.sensor for f in found.values() if f.clock}  # which explains what else disagrees
@@ -111,5 +129,6 @@ class Crosscheck:
             if suspected[key] >= IN_A_ROW[kind] and now - self._said.get(key, -math.inf) > AGAIN_S:
                 self._said[key] = now
                 zero = f"; 0 s is {start:.1f} s" if finding.clock == "jump" else ""
-                yield Event(now, finding.sensor, kind, f"{finding.text}{zero}")
+                events.append(Event(now, finding.sensor, kind, f"{finding.text}{zero}"))
         self._suspected = suspected
+        yield events
