@@ -7,6 +7,7 @@ from collections import Counter
 from itertools import pairwise
 
 import numpy as np
+import pymap3d
 import pytest
 from dives import Simulated, as_log, changed, falcon, simulated, true_at, without
 from live import Flight, flown, message, navigator, turned
@@ -258,6 +259,16 @@ def test_a_fix_in_degrees_is_as_late_as_one_in_metres(case):
     intake = Intake(config, Counter())
     local, geodetic = Reading("fix", np.zeros(3)), Reading(GEODETIC, np.array([58.0, 14.0, 1.0]))
     assert [time for time, _ in intake.timed(100.0, (local, geodetic))] == [99.5, 99.5]
+
+
+@pytest.mark.parametrize("latitude", [0.0, 58.4, -78.0])
+def test_latitude_and_longitude_are_right_to_a_tenth_of_a_millimetre_wherever_the_vehicle_goes(latitude):
+    intake, way = Intake(Config(), Counter()), np.cumsum(np.random.default_rng(0).normal(0.2, 2.0, (2000, 2)), axis=0)
+    for origin in ((latitude, 17.0), (latitude, -179.99)):
+        intake.origin = origin
+        got = np.array([intake.geodetic(np.array([*p, 3.0])) for p in way])
+        north, east, _ = pymap3d.geodetic2ned(got[:, 0], got[:, 1], 0.0, *origin, 0.0)
+        assert np.hypot(*(np.column_stack([north, east]) - way).T).max() < 1e-4
 
 
 def test_thruster_lines_that_change_their_count_are_left_out_and_the_estimate_begins(case):

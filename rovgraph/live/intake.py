@@ -1,7 +1,9 @@
 """From what a source says to measurements as the estimator takes them."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pymap3d
@@ -14,6 +16,40 @@ from rovgraph.log import Measurement
 SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
 OTHERS_SPACING_S = 0.005
 _STREAM = {GEODETIC: "fix"}  # where a reading goes by another name
+PATCH_M = 10.0  # so far around a point latitude and longitude are linear, to a tenth of a millimetre up to 80 degrees
+
+
+class _Patch(NamedTuple):
+    """Latitude and longitude around a point: the exact conversion takes as long as all else of a solution.
+
+    Attributes
+    ----------
+    origin : latitude and longitude of north = east = 0 [deg]
+    north, east : of the point [m]
+    latitude, longitude : of the point, and by a metre north, and east [deg]
+    """
+
+    origin: tuple[float, float]
+    north: float
+    east: float
+    latitude: tuple[float, float, float]
+    longitude: tuple[float, float, float]
+
+    @staticmethod
+    def around(north: float, east: float, origin: tuple[float, float]) -> "_Patch":
+        """The patch of a point."""
+        ahead, aside = np.array([0.0, PATCH_M, -PATCH_M, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, PATCH_M, -PATCH_M])
+        found = np.array(pymap3d.ned2geodetic(north + ahead, east + aside, 0.0, *origin, 0.0)[:2])
+        away = (found - found[:, :1] + 180.0) % 360.0 - 180.0  # longitudes leap at the date line
+        by_north, by_east = away[:, 1] - away[:, 2], away[:, 3] - away[:, 4]
+        latitude, longitude = np.column_stack([found[:, 0], np.column_stack([by_north, by_east]) / (2.0 * PATCH_M)])
+        return _Patch(origin, north, east, tuple(latitude.tolist()), tuple(longitude.tolist()))
+
+    def at(self, north: float, east: float) -> tuple[float, float]:
+        """Latitude and longitude [deg] of a place close by."""
+        ahead, aside = north - self.north, east - self.east
+        latitude, longitude = (at + ahead * by_north + aside * by_east for at, by_north, by_east in self[3:])
+        return latitude, longitude if abs(longitude) <= 180.0 else longitude - math.copysign(360.0, longitude)
 
 
 class Intake:
@@ -37,6 +73,7 @@ class Intake:
         self._newest: dict[str, float] = {}
         self._sizes: dict[str, int] = {}
         self._local = False  # whether fixes come in north and east
+        self._patch: _Patch | None = None
 
     def timed(self, time: float, readings: tuple[Reading, ...]) -> Sequence[tuple[float, tuple[Reading, ...]]]:
         """Readings with their times, where some sensors are known to be late [s]."""
@@ -82,5 +119,8 @@ class Intake:
         """Latitude and longitude [deg] of a position, shape (3,), where the origin is known."""
         if self.origin is None:
             return None, None
-        latitude, longitude, _ = pymap3d.ned2geodetic(p_n[0], p_n[1], 0.0, *self.origin, 0.0)
-        return float(latitude), float(longitude)
+        north, east, patch = float(p_n[0]), float(p_n[1]), self._patch
+        far = patch is None or max(abs(north - patch.north), abs(east - patch.east)) > PATCH_M
+        if patch is None or far or patch.origin != self.origin:
+            self._patch = patch = _Patch.around(north, east, self.origin)
+        return patch.at(north, east)
