@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +69,7 @@ class KeyframeRows:
     scale: Array
     gravity: float
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Components of all measurements."""
         return int(self.sensors[self.which, at.DIM].sum())

@@ -219,7 +219,7 @@ def run_isam2(
     """iSAM2 that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
     estimator = IncrementalEstimator(initial, update_s, searches)
     for interval in intervals:
-        estimator.step(interval)
+        estimator.step(replace(interval, measurements=[*interval.measurements]))  # which are asked for again and again
         if interval.index % 50 == 0:
             progress(interval.index / len(intervals))
     estimator.update()
