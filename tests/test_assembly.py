@@ -14,6 +14,7 @@ from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.log_assembly import assemble_log
+from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.instruments import instruments
 from rovgraph.log import Log
@@ -32,6 +33,11 @@ def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInte
     whole = assemble_log(log, config, assembler.instruments, np.zeros(6), offsets, left_out)
     same(done, whole.intervals)
     same(DiveRows.of(done, [*assembler.instruments]), whole.rows)
+    for part in (slice(0, None), slice(len(done) // 2, len(done) - 1)):  # as measurements by themselves, too
+        columns, alone = (MeasurementTable.of_dive(some[part]) for some in (whole.intervals, done))
+        same([*map(columns.__getitem__, range(len(columns)))], [*map(alone.__getitem__, range(len(alone)))])
+        for sensor in alone.used:
+            same(columns.of_sensor(sensor).rows, alone.of_sensor(sensor).rows)
     assert left_out == assembler.left_out
     return done, assembler
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,38 @@ def test_both_come_to_the_same_states(solved):
         sd = sds(graph, name)
         assert (np.abs(a.calibration[name] - b.calibration[name]) < 1e-3 * sd).all(), name
     assert (np.abs(a.bias - b.bias) < 1e-3 * sds(graph, BIAS)).all()
+
+
+def test_the_last_step_leaves_next_to_nothing_and_covariances_are_those_of_where_it_led():
+    dive = batch(*both_compasses())
+    best = dive.optimum()
+    anew = ChainOptimum(best.chain, best.solution)
+    assert best.begun is not None and anew.root.explained() < 1e-3
+    assert best.chain.cost(best.state, best.solution.gates) < best.chain.cost(best.begun, best.solution.gates)
+    for variable in (POSE, VELOCITY, BIAS):
+        np.testing.assert_allclose(sds(anew, variable), sds(best, variable), rtol=1e-3)
+
+
+def test_what_is_estimated_or_considered_afterwards_is_as_if_it_had_been_from_the_beginning():
+    considered = {"dvl_pitch": {"estimate": "considered", "sd_deg": 1.0}}
+    case = simulated(falcon(calibration=considered), 60.0, seed=4, **SHORT)
+    b = batch(case.log, case.config)
+    states = dead_reckon(b.intervals, b.initial, {n: belief.mean for n, belief in beliefs(b.initial.config).items()})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gauss_newton, "FINE", EXACT)
+        patch.setattr(gauss_newton, "REST", EXACT)
+        held = smooth_chain(b.intervals, b.initial, states)
+        assert held.unknowns.considered == ("dvl_pitch",)
+        found = held.estimating(["dvl_pitch"])
+        exact = replace(held.chain, unknowns=found.unknowns)
+        alone = gauss_newton.minimise(exact, exact.start(states, None))
+        np.testing.assert_allclose(found.state.p_n, alone.point.p_n, atol=1e-5)
+        assert found.solution.cost == pytest.approx(alone.cost, rel=1e-9)
+        assert abs(found.state.calibration["dvl_pitch"][0]) > 1e-4
+        again = found.considering(["dvl_pitch"])
+    np.testing.assert_allclose(again.state.p_n, held.state.p_n, atol=1e-5)
+    np.testing.assert_allclose(again.state.calibration["dvl_pitch"], 0.0, atol=1e-15)
+    np.testing.assert_allclose(sds(again, POSE), sds(held, POSE), rtol=1e-6)
 
 
 def test_both_know_them_equally_well(solved):

@@ -215,6 +215,40 @@ def test_considered_variables_add_their_own_covariance_and_move_nothing(held):
         assert_close(cross[k], np.hstack([P[here, n * d :], (gain @ believed)[here]]))
 
 
+@pytest.mark.parametrize("free", [[], [0, 1, 2], [4, 0, 2], [0, 1, 2, 3, 4]], ids=str)
+def test_any_components_of_the_border_can_be_held_anywhere_and_scored(free):
+    """As by dense least squares whose gradient has the score in it, from one elimination."""
+    chain, rng = random_chain(5, 15, 2, 5), np.random.default_rng(3)
+    J, r = chain.dense()
+    n, d = chain.n, chain.d
+    held, score = rng.standard_normal(5), rng.standard_normal(5)
+    used = np.r_[: n * d, n * d + np.array(free, dtype=int)]
+    fixed = held * ~np.isin(np.arange(5), free)
+    gradient = J[:, used].T @ (r - J[:, n * d :] @ fixed) + np.concatenate([np.zeros(n * d), score[free]])
+    expected = np.linalg.solve(J[:, used].T @ J[:, used], gradient)
+    root = chain.eliminate()
+    y = root.border_with(np.array(free, dtype=np.int64), held, score)
+    assert_close(np.concatenate([root.followed(y).ravel(), y[free]]), expected)
+    np.testing.assert_array_equal(np.delete(y, free), np.delete(held, free))
+
+
+@pytest.mark.parametrize("held", [0, 2])
+def test_errors_counted_from_the_optimum_are_at_rest_there_and_as_well_known(held):
+    chain = random_chain(5, 15, 2, 5)
+    before, after = chain.eliminate(), chain.eliminate()
+    x, y = before.solve(held)
+    after.move_to(y)
+    for at_rest in after.solve(held):
+        np.testing.assert_allclose(at_rest, 0.0, atol=1e-9)
+    assert after.explained(held) < 1e-18 < before.explained(held)
+    assert after.least(held) == pytest.approx(before.least(held), rel=1e-12)
+    every = np.arange(5)
+    again = before.border_with(every, np.zeros(5))  # from elsewhere, to the same place
+    moved = after.border_with(every, np.zeros(5))
+    assert_close(y + moved, again)
+    assert_close(x + after.followed(moved), before.followed(again))
+
+
 def test_draws_have_the_covariance_of_the_states_with_the_border_held(chain):
     """A draw is linear in white noise, so that unit vectors give the whole root of the covariance."""
     root, n, d = chain.eliminate(), chain.n, chain.d
