@@ -14,7 +14,7 @@ from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING
 from rovgraph.engine.chain_window import window
 from rovgraph.engine.dive_rows import DiveRows
-from rovgraph.engine.gauss_newton import Solution
+from rovgraph.engine.gauss_newton import Solution, left_after, whole_share
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, weights_of
@@ -139,20 +139,24 @@ class ChainOptimum:
         ------
         InputError : the data do not determine some variable, which is named
         """
-        held, known = len(self._believed), self.solution
+        held, known, gates = len(self._believed), self.solution, self.solution.gates
         promised, (x, y) = self.root.explained(held), self.root.solve(held)
-        point = self.wide.moved(self.state, ChainStep(x, y), 1.0)
-        if not promised <= gauss_newton.REST:  # it is not as close as it seemed
-            del vars(self)["root"]  # of a long dive there is no room for two
-            ahead = at_rest(self.chain, point, known)
-            if ahead and ahead.cost < known.cost and known.iterations < gauss_newton.MAX_ITERATIONS:
-                return ChainOptimum(self.chain, replace(ahead, iterations=known.iterations + 1)).rested()
-            return ChainOptimum(self.chain, resume(self.chain, self.state, known))
-        solution = replace(known, point=point, cost=known.cost - promised, iterations=known.iterations + 1)
-        rested = ChainOptimum(self.chain, solution, self.state)
-        self.root.move_to(y)
-        vars(rested).update(wide=self.wide, root=vars(self).pop("root"))
-        return rested
+        step = ChainStep(x, y)
+        point = self.wide.moved(self.state, step, 1.0)
+        decrease = self.chain.cost(self.state, gates) - self.chain.cost(point, gates)
+        if promised <= gauss_newton.REST and left_after(promised, decrease) <= gauss_newton.FINE:
+            there = replace(known, point=point, cost=known.cost - decrease, iterations=known.iterations + 1)
+            rested = ChainOptimum(self.chain, there, self.state)
+            self.root.move_to(y)
+            vars(rested).update(wide=self.wide, root=vars(self).pop("root"))
+            return rested
+        del vars(self)["root"]  # of a long dive there is no room for two
+        further = self.wide.moved(self.state, step, whole_share(promised, decrease))
+        some = [one for one in (at_rest(self.chain, there, known) for there in (further, point)) if one]
+        ahead = min(some, key=lambda one: one.cost, default=known)
+        if ahead.cost < known.cost and known.iterations < gauss_newton.MAX_ITERATIONS:
+            return ChainOptimum(self.chain, replace(ahead, iterations=known.iterations + 1)).rested()
+        return ChainOptimum(self.chain, resume(self.chain, self.state, known))
 
     def _other(self, chain: Chain, moved: Mapping[str, Array], score: Array | None = None) -> "ChainOptimum":
         """The optimum of a chain with other unknowns of these, from where its linear problem has it.

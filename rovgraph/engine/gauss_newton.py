@@ -7,10 +7,11 @@ converged, measurements beyond their gate are taken out, those back within it le
 gates rest. A measurement that is out costs what one at its gate costs: the robust cost is a truncated loss, of which
 optima with different gates compare.
 
-It has converged when the decrease that is left is small. What a whole step took off the cost beyond what the linear
-problem promised, or less, is the work of what is not linear; that leaves the next step a tenth of it at most, in all
-descents that were looked at. Steps that converge by a factor leave a geometric series of decreases, so two of them say
-what is left, too. A decrease of e is a move of sqrt(2 e) sd in the direction in which the data know least about it.
+It has converged when the decrease that is left is small. A whole step that takes g off the cost where the linear
+problem promised p has bent the cost by b = g / p - 1 of what was promised: by weights that change, or by what is not
+linear. Along a parabola of another curvature, steps leave p b^2 / (1 - b). Steps that converge by a factor leave a
+geometric series of decreases, so two of them say what is left, too. A decrease of e is a move of sqrt(2 e) sd in the
+direction in which the data know least about it.
 """
 
 import math
@@ -28,13 +29,14 @@ MAX_ITERATIONS = 50
 MAX_GATINGS = 8
 SMALLEST_STEP = 2.0**-12
 FINE = 1e-3  # decrease of the cost that is left when the last round stops: 0.045 sd
-REST = 5e-2  # the same where one more step is taken, of the elimination that covariances come of
+REST = 5e-3  # the same where one more step is taken, of the elimination that covariances come of
 COARSE = 1e-2  # the same as a part of the cost, of the rounds before the gates rest
 
 # a parabola with the slope that is promised and the decrease that is found is lower at twice the step from here on
 FALLS_SHORT = 4.0 / 3.0
 LEAST_LEFT = 0.1  # of a step's decrease: after steps that were still far away the next may converge less well
-LEFT_BY_BENDS = 0.1  # of what a whole step took off the cost beyond what was promised, or less
+MOST_BEND = 0.9  # for which a step is made longer
+LEAST_OF_BEND = 0.1  # of g - p, that is left at least: not all of a step bends alike
 
 Point = TypeVar("Point")
 Step = TypeVar("Step")
@@ -215,11 +217,27 @@ def _descend(
         tolerance = least if fine else max(least, COARSE * now.cost)
         point, cost, promised = _search(problem, now.point, gates, now.cost, tolerance)
         decrease = now.cost - cost
-        left = min(_left(decrease, now.decrease), LEFT_BY_BENDS * abs(decrease - promised))
+        left = min(_left(decrease, now.decrease), left_after(promised, decrease))
         now = _Descent(point, cost, decrease, left, step)
         if now.left <= (least if fine else max(least, COARSE * cost)):
             return now
     return now
+
+
+def left_after(promised: float, decrease: float) -> float:
+    """What steps will still take off the cost after a whole one, from what it promised and what it did."""
+    if not 0.0 < promised < math.inf:
+        return 0.0 if promised == 0.0 else math.inf
+    bend = decrease / promised - 1.0
+    if bend >= 1.0:
+        return math.inf
+    return max(LEAST_OF_BEND * abs(decrease - promised), promised * bend**2 / (1.0 - bend))
+
+
+def whole_share(promised: float, decrease: float) -> float:
+    """Of a step that falls short, how many times it leads to the least cost: along a parabola of another curvature."""
+    bend = decrease / promised - 1.0 if 0.0 < promised < math.inf else 0.0
+    return 1.0 / (1.0 - min(max(bend, 0.0), MOST_BEND))
 
 
 def _left(decrease: float, before: float) -> float:
