@@ -139,6 +139,24 @@ def test_a_library_stays_with_its_owner(library, owner):
     assert not strangers, f"only rovgraph/{owner} imports {library}"
 
 
+def test_a_kernel_is_called_from_python_or_by_its_address_but_linked_into_none():
+    """The cache keeps no more of it than its machine code; what kernels share is a helper."""
+    trees = {path.stem: ast.parse(path.read_text(encoding="utf-8")) for path in (PACKAGE / "kernels").glob("*.py")}
+    functions = [node for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+
+    def decorated(node: ast.FunctionDef, by: str) -> bool:
+        names = (d.func if isinstance(d, ast.Call) else d for d in node.decorator_list)
+        return any(isinstance(name, ast.Name) and name.id == by for name in names)
+
+    kernels = {node.name for node in functions if decorated(node, "kernel")}
+    compiled = [node for node in functions if any(decorated(node, by) for by in ("kernel", "helper", "view_helper"))]
+    assert len(kernels) > 20 and len(compiled) > 100
+    for node in compiled:
+        arguments = {argument.arg for argument in node.args.args}  # a kernel's address among them
+        called = {c.func.id for c in ast.walk(node) if isinstance(c, ast.Call) and isinstance(c.func, ast.Name)}
+        assert not (called - arguments) & kernels, node.name
+
+
 def test_no_drawers():
     """A module is named after what it is about."""
     vague = {"utils", "util", "common", "helpers", "misc", "tools"}

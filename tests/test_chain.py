@@ -12,7 +12,7 @@ from dives import altered, batch, changed, falcon, interrupted, simulated, start
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
-from rovgraph.engine import gauss_newton
+from rovgraph.engine import chain_optimum, gauss_newton
 from rovgraph.engine.chain import ChainStep
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
 from rovgraph.engine.optimum import Optimum
@@ -156,6 +156,22 @@ def test_the_last_step_leaves_next_to_nothing_and_covariances_are_those_of_where
     assert best.chain.cost(best.state, best.solution.gates) < best.chain.cost(best.begun, best.solution.gates)
     for variable in (POSE, VELOCITY, BIAS):
         np.testing.assert_allclose(sds(anew, variable), sds(best, variable), rtol=1e-3)
+
+
+def test_covariances_of_a_long_dive_are_made_again_and_those_of_a_short_one(monkeypatch):
+    dive = batch(*both_compasses())
+    short = dive.optimum()
+    monkeypatch.setattr(chain_optimum, "SHORT", 10)
+    long = dive.optimum()
+    expected = sds(short, POSE)
+    for _ in range(2):
+        np.testing.assert_allclose(sds(long, POSE), expected, rtol=1e-12)
+        assert "root" not in vars(long), "of a long dive it is large"
+        long.forget_covariances()
+    again = ChainOptimum(long.chain, long.solution, long.begun)
+    assert again.linear == pytest.approx(short.linear, rel=1e-12) and "root" not in vars(again)
+    np.testing.assert_allclose(again.newest_covariance(), short.newest_covariance(), rtol=1e-9, atol=1e-15)
+    assert "root" not in vars(again)
 
 
 def test_what_is_estimated_or_considered_afterwards_is_as_if_it_had_been_from_the_beginning():

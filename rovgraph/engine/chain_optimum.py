@@ -101,13 +101,19 @@ class ChainOptimum:
     @cached_property
     def _end(self) -> SquareRoot:
         """The same, of the newest keyframe and the border."""
-        root = self.root
-        return replace(root, conditionals=root.conditionals[-1:].copy())
+        if self._at_hand:
+            return replace(self.root, conditionals=self.root.conditionals[-1:].copy())
+        return self.wide.eliminate(self.linearised_at, self.solution.gates, kept=1)
 
     @property
     def _short(self) -> bool:
         """Whether all conditionals may stay in memory."""
         return len(self.intervals) <= SHORT
+
+    @property
+    def _at_hand(self) -> bool:
+        """Whether `root` is there, or may be."""
+        return self._short or "root" in vars(self)
 
     def without_what_is_at_hand(self) -> "ChainOptimum":
         """The same; of a long dive, what it keeps is large and can be made again."""
@@ -122,15 +128,17 @@ class ChainOptimum:
         P_y = self._end.border_covariance(self._believed)
         if self._short:
             return self.root.covariances(P_y), P_y
+        root = self.root
         _ = self.linear  # for nothing, while it is at hand
-        root = vars(self).pop("root")
+        del vars(self)["root"]
         return root.turn_into_covariances(P_y), P_y
 
     @cached_property
     def linear(self) -> tuple[float, float]:
         """Log determinant of the information of what is estimated, and its least sum of squares."""
-        held = len(self._believed)
-        return self.root.log_determinant(held), self.root.least(held)
+        held, gates = len(self._believed), self.solution.gates
+        root = self.root if self._at_hand else self.wide.eliminate(self.linearised_at, gates, diagonal=True)
+        return root.log_determinant(held), root.least(held)
 
     def rested(self) -> "ChainOptimum":
         """The optimum a last step ahead, which the elimination yields that its covariances come of.
@@ -140,6 +148,8 @@ class ChainOptimum:
         InputError : the data do not determine some variable, which is named
         """
         held, known, gates = len(self._believed), self.solution, self.solution.gates
+        if not known.converged:
+            return self
         promised, (x, y) = self.root.explained(held), self.root.solve(held)
         step = ChainStep(x, y)
         point = self.wide.moved(self.state, step, 1.0)
@@ -156,7 +166,8 @@ class ChainOptimum:
         ahead = min(some, key=lambda one: one.cost, default=known)
         if ahead.cost < known.cost and known.iterations < gauss_newton.MAX_ITERATIONS:
             return ChainOptimum(self.chain, replace(ahead, iterations=known.iterations + 1)).rested()
-        return ChainOptimum(self.chain, resume(self.chain, self.state, known))
+        again = resume(self.chain, self.state, known)
+        return ChainOptimum(self.chain, replace(again, iterations=known.iterations + again.iterations))
 
     def _other(self, chain: Chain, moved: Mapping[str, Array], score: Array | None = None) -> "ChainOptimum":
         """The optimum of a chain with other unknowns of these, from where its linear problem has it.

@@ -66,6 +66,7 @@ class DiveRows:
         row_scales = np.zeros((0, 6, 6)) if found.scales is None else found.scales
         number = np.array([index.get(sensor, -1) for sensor in found.sensors], dtype=np.int64)
         which = number[found.which]
+        assert (which >= 0).all(), "a sensor that is not in use has measured something"
         ends = np.repeat(np.arange(n), [len(i.measurements) for i in intervals])
         time = np.array([i.time for i in intervals])
         own = found.rows, which, row_scales, found.keyframe

@@ -152,8 +152,7 @@ class FilterEngine:
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
         interval = np.arange(taken).repeat(np.diff(some.taken[:taken], prepend=0))
-        sensors = [rows.sensors[which] for which in some.which[:m].tolist()]
-        met = sensors, interval, np.arange(m) < some.first[interval], *(a[:m] for a in out[-2:])
+        met = rows.sensors, some.which[:m], interval, np.arange(m) < some.first[interval], *(a[:m] for a in out[-2:])
         return FilterRun(before, Gaussian(x, c, P, (), B, before.L), *(a[:taken] for a in out[:-2]), *met)
 
     def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:

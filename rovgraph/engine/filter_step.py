@@ -148,7 +148,7 @@ class FilterRun:
     x, c : ndarray, shapes (k, 21), (k, C), the keyframes, as of `Gaussian`
     predicted_x, predicted_c : the same, before what was measured at them
     pose, velocity, sd : ndarray, shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
-    sensors : m names, of the measurements
+    sensors, which : names, and ndarray of int, shape (m,), whose of them each measurement is
     interval, between : ndarray of int and of bool, shape (m,), the interval of each, and whether it belongs to the
         keyframe before that
     nis, weight : ndarray, shape (m,), of the measurements, as of `ProcessedMeasurement`
@@ -164,6 +164,7 @@ class FilterRun:
     velocity: Array
     sd: Array
     sensors: Sequence[str]
+    which: NDArray[np.int64]
     interval: NDArray[np.int64]
     between: NDArray[np.bool_]
     nis: Array
@@ -172,9 +173,29 @@ class FilterRun:
     def __len__(self) -> int:
         return len(self.x)
 
-    def met(self, places: NDArray[np.int64]) -> tuple[Array, Array]:
-        """x and c of some measurements, as of `ProcessedMeasurement`, shapes (n, 21), (n, C)."""
-        interval, between = self.interval[places], self.between[places]
+
+@dataclass(frozen=True)
+class MetStates:
+    """x and c of n measurements that a filter met while it ran through intervals, as of `ProcessedMeasurement`.
+
+    Attributes
+    ----------
+    before : Gaussian of the keyframe before the intervals
+    x, c, predicted_x, predicted_c : as of `FilterRun`
+    interval, between : as of it, of the n measurements
+    """
+
+    before: Gaussian
+    x: Array
+    c: Array
+    predicted_x: Array
+    predicted_c: Array
+    interval: NDArray[np.int64]
+    between: NDArray[np.bool_]
+
+    def __call__(self) -> tuple[Array, Array]:
+        """x and c, shapes (n, 21), (n, C)."""
+        interval, between = self.interval, self.between
         x, c = self.predicted_x[interval], self.predicted_c[interval]
         former, first = between & (interval > 0), between & (interval == 0)
         x[former], c[former] = self.x[interval[former] - 1], self.c[interval[former] - 1]

@@ -40,19 +40,19 @@ class LinkedLibrary(JITCodeLibrary):
 
 
 class KernelLibrary(JITCodeLibrary):
-    """A kernel's code, which nothing links: what the cache keeps of it is machine code, and the names in it.
+    """Code of a kernel that no other calls but by its address: the cache keeps machine code of it, and its name.
 
-    numba would keep LLVM's code beside it, and read it again whenever the kernel is loaded, which takes longer than
-    all else of loading it.
+    numba would keep LLVM's code beside it, to be linked into others, and read it again whenever the kernel is loaded,
+    which takes longer than all else of loading it.
     """
 
     def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
-        """As numba's, with the kernel and its wrappers in name only: numba asks whether they are there."""
+        """As numba's, with the kernel and its wrappers in name only: it asks whether they are there."""
         name, kind, (machine_code, code) = cast(Any, super()).serialize_using_object_code()
         own = f"{len(name)}{name}B"  # as mangled
         names = [f.name for f in parse_bitcode(code).functions if own in f.name and not f.is_declaration]
         empty = "".join(f'define void @"{each}"() {{ ret void }}\n' for each in names)
-        return name, kind, (machine_code, parse_assembly(empty).as_bitcode())
+        return name, kind, (machine_code, parse_assembly(empty).as_bitcode() if names else code)
 
 
 class HelperCompiler(CompilerBase):
@@ -68,13 +68,14 @@ class HelperCompiler(CompilerBase):
 
 
 class KernelCompiler(Compiler):
-    """numba's compiler with such a library."""
+    """numba's compiler, with such a library for the kernels of this package."""
 
     def define_pipelines(self) -> Any:
         """As numba's."""
-        library: Any = KernelLibrary
-        self.state.library = library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-        self.state.library.enable_object_caching()
+        if self.state.func_id.modname.rpartition(".")[0] == __package__:
+            library: Any = KernelLibrary
+            self.state.library = library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+            self.state.library.enable_object_caching()
         return cast(Any, super()).define_pipelines()
 
 

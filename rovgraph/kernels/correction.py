@@ -19,7 +19,7 @@ from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
 from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
 from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME
-from rovgraph.kernels.moves import move_estimate
+from rovgraph.kernels.moves import move
 from rovgraph.kernels.robust_update import (
     correction,
     inflate,
@@ -252,7 +252,6 @@ def correct(
         delta[i] += behind[i]
     for j in range(m):
         weight_out[j] *= weight[j]
-    layout = coordinates_of_velocity(x, P, layout)
-    move_estimate(x, c, P, B, delta, layout.columns, layout.seen, layout.params, layout.rows)
+    move(x, c, P, B, delta, coordinates_of_velocity(x, P, layout))
     for i in range(len(places_out)):
         places_out[i] = delta[n - len(places_out) + i]

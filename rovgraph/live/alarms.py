@@ -131,6 +131,8 @@ class LiveAlarms:
                 self._samples.setdefault(sensor, []).append((one, count.share))
         if time >= self._due_lasting:
             self._due_lasting += LASTING_EVERY_S * np.ceil((time - self._due_lasting + 1e-6) / LASTING_EVERY_S)
+            for found in self._work:  # that few keyframes have left
+                self._lasting = found
             self._work = self._look_at_lasting(engine, time, self._samples)
             self._samples = {}
         self._lasting = next(self._work, self._lasting)

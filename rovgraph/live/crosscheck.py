@@ -45,7 +45,7 @@ class Crosscheck:
     _newest: list[Measurement] = field(default_factory=list)  # since the last comparison
     _samples: list[Measurement] = field(default_factory=list)  # of the IMU, still to be averaged
     _next: float = math.inf
-    _work: Iterator[list[Event]] | None = None  # what is left to compare: a part with each sample of the IMU
+    _work: Iterator[list[Event]] = field(default_factory=lambda: iter(()))  # left to compare, a part with each sample
     _suspected: dict[tuple[str, str], int] = field(default_factory=dict)  # in how many windows in a row
     _said: dict[tuple[str, str], float] = field(default_factory=dict)  # when [s]
 
@@ -61,30 +61,22 @@ class Crosscheck:
         if self._next == math.inf:
             self._next = m.time + FIRST_S
         if m.time >= self._next:
+            left = self._all_of(self._work)  # where the IMU was silent
             self._take_newest(m.time - WINDOW_S)
             span = m.time - min(float(stream.time[0]) for stream in self._window.values())
             self._next, self._work = m.time + min(max(0.25 * span, EVERY_S[0]), EVERY_S[1]), self._compared()
-        elif self._work is not None:
-            return self._go_on()
-        return []
+            return left
+        return next(self._work, [])
 
-    def _go_on(self) -> list[Event]:
-        """Do the next part of the comparison."""
-        events = None if self._work is None else next(self._work, None)
-        if events is None:
-            self._work = None
-        return events or []
-
-    def _all_of(self, work: Iterator[list[Event]] | None) -> list[Event]:
-        """Do all of a comparison."""
-        self._work = None
-        return [event for events in work or () for event in events]
+    def _all_of(self, work: Iterator[list[Event]]) -> list[Event]:
+        """Do all that is left of a comparison."""
+        return [event for events in work for event in events]
 
     def finish(self) -> list[Event]:
         """No more measurements: what `add` has not said yet."""
         events = self._all_of(self._work)
         self._take_newest(-math.inf)
-        return events + self._all_of(self._compared() if self._suspected else None)
+        return events + (self._all_of(self._compared()) if self._suspected else [])
 
     def _average(self) -> None:
         """One sample of the IMU instead of some."""

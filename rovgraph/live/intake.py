@@ -120,7 +120,10 @@ class Intake:
         if self.origin is None:
             return None, None
         north, east, patch = float(p_n[0]), float(p_n[1]), self._patch
-        far = patch is None or max(abs(north - patch.north), abs(east - patch.east)) > PATCH_M
-        if patch is None or far or patch.origin != self.origin:
+        if (
+            patch is None
+            or patch.origin != self.origin
+            or not max(abs(north - patch.north), abs(east - patch.east)) <= PATCH_M
+        ):
             self._patch = patch = _Patch.around(north, east, self.origin)
         return patch.at(north, east)

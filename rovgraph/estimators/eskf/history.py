@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import FilterRun, Gaussian, ProcessedMeasurement, stack_states, states_of
+from rovgraph.engine.filter_step import FilterRun, Gaussian, MetStates, ProcessedMeasurement, stack_states, states_of
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import Block
@@ -75,11 +75,12 @@ class FilterHistory:
 
     def extend(self, intervals: Sequence[KeyframeInterval], run: FilterRun) -> None:
         """Take the intervals that a filter has run through."""
-        sensors = np.array(run.sensors)
-        for sensor in dict.fromkeys(run.sensors):
-            own = np.flatnonzero(sensors == sensor)
-            met = _Met(partial(run.met, own), run.nis[own].tolist(), run.weight[own].tolist())
-            self._met.setdefault(sensor, []).append(met)
+        for which in dict.fromkeys(run.which.tolist()):
+            own = np.flatnonzero(run.which == which)
+            of_keyframes = run.before, run.x, run.c, run.predicted_x, run.predicted_c
+            states = MetStates(*of_keyframes, run.interval[own], run.between[own])
+            met = _Met(states, run.nis[own].tolist(), run.weight[own].tolist())
+            self._met.setdefault(run.sensors[which], []).append(met)
         self.intervals += intervals
         if len(intervals):
             self._pieces.append((run.x, run.c, run.pose, run.velocity, run.sd))
@@ -147,7 +148,8 @@ class FilterHistory:
         """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
         nis = {}
         for sensor, parts in self._met.items():
-            found, weight = (np.array([v for part in parts for v in getattr(part, name)]) for name in ("nis", "weight"))
+            found = np.array([value for part in parts for value in part.nis])
+            weight = np.array([value for part in parts for value in part.weight])
             admitted = found[weight > 0.0]
             nis[sensor] = {
                 "mean": float(np.mean(admitted)) if len(admitted) else None,
