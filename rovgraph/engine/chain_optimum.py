@@ -125,10 +125,10 @@ class ChainOptimum:
 
         What they come of would be the larger part of a long dive.
         """
+        root = self.root  # first, as the rest comes of it
         P_y = self._end.border_covariance(self._believed)
         if self._short:
-            return self.root.covariances(P_y), P_y
-        root = self.root
+            return root.covariances(P_y), P_y
         _ = self.linear  # for nothing, while it is at hand
         del vars(self)["root"]
         return root.turn_into_covariances(P_y), P_y
