@@ -9,6 +9,7 @@ from dives import Simulated, batch, falcon, renewed, simulated, started, true_at
 from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
+from rovgraph.engine import gauss_newton
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.keyframes import KeyframeInterval
@@ -42,7 +43,9 @@ def test_a_dive_that_tilts_far_shows_the_scales_of_accelerometer_and_gyro(estima
         assert (sd < 0.25 * 0.01).all()
 
 
-def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows():
+def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows(monkeypatch):
+    for tolerance in ("FINE", "REST"):
+        monkeypatch.setattr(gauss_newton, tolerance, 1e-9)
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))
     chain = smoother.optimum()

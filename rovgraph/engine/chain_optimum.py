@@ -231,17 +231,17 @@ class ChainOptimum:
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
-        return self._knowledge_at(self.state, keyframes)
+        return self._knowledge_at(self.linearised_at, keyframes)
 
     def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
         """As `rovgraph.engine.optimum.Optimum`."""
         held = replace(self.chain, unknowns=self.unknowns.of(()))
         white = np.random.default_rng(seed).standard_normal((len(self.intervals), MOTION))
         # the border does not touch what the keyframes' own columns are eliminated to
-        own = held.eliminate(self.state, self.solution.gates) if self.wide.layout.walking else self.root
+        own = held.eliminate(self.linearised_at, self.solution.gates) if self.wide.layout.walking else self.root
         noise = own.draw(white)
         more, less = (
-            self._knowledge_at(held.moved(self.state, ChainStep(sign * noise, np.empty(0)), 1.0), keyframes)
+            self._knowledge_at(held.moved(self.linearised_at, ChainStep(sign * noise, np.empty(0)), 1.0), keyframes)
             for sign in (1.0, -1.0)
         )
         return more, less
