@@ -69,9 +69,9 @@ def dense(linear, order):
 
 
 def as_graph(dive, b):
-    """GTSAM's graph of a dive whose calibration is constant, and its values at the chain's optimum."""
-    problem = make_problem(dive.intervals, b.prior, b.config, dive.beliefs, b.instruments)
-    return problem, make_values(problem, dive.state, dive.state.calibration)
+    """GTSAM's graph of a dive whose calibration is constant, and its values where the chain is linearised."""
+    problem, point = make_problem(dive.intervals, b.prior, b.config, dive.beliefs, b.instruments), dive.linearised_at
+    return problem, make_values(problem, point, point.calibration)
 
 
 def test_information_agrees_with_a_dense_inversion_at_every_time():
