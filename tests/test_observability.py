@@ -116,7 +116,8 @@ def at_truth(case, dive):
     there = truth.at(time)
     bias = np.array([np.interp(time, truth.time, column) for column in case.dive.hidden["bias"].T]).T
     hidden = {**dive.unknowns.fixed, **case.dive.hidden["calibration"]}
-    return replace(dive, solution=replace(dive.solution, point=State(there.R_nb, there.p_n, there.v_n, bias, hidden)))
+    point = State(there.R_nb, there.p_n, there.v_n, bias, hidden)
+    return replace(dive, solution=replace(dive.solution, point=point), begun=None)
 
 
 def test_what_noise_pretends_is_taken_off(straight):
