@@ -119,12 +119,12 @@ class SquareRoot:
         return x[..., 0]
 
     def border_with(self, free: Index, y: Array, score: Array | None = None) -> Array:
-        """The border where the sum of squares is least.
+        """The border where the sum of squares is least, less twice its product with a score; shape (c,).
 
         Parameters
         ----------
-        free : components that may move
-        y : ndarray, shape (c,), the others, which are held
+        free : ndarray of int, components that may move
+        y : ndarray, shape (c,), where the others are held; what it has of the free ones is ignored
         score : ndarray, shape (c,), log likelihood of a unit of each beyond that of the rows
         """
         out, R, z = y.copy(), self.border[:, :-1], self.border[:, -1]
@@ -137,7 +137,7 @@ class SquareRoot:
         return out
 
     def move_to(self, y: Array) -> None:
-        """Count errors from `followed` keyframes and a border y, in place."""
+        """Count errors from a border y, shape (c,), and the keyframes that follow it (`followed`), in place."""
         self.conditionals[:, :, -1] = 0.0
         self.border[:, -1] -= self.border[:, :-1] @ y
 

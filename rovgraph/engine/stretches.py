@@ -224,7 +224,7 @@ def resume(
 
 
 def at_rest(problem: Linearizable[Point, Step], point: Point, known: Solution[Point]) -> Solution[Point] | None:
-    """The same, if it may lie at a point; None = gates change there."""
+    """A known solution moved to a point close by, with its gates and stretches; None = gates change there."""
     barred = _barred(problem.measured(), known.stretches)
     stands = standing(problem, point, known.gates, barred)
     return stands and _with_stretches(problem, stands, known)

@@ -3,7 +3,7 @@
 The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_CACHE_DIR``, this package's
 ``__pycache__`` and the user's cache directory; where there is none, kernels are compiled in each process.
 Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
-calls another one in a changed module is compiled again, which numba's own cache does not notice.
+calls a helper of a changed module is compiled again, which numba's own cache does not notice.
 
 Where several modules are missing, as many processes as there are cores compile them, each module after those that it
 imports. A process keeps the helpers that it has compiled for its next modules.

@@ -8,6 +8,7 @@ is said, and again after half an hour if it lasts, with the figures that it then
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 
 from rovgraph.check.agreement import headings, vertical
 from rovgraph.check.dvl import dvl_and_imu
@@ -61,22 +62,18 @@ class Crosscheck:
         if self._next == math.inf:
             self._next = m.time + FIRST_S
         if m.time >= self._next:
-            left = self._all_of(self._work)  # where the IMU was silent
+            left = [*chain.from_iterable(self._work)]  # where the IMU was silent
             self._take_newest(m.time - WINDOW_S)
             span = m.time - min(float(stream.time[0]) for stream in self._window.values())
             self._next, self._work = m.time + min(max(0.25 * span, EVERY_S[0]), EVERY_S[1]), self._compared()
             return left
         return next(self._work, [])
 
-    def _all_of(self, work: Iterator[list[Event]]) -> list[Event]:
-        """Do all that is left of a comparison."""
-        return [event for events in work for event in events]
-
     def finish(self) -> list[Event]:
         """No more measurements: what `add` has not said yet."""
-        events = self._all_of(self._work)
+        events = [*chain.from_iterable(self._work)]
         self._take_newest(-math.inf)
-        return events + (self._all_of(self._compared()) if self._suspected else [])
+        return events + ([*chain.from_iterable(self._compared())] if self._suspected else [])
 
     def _average(self) -> None:
         """One sample of the IMU instead of some."""
