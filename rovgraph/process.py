@@ -6,10 +6,10 @@ import gc
 import os
 import sys
 
-GARBAGE = 100_000  # objects made and not freed before the collector looks; Python's own is 700
+GARBAGE = 1_000_000  # objects made and not freed before the collector looks; Python's own is 700
 # bytes of an array that glibc maps by itself, so that it goes back to the system when it is freed: its own limit rises
 # to 32 MB, and what an hour's dive has freed below that stays with the process
-MAPPED, KEPT = 1 << 20, 32 << 20
+MAPPED, KEPT = 16 << 20, 32 << 20
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 # a library's pool of threads would spin beside kernels that need none, and in workers fight over the same cores
 ONE_THREAD = dict.fromkeys(

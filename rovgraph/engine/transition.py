@@ -67,7 +67,7 @@ def residual(interval: KeyframeInterval, before: State, after: State) -> tuple[A
 
 
 def whitening(interval: KeyframeInterval) -> Array:
-    """W, lower triangular, shape (15, 15), with W' W the information of the residual."""
+    """W of `rovgraph.kernels.motion_residual.motion_weights`, shape (15, 15)."""
     W = np.empty((1, 15, 15))
     motion_weights(_rows([interval]), W)
     return np.asarray(W[0])

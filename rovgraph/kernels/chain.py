@@ -83,7 +83,7 @@ def append_rows(source: Array, begin: int, end: int, column: int, columns: int, 
 @view_helper
 def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
     """Fold the rows below the border's triangle into it; returns the square that no value of the border explains."""
-    triangularise(Y, c, c, end, v, w)
+    triangularise(Y, c, c, end, end, v, w)
     left = 0.0
     for i in range(c, end):
         left += Y[i, c] * Y[i, c]
@@ -110,11 +110,12 @@ def load_measurements(rows: Array, targets: Index, begin: int, end: int, s: int,
 
 
 @view_helper
-def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, walk_r: Array, room: Room) -> None:
+def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, walk_r: Array, room: Room) -> int:
     """Rows of the motion after a keyframe into W, below its own d; the scale becomes that of the keyframe after it.
 
     A has shape (s, 2 (s + 1)): columns of the keyframe before, right-hand side, columns of the keyframe after. The rest
-    is that of `rovgraph.kernels.linear_chain.eliminate`, of one motion.
+    is that of `rovgraph.kernels.linear_chain.eliminate`, of one motion. Returns the row of W from which on nothing
+    stands left of A's diagonal: the rows of walks.
     """
     s, d, W_out, scale_out = len(A), len(A) + len(walk), room.W, room.scale
     last = d + len(scale_out)
@@ -140,6 +141,19 @@ def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, wa
         W_out[d + i, i], W_out[d + i, d + i] = -factor * kept[i - s], factor
         W_out[d + i, last] = walk_r[i - s]
         scale_out[i] = factor * factor
+    dense = s
+    while dense > 0 and _starts_at(A[dense - 1], dense - 1):
+        dense -= 1
+    return d + dense
+
+
+@view_helper
+def _starts_at(row: Array, column: int) -> bool:
+    """Whether a row is zero before a column."""
+    zeros = 0
+    while zeros < column and row[zeros] == 0.0:
+        zeros += 1
+    return zeros == column
 
 
 @view_helper
@@ -194,7 +208,7 @@ def absorb(
     """
     V, W, Y, d = room.V, room.W, room.Y, room.W.shape[0] // 2
     c, failing = room.scale.shape[0] - d, -1
-    triangularise(V, d, 0, end, room.v, room.w)
+    triangularise(V, d, 0, end, end, room.v, room.w)
     last = append_rows(V, d, end, d, c + 1, last, Y)
     stops_here = stop < stops.shape[0] and stops[stop] == k
     if last > c + PENDING or stops_here or k == n - 1:
@@ -214,15 +228,16 @@ def absorb(
 
 
 @view_helper
-def pass_on(k: int, n: int, room: Room, conditionals_out: Array) -> int:
+def pass_on(k: int, n: int, dense: int, room: Room, conditionals_out: Array) -> int:
     """Eliminate keyframe k from W; what is left is known of the one after it. Returns what is not determined, or -1.
 
-    Of its conditional only R's diagonal is kept where there is room for one column.
+    ``dense`` is what `load_motion` returned. Of the conditional only R's diagonal is kept where there is room for one
+    column.
     """
     W, d = room.W, room.W.shape[0] // 2
     c = room.scale.shape[0] - d
     if k < n - 1:
-        triangularise(W, d, d, 2 * d, room.v, room.w)
+        triangularise(W, d, d, dense, 2 * d, room.v, room.w)
         append_rows(W, d, 2 * d, d, d + c + 1, 0, room.V)
     # before the last keyframe, where scale is that of the next by now, a motion determines all that is a number
     failing, row = undetermined(W, room.scale, 0, d, k * d), min(k, conditionals_out.shape[0] - 1)

@@ -145,7 +145,7 @@ def eliminate_dive(
     C, targets, bias = np.zeros((MOTION, 6 * of_scale)), np.empty(6 * of_scale, np.int64), np.empty((2, 6))
     for i in range(len(targets)):
         targets[i] = column[MOTION + ACC_SCALE + i]
-    left_out[0] = 0.0
+    left_out[0], dense = 0.0, 0
     for k in range(n):
         c_k = c[k * of_c]
         end = load_measurements(given, given_targets, given_first[k], given_first[k + 1], MOTION, d, room)
@@ -167,8 +167,8 @@ def eliminate_dive(
                     C[i, j] = 0.0
                     for m in range(6):  # of both biases alike, which leaves the walk of the bias out of it
                         C[i, j] += (A[i, 9 + m] + A[i, AFTER + 9 + m]) * scales[k, m, j]
-            load_motion(A, C, targets, walk[k], kept[k], walk_r[k], room)
-        failing = max(failing, pass_on(k, n, room, conditionals_out))
+            dense = load_motion(A, C, targets, walk[k], kept[k], walk_r[k], room)
+        failing = max(failing, pass_on(k, n, dense, room, conditionals_out))
         if failing >= 0:
             return failing
     return close_border(n, d, room, border_out)

@@ -68,7 +68,10 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
 
 
 @view_helper
-def triangularise(W: Array, columns: int, top: int, end: int, v: Array, w: Array) -> None:
-    """Clear the first columns of W's rows ``top`` to ``end`` below the diagonal; rows above are triangular."""
+def triangularise(W: Array, columns: int, top: int, dense: int, end: int, v: Array, w: Array) -> None:
+    """Clear the first columns of W's rows ``top`` to ``end`` below the diagonal; rows above are triangular.
+
+    Rows from ``dense`` on have nothing left of the column that is as far from the first one as they are from ``top``.
+    """
     for j in range(columns):
-        reflect(W, j, max(j + 1, top), end, j, v, w)
+        reflect(W, j, max(j + 1, top), min(end, max(dense, top + j + 1)), j, v, w)

@@ -59,7 +59,7 @@ def eliminate(
         most = max(most, first[k + 1] - first[k])
     room, last, stop = make_room(d, c, most, border_rows), c + border_rows.shape[0], 0
     motion = np.empty((s, 2 * (s + 1)))
-    left_out[0] = 0.0
+    left_out[0], dense = 0.0, 0
     for k in range(n):
         end = load_measurements(rows, targets, first[k], first[k + 1], s, d, room)
         last, stop, failing = absorb(k, n, end, last, stops, stop, room, filtered_out, left_out)
@@ -68,8 +68,8 @@ def eliminate(
                 motion[i, s] = r[k, i]
                 for j in range(s):
                     motion[i, j], motion[i, s + 1 + j] = A_i[k, i, j], A_j[k, i, j]
-            load_motion(motion, C[k], C_targets, walk[k], kept[k], walk_r[k], room)
-        failing = max(failing, pass_on(k, n, room, conditionals_out))
+            dense = load_motion(motion, C[k], C_targets, walk[k], kept[k], walk_r[k], room)
+        failing = max(failing, pass_on(k, n, dense, room, conditionals_out))
         if failing >= 0:
             return failing
     return close_border(n, d, room, border_out)

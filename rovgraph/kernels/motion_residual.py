@@ -18,6 +18,7 @@ from rovgraph.geometry import Array
 from rovgraph.kernels.coasting import coasting_covariance, coasting_error
 from rovgraph.kernels.compile import helper, kernel, view_helper
 from rovgraph.kernels.cruising import cruising_covariance, cruising_error
+from rovgraph.kernels.layout import ACC_BIAS
 from rovgraph.kernels.motion import (
     MotionScratch,
     is_coasted,
@@ -34,6 +35,8 @@ from rovgraph.kernels.rotations import (
     multiply_transposed,
     rotate_back,
 )
+
+BIASES = ACC_BIAS  # components of a residual from there on are changes of bias
 
 
 class ResidualScratch(NamedTuple):
@@ -157,29 +160,33 @@ def _linear_error(at: int, away: Array, R_j: Array, A: Array, scratch: ResidualS
 
 @helper
 def _whitening(S: Array, W_out: Array) -> None:
-    """The inverse of the Cholesky factor of S, which is lost."""
+    """The inverse of the Cholesky factor of S, biases first; S is lost."""
     for j in range(15):
+        b = (j + BIASES) % 15
         for i in range(j, 15):
-            total = S[i, j]
+            a = (i + BIASES) % 15
+            total = S[a, b]
             for k in range(j):
-                total -= S[i, k] * S[j, k]
-            S[i, j] = total / math.sqrt(S[j, j]) if i > j else total
-        S[j, j] = math.sqrt(S[j, j])
+                c = (k + BIASES) % 15
+                total -= S[a, c] * S[b, c]
+            S[a, b] = total / S[b, b] if i > j else math.sqrt(total)
     for j in range(15):
+        b = (j + BIASES) % 15
         for i in range(15):
-            W_out[i, j] = 0.0
-        W_out[j, j] = 1.0 / S[j, j]
+            W_out[i, b] = 0.0
+        W_out[b, b] = 1.0 / S[b, b]
         for i in range(j + 1, 15):
-            total = 0.0
+            a, total = (i + BIASES) % 15, 0.0
             for k in range(j, i):
-                total -= S[i, k] * W_out[k, j]
-            W_out[i, j] = total / S[i, i]
+                c = (k + BIASES) % 15
+                total -= S[a, c] * W_out[c, b]
+            W_out[a, b] = total / S[a, a]
 
 
 @view_helper
 def whiten_motion(W: Array, A: Array, A_out: Array) -> None:
-    """W A of one interval, for the lower triangular W of `motion_weights` and A of `motion_error`."""
-    for i in range(15):
+    """W A of one interval, for W of `motion_weights` and A of `motion_error`."""
+    for i in range(BIASES):
         x, y, z = W[i, 0], W[i, 1], W[i, 2]
         for j in range(WIDTH):
             A_out[i, j] = x * A[0, j] + y * A[1, j] + z * A[2, j]
@@ -187,6 +194,14 @@ def whiten_motion(W: Array, A: Array, A_out: Array) -> None:
             x, y, z = W[i, 3 * k], W[i, 3 * k + 1], W[i, 3 * k + 2]
             for j in range(WIDTH):
                 A_out[i, j] += x * A[3 * k, j] + y * A[3 * k + 1, j] + z * A[3 * k + 2, j]
+    for i in range(BIASES, 15):
+        for j in range(WIDTH):
+            A_out[i, j] = 0.0
+    for i in range(15):
+        for m in range(BIASES, 15 if i < BIASES else i + 1):
+            A_out[i, m] += W[i, m] * A[m, m]
+            A_out[i, RESIDUAL] += W[i, m] * A[m, RESIDUAL]
+            A_out[i, AFTER + m] += W[i, m] * A[m, AFTER + m]
 
 
 @helper
@@ -244,6 +259,8 @@ def motion_residuals(
             total = 0.0
             for j in range(i + 1):
                 total += W[k, i, j] * r[j]
+            for j in range(max(i + 1, BIASES), 15):
+                total += W[k, i, j] * r[j]
             r_out[k, i] = total
 
 
@@ -282,7 +299,10 @@ def motion_errors(
 
 @kernel("void(f8[:, ::1], f8[:, :, ::1])")
 def motion_weights(motions: Array, W_out: Array) -> None:
-    """W, lower triangular, with W' W the information of each residual, shape (n, 15, 15)."""
+    """W, with W' W the information of each residual, shape (n, 15, 15).
+
+    It whitens biases first, then rotation, position and velocity, so that the rows of biases are those of their walks.
+    """
     S = np.empty((15, 15))
     for k in range(len(motions)):
         motion_covariance(motions[k], S)
