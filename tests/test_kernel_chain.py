@@ -78,9 +78,9 @@ class Chain:
         for k in range(last):
             for i in range(self.s):
                 parts = self._others(k, m.targets, m.C[k, i])
-                parts += [(k * d + j, m.A_i[k, i, j]) for j in range(self.s)]
-                parts += [((k + 1) * d + j, m.A_j[k, i, j]) for j in range(self.s)]
-                yield m.r[k, i], parts
+                parts += [(k * d + j, m.A[k, i, j]) for j in range(self.s)]
+                parts += [((k + 1) * d + j, m.A[k, i, self.s + 1 + j]) for j in range(self.s)]
+                yield m.A[k, i, self.s], parts
             for i in range(self.w):
                 here = k * d + self.s + i
                 yield m.walk_r[k, i], [(here, -m.walk[k, i] * m.kept[k, i]), (here + d, m.walk[k, i])]
@@ -119,15 +119,15 @@ def random_chain(n: int, s: int, w: int, c: int, seed: int = 0) -> Chain:
     e = min(c, 2)
     motion_targets = [d + c - 1 - j for j in range(e)] + [s + j for j in range(w)] + [-1]
     motions = MotionRows(
-        rng.standard_normal((n - 1, s, s)),
-        rng.standard_normal((n - 1, s, s)),
-        rng.standard_normal((n - 1, s)),
+        rng.standard_normal((n - 1, s, 2 * (s + 1))),
         rng.standard_normal((n - 1, s, len(motion_targets))),
         np.array(motion_targets, dtype=np.int64),
         rng.uniform(0.5, 2.0, (n - 1, w)),
         rng.uniform(0.5, 1.0, (n - 1, w)),
         rng.standard_normal((n - 1, w)),
     )
+    for i in range(2 * s // 3, s):  # every other motion has rows that begin at the diagonal, as a bias's do
+        motions.A[::2, i, :i] = 0.0
     of_border, walking = [d + j for j in range(min(c, 3))], [s + j for j in range(w)]
     sensors = [
         random_sensor(rng, n, s, 1, d + 2, walking, every=True),  # the first keyframe's prior
@@ -330,7 +330,7 @@ def test_a_vague_prior_survives_precise_motions():
     n, prior_sd, step_sd = 3000, 1e3, 4e-4
     chain = random_walk(n, 2, prior_sd, step_sd)
     mixed = np.array([[0.8, -0.6], [0.6, 0.8]])
-    for part in (chain.motions.A_i, chain.motions.A_j, chain.sensors[0].J):
+    for part in (chain.motions.A[:, :, :2], chain.motions.A[:, :, 3:5], chain.sensors[0].J):
         part[:] = part @ mixed  # or all would be powers of one number
     P = chain.eliminate().covariances(np.zeros((0, 0)))
     expected = prior_sd**2 + step_sd**2 * np.arange(n)
@@ -374,7 +374,7 @@ def test_a_component_that_nothing_determines_is_named_at_the_first_stop_or_the_e
 def test_a_row_that_is_no_number_is_found_where_it_is(where):
     chain = random_chain(6, 15, 0, 4)
     if where == "motion":
-        chain.motions.A_i[3, 2, 5] = np.nan
+        chain.motions.A[3, 2, 5] = np.nan
         expected = 3
     else:
         chain.sensors[1].J[4, 0, 5] = np.nan

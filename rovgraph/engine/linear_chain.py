@@ -17,16 +17,14 @@ class MotionRows:
 
     Attributes
     ----------
-    A_i, A_j : ndarray, shape (n - 1, s, s), Jacobians by the keyframes before and after
-    r : ndarray, shape (n - 1, s), right-hand sides
+    A : ndarray, shape (n - 1, s, 2 (s + 1)), columns of the keyframe before, right-hand sides, columns of the keyframe
+        after, and one that is not read, as `rovgraph.kernels.motion_row`
     C, targets : ndarray, shapes (n - 1, s, e) and (e,), Jacobians by other columns (see `rovgraph.kernels.chain`)
     walk, kept, walk_r : ndarray, shape (n - 1, d - s), one over the sd of a walk, what it keeps of the value before,
         and right-hand sides
     """
 
-    A_i: Array
-    A_j: Array
-    r: Array
+    A: Array
     C: Array
     targets: Index
     walk: Array
@@ -35,10 +33,16 @@ class MotionRows:
 
     @staticmethod
     def of_states(A_i: Array, A_j: Array, r: Array) -> "MotionRows":
-        """Rows of motions in which nothing walks and that know nothing of the border."""
+        """Rows of motions in which nothing walks and that know nothing of the border.
+
+        Parameters
+        ----------
+        A_i, A_j : ndarray, shape (n - 1, s, s), Jacobians by the keyframes before and after
+        r : ndarray, shape (n - 1, s), right-hand sides
+        """
         count, s = r.shape
-        none = np.zeros((count, 0))
-        return MotionRows(A_i, A_j, r, np.zeros((count, s, 0)), np.zeros(0, dtype=np.int64), none, none, none)
+        A, none = np.concatenate([A_i, r[..., None], A_j, np.zeros((count, s, 1))], axis=2), np.zeros((count, 0))
+        return MotionRows(A, np.zeros((count, s, 0)), np.zeros(0, dtype=np.int64), none, none, none)
 
 
 def eliminate(
@@ -60,6 +64,6 @@ def eliminate(
     rows = measurements.values, measurements.targets, measurements.first, border_rows, np.array(stops, dtype=np.int64)
 
     def fill(*out: Array) -> int:
-        return eliminate_rows(m.A_i, m.A_j, m.r, m.C, m.targets, m.walk, m.kept, m.walk_r, *rows, *out)
+        return eliminate_rows(m.A, m.C, m.targets, m.walk, m.kept, m.walk_r, *rows, *out)
 
-    return square_root(n, m.A_i.shape[1] + m.walk.shape[1], c, len(stops), fill)
+    return square_root(n, m.A.shape[1] + m.walk.shape[1], c, len(stops), fill)

@@ -1,20 +1,16 @@
 """A chain whose rows are at hand, eliminated: for studies of the solver; `rovgraph.kernels.dive` makes them itself."""
 
-import numpy as np
-
 from rovgraph.geometry import Array
 from rovgraph.kernels.chain import Index, absorb, close_border, load_measurements, load_motion, make_room, pass_on
 from rovgraph.kernels.compile import kernel
 
 
 @kernel(
-    "i8(f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1],"
-    " f8[:, ::1], i8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1])"
+    "i8(f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[:, ::1], i8[::1],"
+    " f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1])"
 )
 def eliminate(
-    A_i: Array,
-    A_j: Array,
-    r: Array,
+    A: Array,
     C: Array,
     C_targets: Index,
     walk: Array,
@@ -34,8 +30,7 @@ def eliminate(
 
     Parameters
     ----------
-    A_i, A_j : shape (n - 1, s, s), whitened Jacobians of a motion by the keyframes before and after it
-    r : shape (n - 1, s), its right-hand side
+    A : shape (n - 1, s, 2 (s + 1)), whitened rows of a motion, as `rovgraph.kernels.motion_row` lays them out
     C, C_targets : shapes (n - 1, s, e) and (e,), its other columns, of the keyframe before it or of the border
     walk, kept, walk_r : shape (n - 1, d - s), the last components walk: ``walk (x_{k+1} - kept x_k) = walk_r`` is white
     rows : shape (m, s + q + 1), of measurements in the order of keyframes: the first s components of the
@@ -53,22 +48,17 @@ def eliminate(
     -------
     -1, or the first component that the rows do not determine, ``k d + j`` of a keyframe and ``n d + j`` of the border
     """
-    n, d, s, c = conditionals_out.shape[0], conditionals_out.shape[1], A_i.shape[1], border_out.shape[0]
+    n, d, s, c = conditionals_out.shape[0], conditionals_out.shape[1], A.shape[1], border_out.shape[0]
     most = 0
     for k in range(n):
         most = max(most, first[k + 1] - first[k])
     room, last, stop = make_room(d, c, most, border_rows), c + border_rows.shape[0], 0
-    motion = np.empty((s, 2 * (s + 1)))
     left_out[0], dense = 0.0, 0
     for k in range(n):
         end = load_measurements(rows, targets, first[k], first[k + 1], s, d, room)
         last, stop, failing = absorb(k, n, end, last, stops, stop, room, filtered_out, left_out)
         if k < n - 1:
-            for i in range(s):
-                motion[i, s] = r[k, i]
-                for j in range(s):
-                    motion[i, j], motion[i, s + 1 + j] = A_i[k, i, j], A_j[k, i, j]
-            dense = load_motion(motion, C[k], C_targets, walk[k], kept[k], walk_r[k], room)
+            dense = load_motion(A[k], C[k], C_targets, walk[k], kept[k], walk_r[k], room)
         failing = max(failing, pass_on(k, n, dense, room, conditionals_out))
         if failing >= 0:
             return failing
