@@ -212,6 +212,12 @@ def test_a_reinitialisation_in_the_thread_makes_it_the_reinitialised_filter(once
     same(known[-20:], recorded.filtered[-20:], 1e-5, rtol=1e-2)  # of two optima, each within its tolerance
 
 
+def test_keyframes_that_no_reinitialisation_needs_are_freed(once, initial, measurements):
+    thread = Reinitialisations(patient=True)
+    reinitialised(initial, measurements, thread)
+    assert not thread._passed
+
+
 def test_a_reinitialisation_that_takes_longer_than_the_lag_makes_it_the_same(
     once, monkeypatch, case, initial, measurements
 ):

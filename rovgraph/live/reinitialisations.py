@@ -36,6 +36,7 @@ _Smoothed = tuple[Gaussian, list[Statistic]]
 
 EXAMINED_FROM_S = 60.0  # of the dive: what was held wrongly for less shows little
 SEARCHED_UNTIL_S = 500.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
+FREED = 20  # keyframes that are no longer needed, after each new one: thousands at once take 40 ms
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,8 @@ class Reinitialisations:
             except InputError as error:
                 self.news.append(f"the filter is reinitialised no more ({error}); it goes on as it is")
                 self.close()
+        if not self._due:
+            del self._passed[-FREED:]
         return self.waited - before
 
     def again(self) -> None:
@@ -104,7 +107,7 @@ class Reinitialisations:
 
     def close(self) -> None:
         """Wait for nothing any more."""
-        self._due, self._passed, self._running = [], [], None
+        self._due, self._running = [], None
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     def _begin(self, engine: FixedLag, dvl_contradicted: bool) -> None:
