@@ -48,7 +48,7 @@ class NoiseFloor:
         self._count += 1
 
     def densities(self) -> Array:
-        """Noise densities to go on with, shape (2,); in_outage to knocks."""
+        """Noise densities to go on with, shape (2,); blind to knocks."""
         known = min(self._count, INTERVALS)
         if known < ENOUGH:
             return self.believed

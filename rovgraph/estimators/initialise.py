@@ -148,7 +148,7 @@ def _resolve_environment(log: Log, config: Config, assumptions: list[str]) -> Co
 
 
 def sample_density(time: Array, samples: Array) -> float:
-    """Noise density that samples show by themselves, in_outage to knocks [unit/rtHz].
+    """Noise density that samples show by themselves, blind to knocks [unit/rtHz].
 
     Parameters
     ----------

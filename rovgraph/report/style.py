@@ -1,4 +1,4 @@
-"""How all figures look: sizes, colours that the colour-in_outage and a grey print keep apart, time axes."""
+"""How all figures look: sizes, colours that the colour-blind and a grey print keep apart, time axes."""
 
 import contextlib
 from collections.abc import Iterator, Sequence

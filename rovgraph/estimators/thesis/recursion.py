@@ -28,7 +28,7 @@ from rovgraph.estimators.thesis.truth import TrueMotion
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.thesis import SAMPLE_S
 
-InsertResult = tuple[Mask, Array, Array, Array]  # a measurement: which components, innovation, whitened, sd
+UpdateResult = tuple[Mask, Array, Array, Array]  # a measurement: which components, innovation, whitened, sd
 
 LONGEST_STEP_S = 1.5 * SAMPLE_S  # of forward Euler; a longer interval is divided
 
@@ -144,7 +144,7 @@ class _Batch:
             for part in range(parts[step]):
                 self._predict(dt[step] * (part < count[step]))
             self._time, self._epoch = table.time[step], table.epoch[step]
-            taken: InsertResult | None = None
+            taken: UpdateResult | None = None
             if table.ping[step]:
                 taken = self._take_ping(table.number[step], table.active[step])
             elif self._imu is not None:
@@ -168,7 +168,7 @@ class _Batch:
             F = self._process.step(self._truth(self._x), dt, self._epoch)[1]
         self._x, self._P = x, propagate_covariance(self._P, F, Q, self._moving)
 
-    def _take_sample(self, model: ImuModel, active: Mask) -> InsertResult:
+    def _take_sample(self, model: ImuModel, active: Mask) -> UpdateResult:
         z = self._samples.at(self._epoch)
 
         def innovate(x: Array) -> Linearized:
@@ -177,7 +177,7 @@ class _Batch:
 
         return self._update(innovate, np.isfinite(z) & active[:, None], self._R_imu)
 
-    def _take_ping(self, number: NDArray[np.int64], active: Mask) -> InsertResult:
+    def _take_ping(self, number: NDArray[np.int64], active: Mask) -> UpdateResult:
         z = self._pings.at(number)
         measured = np.isfinite(z) & active[:, None]
         heading = bool(measured[:, HEADING].any())
@@ -190,7 +190,7 @@ class _Batch:
 
         return self._update(innovate, measured, self._R_dvl)
 
-    def _update(self, innovate: Innovate, measured: Mask, R: Array) -> InsertResult:
+    def _update(self, innovate: Innovate, measured: Mask, R: Array) -> UpdateResult:
         """Update with the components that were measured and bring quaternions back to unit length."""
 
         def innovate_at(x: Array) -> Linearized:
@@ -222,7 +222,7 @@ class _Batch:
             )
         return len(diverged) > 0
 
-    def _keep_innovations(self, taken: InsertResult, table: Timetable, step: int) -> None:
+    def _keep_innovations(self, taken: UpdateResult, table: Timetable, step: int) -> None:
         measured, *columns = taken
         for b in np.flatnonzero(table.keeps_innovation[step]).tolist():
             m = self._members[b]
