@@ -28,6 +28,7 @@ from checkouts import ROOT, Checkout, Failed, checkout_of
 T = TypeVar("T")
 BASE = "27325b3"
 SHIPPED = ROOT / "data" / "falcon"
+# all but iSAM2's, and those with thrusters
 IN_BOTH = ["--estimators", "dead-reckoning,4.*,ekf-[abcm]*,rts-*,graph-filtered-*,graph-smoothed-[abcm]*"]
 ICTINEU = ROOT.parent / "shared" / "data" / "ictineu"
 
@@ -239,7 +240,7 @@ def replays(bench: Bench, kind: str, rate: float, times: float, p99: float, long
 
 
 def compare(bench: Bench) -> Iterator[Line]:
-    """As it stands, and with the estimators that 27325b3 has: it compares none of iSAM2's."""
+    """As it stands, and with the estimators of 27325b3, which has none of iSAM2's."""
     few = ["--estimators", "dead-reckoning"]
     for words, options in ("", few if bench.quick else []), (", without iSAM2", few if bench.quick else IN_BOTH):
         base, now = bench.both(lambda c, o=options: scaled(c, partial(_comparison, bench, o), bench.seeds, 30))
@@ -247,7 +248,8 @@ def compare(bench: Bench) -> Iterator[Line]:
 
 
 def _comparison(bench: Bench, options: list[str], checkout: Checkout, seeds: int) -> float:
-    scenario = ["--scenario", "vattern", "--seeds", seeds, *options]
+    # in one process: several would share out the estimators of one dive, and each simulate it
+    scenario = ["--scenario", "vattern", "--seeds", seeds, "--jobs", 1, *options]
     return checkout.rovgraph("compare", *scenario, "--out", bench.results(checkout), "--force").processor
 
 
@@ -301,6 +303,8 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3, help="dives of a cell of the study, 2 or more, scaled to 50")
     parser.add_argument("--ictineu", type=Path, default=ICTINEU, metavar="DIR", help="log.csv.gz and ictineu.yaml")
     given = parser.parse_args()
+    if min(given.seeds, given.runs) < 2:
+        parser.error("--seeds and --runs: 2 or more")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         base = None

@@ -8,7 +8,8 @@ import sys
 
 GARBAGE = 1_000_000  # objects made and not freed before the collector looks; Python's own is 700
 # bytes of an array that glibc maps by itself, so that it goes back to the system when it is freed: its own limit rises
-# to 32 MB, and what an hour's dive has freed below that stays with the process
+# to 32 MB, and much of what an hour's dive has freed stays with the process. The arrays of a dive of minutes may stay:
+# the system clears what it hands out again
 MAPPED, KEPT = 16 << 20, 32 << 20
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 # a library's pool of threads would spin beside kernels that need none, and in workers fight over the same cores
@@ -33,7 +34,7 @@ def be_frugal() -> None:
 
 
 def give_back() -> None:
-    """Let the system have what was freed below `MAPPED`: between tasks of which each makes very many small objects."""
+    """Let the system have what was freed below `MAPPED`: between tasks of which each makes very many objects."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)

@@ -48,6 +48,10 @@ def test_ratios_are_of_what_it_was_to_what_it_is_and_judged_by_the_target(engine
     assert engine.Line("x", "s", 40.0, 1.0, engine.times_less(40)).row(False).endswith("|  |")
 
 
+def test_what_a_command_costs_once_is_not_multiplied(engine):
+    assert engine.scaled(None, lambda checkout, dives: 5.0 + 2.0 * dives, 3, 30) == pytest.approx(65.0)
+
+
 @pytest.mark.slow
 def test_processor_time_and_memory_are_those_of_the_command_and_an_error_is_its_last_line(engine):
     checkout = engine.Checkout(engine.ROOT, "now.py")

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -213,6 +214,14 @@ def test_a_reinitialisation_in_the_thread_makes_it_the_reinitialised_filter(once
 
 
 def test_keyframes_that_no_reinitialisation_needs_are_freed(once, initial, measurements):
+    """A few at a time."""
+    thread, kept = Reinitialisations(patient=True), list[int]()
+    reinitialised(initial, measurements, thread, at=lambda time: kept.append(len(thread._passed)))
+    assert max(kept) > reinitialisations.FREED and kept[-1] == 0
+    assert max(before - after for before, after in pairwise(kept)) == reinitialisations.FREED
+
+
+def test_nothing_is_kept_of_a_dive_that_ends_before_its_last_reinitialisation(initial, measurements):
     thread = Reinitialisations(patient=True)
     reinitialised(initial, measurements, thread)
     assert not thread._passed

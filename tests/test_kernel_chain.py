@@ -117,7 +117,7 @@ def random_sensor(
 def random_chain(n: int, s: int, w: int, c: int, seed: int = 0) -> Chain:
     rng, d = np.random.default_rng(seed), s + w
     e = min(c, 2)
-    motion_targets = [d + c - 1 - j for j in range(e)] + [s + j for j in range(w)] + [-1]
+    motion_targets = [d + c - 1 - j for j in range(e)] + [s + j for j in range(w)] + [-1, 0]
     motions = MotionRows(
         rng.standard_normal((n - 1, s, 2 * (s + 1))),
         rng.standard_normal((n - 1, s, len(motion_targets))),

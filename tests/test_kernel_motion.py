@@ -14,7 +14,7 @@ import pytest
 from rovgraph.geometry import Array, exp_rotation, log_rotation, matrix_from_rpy, rpy_from_matrix, wrap_angle
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
 from rovgraph.kernels.motion import transitions
-from rovgraph.kernels.motion_residual import motion_errors, motion_weights, whiten_motion
+from rovgraph.kernels.motion_residual import motion_errors, motion_residuals, motion_weights, whiten_motion
 from rovgraph.kernels.motion_row import (
     BIAS,
     BY_BIAS,
@@ -327,21 +327,32 @@ def test_transition_carries_small_errors(case, gap):
     close(F, derivative(moved), 1e-8)
 
 
+@pytest.mark.parametrize("gap", [0.0, 2.0, NO_IMU], ids=["whole", "coasted", "cruised"])
 @cases
-def test_weights_whiten(case):
-    row, _ = case.row()
-    W, S = weight(row), row[COVARIANCE:].reshape(15, 15)
+def test_weights_whiten_biases_first(case, gap):
+    """So that the rows of biases are those of their walks, exactly."""
+    row, _ = case.row(gap)
+    W = weight(row)
     biases_first = np.roll(np.arange(15), 6)
     ordered = W[np.ix_(biases_first, biases_first)]
     np.testing.assert_array_equal(ordered, np.tril(ordered))
-    np.testing.assert_allclose(W @ S @ W.T, np.eye(15), atol=1e-6)
+    if gap == 0.0:
+        S = row[COVARIANCE:].reshape(15, 15)
+        np.testing.assert_allclose(W @ S @ W.T, np.eye(15), atol=1e-6)
     before = ends(8, case.bias)
-    after = predict(row, before).moved(0.01 * np.random.default_rng(5).normal(size=(1, 15)))
+    after = transition(row, before)[0].moved(0.01 * np.random.default_rng(5).normal(size=(1, 15)))
     r, A_i, A_j = error(row, before, after)
     motion = np.column_stack([A_i, r, A_j, np.zeros(15)])
     whitened = np.empty_like(motion)
     whiten_motion(W, motion, whitened)
     close(whitened, W @ motion)
+    for of_keyframe in (whitened[9:, :15], whitened[9:, 16:31]):
+        np.testing.assert_array_equal(np.delete(of_keyframe, np.s_[9:15], axis=1), 0.0)
+        np.testing.assert_array_equal(of_keyframe[:, 9:], np.diag(np.diagonal(of_keyframe[:, 9:])))
+    alone = np.empty((1, 15))
+    two = (np.concatenate(both) for both in zip(before.all, after.all, strict=True))
+    motion_residuals(row[None], W[None], *two, np.empty((0, 6)), alone)
+    close(alone[0], W @ r)
 
 
 def test_many_intervals_are_each_alone():

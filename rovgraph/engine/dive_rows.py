@@ -26,7 +26,7 @@ class DiveRows:
     Attributes
     ----------
     motions, weights : ndarray, shapes (n - 1, ROW), (n - 1, 15, 15), of `rovgraph.kernels.motion_row`, and their
-        square-root information, lower triangular
+        square-root information, of `rovgraph.kernels.motion_residual.motion_weights`
     scales : ndarray, shape (n - 1, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
     rows : ndarray, shape (m, ROW), of `rovgraph.kernels.measurement_row`
     which : ndarray of int, shape (m,), the sensor of each, of ``sensors``
@@ -145,7 +145,11 @@ class DiveRows:
         )
 
     def motion_residuals(self, state: State) -> Array:
-        """Whitened residuals of the motions, shape (n - 1, 15), at a state of all keyframes."""
+        """Whitened residuals of the motions, shape (n - 1, 15), at a state of all keyframes.
+
+        Columns 9 to 14 are the changes of the biases, those before rotation, position and velocity beyond what the
+        former tell of the latter.
+        """
         shift, r = np.empty((0, 6)), np.empty((len(self.motions), MOTION))
         if len(self.scales):
             k = [np.broadcast_to(np.atleast_2d(state.calibration[s]), (len(self), 3))[1:] for s in SCALES]

@@ -18,7 +18,7 @@ class MotionRows:
     Attributes
     ----------
     A : ndarray, shape (n - 1, s, 2 (s + 1)), columns of the keyframe before, right-hand sides, columns of the keyframe
-        after, and one that is not read, as `rovgraph.kernels.motion_row`
+        after, and one that is not read
     C, targets : ndarray, shapes (n - 1, s, e) and (e,), Jacobians by other columns (see `rovgraph.kernels.chain`)
     walk, kept, walk_r : ndarray, shape (n - 1, d - s), one over the sd of a walk, what it keeps of the value before,
         and right-hand sides

@@ -114,8 +114,8 @@ def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, wa
     """Rows of the motion after a keyframe into W, below its own d; the scale becomes that of the keyframe after it.
 
     A has shape (s, 2 (s + 1)): columns of the keyframe before, right-hand side, columns of the keyframe after. The rest
-    is that of `rovgraph.kernels.linear_chain.eliminate`, of one motion. Returns the row of W from which on nothing
-    stands left of A's diagonal: the rows of walks.
+    is that of `rovgraph.kernels.linear_chain.eliminate`, of one motion. Returns the first row of W from which on row
+    d + i is zero before column i, for `triangularise`: the rows of walks.
     """
     s, d, W_out, scale_out = len(A), len(A) + len(walk), room.W, room.scale
     last = d + len(scale_out)
@@ -142,7 +142,7 @@ def load_motion(A: Array, C: Array, targets: Index, walk: Array, kept: Array, wa
         W_out[d + i, last] = walk_r[i - s]
         scale_out[i] = factor * factor
     dense = s
-    while dense > 0 and _starts_at(A[dense - 1], dense - 1):
+    while dense > 0 and _starts_at(W_out[d + dense - 1], dense - 1):
         dense -= 1
     return d + dense
 

@@ -71,7 +71,7 @@ def reflect(W: Array, pivot: int, first: int, last: int, column: int, v: Array, 
 def triangularise(W: Array, columns: int, top: int, dense: int, end: int, v: Array, w: Array) -> None:
     """Clear the first columns of W's rows ``top`` to ``end`` below the diagonal; rows above are triangular.
 
-    Rows from ``dense`` on have nothing left of the column that is as far from the first one as they are from ``top``.
+    Row i from ``dense`` on is zero before column i - top, and left out of the reflections until then.
     """
     for j in range(columns):
         reflect(W, j, max(j + 1, top), min(end, max(dense, top + j + 1)), j, v, w)

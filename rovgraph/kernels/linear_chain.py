@@ -30,7 +30,8 @@ def eliminate(
 
     Parameters
     ----------
-    A : shape (n - 1, s, 2 (s + 1)), whitened rows of a motion, as `rovgraph.kernels.motion_row` lays them out
+    A : shape (n - 1, s, 2 (s + 1)), whitened rows of a motion: columns of the keyframe before it, right-hand side,
+        columns of the keyframe after it, and one that is not read
     C, C_targets : shapes (n - 1, s, e) and (e,), its other columns, of the keyframe before it or of the border
     walk, kept, walk_r : shape (n - 1, d - s), the last components walk: ``walk (x_{k+1} - kept x_k) = walk_r`` is white
     rows : shape (m, s + q + 1), of measurements in the order of keyframes: the first s components of the

@@ -158,34 +158,39 @@ def _linear_error(at: int, away: Array, R_j: Array, A: Array, scratch: ResidualS
             row[j] += slope[i, 0] * A[0, j] + slope[i, 1] * A[1, j] + slope[i, 2] * A[2, j]
 
 
-@helper
-def _whitening(S: Array, W_out: Array) -> None:
-    """The inverse of the Cholesky factor of S, biases first; S is lost."""
+@view_helper
+def _whitening(S: Array, ordered: Array, W_out: Array) -> None:
+    """The inverse of the Cholesky factor of S, biases first; S and ``ordered``, shape (15, 15), are lost."""
+    for i in range(15):
+        for j in range(15):
+            ordered[i, j] = S[(i + BIASES) % 15, (j + BIASES) % 15]
     for j in range(15):
-        b = (j + BIASES) % 15
         for i in range(j, 15):
-            a = (i + BIASES) % 15
-            total = S[a, b]
+            total = ordered[i, j]
             for k in range(j):
-                c = (k + BIASES) % 15
-                total -= S[a, c] * S[b, c]
-            S[a, b] = total / S[b, b] if i > j else math.sqrt(total)
+                total -= ordered[i, k] * ordered[j, k]
+            ordered[i, j] = total / math.sqrt(ordered[j, j]) if i > j else total
+        ordered[j, j] = math.sqrt(ordered[j, j])
     for j in range(15):
-        b = (j + BIASES) % 15
         for i in range(15):
-            W_out[i, b] = 0.0
-        W_out[b, b] = 1.0 / S[b, b]
+            S[i, j] = 0.0
+        S[j, j] = 1.0 / ordered[j, j]
         for i in range(j + 1, 15):
-            a, total = (i + BIASES) % 15, 0.0
+            total = 0.0
             for k in range(j, i):
-                c = (k + BIASES) % 15
-                total -= S[a, c] * W_out[c, b]
-            W_out[a, b] = total / S[a, a]
+                total -= ordered[i, k] * S[k, j]
+            S[i, j] = total / ordered[i, i]
+    for i in range(15):
+        for j in range(15):
+            W_out[(i + BIASES) % 15, (j + BIASES) % 15] = S[i, j]
 
 
 @view_helper
 def whiten_motion(W: Array, A: Array, A_out: Array) -> None:
-    """W A of one interval, for W of `motion_weights` and A of `motion_error`."""
+    """W A of one interval, for W of `motion_weights` and A of `motion_error`.
+
+    Rows of biases have their own two columns and the residual in A, and nothing before the biases in W.
+    """
     for i in range(BIASES):
         x, y, z = W[i, 0], W[i, 1], W[i, 2]
         for j in range(WIDTH):
@@ -257,9 +262,7 @@ def motion_residuals(
             rotate_back(Jr, seen, r[6:9])
         for i in range(15):
             total = 0.0
-            for j in range(i + 1):
-                total += W[k, i, j] * r[j]
-            for j in range(max(i + 1, BIASES), 15):
+            for j in range(15):
                 total += W[k, i, j] * r[j]
             r_out[k, i] = total
 
@@ -303,7 +306,7 @@ def motion_weights(motions: Array, W_out: Array) -> None:
 
     It whitens biases first, then rotation, position and velocity, so that the rows of biases are those of their walks.
     """
-    S = np.empty((15, 15))
+    S, ordered = np.empty((15, 15)), np.empty((15, 15))
     for k in range(len(motions)):
         motion_covariance(motions[k], S)
-        _whitening(S, W_out[k])
+        _whitening(S, ordered, W_out[k])

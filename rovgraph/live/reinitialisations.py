@@ -36,7 +36,7 @@ _Smoothed = tuple[Gaussian, list[Statistic]]
 
 EXAMINED_FROM_S = 60.0  # of the dive: what was held wrongly for less shows little
 SEARCHED_UNTIL_S = 500.0  # for noise, which takes seconds of a core in longer dives, and has shown by then
-FREED = 20  # keyframes that are no longer needed, after each new one: thousands at once take 40 ms
+FREED = 20  # keyframes, after each new one, once no re-initialisation needs them: thousands at once take 40 ms
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Reinitialisations:
                 self._adopt(engine, *self._running)
             except InputError as error:
                 self.news.append(f"the filter is reinitialised no more ({error}); it goes on as it is")
-                self.close()
+                self._stop()
         if not self._due:
             del self._passed[-FREED:]
         return self.waited - before
@@ -106,7 +106,12 @@ class Reinitialisations:
         self._running = None
 
     def close(self) -> None:
-        """Wait for nothing any more."""
+        """Wait for nothing any more; no keyframe comes after it."""
+        self._stop()
+        self._passed = []
+
+    def _stop(self) -> None:
+        """Smooth no more; `step` frees the keyframes."""
         self._due, self._running = [], None
         self._thread.shutdown(wait=False, cancel_futures=True)
 
@@ -141,7 +146,7 @@ class Reinitialisations:
         self._due.pop(0)
         self._running = None
         if not self._due:
-            self.close()
+            self._stop()
 
 
 def _keyframe(snapshot: FilterSnapshot) -> Keyframe:
