@@ -8,6 +8,7 @@ from dives import altered, falcon, simulated, without
 
 from rovgraph.check import Finding, bridge_jumps, examine
 from rovgraph.check.acceleration import ORIENTATIONS
+from rovgraph.check.agreement import heading_lag
 from rovgraph.check.inertial import inertial_motion
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import DataWarning
@@ -181,6 +182,15 @@ def test_a_compass_that_is_half_a_minute_late_is_measured(dive):
     log, config = dive
     text = said(later(log, "dvl_heading", 27.0), config, "dvl_heading")
     assert any(f"comes {x} s later than the gyro's" in text for x in ("26.98", "26.99", "27.00", "27.01", "27.02"))
+
+
+@pytest.mark.parametrize("late", [0.0, 0.5])
+@pytest.mark.parametrize("seed", [3, 4])
+def test_waves_are_no_lag_of_a_compass(seed, late):
+    """Rolling and pitching, a heading turns otherwise than the gyro's z axis shows, which seemed 0.15 s."""
+    case = simulated(falcon(), 300.0, seed, "figure8")
+    found = heading_lag(later(case.log, "dvl_heading", late), case.config, "dvl_heading")
+    assert found is not None and found[0] == pytest.approx(late, abs=0.06)
 
 
 def test_fixes_that_are_late_are_measured(with_fixes):

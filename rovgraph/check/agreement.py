@@ -10,6 +10,7 @@ import numpy as np
 from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
 from rovgraph.check.inertial import inertial_motion
 from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
+from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, cross, rotate
 from rovgraph.log import Log, Stream
@@ -20,6 +21,7 @@ CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
 EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
 WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
+LEAST_LEVEL = 0.1  # cos(pitch)^2 below which a heading turns at any rate
 NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading"}
 
 
@@ -41,8 +43,7 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         noise = _change_noise(heading, window)
         yield _turning(log, sensor, f, noise)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
-            # short windows: in long ones a compass's deviation looks like a lag
-            found = lag(gyro, heading, max(1.0, 1.5 * period))
+            found = _heading_lag(log, config, heading)
             delay = config.delay_s.get(sensor, 0.0) + found.seconds
             remedy = f"if it is late, state delay_s: {{{sensor}: {delay:.2g}}}"
             yield from _clock(sensor, f"the turning of {NAMES[sensor]}", "the gyro's", found, EVIDENCE, remedy)
@@ -52,15 +53,40 @@ def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | 
     """How much later a compass turns than the gyro, and its sd [s]; None where it does not follow the gyro."""
     if sensor not in NAMES or len(log[sensor]) < MIN_WINDOWS:
         return None
-    heading = _heading(log, config, sensor)
-    found = lag(_gyro_yaw(log["imu"], config), heading, max(1.0, 1.5 * float(np.median(np.diff(heading.time)))))
+    found = _heading_lag(log, config, _heading(log, config, sensor))
     return None if np.isnan(found.seconds) or np.isnan(found.sd) else (found.seconds, found.sd)
+
+
+def _heading_lag(log: Log, config: Config, heading: Signal) -> Lag:
+    """How much later a heading shows a turn than the gyro.
+
+    In short windows: in long ones a compass's deviation looks like a lag. Legs of a dive are told apart best by what
+    the vehicle's own axis shows beside them.
+    """
+    window = max(1.0, 1.5 * float(np.median(np.diff(heading.time))))
+    coarse = coarse_lag(_gyro_yaw(log["imu"], config), heading, window)
+    return lag(_heading_by_gyro(log, config), heading, window, coarse)
 
 
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
     """Integrated rate about the body's z axis [rad]."""
     rate_b = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])
     return Signal(imu.time, integral(imu, rate_b[:, 2]))
+
+
+def _heading_by_gyro(log: Log, config: Config) -> Signal:
+    """Change of heading by the gyro, of a vehicle that rolls and pitches, where gravity shows the vertical [rad].
+
+    With d down in b it is h' = (w_y d_y + w_z d_z) / (d_y^2 + d_z^2). Beside the rate about z, waves look like a lag.
+    """
+    motion = inertial_motion(log, config) if tilt(log, config) <= GRAVITY_ANGLE else None
+    if motion is None or not motion.known.any():
+        return _gyro_yaw(log["imu"], config)
+    (_, w_y, w_z), (_, d_y, d_z) = motion.rate_b.T, motion.down_b.T
+    rate = (w_y * d_y + w_z * d_z) / np.maximum(d_y**2 + d_z**2, LEAST_LEVEL)
+    edges = np.append(motion.time - 0.5 * motion.step, motion.time[-1] + 0.5 * motion.step)
+    known = np.append(motion.known, False) | np.append(False, motion.known)  # a gap stays one
+    return Signal(edges[known], np.append(0.0, np.cumsum(motion.step * rate))[known])
 
 
 def _heading(log: Log, config: Config, sensor: str) -> Signal:

@@ -129,8 +129,9 @@ def coarse_lag(a: Signal, b: Signal, window: float) -> float:
     return float(lags[best]) if correlation[best] > FOLLOWS and far_better else 0.0
 
 
-def lag(a: Signal, b: Signal, window: float) -> Lag:
-    """How much later b shows the same motion than a; NaN if they do not follow each other.
+def lag(a: Signal, b: Signal, window: float, coarse: float | None = None) -> Lag:
+    """How much later b shows the same motion than a; NaN if they do not follow each other. ``coarse`` is that of
+    `coarse_lag`, where it is known better than these signals tell.
 
     ``a``, the less noisy one, is moved along: b's noise is then the same at every lag, so that
     the correlation is a smooth function of it. The standard deviation comes from leaving out one
@@ -148,7 +149,7 @@ def lag(a: Signal, b: Signal, window: float) -> Lag:
         value = signal.at(times - late, window)
         return value[OVERLAP:] - value[:-OVERLAP]
 
-    centre = coarse_lag(a, b, window)
+    centre = coarse_lag(a, b, window) if coarse is None else coarse
     b = Signal(b.time - centre, b.value)
     part, y = np.arange(count) * PARTS // count, changes(b, 0.0)
     sums = np.array([_moments(changes(a, float(x)), y, part) for x in lags])
