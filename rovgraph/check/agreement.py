@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
-from rovgraph.check.inertial import inertial_motion
+from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config, mount_matrix
@@ -29,11 +29,10 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
     """Every heading turns as the gyro does: direction, unit and clock."""
     if "imu" not in log or len(log["imu"]) < 3:
         return
-    gyro = _gyro_yaw(log["imu"], config)
-    for sensor in ("mag", "ahrs", "dvl_heading"):
-        if sensor not in log or len(log[sensor]) < MIN_WINDOWS:
-            continue
-        heading = _heading(log, config, sensor)
+    sensors = [sensor for sensor in NAMES if sensor in log and len(log[sensor]) >= MIN_WINDOWS]
+    gyro, motion = _gyro_yaw(log["imu"], config), inertial_motion(log, config) if sensors else None
+    for sensor in sensors:
+        heading = _heading(log, config, sensor, motion)
         period = float(np.median(np.diff(heading.time)))
         window = max(2.0, 3.0 * period)
         f = fit(gyro, heading, window)
@@ -43,7 +42,7 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
         noise = _change_noise(heading, window)
         yield _turning(log, sensor, f, noise)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
-            found = _heading_lag(log, config, heading)
+            found = _heading_lag(gyro, _heading_by_gyro(log, config, motion), heading)
             delay = config.delay_s.get(sensor, 0.0) + found.seconds
             remedy = f"if it is late, state delay_s: {{{sensor}: {delay:.2g}}}"
             yield from _clock(sensor, f"the turning of {NAMES[sensor]}", "the gyro's", found, EVIDENCE, remedy)
@@ -53,19 +52,19 @@ def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | 
     """How much later a compass turns than the gyro, and its sd [s]; None where it does not follow the gyro."""
     if sensor not in NAMES or len(log[sensor]) < MIN_WINDOWS:
         return None
-    found = _heading_lag(log, config, _heading(log, config, sensor))
+    gyro, motion = _gyro_yaw(log["imu"], config), inertial_motion(log, config)
+    found = _heading_lag(gyro, _heading_by_gyro(log, config, motion), _heading(log, config, sensor, motion))
     return None if np.isnan(found.seconds) or np.isnan(found.sd) else (found.seconds, found.sd)
 
 
-def _heading_lag(log: Log, config: Config, heading: Signal) -> Lag:
-    """How much later a heading shows a turn than the gyro.
+def _heading_lag(gyro: Signal, by_gyro: Signal, heading: Signal) -> Lag:
+    """How much later a heading shows a turn than the gyro does, about the body's z axis and as a heading.
 
     In short windows: in long ones a compass's deviation looks like a lag. Legs of a dive are told apart best by what
     the vehicle's own axis shows beside them.
     """
     window = max(1.0, 1.5 * float(np.median(np.diff(heading.time))))
-    coarse = coarse_lag(_gyro_yaw(log["imu"], config), heading, window)
-    return lag(_heading_by_gyro(log, config), heading, window, coarse)
+    return lag(by_gyro, heading, window, coarse_lag(gyro, heading, window))
 
 
 def _gyro_yaw(imu: Stream, config: Config) -> Signal:
@@ -74,13 +73,12 @@ def _gyro_yaw(imu: Stream, config: Config) -> Signal:
     return Signal(imu.time, integral(imu, rate_b[:, 2]))
 
 
-def _heading_by_gyro(log: Log, config: Config) -> Signal:
+def _heading_by_gyro(log: Log, config: Config, motion: InertialMotion | None) -> Signal:
     """Change of heading by the gyro, of a vehicle that rolls and pitches, where gravity shows the vertical [rad].
 
     With d down in b it is h' = (w_y d_y + w_z d_z) / (d_y^2 + d_z^2). Beside the rate about z, waves look like a lag.
     """
-    motion = inertial_motion(log, config) if tilt(log, config) <= GRAVITY_ANGLE else None
-    if motion is None or not motion.known.any():
+    if motion is None or not motion.known.any() or tilt(log, config) > GRAVITY_ANGLE:
         return _gyro_yaw(log["imu"], config)
     (_, w_y, w_z), (_, d_y, d_z) = motion.rate_b.T, motion.down_b.T
     rate = (w_y * d_y + w_z * d_z) / np.maximum(d_y**2 + d_z**2, LEAST_LEVEL)
@@ -89,16 +87,16 @@ def _heading_by_gyro(log: Log, config: Config) -> Signal:
     return Signal(edges[known], np.append(0.0, np.cumsum(motion.step * rate))[known])
 
 
-def _heading(log: Log, config: Config, sensor: str) -> Signal:
+def _heading(log: Log, config: Config, sensor: str, motion: InertialMotion | None) -> Signal:
     """A heading without jumps, of whatever circle its numbers suggest."""
     stream = log[sensor]
-    values = _magnetic_heading(log, config) if sensor == "mag" else stream.data[:, 0]
+    values = _magnetic_heading(log, config, motion) if sensor == "mag" else stream.data[:, 0]
     return Signal(stream.time, np.unwrap(values, period=_circle(values)))
 
 
-def _magnetic_heading(log: Log, config: Config) -> Array:
+def _magnetic_heading(log: Log, config: Config, motion: InertialMotion | None) -> Array:
     """Heading of the field's horizontal part, shape (n,) [rad]."""
-    stream, motion = log["mag"], inertial_motion(log, config)
+    stream = log["mag"]
     field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
     if motion is None:
         return np.asarray(np.arctan2(-field_b[:, 1], field_b[:, 0]))

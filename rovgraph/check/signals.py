@@ -130,12 +130,12 @@ def coarse_lag(a: Signal, b: Signal, window: float) -> float:
 
 
 def lag(a: Signal, b: Signal, window: float, coarse: float | None = None) -> Lag:
-    """How much later b shows the same motion than a; NaN if they do not follow each other. ``coarse`` is that of
-    `coarse_lag`, where it is known better than these signals tell.
+    """How much later b shows the same motion than a; NaN if they do not follow each other.
 
     ``a``, the less noisy one, is moved along: b's noise is then the same at every lag, so that
     the correlation is a smooth function of it. The standard deviation comes from leaving out one
     part of the log after the other, which needs no model of what the two signals do not share.
+    ``coarse`` is what `coarse_lag` gives, where other signals tell it better.
     """
     step = 0.1
     lags = np.arange(-LARGEST_LAG, LARGEST_LAG + step / 2, step)
