@@ -14,8 +14,8 @@ import numpy as np
 from online import messages
 
 from rovgraph.config import Config
-from rovgraph.estimators.alarms import verdict_of
-from rovgraph.estimators.dive import smooth
+from rovgraph.diagnosis import verdict_of
+from rovgraph.dive import smooth
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
 from rovgraph.log import Log

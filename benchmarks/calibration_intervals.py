@@ -27,7 +27,7 @@ from scipy.stats import binomtest
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config
-from rovgraph.estimators.dive import smooth
+from rovgraph.dive import smooth
 from rovgraph.log import Log
 
 YAW_SD_DEG, SCALE_SD = 10.0, 0.03  # of the priors: wide, so that the dive decides

@@ -25,7 +25,7 @@ import pandas as pd
 from scipy.signal import butter, sosfiltfilt
 
 from rovgraph.config import Config, load_config, mount_matrix
-from rovgraph.estimators.dive import smooth
+from rovgraph.dive import smooth
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.evaluate import read_reference
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, rotate, rpy_from_matrix, transpose

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.config import load_config
-from rovgraph.estimators.dive import smooth
+from rovgraph.dive import smooth
 from rovgraph.evaluate import evaluate, read_reference
 from rovgraph.geometry import log_rotation, transpose
 from rovgraph.live.clocks import Clocks

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from rovgraph.diagnosis import Evidence, statistics
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.estimators.alarms import Evidence, statistics
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed
 from rovgraph.estimators.thesis import FILTERS, FilterJob, run_filters

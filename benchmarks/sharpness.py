@@ -19,7 +19,7 @@ from fault_campaign.instruments import log_table
 from fault_campaign.judge import SETTLED_S, Dive
 
 from rovgraph.config import Config
-from rovgraph.estimators.dive import smooth
+from rovgraph.dive import smooth
 from rovgraph.log import Log
 
 UNDER_WAY = "FOG under way, DVL 1 Hz"

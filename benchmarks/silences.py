@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.config import Config, load_config
-from rovgraph.estimators.dive import smooth
+from rovgraph.dive import smooth
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.evaluate import evaluate, read_reference

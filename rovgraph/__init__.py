@@ -34,7 +34,7 @@ Quantities of many epochs carry the epochs on the leading axis: positions are
 
 Layers (imports go downwards only)
 ----------------------------------
-cli / api, extend / pages / report, export, web / studies, live / interchange /
+cli / api, extend / pages / report, export, web / studies, live / dive, interchange / diagnosis /
 estimators, simulate, evaluate, calibrate / check / graph / engine /
 instruments / log / sensors / config, trajectory / vehicle /
 state, calibration, thesis / kernels / gauss_markov, units, gps_time / geometry, workers, fast_csv, spilling /

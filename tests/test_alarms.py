@@ -29,12 +29,12 @@ from test_places import circle
 
 from rovgraph.cli.app import main
 from rovgraph.config import load_config, mount_matrix
+from rovgraph.diagnosis import Statistic, find_alarms, verdict_of
+from rovgraph.diagnosis.alarm import alarm_of
+from rovgraph.diagnosis.constants import TIME_OFFSETS
+from rovgraph.dive import Dive, smooth
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.released import release
-from rovgraph.estimators.alarms import Statistic, find_alarms, verdict_of
-from rovgraph.estimators.alarms.alarm import alarm_of
-from rovgraph.estimators.alarms.constants import TIME_OFFSETS
-from rovgraph.estimators.dive import Dive, smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import rotate, transpose

@@ -25,11 +25,11 @@ from dives import (
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
+from rovgraph.dive import smooth
 from rovgraph.engine import gauss_newton
 from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.estimators.dive import smooth
 from rovgraph.graph.batch import Problem, indeterminate, make_problem, make_values, solve
 from rovgraph.graph.keys import key
 from rovgraph.graph.marginals import covariances, marginals

@@ -5,7 +5,7 @@ import pytest
 from dives import Simulated, altered, falcon, kept, position_errors, rms, simulated
 
 from rovgraph.config import Config
-from rovgraph.estimators.dive import smooth
+from rovgraph.dive import smooth
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.log.frozen import equal_runs, frozen_stretches, without_frozen

@@ -18,11 +18,11 @@ from dives import (
 )
 from live import message
 
+from rovgraph.dive import smooth
 from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.engine.filter_step import calibration_vector, states_of
 from rovgraph.errors import InputError
 from rovgraph.estimators import incremental as incremental_module
-from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator

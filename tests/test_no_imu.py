@@ -28,11 +28,11 @@ from scipy.stats import chi2
 from rovgraph.api.online import Online
 from rovgraph.cli.app import main
 from rovgraph.config import Config
+from rovgraph.dive import smooth
 from rovgraph.engine import gauss_newton
 from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.errors import InputError
 from rovgraph.estimators.attitude_gaps import without_attitude_gaps
-from rovgraph.estimators.dive import smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, wrap_angle

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from dives import batch, falcon, interrupted, simulated, started
 
+from rovgraph.dive import Dive, smooth
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import COARSE
 from rovgraph.engine.optimum import NEWEST, estimated_parts
 from rovgraph.engine.rate_noise import ARM, spurious_information
 from rovgraph.engine.released import release
-from rovgraph.estimators.dive import Dive, smooth
 from rovgraph.estimators.observability import OBSERVABLE_BELOW, relative_sd, shown
 from rovgraph.simulate.path import Style
 from rovgraph.studies.observability import observe

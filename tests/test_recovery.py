@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from dives import Simulated, altered, falcon, initial_conditions, interrupted, renewed, simulated, true_at
 
+from rovgraph.dive import assemble
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.keyframes import KeyframeMeasurement
-from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.geometry import Array
 from rovgraph.kernels.moves import difference, move_estimate

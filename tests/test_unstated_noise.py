@@ -9,13 +9,13 @@ from dives import altered, batch, changed, falcon, simulated, true_at
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import parse_config
+from rovgraph.diagnosis import find_alarms
+from rovgraph.diagnosis.unstated_noise import changed as with_noise
+from rovgraph.diagnosis.unstated_noise import find_noise, noise_factor, unstated
+from rovgraph.dive import smooth
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.lasting import LASTING, _Baseline, find_lasting, unity
 from rovgraph.engine.linear_constants import LinearConstants
-from rovgraph.estimators.alarms import find_alarms
-from rovgraph.estimators.dive import smooth
-from rovgraph.estimators.unstated_noise import changed as with_noise
-from rovgraph.estimators.unstated_noise import find_noise, noise_factor, unstated
 from rovgraph.gauss_markov import stationary_walk
 from rovgraph.simulate.files import known
 from rovgraph.state import POSE

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 import rovgraph as rg
+from rovgraph.dive import assemble
 from rovgraph.engine.released import release
 from rovgraph.engine.variance_sources import variance_sources
-from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.initialise import initialise
 from rovgraph.pages.causes import CAUSES, largest_cause
 from rovgraph.pages.reporting import page_of

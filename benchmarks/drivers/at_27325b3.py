@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 from driver import processor, run
+from rovgraph.estimators.dive import assemble, smooth
 from rovgraph.estimators.error_state import RENEW_AT_S, replay
 from rovgraph.live.complaints import Complaints
 
 from rovgraph.config import Config, load_config
-from rovgraph.estimators.dive import assemble, smooth
 from rovgraph.estimators.initialise import initialise
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.message import Message, Reading

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from online import falcon, replay
 
 from rovgraph.config import Config, load_config
-from rovgraph.estimators.dive import assemble, smooth
+from rovgraph.dive import assemble, smooth
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.error_state import replay as replay_filter
 from rovgraph.estimators.initialise import initialise

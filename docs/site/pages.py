@@ -36,7 +36,7 @@ FOLDERS = {"examples": "examples.md"}  # folder of the project -> page that show
 RETURNED = (  # classes that the functions return, beside those of `rg.__all__`
     "rovgraph.estimators.estimate.Estimate",
     "rovgraph.estimators.estimate.CalibrationEstimate",
-    "rovgraph.estimators.alarms.Alarm",
+    "rovgraph.diagnosis.Alarm",
     "rovgraph.api.online.LiveRun",
     "rovgraph.live.solution.Solution",
     "rovgraph.live.solution.Event",

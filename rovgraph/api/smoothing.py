@@ -8,10 +8,10 @@ from typing import Any
 
 from rovgraph.api.logs import given, prepared
 from rovgraph.config import Config
+from rovgraph.diagnosis import Alarm, Verdict
+from rovgraph.dive import Dive
+from rovgraph.dive import smooth as smooth_dive
 from rovgraph.errors import InputError, as_path, as_texts, collected_warnings
-from rovgraph.estimators import dive as library
-from rovgraph.estimators.alarms import Alarm, Verdict
-from rovgraph.estimators.dive import Dive
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate
 from rovgraph.export import Options, Track, fixes_of, write_track
 from rovgraph.export.track import ESTIMATES as TRACKS
@@ -235,7 +235,7 @@ def smooth(
     with collected_warnings() as texts:
         log = prepared(log, config)
         checked = time.perf_counter()
-        dive = library.smooth(log, config, estimate, progress)
+        dive = smooth_dive(log, config, estimate, progress)
     seconds = {"checking": checked - began, "estimating": time.perf_counter() - checked}
     return Result(dive, log, (*log.warnings, *texts), seconds)
 

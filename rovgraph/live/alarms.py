@@ -1,4 +1,4 @@
-"""Alarms while a dive goes on: the statistics of `rovgraph.estimators.alarms` on what the filter has met lately.
+"""Alarms while a dive goes on: the statistics of `rovgraph.diagnosis` on what the filter has met lately.
 
 Looked at are keyframes that the lag has passed. Rejections and mean squares of innovations are those of the last
 minute. One innovation of each sensor and keyframe, the first, enters the statistic of lasting errors: between keyframes
@@ -12,14 +12,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rovgraph.calibration import LAYOUT, TABLE
-from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states
-from rovgraph.engine.gauss_newton import Stretch
-from rovgraph.estimators.alarms import Alarm, Statistic, Verdict, find_alarms, verdict_of
-from rovgraph.estimators.alarms.constants import MOVED, earth_rate_of, moved_constant, sds_moved
-from rovgraph.estimators.alarms.evidence import MINUTE, SensorResiduals
-from rovgraph.estimators.alarms.motion import SETTLED_S, apart
-from rovgraph.estimators.alarms.residuals import (
+from rovgraph.diagnosis import Alarm, Statistic, Verdict, find_alarms, verdict_of
+from rovgraph.diagnosis.constants import MOVED, earth_rate_of, moved_constant, sds_moved
+from rovgraph.diagnosis.evidence import MINUTE, SensorResiduals
+from rovgraph.diagnosis.motion import SETTLED_S, apart
+from rovgraph.diagnosis.residuals import (
     ENOUGH,
     lasting_in,
     rejected_in,
@@ -27,8 +24,11 @@ from rovgraph.estimators.alarms.residuals import (
     too_large_in,
     too_small_in,
 )
-from rovgraph.estimators.alarms.sensors import frozen_for
-from rovgraph.estimators.alarms.stretches import taken_out_in
+from rovgraph.diagnosis.sensors import frozen_for
+from rovgraph.diagnosis.stretches import taken_out_in
+from rovgraph.engine.filter import FilterEngine
+from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states
+from rovgraph.engine.gauss_newton import Stretch
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import Array

@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rovgraph.diagnosis import Statistic, find_alarms
+from rovgraph.diagnosis.constants import earth_rate_of, held_in
+from rovgraph.diagnosis.unstated_noise import unstated
 from rovgraph.engine.chain_layout import COLUMNS
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.filter import FilterEngine
@@ -21,12 +24,9 @@ from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.released import as_chain
 from rovgraph.errors import InputError
-from rovgraph.estimators.alarms import Statistic, find_alarms
-from rovgraph.estimators.alarms.constants import earth_rate_of, held_in
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.estimators.eskf.reinitialisation import reinitialised
-from rovgraph.estimators.unstated_noise import unstated
 from rovgraph.geometry import Array
 from rovgraph.state import BIAS, VELOCITY
 from rovgraph.trajectory import Trajectory

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from rovgraph.config import Config
-from rovgraph.estimators.alarms.alarm import Alarm, verdict_of
+from rovgraph.diagnosis.alarm import Alarm, verdict_of
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, Estimate, History
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array

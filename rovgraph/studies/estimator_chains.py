@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rovgraph.config import Config
+from rovgraph.dive import assemble
 from rovgraph.engine.stretches import Searches
 from rovgraph.errors import InputError
-from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise

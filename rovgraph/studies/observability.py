@@ -12,9 +12,9 @@ import numpy as np
 
 from rovgraph.calibration import TABLE, Variable
 from rovgraph.config import Config
+from rovgraph.dive import assemble
 from rovgraph.engine.optimum import OTHERS, Optimum, joint_prior_sd
 from rovgraph.errors import InputError
-from rovgraph.estimators.dive import assemble
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.observability import (
     data_information,

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from math import exp, isfinite
 
+from rovgraph.diagnosis.alarm import Statistic
+from rovgraph.diagnosis.evidence import Evidence, span
 from rovgraph.engine.gauss_newton import Stretch
-from rovgraph.estimators.alarms.alarm import Statistic
-from rovgraph.estimators.alarms.evidence import Evidence, span
 
 TAKEN_OUT_S = 0.0  # any
 CLOSE = 1e-4  # likelihood of the next best explanation against the best

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import chdtri
 
+from rovgraph.diagnosis.alarm import Statistic
+from rovgraph.diagnosis.evidence import Evidence, windows
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.dive_rows import DiveRows
-from rovgraph.estimators.alarms.alarm import Statistic
-from rovgraph.estimators.alarms.evidence import Evidence, windows
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.trajectory import Trajectory
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.config import Config, mount_matrix
+from rovgraph.diagnosis.alarm import Statistic
+from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Optimum
-from rovgraph.estimators.alarms.alarm import Statistic
-from rovgraph.estimators.alarms.evidence import Evidence
 from rovgraph.geometry import Array, cross, rotate, signed_permutations, transpose
 from rovgraph.log import Log
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy

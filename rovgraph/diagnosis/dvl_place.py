@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rovgraph.calibration import MOUNT, TABLE
+from rovgraph.diagnosis.constants import FEIGNED, MOVED, RELEASED
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import release
-from rovgraph.estimators.alarms.constants import FEIGNED, MOVED, RELEASED
 from rovgraph.geometry import Array
 
 PLACED = 5.0  # sds from which a DVL is elsewhere

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rovgraph.config import Config, beliefs
+from rovgraph.diagnosis import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
+from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_noise
+from rovgraph.diagnosis.unstated_noise import changed as with_noise
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
 from rovgraph.engine.initial_conditions import InitialConditions
@@ -14,14 +17,11 @@ from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.stretches import Searches
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.engine.variance_sources import variance_sources
-from rovgraph.estimators.alarms import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
 from rovgraph.estimators.attitude_gaps import AttitudeGap, without_attitude_gaps
 from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed
-from rovgraph.estimators.unstated_noise import UnstatedNoise, find_noise
-from rovgraph.estimators.unstated_noise import changed as with_noise
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
 from rovgraph.process import give_back

@@ -6,11 +6,11 @@ import numpy as np
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
+from rovgraph.diagnosis.alarm import Statistic
+from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import Released, as_chain, release
-from rovgraph.estimators.alarms.alarm import Statistic
-from rovgraph.estimators.alarms.evidence import Evidence
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import EARTH_RATE, Array
 from rovgraph.units import behind, shown

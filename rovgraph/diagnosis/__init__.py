@@ -6,10 +6,10 @@ small, with their limits (docs/alarms.md). What is beyond its limit is an `Alarm
 
 from collections.abc import Callable, Iterator, Sequence
 
-from rovgraph.estimators.alarms import constants, motion, residuals, sensors, stretches
-from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic, Verdict, alarm_of, verdict_of
-from rovgraph.estimators.alarms.dvl_cause import dvl_cause
-from rovgraph.estimators.alarms.evidence import Evidence
+from rovgraph.diagnosis import constants, motion, residuals, sensors, stretches
+from rovgraph.diagnosis.alarm import Alarm, Severity, Statistic, Verdict, alarm_of, verdict_of
+from rovgraph.diagnosis.dvl_cause import dvl_cause
+from rovgraph.diagnosis.evidence import Evidence
 
 __all__ = ["Alarm", "Evidence", "Severity", "Statistic", "Verdict", "find_alarms", "statistics", "verdict_of"]
 

@@ -22,13 +22,13 @@ from scipy.special import chdtri
 
 from rovgraph.calibration import AUTO, TABLE
 from rovgraph.config import Config
+from rovgraph.diagnosis import Alarm, Statistic
+from rovgraph.diagnosis.dvl_place import DvlPlace, other_place
+from rovgraph.diagnosis.residuals import SD_KEY
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
 from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.rate_noise import ARM
-from rovgraph.estimators.alarms import Alarm, Statistic
-from rovgraph.estimators.alarms.residuals import SD_KEY
-from rovgraph.estimators.dvl_place import DvlPlace, other_place
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
 

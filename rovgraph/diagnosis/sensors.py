@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+from rovgraph.diagnosis.alarm import Alarm, Severity, Statistic
+from rovgraph.diagnosis.evidence import Evidence, span
 from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
-from rovgraph.estimators.alarms.alarm import Alarm, Severity, Statistic
-from rovgraph.estimators.alarms.evidence import Evidence, span
 
 FROZEN_S = 3.0  # in all [s]
 MEASURE_THE_SAME = (

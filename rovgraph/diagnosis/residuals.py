@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri
 
+from rovgraph.diagnosis.alarm import Statistic
+from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span, windows
 from rovgraph.engine.constant_velocity import has_constant_velocity
-from rovgraph.estimators.alarms.alarm import Statistic
-from rovgraph.estimators.alarms.evidence import MINUTE, Evidence, SensorResiduals, span, windows
 from rovgraph.geometry import Array
 
 CHANCE = 1e-6  # that a figure of a healthy sensor is beyond its limit
