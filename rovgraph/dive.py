@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rovgraph.config import Config, beliefs
-from rovgraph.diagnosis import Alarm, Evidence, Statistic, Verdict, find_alarms, statistics, verdict_of
+from rovgraph.diagnosis import (
+    Alarm,
+    Evidence,
+    Statistic,
+    Verdict,
+    find_advice,
+    find_alarms,
+    statistics,
+    verdict_of,
+)
 from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_noise
 from rovgraph.diagnosis.unstated_noise import changed as with_noise
 from rovgraph.engine.chain_optimum import ChainOptimum
@@ -57,6 +66,11 @@ class Dive:
     def alarms(self) -> list[Alarm]:
         """Alarms of the dive, causes before their consequences."""
         return find_alarms(self.statistics, float(self.estimates[0].trajectory.time[0]))
+
+    @cached_property
+    def advice(self) -> list[Alarm]:
+        """What could be stated better, which is no evidence of error."""
+        return find_advice(self.statistics)
 
     @property
     def verdict(self) -> Verdict:

@@ -29,7 +29,7 @@ from test_places import circle
 
 from rovgraph.cli.app import main
 from rovgraph.config import load_config, mount_matrix
-from rovgraph.diagnosis import Statistic, find_alarms, verdict_of
+from rovgraph.diagnosis import RULES, Statistic, find_alarms, verdict_of
 from rovgraph.diagnosis.alarm import alarm_of
 from rovgraph.diagnosis.constants import TIME_OFFSETS
 from rovgraph.dive import Dive, smooth
@@ -199,17 +199,22 @@ def test_a_field_that_changes_along_the_way_is_named_and_the_remedy_mends_it():
 
 
 def statistic(figure: float, kind: str = "rejected", sensor: str = "dvl") -> Statistic:
-    return Statistic(kind, sensor, 10.0, 70.0, figure, 1.0, 5.0, "something is so", "do something")
+    """One whose figure is given in units of its lower limit."""
+    limit = RULES[kind].doubtful
+    return Statistic(kind, sensor, 10.0, 70.0, figure * limit, "something is so", "do something")
 
 
 def test_the_worst_alarm_is_the_verdict():
     assert [alarm_of(statistic(f)) is None for f in (0.5, 1.0, 1.1)] == [True, True, False]
     alarms = find_alarms([statistic(0.5), statistic(2.0), statistic(3.0), statistic(2.0, sensor="mag")], 0.0)
-    assert [(a.sensor, a.figure) for a in alarms] == [("dvl", 3.0), ("mag", 2.0)]
+    assert [(a.sensor, a.figure / a.limit) for a in alarms] == [
+        ("dvl", pytest.approx(3.0)),
+        ("mag", pytest.approx(2.0)),
+    ]
     assert verdict_of(alarms) == "doubtful"
-    assert verdict_of(find_alarms([statistic(6.0), statistic(2.0, sensor="mag")], 0.0)) == "wrong"
+    assert verdict_of(find_alarms([statistic(11.0), statistic(2.0, sensor="mag")], 0.0)) == "wrong"
     assert verdict_of([]) == "trusted"
-    any_is_too_much = [Statistic("taken out", "dvl", 0.0, s, s, 0.0, np.inf, "is so", "do") for s in (3.0, 5.0)]
+    any_is_too_much = [Statistic("taken out", "dvl", 0.0, s, s, "is so", "do") for s in (3.0, 5.0)]
     assert [a.figure for a in find_alarms(any_is_too_much, 0.0)] == [5.0]
     assert alarms[0].text == "dvl: something is so; do something"
 

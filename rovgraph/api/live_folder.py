@@ -59,6 +59,7 @@ def summarise(folder: Path, session: Session) -> None:
             "state": "finished",
             "verdict": solution.verdict,
             "alarms": [vars(alarm) for alarm in navigator.alarms.history.values()],
+            "advice": [vars(advice) for advice in navigator.alarms.advice.values()],
             "time": solution.time,
             "position_m": solution.position.tolist(),
             "position_sd_m": solution.position_sd.tolist(),

@@ -88,6 +88,11 @@ class Result:
         return self.dive.alarms
 
     @property
+    def advice(self) -> Sequence[Alarm]:
+        """What could be stated better: no evidence of error, and no part of the verdict."""
+        return self.dive.advice
+
+    @property
     def assumptions(self) -> Sequence[str]:
         """What neither log nor configuration states, and how native files were read, a line each."""
         return (*self.log.notes, *self.dive.assumptions)
@@ -156,7 +161,7 @@ class Result:
                 self.config,
                 [*self.assumptions],
                 seconds,
-                self.alarms,
+                [*self.alarms, *self.advice],
                 self.warnings,
                 self.dive.frozen,
             )

@@ -79,7 +79,7 @@ def smooth(
 
 
 def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
-    """Print verdict, alarms, tables and assumptions."""
+    """Print verdict, alarms, tables, assumptions and advice."""
     from rovgraph.cli.console import console, say
     from rovgraph.report.tables import calibration_table, summary_table
 
@@ -91,5 +91,7 @@ def show_result(result: "Result", summary: dict[str, Any], out: Path) -> None:
     shown.print(calibration_table(result.dive.estimates))
     for line in result.assumptions:
         say(shown, f"assumed: {line}")
+    for advice in result.advice:
+        say(shown, f"advice: {advice.text}")
     page = " (open report.html)" if (out / "report.html").exists() else ""
     say(shown, f"results in {out}{page}")

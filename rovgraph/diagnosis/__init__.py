@@ -1,17 +1,32 @@
-"""Alarms of an estimate on its own evidence, and the verdict for the whole dive.
+"""What can be wrong with a dive: rules before, after and during it, what is found, and the verdict.
 
-`STATISTICS` is the table: each function takes the `Evidence` of a dive and yields numbers that healthy dives keep
-small, with their limits (docs/alarms.md). What is beyond its limit is an `Alarm`; the worst of them is the verdict.
+Begin with `rules`, the one table of limits. `STATISTICS` are the functions: each takes the `Evidence` of a dive and
+yields figures that healthy dives keep small (docs/alarms.md). What is beyond its limit is an `Alarm`; the worst of them
+is the verdict. `unstated_noise` finds what explains a dive better than its configuration. It stands above the
+estimators, whose eliminations it asks for; `rovgraph.dive` and `rovgraph.live` use it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 
 from rovgraph.diagnosis import constants, motion, residuals, sensors, stretches
-from rovgraph.diagnosis.alarm import Alarm, Severity, Statistic, Verdict, alarm_of, verdict_of
+from rovgraph.diagnosis.alarm import Alarm, Statistic, Verdict, alarm_of, verdict_of
 from rovgraph.diagnosis.dvl_cause import dvl_cause
 from rovgraph.diagnosis.evidence import Evidence
+from rovgraph.diagnosis.rules import RULES, Rule, Severity
 
-__all__ = ["Alarm", "Evidence", "Severity", "Statistic", "Verdict", "find_alarms", "statistics", "verdict_of"]
+__all__ = [
+    "RULES",
+    "Alarm",
+    "Evidence",
+    "Rule",
+    "Severity",
+    "Statistic",
+    "Verdict",
+    "find_advice",
+    "find_alarms",
+    "statistics",
+    "verdict_of",
+]
 
 TINY = 1e-9  # a limit may be 0
 
@@ -48,12 +63,22 @@ def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
     numbers : of `statistics`
     start : when the dive began [s]
     """
+    worst = [alarm for alarm in _worst(numbers) if alarm.severity != "advice"]
+    return [*worst, *sensors.contradictions(worst, start)]
+
+
+def find_advice(numbers: Sequence[Statistic]) -> list[Alarm]:
+    """What could be stated better and is no evidence of error, the worst of each kind and sensor."""
+    return [one for one in _worst(numbers) if one.severity == "advice"]
+
+
+def _worst(numbers: Sequence[Statistic]) -> list[Alarm]:
     worst: dict[tuple[str, str], Alarm] = {}
     for alarm in filter(None, map(alarm_of, numbers)):
         known = worst.get((alarm.kind, alarm.sensor))
         if known is None or _badness(alarm) > _badness(known):
             worst[alarm.kind, alarm.sensor] = alarm
-    return [*worst.values(), *sensors.contradictions(list(worst.values()), start)]
+    return [*worst.values()]
 
 
 def _badness(alarm: Alarm) -> tuple[bool, float]:

@@ -1,26 +1,29 @@
-"""What an alarm is, and the verdict that alarms come to."""
+"""Alarms, advice, and the verdict that alarms come to."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-Severity = Literal["doubtful", "wrong"]
+from rovgraph.diagnosis.rules import RULES, Severity
+
 Verdict = Literal["trusted", "doubtful", "wrong"]
 
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number that healthy dives keep small.
+    """A number that healthy dives keep small, and its limits by the rule of its kind.
 
     Attributes
     ----------
-    kind : row of the table in docs/alarms.md, as "rejected"
+    kind : of `RULES`
     sensor : what it is about: a stream of the log, "imu", or "dive"
     begin, end : the time that it is about [s]
     figure : the number
-    doubtful, wrong : limits; beyond them the dive is doubtful, or wrong
     cause : what is so, with its figures
     remedy : what to do, naming a configuration key or a command
+    factor : times the rule's limits
+    chance : quantile of the figure's distribution in healthy dives, beyond which both limits lie
+    certain : what is "wrong" from here on, where that is less than by the rule
     """
 
     kind: str
@@ -28,17 +31,26 @@ class Statistic:
     begin: float
     end: float
     figure: float
-    doubtful: float
-    wrong: float
     cause: str
     remedy: str
+    factor: float = 1.0
+    chance: float = 0.0
+    certain: float = float("inf")
+
+    @property
+    def doubtful(self) -> float:
+        """Beyond it the dive is doubtful, or the line is advice."""
+        return max(self.factor * RULES[self.kind].doubtful, self.chance)
+
+    @property
+    def wrong(self) -> float:
+        """Beyond it the dive is wrong."""
+        return max(min(self.factor * RULES[self.kind].wrong, self.certain), self.chance)
 
     @property
     def severity(self) -> Severity | None:
         """None = within its limits."""
-        if self.figure > self.wrong:
-            return "wrong"
-        return "doubtful" if self.figure > self.doubtful else None
+        return RULES[self.kind].severity(self.figure, self.doubtful, self.wrong)
 
 
 @dataclass(frozen=True)
@@ -49,7 +61,7 @@ class Alarm:
     ----------
     kind, sensor, begin, end, figure : of the `Statistic`
     limit : that it is beyond
-    severity : "doubtful" or "wrong"
+    severity : "doubtful" or "wrong"; "advice" is no evidence of error
     text : one line with cause and remedy
     """
 
@@ -64,15 +76,15 @@ class Alarm:
 
 
 def alarm_of(statistic: Statistic) -> Alarm | None:
-    """The alarm that a statistic raises, if it does."""
-    s = statistic
-    if s.severity is None:
+    """The alarm or the advice that a statistic raises, if it does."""
+    s, severity = statistic, statistic.severity
+    if severity is None:
         return None
-    limit = s.wrong if s.severity == "wrong" else s.doubtful
-    return Alarm(s.kind, s.sensor, s.begin, s.end, s.figure, limit, s.severity, f"{s.sensor}: {s.cause}; {s.remedy}")
+    limit = s.wrong if severity == "wrong" else s.doubtful
+    return Alarm(s.kind, s.sensor, s.begin, s.end, s.figure, limit, severity, f"{s.sensor}: {s.cause}; {s.remedy}")
 
 
 def verdict_of(alarms: Iterable[Alarm]) -> Verdict:
-    """The worst of their severities; "trusted" where there is none."""
+    """The worst of their severities; "trusted" where none is evidence of error."""
     severities = {alarm.severity for alarm in alarms}
-    return "wrong" if "wrong" in severities else "doubtful" if severities else "trusted"
+    return "wrong" if "wrong" in severities else "doubtful" if "doubtful" in severities else "trusted"

@@ -8,6 +8,7 @@ from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
+from rovgraph.diagnosis.rules import RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import Released, as_chain, release
@@ -15,10 +16,7 @@ from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import EARTH_RATE, Array
 from rovgraph.units import behind, shown
 
-# Of the 25 components of a dive one is beyond 3 sds in every fifteenth healthy dive, beyond 4 in one of 600.
-MOVED, FAR_MOVED = 4.0, 10.0  # sds
 NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
-HELD, HELD_FAR_OFF = 5.0, 30.0  # sds
 # errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
 SHOWN = 0.3
 SHOWN_OF = {"fix_time_offset": 1.0}  # the velocity that makes a late fix wrong is known well, whatever fixes scatter
@@ -30,8 +28,6 @@ FEIGNED = {
     "ahrs_time_offset": 0.01,
     "mag_time_offset": 5e-3,
 }  # by errors in variables, however long the dive is
-DISAGREE, DISAGREE_BADLY = 10.0, 30.0  # sds
-FEELS_THE_EARTH = 10.0  # sds
 MATTERS = 0.2  # of the prior sd: a smaller difference of halves
 SHARE_OF_SD = 0.3  # of a constant's sd at half the dive, that linearisation may feign
 TIME_OFFSETS = tuple(name for name, variable in TABLE.items() if variable.time_offset)
@@ -95,7 +91,7 @@ def sds_moved(value: Array, sd: Array, prior_mean: Array, prior_sd: Array) -> Ar
 
 
 def _moved(begin: float, end: float, sensor: str, figure: float, cause: str, remedy: str) -> Statistic:
-    return Statistic("moved", sensor, begin, end, figure, MOVED, FAR_MOVED, cause, remedy)
+    return Statistic("moved", sensor, begin, end, figure, cause, remedy)
 
 
 def held(evidence: Evidence) -> Iterator[Statistic]:
@@ -123,11 +119,11 @@ def held_in(best: ChainOptimum, config: Config, v_sd: float, start: float, end: 
             start,
             end,
             abs(r.step) / float(np.linalg.norm([r.sd, FEIGNED.get(r.name, 0.0), allowed])),
-            HELD,
-            FAR_MOVED if considered else HELD_FAR_OFF,  # the prior's sd is all that the track's sd has of it
             f"{r.label} is held at {factor * mean:.4g}{behind(unit)}, but the measurements shift it "
             f"by {factor * r.step:+.2g} ± {factor * r.sd:.1g}{behind(unit)}",
             _remedy_of_held(r, config),
+            # the prior's sd is all that the track's sd has of it
+            certain=RULES["moved"].wrong if considered else np.inf,
         )
 
 
@@ -150,8 +146,6 @@ def earth_rate_of(sd: float, begin: float, end: float) -> Statistic:
         begin,
         end,
         EARTH_RATE / sd,
-        FEELS_THE_EARTH,
-        np.inf,
         f"the gyro's bias has an sd of {np.rad2deg(sd) * 3600:.2g} deg/h, but the Earth's rotation of 15 deg/h is "
         "not modelled",
         "state environment.latitude_deg and environment.earth_rotation: true",
@@ -185,8 +179,6 @@ def halves(evidence: Evidence) -> Iterator[Statistic]:
                 evidence.start,
                 evidence.end,
                 off,
-                DISAGREE,
-                DISAGREE_BADLY,
                 f"{label} differs by {off:.0f} sd between the first half of the dive and the second",
                 f"it changes during the dive, or another error looks like it: check {_key_of(name)}, "
                 f"or let it walk (calibration.{name})",

@@ -29,7 +29,6 @@ SUSPICIOUS = 0.1  # share of rejected pings from which on it is worth a look
 OVER_S = 3.0  # T
 SHIFTS_S = np.arange(-2.0, 2.01, 0.05)
 CLIPPED = 3.0  # times the median error, beyond which an error counts no more
-BETTER = 1.15  # times smaller an error than as configured
 ENOUGH = 50  # pings
 UNTIL_THEN = "until that is mended the track is wrong"
 
@@ -58,7 +57,7 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
         remedy = f"correct the clock, or state calibration.dvl_time_offset: {entry}"
         figure, kind = as_configured / shifted[shift], "clock"
     text = f"{cause}; corrected, it agrees {figure:.1f} times better with the IMU"
-    found = Statistic(kind, "dvl", evidence.start, evidence.end, figure, BETTER, BETTER, text, remedy)
+    found = Statistic(kind, "dvl", evidence.start, evidence.end, figure, text, remedy)
     yield _as_checked(found, evidence.log, config) if found.severity else found
 
 

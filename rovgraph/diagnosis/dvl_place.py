@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rovgraph.calibration import MOUNT, TABLE
-from rovgraph.diagnosis.constants import FEIGNED, MOVED, RELEASED
+from rovgraph.diagnosis.constants import FEIGNED, RELEASED
+from rovgraph.diagnosis.rules import RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import release
@@ -66,4 +67,6 @@ def other_place(best: ChainOptimum) -> DvlPlace | None:
 def _is_turned(best: ChainOptimum) -> bool:
     """Whether the DVL's mounting is estimated far from its prior, as it is where axes are named wrongly."""
     own = [best.beliefs[name] for name in MOUNT if best.unknowns.walks.get(name) == 0.0]
-    return any(abs(float(best.state.calibration[b.variable.name][0] - b.mean[0])) > MOVED * b.sd for b in own)
+    return any(
+        abs(float(best.state.calibration[b.variable.name][0] - b.mean[0])) > RULES["moved"].doubtful * b.sd for b in own
+    )

@@ -7,21 +7,17 @@ from scipy.special import chdtri
 
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence, windows
+from rovgraph.diagnosis.rules import CHANCE
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.trajectory import Trajectory
 
-CHANCE = 1e-6  # that a figure of a healthy dive is beyond its limit
 IMU_S = 20.0  # over which errors of the IMU last that are no noise
-IMU, IMU_BADLY = 3.0, 50.0  # variance of means over that time, 1 for noise
 # of a motion's residual: what people call it, columns, and the signal behind it
 PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slice(6, 9), "acc"))
-# end of the dive against its start, in sds of the bias's walk; smoothing keeps what is not seen near its start
-DRIFT, LARGE_DRIFT = 4.0, 30.0
 # a bias's history, columns of a motion's residual, what people call it, its unit, and how many of them make one
 BIASES = (("acc_bias", slice(9, 12), "acc", "m/s2", 1.0), ("gyr_bias", slice(12, 15), "gyr", "deg/s", np.rad2deg(1.0)))
-JUMP, LARGE_JUMP = 40.0, 100.0  # squared, in joint sds
 SETTLED_S = 10.0  # from which on the filter is asked
 COARSE = 300  # epochs at which both are compared
 
@@ -53,11 +49,10 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
                 begin,
                 min(begin + IMU_S, evidence.end),
                 ratio,
-                max(IMU, by_chance),
-                max(IMU_BADLY, by_chance),
                 f"{part} {axis} contradicts the other sensors: means over {IMU_S:g} s vary {ratio:.0f} times as much "
                 f"as its noise allows, most at {evidence.since(begin):.0f} s",
                 f"check imu.mount_rpy_deg and the compasses, estimate calibration.{key}_scale or raise imu.noise.{key}",
+                chance=by_chance,
             )
 
 
@@ -79,8 +74,6 @@ def bias_drift(evidence: Evidence) -> Iterator[Statistic]:
             evidence.start,
             evidence.end,
             float(gone[axis]),
-            DRIFT,
-            LARGE_DRIFT,
             f"{history.labels[axis]} drifts from {first:.2g} to {last:.2g} {unit} during the dive, {gone[axis]:.0f} sd "
             f"of what imu.noise.{key}_walk allows",
             f"let the IMU warm up before the dive, or raise imu.noise.{key}_walk",
@@ -131,8 +124,6 @@ def apart(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statistic]:
             float(s.time[at[k]]),
             float(s.time[at[k]]),
             float(square[k]),
-            JUMP,
-            LARGE_JUMP,
             f"smoothed and filtered {what} differ by {size[k]:.2g} {unit}, {np.sqrt(square[k]):.0f} joint sds, "
             f"at {float(s.time[at[k]]) - start:.0f} s",
             "later measurements contradict the filter: look at the residuals before that time",

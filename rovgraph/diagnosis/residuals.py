@@ -14,19 +14,15 @@ from scipy.special import bdtrc, chdtri
 
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span, windows
+from rovgraph.diagnosis.rules import CHANCE, RULES
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.geometry import Array
 
-CHANCE = 1e-6  # that a figure of a healthy sensor is beyond its limit
 ENOUGH = 20  # measurements
-REJECTED, MOSTLY_REJECTED = 0.05, 0.5  # share in a minute
 GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
 USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
-TOO_LARGE, FAR_TOO_LARGE = 2.0, 6.0  # mean square of the dive
 IN_A_MINUTE = 1.5  # times as much
-TOO_SMALL = 0.3
 LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
-LASTING, BADLY_LASTING = 4.0, 100.0  # variance of the means over that time, 1 for noise
 OF_ONE = 8.0  # a single mean may be that much more
 SD_KEY = {
     "dvl": "dvl.velocity_sd_mps",
@@ -60,7 +56,7 @@ def rejected(evidence: Evidence) -> Iterator[Statistic]:
         if np.bincount(window).max(initial=0) < ENOUGH and _gives_up(out):
             share[:] = out.mean()
         worst = int(np.argmax(share))
-        bad = np.flatnonzero(share > REJECTED)
+        bad = np.flatnonzero(share > RULES["rejected"].doubtful)
         begin, end = (bad[0], bad[-1]) if len(bad) else (worst, worst)
         begin_s, end_s = evidence.start + begin * MINUTE, min(evidence.start + (end + 1) * MINUTE, evidence.end)
         yield rejected_in(r.sensor, begin_s, end_s, float(share[worst]), evidence.start)
@@ -91,8 +87,6 @@ def rejected_in(sensor: str, begin: float, end: float, share: float, start: floa
         begin,
         end,
         share,
-        REJECTED,
-        MOSTLY_REJECTED,
         f"up to {share:.0%} of its measurements contradict the others and were rejected, {span(begin, end, start)}",
         f"if the instrument failed, remove that time from the log; if it lasts, check its mounting, signs "
         f"and clock (rovgraph check), and {sd_key(sensor)}{_CHANGING_FIELD if sensor == 'mag' else ''}",
@@ -134,10 +128,10 @@ def too_large_in(
         begin,
         end,
         square,
-        max(factor * TOO_LARGE, by_chance),
-        max(factor * FAR_TOO_LARGE, by_chance),
         f"its residuals are {np.sqrt(square):.1f} times as large as its stated noise, {span(begin, end, start)}",
         f"find what disturbs it there, or raise {sd_key(sensor)}",
+        factor,
+        by_chance,
     )
 
 
@@ -160,8 +154,6 @@ def too_small_in(sensor: str, begin: float, end: float, mean: float) -> Statisti
         begin,
         end,
         1.0 / max(mean, 1e-9),
-        1.0 / TOO_SMALL,
-        np.inf,
         f"its innovations are {np.sqrt(mean):.2f} times as large as their stated sd, so the stated noise is too large",
         f"lower {sd_key(sensor)}",
     )
@@ -187,11 +179,10 @@ def lasting_in(r: SensorResiduals, start: float, end: float, began: float | None
         begin,
         min(begin + seconds, end),
         ratio,
-        max(LASTING, by_chance),
-        max(BADLY_LASTING, by_chance),
         f"residuals of {r.components[component]} do not average out: means over {seconds:g} s vary {ratio:.0f} "
         f"times as much as noise, most at {begin - (start if began is None else began):.0f} s",
         _remedy_of_lasting(r.sensor),
+        chance=by_chance,
     )
 
 
@@ -213,7 +204,7 @@ def _most_lasting(r: SensorResiduals, start: float) -> tuple[float, int, float, 
             n = len(square)
             out.append((seconds, component, float(square.mean()), float(chdtri(n, CHANCE)) / n, begin))
             out.append((seconds, component, float(square[k]) / OF_ONE, float(chdtri(1, CHANCE / n)) / OF_ONE, begin))
-    return max(out, key=lambda one: one[2] / max(LASTING, one[3]), default=None)
+    return max(out, key=lambda one: one[2] / max(RULES["lasting"].doubtful, one[3]), default=None)
 
 
 def _allowed(r: SensorResiduals, used: NDArray[np.bool_], window: Array, component: int) -> Array:

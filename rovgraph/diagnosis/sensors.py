@@ -3,11 +3,10 @@
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
-from rovgraph.diagnosis.alarm import Alarm, Severity, Statistic
+from rovgraph.diagnosis.alarm import Alarm, Statistic
 from rovgraph.diagnosis.evidence import Evidence, span
-from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
+from rovgraph.diagnosis.rules import RULES, Severity
 
-FROZEN_S = 3.0  # in all [s]
 MEASURE_THE_SAME = (
     ("heading", ("mag", "dvl_heading", "ahrs")),
     ("vertical motion", ("dvl", "depth")),
@@ -35,8 +34,6 @@ def frozen_for(sensor: str, first: float, last: float, seconds: float, times: in
         first,
         last,
         seconds,
-        FROZEN_S,
-        float("inf"),
         f"repeats its values for {seconds:.0f} s{often}, {span(first, last, start)}; they were ignored",
         "check the instrument and its driver; the track is less certain there, and its sd includes that",
     )
@@ -56,8 +53,6 @@ def no_attitude(evidence: Evidence) -> Iterator[Statistic]:
             worst.begin,
             worst.end,
             seconds,
-            LONGEST_CRUISED_S,
-            float("inf"),
             f"no {part} for {seconds:.0f} s, {evidence.span(worst.begin, worst.end)}{often}: the vehicle's "
             f"turns are unknown there, and {sum(gap.pings for gap in gaps)} DVL pings were ignored",
             f"check the instrument and its driver, or map another source of {part}; position is less certain there, "
@@ -88,4 +83,6 @@ def contradictions(alarms: Sequence[Alarm], start: float) -> Iterator[Alarm]:
                 f"{one} and {other}: they contradict each other in {what}, {span(begin, end, start)}; remove one "
                 "of them from the log to find which one is wrong"
             )
-            yield Alarm("contradiction", f"{one}, {other}", begin, end, figure, 1.0, severity, text)
+            yield Alarm(
+                "contradiction", f"{one}, {other}", begin, end, figure, RULES["contradiction"].doubtful, severity, text
+            )

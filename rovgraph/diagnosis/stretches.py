@@ -7,9 +7,6 @@ from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence, span
 from rovgraph.engine.gauss_newton import Stretch
 
-TAKEN_OUT_S = 0.0  # any
-CLOSE = 1e-4  # likelihood of the next best explanation against the best
-
 
 def taken_out(evidence: Evidence) -> Iterator[Statistic]:
     """Intervals in which a sensor contradicts all others, of `rovgraph.engine.stretches`."""
@@ -25,8 +22,6 @@ def taken_out_in(stretch: Stretch, start: float) -> Statistic:
         stretch.begin,
         stretch.end,
         stretch.end - stretch.begin,
-        TAKEN_OUT_S,
-        float("inf"),
         f"contradicts all other sensors, {span(stretch.begin, stretch.end, start)}, and was ignored there",
         "check the instrument at that time: a bias, a false lock, water instead of the bottom; an error that grew "
         "slowly may have started earlier",
@@ -44,8 +39,6 @@ def close(evidence: Evidence) -> Iterator[Statistic]:
         evidence.start,
         evidence.end,
         exp(-margin),
-        CLOSE,
-        float("inf"),
         f"sensors contradict each other, and a cost difference of only {margin:.1f} decided which one to ignore",
         "check the rejected sensors, and remove the wrong one from the log",
     )

@@ -119,7 +119,7 @@ def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Ite
     begin, end = best.intervals[0].time, best.intervals[-1].time
     for one in find_noise(best, config, alarms, UNLIKELY):
         if not _is_allowed_for(one, best):
-            yield Statistic("unstated", one.sensor, begin, end, 1.0, 0.0, np.inf, one.cause, one.remedy)
+            yield Statistic("unstated", one.sensor, begin, end, 1.0, one.cause, one.remedy)
 
 
 def _is_allowed_for(one: UnstatedNoise, best: ChainOptimum) -> bool:

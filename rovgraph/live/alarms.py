@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rovgraph.calibration import LAYOUT, TABLE
-from rovgraph.diagnosis import Alarm, Statistic, Verdict, find_alarms, verdict_of
-from rovgraph.diagnosis.constants import MOVED, earth_rate_of, moved_constant, sds_moved
+from rovgraph.diagnosis import Alarm, Statistic, Verdict, find_advice, find_alarms, verdict_of
+from rovgraph.diagnosis.constants import earth_rate_of, moved_constant, sds_moved
 from rovgraph.diagnosis.evidence import MINUTE, SensorResiduals
 from rovgraph.diagnosis.motion import SETTLED_S, apart
 from rovgraph.diagnosis.residuals import (
@@ -24,6 +24,7 @@ from rovgraph.diagnosis.residuals import (
     too_large_in,
     too_small_in,
 )
+from rovgraph.diagnosis.rules import RULES
 from rovgraph.diagnosis.sensors import frozen_for
 from rovgraph.diagnosis.stretches import taken_out_in
 from rovgraph.engine.filter import FilterEngine
@@ -72,10 +73,12 @@ class LiveAlarms:
     events : since it was last emptied
     history : every alarm of the run as it was at its worst, those by the smoothed dive as they were last, in the order
         in which they began
+    advice : what could be stated better, by kind and sensor, as it was first; no evidence of error
     """
 
     events: list[Event] = field(default_factory=list)
     history: dict[tuple[str, str, float], Alarm] = field(default_factory=dict)
+    advice: dict[tuple[str, str], Alarm] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._start = self._due = self._due_lasting = np.nan
@@ -187,7 +190,7 @@ class LiveAlarms:
         for name in engine.unknowns.estimated:
             belief, variable = engine.beliefs[name], TABLE[name]
             values, own, prior_sd = known.c[LAYOUT[name]], sd[columns[name]], np.full(variable.dim, belief.sd)
-            for k in np.flatnonzero(sds_moved(values, own, belief.mean, prior_sd) > MOVED):
+            for k in np.flatnonzero(sds_moved(values, own, belief.mean, prior_sd) > RULES["moved"].doubtful):
                 numbers = float(values[k]), float(own[k]), float(belief.mean[k]), belief.sd
                 estimate = CalibrationEstimate(variable.labels[k], variable.unit, variable.about, True, *numbers)
                 yield from moved_constant(estimate, self._start, time)
@@ -222,6 +225,10 @@ class LiveAlarms:
             else:
                 raised.last, raised.alarm = time, self._renewed(raised.alarm, alarm, time)
             self.history[(*key, self._raised[key].alarm.begin)] = self._raised[key].alarm
+        for one in find_advice(statistics):
+            if (one.kind, one.sensor) not in self.advice:
+                self.advice[one.kind, one.sensor] = one
+                self._say(time, one.sensor, "advice", one.text)
         for key, raised in list(self._raised.items()):
             if time - raised.last >= OVER_S:
                 del self._raised[key]

@@ -29,6 +29,7 @@ def verdict_section(source: DiveSource) -> Section:
         "Alarms": alarms,
         "Warnings about the log": summary.get("warnings") or [],
         "Assumed, because neither log nor configuration said": summary.get("assumptions") or [],
+        "Advice: no evidence of error": [str(a.get("text", "")) for a in summary.get("advice") or []],
     }
     notes = [source.other_version] if source.other_version else []
     lead = [how_good(source), *limits(source), *notes]

@@ -59,7 +59,7 @@ def write_results(
     log, config : what they were made from
     assumptions : what was taken for granted, a sentence each
     seconds : stage of the work -> wall time [s]
-    alarms : what the estimates say against themselves
+    alarms : what the estimates say against themselves, and advice
     warnings : what was said of the log, a line each
     frozen : times in which a sensor repeated itself
 
@@ -115,7 +115,7 @@ def summarise(
         "name": config.name,
         "log": log.source,
         "verdict": verdict_of(alarms),
-        "alarms": [_alarm_numbers(alarm, main.trajectory.time[0]) for alarm in alarms],
+        **{name: [_alarm_numbers(a, main.trajectory.time[0]) for a in some] for name, some in _parted(alarms).items()},
         "origin": None if log.origin is None else {"lat_deg": log.origin[0], "lon_deg": log.origin[1]},
         "start_time_s": main.trajectory.time[0],
         "main_estimate": main.kind,
@@ -259,6 +259,14 @@ def _end_ellipse(track: Trajectory) -> tuple[float, float, float]:
         return float("nan"), float("nan"), float("nan")
     major, minor, bearing = ellipse_axes(track.cov_p[-1:])
     return float(major[0]), float(minor[0]), float(np.rad2deg(bearing[0])) % 180.0
+
+
+def _parted(alarms: Sequence[Alarm]) -> dict[str, list[Alarm]]:
+    """Evidence of error, and advice."""
+    return {
+        "alarms": [alarm for alarm in alarms if alarm.severity != "advice"],
+        "advice": [alarm for alarm in alarms if alarm.severity == "advice"],
+    }
 
 
 def _alarm_numbers(alarm: Alarm, start: float) -> dict[str, Any]:

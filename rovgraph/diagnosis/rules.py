@@ -1,0 +1,107 @@
+"""The one table of what can be wrong with a dive: each rule's figure, its limits, and how often it errs.
+
+Check, `smooth` and `online` take their limits from `RULES`, and docs/alarms.md prints it. A figure beyond ``doubtful``
+or ``wrong`` is an alarm, and the worst alarm is the verdict. What is better than stated is advice: it is no evidence of
+error, and no part of the verdict.
+"""
+
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import Literal
+
+Severity = Literal["advice", "doubtful", "wrong"]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A figure that healthy dives keep small.
+
+    Attributes
+    ----------
+    kind : name, as in summary.json
+    figure : what the number is
+    doubtful, wrong : limits; infinite = never
+    rate : share of healthy dives in which chance takes the figure beyond the lower limit, that it was set to
+    live : how `rovgraph online` has it; empty = not at all
+    advice : the figure says that something is better than stated, which is advice
+    """
+
+    kind: str
+    figure: str
+    doubtful: float
+    wrong: float = inf
+    rate: float = 1e-6
+    live: str = ""
+    advice: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse limits by which a rule can never, or must always, speak.
+
+        Raises
+        ------
+        ValueError : so
+        """
+        if not isfinite(min(self.doubtful, self.wrong)) or self.doubtful < 0.0 or not self.doubtful <= self.wrong:
+            raise ValueError(f"rule {self.kind!r}: limits {self.doubtful:g} and {self.wrong:g} say never, or always")
+        if not 0.0 <= self.rate < 0.05:
+            raise ValueError(f"rule {self.kind!r}: a rate of false alarms of {self.rate:g}")
+
+    def severity(self, figure: float, doubtful: float | None = None, wrong: float | None = None) -> Severity | None:
+        """What a figure means, by the rule's limits or others; None = it is within them."""
+        if figure > (self.wrong if wrong is None else wrong):
+            return "wrong"
+        if figure > (self.doubtful if doubtful is None else doubtful):
+            return "advice" if self.advice else "doubtful"
+        return None
+
+
+CHANCE = 1e-6  # that a figure of a healthy sensor is beyond a limit that is a quantile of its distribution
+
+_ROWS = (
+    Rule("axes", "error of the DVL against the IMU, over that with other axes", 1.15, 1.15, live="as a `check` event"),
+    Rule("clock", "the same, over that with shifted stamps", 1.15, 1.15, live="as a `clock` event"),
+    Rule(
+        "check", "findings of `rovgraph check` that say that data are wrong, and that are not resolved", 0.0, rate=0.0
+    ),
+    Rule(
+        "held", "error of a constant that is not estimated, in its sds", 5.0, 30.0, live="of the smoothed dive so far"
+    ),
+    Rule(
+        "moved", "shift of an estimated variable or a first bias, in sds of that shift", 4.0, 10.0, 1.6e-3, live="now"
+    ),
+    Rule("earth rate", "the Earth's rate over the sd of the gyro's bias, where it is not modelled", 10.0, live="now"),
+    Rule("frozen", "seconds in which a sensor repeats itself", 3.0, live="as it happens"),
+    Rule("no heading", "seconds without heading, without an IMU", 10.0, rate=0.0),
+    Rule("no tilt", "seconds without roll and pitch, without an IMU", 10.0, rate=0.0),
+    Rule("taken out", "seconds in which a sensor was ignored, since it contradicts all others", 0.0, live="of the DVL"),
+    Rule("close", "likelihood of the next best choice of what to ignore", 1e-4),
+    Rule(
+        "rejected",
+        "largest share of a sensor's measurements rejected in a minute",
+        0.05,
+        0.5,
+        live="of the last minute",
+    ),
+    Rule("too large", "mean square of normalised residuals, in the dive", 2.0, 6.0, live="of the last minute"),
+    Rule(
+        "too small",
+        "1 over the mean of the filter's NIS per dimension: the noise is smaller than stated",
+        1.0 / 0.3,
+        advice=True,
+        live="of the last minute",
+    ),
+    Rule("lasting", "variance of means over 5 or 20 s, 1 for white noise", 4.0, 100.0, live="of the last minute"),
+    Rule("imu", "the same of the IMU's own residuals, over 20 s", 3.0, 50.0),
+    Rule("bias drift", "change of a bias from start to end, in sds of its walk", 4.0, 30.0, 4e-4),
+    Rule(
+        "estimates",
+        "largest squared difference of smoothed and filtered position, depth or heading, in joint sds",
+        40.0,
+        100.0,
+        live="at each re-initialisation",
+    ),
+    Rule("halves", "difference of a constant between the halves of the dive, in sds", 10.0, 30.0),
+    Rule("unstated", "noise, an error that lasts, or another place of the DVL, found but not used", 0.0, live="only"),
+    Rule("contradiction", "the smaller of two sensors' excesses over their limits", 1.0, 1.0, live="as above"),
+)
+RULES = {rule.kind: rule for rule in _ROWS}
