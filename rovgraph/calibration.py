@@ -392,6 +392,17 @@ TABLE: dict[str, Variable] = {
             estimate=True,
             time_constant=0.5,
         ),
+        Variable(
+            "bottom_velocity",
+            "7",
+            ("_north", "_east"),
+            "m/s",
+            0.1,
+            ("dvl",),
+            "velocity of what bottom track sees (a bed that moves, a cloud, a hull, ice, water)",
+            "position fixes; the IMU, where it changes",
+            time_constant=60.0,
+        ),
     )
 }
 

@@ -1,12 +1,13 @@
 """A whole dive: from a log and a configuration to its estimates."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rovgraph.config import Config, beliefs
+from rovgraph.config import Config
 from rovgraph.diagnosis import (
     Alarm,
     Evidence,
@@ -17,11 +18,11 @@ from rovgraph.diagnosis import (
     statistics,
     verdict_of,
 )
-from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_noise
-from rovgraph.diagnosis.unstated_noise import changed as with_noise
+from rovgraph.diagnosis.unstated_noise import UnstatedNoise, find_errors, find_noise
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S
 from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.lasting import Rival
 from rovgraph.engine.optimum import Optimum
 from rovgraph.engine.stretches import Searches
 from rovgraph.engine.unknowns import unknowns
@@ -35,12 +36,11 @@ from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch, without_frozen
 from rovgraph.process import give_back
 from rovgraph.progress import Progress, no_progress
+from rovgraph.state import State
 from rovgraph.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
-
-MAX_NOISES = 3  # times that a dive is solved again with noise that was found in it
 
 
 @dataclass(frozen=True)
@@ -105,22 +105,58 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     """
     log, frozen = without_frozen(log, config)
     log, gaps = without_attitude_gaps(log, config)
-    found: list[UnstatedNoise] = []
-    dive, best = _solve(log, config, frozen, gaps, estimate, progress)
-    for _ in range(MAX_NOISES if config.graph.find_noise else 0):
-        more = find_noise(best, dive.initial.config, dive.alarms) if isinstance(best, ChainOptimum) else []
-        if not more:
+    known = _Known(log, initialise(log, config), frozen, gaps)
+    dive, best = _solve(known, estimate, progress)
+    for search in (find_noise, find_errors) if config.graph.find_noise else ():
+        if not isinstance(best, ChainOptimum):
             break
-        found, config = found + more, with_noise(config, more)
-        del dive, best  # a long dive is not kept twice
-        dive, best = _solve(log, config, frozen, gaps, estimate, progress)
-        if more[-1].lasts:
-            break
+        found, rivals = search(best, dive.initial.config, dive.alarms)
+        if found:
+            known = known.with_found(found, rivals, best.state, dive.estimates[0].trajectory)
+            del dive, best  # a long dive is not kept twice
+            dive, best = _solve(known, estimate, progress)
     if isinstance(best, ChainOptimum):
         best = best.without_what_is_at_hand()
         give_back()
         dive = _with_main(dive, variance_sources=_sources_where_largest(dive.estimates[0].trajectory, best))
-    return _saying(dive, found) if found else dive
+    return _saying(dive, known.found) if known.found else dive
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A dive, and what its earlier solutions have revealed.
+
+    Attributes
+    ----------
+    log, initial, frozen, gaps : the dive
+    found, rivals : what is believed since, and what would explain it as clearly
+    states, before : of the solution before: State of its keyframes, and its track; None = there is none
+    """
+
+    log: Log
+    initial: InitialConditions
+    frozen: list[FrozenStretch]
+    gaps: list[AttitudeGap]
+    found: tuple[UnstatedNoise, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+    states: State | None = None
+    before: Trajectory | None = None
+
+    def with_found(
+        self, found: Sequence[UnstatedNoise], rivals: Sequence[Rival], states: State, before: Trajectory
+    ) -> "_Known":
+        """The same, with what its newest solution has revealed."""
+        initial = self.initial
+        for one in found:
+            initial = initial.believing(one.beliefs)
+        return replace(
+            self,
+            initial=initial,
+            found=(*self.found, *found),
+            rivals=(*self.rivals, *rivals),
+            states=states,
+            before=self.before or before,
+        )
 
 
 def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, object]:
@@ -137,30 +173,24 @@ def _with_main(dive: Dive, **more: object) -> Dive:
     return replace(dive, estimates=[replace(main, summary={**main.summary, **more}), *dive.estimates[1:]])
 
 
-def _solve(
-    log: Log,
-    config: Config,
-    frozen: list[FrozenStretch],
-    gaps: list[AttitudeGap],
-    estimate: str,
-    progress: Progress,
-) -> tuple[Dive, Optimum | None]:
-    """The dive as configured, and the optimum of its smoothed estimate where a batch solver found it."""
-    initial = initialise(log, config)
+def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Optimum | None]:
+    """The dive as it is believed to be, and the optimum of its smoothed estimate where a batch solver found it."""
+    initial, log = known.initial, known.log
     batch = assemble(log, initial)
-    if config.graph.solver == "isam2":
+    if initial.config.graph.solver == "isam2":
         solver = _isam2(batch, progress)
         best = solver.optimum() if estimate != "filtered" else None
         estimates = [] if best is None else [smoothed(best, solver.initial)]
         if estimate != "smoothed":
             estimates.append(solver.filtered())
     else:
-        estimates, states, best = [], None, None
+        estimates, states, best = [], known.states, None
         passed = _filter(batch, progress) if estimate != "smoothed" else None
         batch.forget_motion_covariances()
         if passed is not None:
             estimates.append(passed.solve())
-            states = None if batch.measurements else passed.states()  # where the filter went is close by
+            if states is None and not batch.measurements:
+                states = passed.states()  # where the filter went is close by
             passed = None  # of a long dive it is large
         give_back()
         if estimate != "filtered":
@@ -170,12 +200,13 @@ def _solve(
             estimates.insert(0, smoothed(best, initial))
             give_back()
     intervals = batch.intervals if best is None else best.intervals
-    numbers = statistics(Evidence(initial, estimates, intervals, best, frozen, log, gaps))
-    left_out = _left_out(batch, frozen, gaps)
-    return Dive([*estimates, batch.dead_reckoning()], initial, left_out, frozen, numbers), best
+    left_out = _left_out(batch, known.frozen, known.gaps)
+    evidence = Evidence(initial, estimates, intervals, best, known.frozen, log, known.gaps)
+    numbers = statistics(evidence)
+    return Dive([*estimates, batch.dead_reckoning()], initial, left_out, known.frozen, numbers), best
 
 
-def _saying(dive: Dive, found: list[UnstatedNoise]) -> Dive:
+def _saying(dive: Dive, found: Sequence[UnstatedNoise]) -> Dive:
     """A dive that says what noise was found in it."""
     initial = replace(dive.initial, assumptions=[*(one.text for one in found), *dive.initial.assumptions])
     return replace(_with_main(dive, noise_found=[one.as_dict() for one in found]), initial=initial)
@@ -205,7 +236,7 @@ def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch], gaps: list[Atti
 def _taken_as_exact(initial: InitialConditions) -> list[str]:
     """What iSAM2's filtered estimate does not doubt although the configuration does, in a line."""
     config = initial.config
-    names = unknowns(beliefs(config), initial.instruments).considered if config.graph.solver == "isam2" else ()
+    names = unknowns(initial.beliefs, initial.instruments).considered if config.graph.solver == "isam2" else ()
     return (
         [f"the filtered estimate of iSAM2 takes these considered variables as exact: {', '.join(names)}"]
         if names

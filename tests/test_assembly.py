@@ -9,7 +9,7 @@ from dives import Simulated, falcon, interrupted, kept, level_log, same, simulat
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.keyframes import KeyframeInterval
@@ -29,7 +29,7 @@ def assembled(log: Log, config: Config | None = None) -> tuple[list[KeyframeInte
     for measurement in log.measurements():
         done += assembler.add(measurement)
     done += assembler.finish()
-    offsets = TimeOffsets.of(config, assembler.instruments)
+    offsets = TimeOffsets.of(beliefs(config), assembler.instruments)
     whole = assemble_log(log, config, assembler.instruments, np.zeros(6), offsets, left_out)
     same(done, whole.intervals)
     same(DiveRows.of(done, [*assembler.instruments]), whole.rows)

@@ -1,9 +1,9 @@
 """Noise that the configuration does not state, found in the residuals: larger than stated, or errors that last.
 
-Both come back as keys of the configuration, with which the dive is solved again, filter and smoother alike. So does
-the place of a DVL that is elsewhere than believed, where the gyro's noise would move it if it were estimated. A
-constant that is held wrongly makes residuals that look like either, so where alarms name one nothing is found. Late
-stamps of the same sensor are a rival: an error that lasts must make the dive likelier than these do.
+Both come back as `Beliefs`, with which the dive is solved again, filter and smoother alike. So does the place of a DVL
+that is elsewhere than believed, where the gyro's noise would move it if it were estimated. A constant that is held
+wrongly makes residuals that look like either, so where alarms name one nothing is found. Late stamps of the same sensor
+are a rival: an error that lasts must make the dive likelier than these do.
 
 The factor of white noise comes from differences of successive residuals, which errors that last leave alone:
 
@@ -12,12 +12,11 @@ The factor of white noise comes from differences of successive residuals, which 
 with m the median of chi-square. A smoother's residuals vary less than the noise, so the factor is a little low.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 from scipy.special import chdtri
 
 from rovgraph.calibration import AUTO, TABLE
@@ -26,9 +25,11 @@ from rovgraph.diagnosis import Alarm, Statistic
 from rovgraph.diagnosis.dvl_place import DvlPlace, other_place
 from rovgraph.diagnosis.residuals import SD_KEY
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.lasting import LASTING, LastingError, find_lasting
+from rovgraph.engine.initial_conditions import Beliefs
+from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting
 from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.rate_noise import ARM
+from rovgraph.gauss_markov import stationary_walk
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
 
@@ -50,6 +51,7 @@ class UnstatedNoise:
     key : of the configuration, that holds it
     values : what stands there with it; numbers, or keys of the section and theirs
     cause, done : what is so, and what is done about it
+    beliefs : the same, for the dive to be solved again
     """
 
     sensor: str
@@ -57,6 +59,7 @@ class UnstatedNoise:
     values: Any
     cause: str
     done: str
+    beliefs: Beliefs
 
     @property
     def text(self) -> str:
@@ -72,52 +75,64 @@ class UnstatedNoise:
         """For JSON."""
         return {"sensor": self.sensor, "key": self.key, "values": self.values, "text": self.text}
 
-    @property
-    def lasts(self) -> bool:
-        """An error that lasts; those are found all at once, after all else."""
-        return isinstance(self.values, Mapping) and "estimate" in self.values
-
 
 def find_noise(
-    best: ChainOptimum, config: Config, alarms: Iterable[Alarm], likely: float = LIKELY
-) -> list[UnstatedNoise]:
-    """What the residuals of a dive say of its noise; white noise goes first, as errors that last stand out of it.
+    best: ChainOptimum, config: Config, alarms: Sequence[Alarm], likely: float = LIKELY
+) -> tuple[list[UnstatedNoise], list[Rival]]:
+    """White noise that is larger than stated, and the place of a DVL that is elsewhere; these have no rivals.
 
     Parameters
     ----------
     best : the optimum
-    config : with which it was solved
+    config : of the dive
     alarms : of the same dive
     likely : sds of what is believed of the DVL's place, up to which another is left to chance
     """
-    named = [alarm for alarm in alarms if alarm.kind in NAMED]
-    place = None if any(one.kind in ("axes", "clock") for one in named) else other_place(best)
-    if place is not None and place.size > likely:
-        return [_placed(place)]
-    late = {alarm.sensor: alarm.figure for alarm in named if alarm.kind == "held" and alarm.sensor in ALONE}
-    if len(late) < len(named):
-        return []
-    larger = [found for sensor in best.blocks if (found := _larger(best, sensor, config)) is not None]
-    if larger:
-        return larger
-    stated = [name for name in LASTING.values() if getattr(config.calibration, name).estimate != AUTO]
-    errors = find_lasting(best, stated)
+    if _named_elsewhere(alarms):
+        return [], []
+    place = _place(best, alarms)
+    found = [_placed(best, place)] if place is not None and place.size > likely else []
+    return found + [larger for sensor in best.blocks if (larger := _larger(best, sensor, config)) is not None], []
+
+
+def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> tuple[list[UnstatedNoise], list[Rival]]:
+    """Errors that last, which stand out of white noise where that is known; and what explains the dive as clearly.
+
+    Parameters are those of `find_noise`.
+    """
+    if _named_elsewhere(alarms):
+        return [], []
+    late = {alarm.sensor: alarm.figure for alarm in alarms if alarm.kind == "held" and alarm.sensor in ALONE}
+    stated = [name for name in LASTING if getattr(config.calibration, name).estimate != AUTO]
+    errors, rivals = find_lasting(best, stated)
+    place = _place(best, alarms)
     if place is not None and any(error.sensor == "dvl" for error in errors):
-        return [_placed(place)]
+        return [_placed(best, place)], []
     # a score test's figure z is worth z^2 / 2 of log likelihood
-    return [_lasting(error, config) for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
+    clear = [error for error in errors if error.gain > 0.5 * late.get(error.sensor, 0.0) ** 2]
+    return [_lasting(best, error) for error in clear], rivals if clear else []
 
 
-def _placed(place: DvlPlace) -> UnstatedNoise:
+def _named_elsewhere(alarms: Sequence[Alarm]) -> bool:
+    """Whether alarms name another cause, of which late stamps of a sensor that stands alone are a rival only."""
+    return any(a.kind in NAMED and not (a.kind == "held" and a.sensor in ALONE) for a in alarms)
+
+
+def _place(best: ChainOptimum, alarms: Sequence[Alarm]) -> DvlPlace | None:
+    return None if any(alarm.kind in ("axes", "clock") for alarm in alarms) else other_place(best)
+
+
+def _placed(best: ChainOptimum, place: DvlPlace) -> UnstatedNoise:
     key = f"calibration.{ARM}"
     values = {"mean": tuple(place.mean.tolist()), "sd": place.sd}
-    return UnstatedNoise("dvl", key, values, place.cause, f"that is used ({key})")
+    beliefs = Beliefs({ARM: replace(best.beliefs[ARM], mean=place.mean, sd=place.sd)})
+    return UnstatedNoise("dvl", key, values, place.cause, f"that is used ({key})", beliefs)
 
 
-def unstated(best: ChainOptimum, config: Config, alarms: Iterable[Alarm]) -> Iterator[Statistic]:
+def unstated(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> Iterator[Statistic]:
     """The same as alarms, of an estimate that goes on without it; parameters are those of `find_noise`."""
     begin, end = best.intervals[0].time, best.intervals[-1].time
-    for one in find_noise(best, config, alarms, UNLIKELY):
+    for one in find_noise(best, config, alarms, UNLIKELY)[0] or find_errors(best, config, alarms)[0]:
         if not _is_allowed_for(one, best):
             yield Statistic("unstated", one.sensor, begin, end, 1.0, one.cause, one.remedy)
 
@@ -141,21 +156,6 @@ def _as_yaml(values: Any) -> str:
     return str(values).lower() if isinstance(values, bool) else f"{float(f'{values:.2g}'):g}"
 
 
-def changed(config: Config, found: Sequence[UnstatedNoise]) -> Config:
-    """The configuration with the noise that was found."""
-    for one in found:
-        config = _set(config, one.key.split("."), one.values)
-    return config
-
-
-def _set(section: Any, keys: Sequence[str], value: Any) -> Any:
-    """A section with one value changed, somewhere inside."""
-    inner = value if len(keys) == 1 else _set(getattr(section, keys[0]), keys[1:], value)
-    if isinstance(inner, Mapping) and isinstance(getattr(section, keys[0]), BaseModel):
-        inner = getattr(section, keys[0]).model_copy(update=dict(inner))
-    return section.model_copy(update={keys[0]: inner})
-
-
 def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | None:
     """White noise of a sensor that is larger than the configuration states."""
     key, block = SD_KEY.get(sensor), best.blocks[sensor]
@@ -169,7 +169,7 @@ def _larger(best: ChainOptimum, sensor: str, config: Config) -> UnstatedNoise | 
         return None
     value = tuple(factor * s for s in stated) if isinstance(stated, tuple) else factor * stated
     cause = f"its noise is {factor:.2g} times what {key} states, by its residuals"
-    return UnstatedNoise(sensor, key, value, cause, "the larger noise is used")
+    return UnstatedNoise(sensor, key, value, cause, "the larger noise is used", Beliefs(noise={sensor: factor}))
 
 
 def noise_factor(r: Array) -> float | None:
@@ -188,16 +188,22 @@ def _is_stated(best: ChainOptimum, sensor: str) -> bool:
     return bool(np.median(np.abs(sd / believed - 1.0)) < OWN_SD)
 
 
-def _lasting(error: LastingError, config: Config) -> UnstatedNoise:
+def _lasting(best: ChainOptimum, error: LastingError) -> UnstatedNoise:
     variable = TABLE[error.variable]
     factor, unit = shown(variable.unit)
     sd, seconds = factor * error.sd, float(error.time_constant)
     key = f"calibration.{error.variable}"
-    if np.isinf(seconds):
+    constant = bool(np.isinf(seconds))
+    walk = 0.0 if constant else stationary_walk(error.sd, seconds)
+    believed = replace(best.beliefs[error.variable], estimate=True, considered=False, sd=error.sd, walk=walk)
+    beliefs = Beliefs({error.variable: replace(believed, time_constant=seconds)})
+    values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd}
+    if constant:
         cause = f"{variable.about}: the dive determines it better than its sd"
-        values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd}
-        return UnstatedNoise(error.sensor, key, values, cause, f"it is estimated ({key})")
-    values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd, "time_constant_s": seconds}
+        return UnstatedNoise(error.sensor, key, values, cause, f"it is estimated ({key})", beliefs)
     size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"
-    cause = f"its errors are correlated over {seconds:.0f} s with an sd of {size}"
-    return UnstatedNoise(error.sensor, key, values, cause, f"they are estimated ({key})")
+    moves = error.variable == "bottom_velocity"
+    what = "the bottom moves, which is correlated" if moves else "its errors are correlated"
+    cause = f"{what} over {seconds:.0f} s with an sd of {size}"
+    values |= {"time_constant_s": seconds}
+    return UnstatedNoise(error.sensor, key, values, cause, f"they are estimated ({key})", beliefs)

@@ -22,6 +22,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from rovgraph.calibration import Belief
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
 from rovgraph.engine.aiding import Aiding
@@ -63,7 +64,8 @@ class Assembler:
     bias : ndarray, shape (6,), for preintegration; may be renewed between intervals
     left_out : (sensor, reason) -> count of measurements that never reach the graph
     learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
-    assumed : how late stamps are; None = as the configuration believes
+    believed : priors of the calibration; None = the configuration's
+    assumed : how late stamps are; None = as these have it
     stamps : the same
     """
 
@@ -72,9 +74,11 @@ class Assembler:
     bias: Array
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
     learn_noise: bool = False
+    believed: InitVar[Mapping[str, Belief] | None] = None
     assumed: InitVar[TimeOffsets | None] = None
 
-    def __post_init__(self, assumed: TimeOffsets | None) -> None:
+    def __post_init__(self, believed: Mapping[str, Belief] | None, assumed: TimeOffsets | None) -> None:
+        believed = beliefs(self.config) if believed is None else believed
         self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
         self._ticking = has_constant_velocity(self.config)
         self._samples = Ticks(self.config) if self._ticking else Samples(self.config, self.learn_noise)
@@ -91,8 +95,7 @@ class Assembler:
         self._segment, self._segment_start = -1, -np.inf
         self._between: list[StampedMeasurement] = []
         self._landmarks = Landmarks(self.config.place.every_s)
-        self.time_offsets = assumed or TimeOffsets.of(self.config, self.instruments)
-        believed = beliefs(self.config)
+        self.time_offsets = assumed or TimeOffsets.of(believed, self.instruments)
         self._scaled = wanted(believed)
         lasting = unknowns(believed, self.instruments).time_constants  # which begin a segment at every keyframe
         self._segment_s = 0.0 if lasting else self.config.graph.segment_s

@@ -7,7 +7,6 @@ from functools import cached_property, partial
 import numpy as np
 
 from rovgraph.calibration import Belief
-from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine import gauss_newton
 from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
@@ -292,7 +291,7 @@ def smooth_chain(
     ------
     InputError : the data do not determine some variable, which is named
     """
-    beliefs, rows = beliefs_of(initial.config), rows or DiveRows.of(intervals, [*initial.instruments])
+    beliefs, rows = initial.beliefs, rows or DiveRows.of(intervals, [*initial.instruments])
     wanted = unknowns(beliefs, rows.used)
     chain = Chain(intervals, initial, beliefs, wanted, rows)
     held = [name for name in wanted.considered if not beliefs[name].variable.time_offset]

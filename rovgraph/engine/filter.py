@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.config import beliefs
 from rovgraph.engine.alignment import POORLY_KNOWN, aligned, poorly_known, with_attitude
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.error_layout import ErrorLayout
@@ -74,7 +73,7 @@ class FilterEngine:
 
     def __init__(self, initial: InitialConditions, considers: bool = True) -> None:
         self.initial = initial
-        self.beliefs = beliefs(initial.config)
+        self.beliefs = initial.beliefs
         self.unknowns = unknowns(self.beliefs, initial.instruments)
         if not considers:
             self.unknowns = replace(self.unknowns, considered=())

@@ -1,12 +1,14 @@
 """What is believed where a dive begins."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from rovgraph.config import Config
+from rovgraph.calibration import Belief
+from rovgraph.config import Config, beliefs
 from rovgraph.engine.constant_velocity import gravity, has_constant_velocity
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument, instruments
@@ -41,6 +43,25 @@ class StatePrior:
 
 
 @dataclass(frozen=True)
+class Beliefs:
+    """What a dive has revealed of its instruments, in place of what the configuration says.
+
+    Attributes
+    ----------
+    calibration : name -> belief of a calibration variable
+    noise : sensor -> factor of its stated white noise
+    """
+
+    calibration: Mapping[str, Belief] = field(default_factory=dict)
+    noise: Mapping[str, float] = field(default_factory=dict)
+
+    def with_more(self, more: "Beliefs") -> "Beliefs":
+        """What was revealed before, and what is now, of the noise by that time."""
+        noise = {s: more.noise.get(s, 1.0) * self.noise.get(s, 1.0) for s in {**self.noise, **more.noise}}
+        return Beliefs({**self.calibration, **more.calibration}, noise)
+
+
+@dataclass(frozen=True)
 class InitialConditions:
     """The resolved start of a dive.
 
@@ -50,12 +71,25 @@ class InitialConditions:
     instruments : the sensors in use, lever arms relative to the IMU
     prior : of the first keyframe, at the IMU
     assumptions : what was assumed, one line each
+    revealed : by the dive itself, and believed since
     """
 
     config: Config
     instruments: dict[str, Instrument]
     prior: StatePrior
     assumptions: list[str]
+    revealed: Beliefs = Beliefs()
+
+    @cached_property
+    def beliefs(self) -> dict[str, Belief]:
+        """The prior of every calibration variable, in the order of the table."""
+        return {**beliefs(self.config), **self.revealed.calibration}
+
+    def believing(self, more: Beliefs) -> "InitialConditions":
+        """The same with what a dive has revealed."""
+        noise = more.noise
+        instruments = {s: replace(i, sd=noise[s] * i.sd) if s in noise else i for s, i in self.instruments.items()}
+        return replace(self, instruments=instruments, revealed=self.revealed.with_more(more))
 
     @property
     def gravity(self) -> float:

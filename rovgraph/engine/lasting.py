@@ -15,6 +15,11 @@ linearised there for another search: fixes that were rejected without the error 
 
 A constant that is off makes residuals that look like an error that lasts, as a DVL's arm does in turns. Where one makes
 the dive likelier, it is found instead, as an error of infinite time constant.
+
+Likelihood alone takes whatever bends most. So each error has a largest sd, by what such an instrument can do: a
+receiver of 1 m is not 5 m off for minutes, a bed easily moves by 0.3 m/s. Explanations that are clear, each by itself,
+are rivals: how much likelier one is measures noise, not whether the right one is among them. Where they put the track
+elsewhere, a dive does not say which is right.
 """
 
 from collections.abc import Collection
@@ -27,10 +32,11 @@ from numpy.typing import NDArray
 from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.gauss_newton import Solution, minimise
+from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.linear_constants import LinearConstants
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.rate_noise import ARM, noise_moves_arm
+from rovgraph.engine.stretches import resume
 from rovgraph.engine.widened_chain import begin_at, with_lasting
 from rovgraph.gauss_markov import stationary_sd, stationary_walk
 from rovgraph.geometry import Array
@@ -39,8 +45,8 @@ from rovgraph.state import State
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
-# sensor -> its error, estimated where the dive shows it
-LASTING = {v.sensors[0]: name for name, v in TABLE.items() if np.isfinite(v.time_constant) and not v.estimate}
+# error -> its sensor; estimated where the dive shows it
+LASTING = {name: v.sensors[0] for name, v in TABLE.items() if np.isfinite(v.time_constant) and not v.estimate}
 ENOUGH = 30  # measurements
 LIKELY = 3.0  # gain of log likelihood, at the optimum without the error, that is worth a look
 WINDOW_S = 20.0  # over which residuals are summed
@@ -52,13 +58,14 @@ WORTH_A_LOOK = {
 }  # least `unity`; the track takes a DVL's error along
 CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
 SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
-LONGEST = {"dvl": 0.5}  # time constant in the length of the dive, 1 where none stands here
 SMALLEST = 0.01  # sd, in that of the table
-IMPLAUSIBLE = 10.0  # the same: a heading that is mirrored is no noise
-CONSTANT = np.array([1.0, 10.0])  # sds of constants that may be the cause, in those they are believed to have
+# largest sd, in that of the table: a compass that is 10 degrees off for minutes is not swinging but broken or mirrored
+LARGEST = {"dvl_error": 10.0}
+LARGEST_OF_OTHERS = 5.0
+LARGEST_OF_FIXES = 5.0  # in their stated noise: of true ones 1.2 to 3.9 were found, where the bed moved 5.4 and more
+CONSTANT = np.array([1.0, 3.0])  # sds of constants that may be the cause, in those they are believed to have
 FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
 EVALUATIONS = 12  # of the likelihood in it
-AT_LONGEST = 0.9  # of that time constant
 AS_PROMISED = 0.1  # of a gain, by which that of the linear dive may differ
 TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
 
@@ -81,8 +88,22 @@ class LastingError:
     gain: float
 
 
-def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> list[LastingError]:
-    """Errors that last, the clearest first, each looked for beside those before it.
+@dataclass(frozen=True)
+class Rival:
+    """An error that explains a dive clearly by itself.
+
+    Attributes
+    ----------
+    error : so
+    p_n : ndarray, shape (n, 3), where the keyframes are with it [m]
+    """
+
+    error: LastingError
+    p_n: Array
+
+
+def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> tuple[list[LastingError], list[Rival]]:
+    """Errors that last, the clearest first, each looked for beside those before it; and what else explains the dive.
 
     Parameters
     ----------
@@ -90,17 +111,20 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> list[Last
     without : calibration variables that are, too
     """
     found: list[LastingError] = []
+    rivals: list[Rival] = []
     now, passed = _Baseline.of(best), {*without}
     while candidates := [_most_likely(now, probe) for probe in _probes(now, passed)]:
         passed |= {c.variable for c in candidates if _implausible(now.chain, c)}  # they have another cause
         candidates = sorted((c for c in candidates if c.variable not in passed), key=lambda c: c.gain, reverse=True)
-        fits = (_fit(now, candidate) for candidate in candidates)
-        clear = next(((error, fitted) for error, fitted in fits if error.gain >= CLEAR), None)
-        if clear is None:
+        clear = [one for one in (_fit(now, candidate) for candidate in candidates) if one[0].gain >= CLEAR]
+        if not clear:
             break
-        error, now = clear
+        if not found:
+            rivals = [Rival(error, fitted.solution.point.p_n) for error, fitted in clear[1:]]
+        error, now = clear[0]
         found.append(error)
-    return found
+    beside = {error.variable for error in found}
+    return found, [rival for rival in rivals if rival.error.variable not in beside]
 
 
 @dataclass(frozen=True)
@@ -137,7 +161,7 @@ class _Baseline:
     def with_error(self, name: str, sd: float, time_constant: float) -> "_Baseline":
         """The dive with one more error, solved from here."""
         wider = with_lasting(self.chain, name, sd, time_constant)
-        solution = minimise(wider, begin_at(wider, self.solution.point), tolerance=TOLERANCE)
+        solution = resume(wider, begin_at(wider, self.solution.point), self.solution, TOLERANCE)
         root = wider.eliminate(solution.point, solution.gates, diagonal=True)
         return _Baseline(wider, solution, root.log_determinant(), root.left)
 
@@ -145,7 +169,7 @@ class _Baseline:
 def _probes(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
     """Errors as large as their sensors' noise with which the dive is more likely."""
     out, (chain, solution) = [], (now.chain, now.solution)
-    for sensor, name in LASTING.items():
+    for name, sensor in LASTING.items():
         block = chain.blocks.get(sensor)
         if block is None or len(block) < ENOUGH or name in {*chain.unknowns.estimated, *passed}:
             continue
@@ -154,7 +178,7 @@ def _probes(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
         seen = np.sum(H**2, axis=(1, 2)) / H.shape[2]
         if not np.any(seen > 0.0) or unity(block, state, H, solution.gates[sensor]) < WORTH_A_LOOK.get(sensor, 0.0):
             continue
-        sd = min(float(1.0 / np.sqrt(np.median(seen[seen > 0.0]))), 0.5 * IMPLAUSIBLE * TABLE[name].sd)
+        sd = min(float(1.0 / np.sqrt(np.median(seen[seen > 0.0]))), 0.5 * _largest(chain, name))
         time_constant = float(np.clip(TABLE[name].time_constant, *_time_constants(chain, sensor)))
         gain = now.linear_gain(name, sd, time_constant)
         if gain > LIKELY:
@@ -241,7 +265,8 @@ def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
     from scipy.optimize import minimize  # takes 0.1 s to load; healthy dives do not need it
 
     name, seconds = begin.variable, _time_constants(now.chain, begin.sensor)
-    sds = TABLE[name].sd * np.array([SMALLEST, IMPLAUSIBLE])
+    largest = _largest(now.chain, name)
+    sds = min(SMALLEST * TABLE[name].sd, 0.1 * largest), largest
     walks = stationary_walk(sds[0], seconds[1]), stationary_walk(sds[1], seconds[0])
 
     def error(x: Array) -> LastingError:
@@ -255,7 +280,7 @@ def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
         return -begin.gain if np.array_equal(x, start) else -now.linear_gain(name, at.sd, at.time_constant)
 
     def stop(intermediate_result: "OptimizeResult") -> None:
-        if error(intermediate_result.x).sd > IMPLAUSIBLE * TABLE[name].sd:
+        if error(intermediate_result.x).sd > largest:
             raise StopIteration
 
     best = minimize(
@@ -273,17 +298,20 @@ def _time_constants(chain: Chain, sensor: str) -> tuple[float, float]:
     """The shortest and the longest that is looked for [s]."""
     duration = float(chain.rows.time[-1] - chain.rows.time[0])
     shortest = SHORTEST * float(np.median(np.diff(chain.blocks[sensor].time)))
-    return shortest, max(LONGEST.get(sensor, 1.0) * duration, shortest)
+    return shortest, max(duration, shortest)
+
+
+def _largest(chain: Chain, name: str) -> float:
+    """The largest sd of an error that such a sensor can have."""
+    if LASTING[name] == "fix":
+        stated = 1.0 / np.abs(chain.blocks["fix"].W[:, 0, 0])
+        return LARGEST_OF_FIXES * float(np.median(stated))
+    return LARGEST.get(name, LARGEST_OF_OTHERS) * TABLE[name].sd
 
 
 def _implausible(chain: Chain, error: LastingError) -> bool:
-    """Whether an error has another cause: it is larger than a sensor's can be, or a DVL's that is there all the time.
-
-    What lasts as long as the dive is the IMU's own scale rather than the bottom under a DVL.
-    """
-    longest = _time_constants(chain, error.sensor)[1]
-    all_the_time = error.sensor in LONGEST and error.time_constant > AT_LONGEST * longest
-    return all_the_time or error.sd > IMPLAUSIBLE * TABLE[error.variable].sd
+    """Whether an error has another cause: it is larger than such a sensor's can be."""
+    return error.sd > _largest(chain, error.variable)
 
 
 def _freedom(chain: Chain, log_determinant: float) -> float:

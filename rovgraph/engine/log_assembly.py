@@ -12,6 +12,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.calibration import Belief
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.aiding import Aiding
 from rovgraph.engine.dive_rows import DiveRows
@@ -80,6 +81,7 @@ def assemble_log(
     bias: Array,
     time_offsets: TimeOffsets,
     left_out: Counter[tuple[str, str]],
+    believed: Mapping[str, Belief] | None = None,
 ) -> AssembledLog:
     """The intervals of a log.
 
@@ -91,6 +93,7 @@ def assemble_log(
     bias : ndarray, shape (6,), for preintegration
     time_offsets : how late stamps are assumed to be
     left_out : (sensor, reason) -> count, of measurements that never reach the graph; is added to
+    believed : priors of the calibration; None = the configuration's
 
     Raises
     ------
@@ -99,7 +102,8 @@ def assemble_log(
     whole = WholeLog(log, instruments, config, time_offsets, HALF_WINDOW_S + time_offsets.span, left_out)
     if not len(whole.imu):
         return AssembledLog([], DiveRows.of([], [*instruments]))
-    return _LogAssembly(whole, config, instruments, bias, time_offsets, left_out).assembled()
+    believed = beliefs(config) if believed is None else believed
+    return _LogAssembly(whole, config, instruments, bias, time_offsets, left_out, believed).assembled()
 
 
 class _LogAssembly:
@@ -113,11 +117,11 @@ class _LogAssembly:
         bias: Array,
         time_offsets: TimeOffsets,
         left_out: Counter[tuple[str, str]],
+        believed: Mapping[str, Belief],
     ) -> None:
         self.whole, self.config, self.instruments, self.bias = whole, config, instruments, bias
         self.time_offsets, self.left_out = time_offsets, left_out
         self.around = HALF_WINDOW_S + time_offsets.span
-        believed = beliefs(config)
         self.scaled, self.R_bs = wanted(believed), mount_matrix(config.imu.mount_rpy_deg)
         lasting = unknowns(believed, instruments).time_constants  # which begin a segment at every keyframe
         self.segment_s = 0.0 if lasting else config.graph.segment_s

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rovgraph.calibration import LAYOUT
-from rovgraph.config import Config, beliefs
+from rovgraph.calibration import LAYOUT, Belief
 from rovgraph.engine.late_stamp_window import KNOT_S
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
@@ -61,10 +60,10 @@ class TimeOffsets:
     assumed: dict[str, float]
 
     @staticmethod
-    def of(config: Config, instruments: Mapping[str, Instrument]) -> "TimeOffsets":
-        """TimeOffsets as the configuration believes them to be."""
+    def of(beliefs: Mapping[str, Belief], instruments: Mapping[str, Instrument]) -> "TimeOffsets":
+        """As the priors of the calibration have them."""
         variable = {sensor: i.time_offset for sensor, i in instruments.items() if i.time_offset is not None}
-        priors = {name: belief for name, belief in beliefs(config).items() if name in variable.values()}
+        priors = {name: belief for name, belief in beliefs.items() if name in variable.values()}
         assumed = {name: float(belief.mean[0]) for name, belief in priors.items()}
         lags = {name: around(assumed[name], REACH_SD * b.sd) for name, b in priors.items() if b.estimate}
         return TimeOffsets(variable, lags, assumed)

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rovgraph.calibration import LAYOUT, TABLE, Belief
-from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, states_of
@@ -74,8 +73,8 @@ class IncrementalEstimator:
         self.known = self.filter.start()
         self.history = FilterHistory(self.filter)
         self.gates: Gates = {}
-        self.engine = Incremental(self.filter, {name: _stiff(belief) for name, belief in beliefs(b.config).items()})
-        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0])
+        self.engine = Incremental(self.filter, {name: _stiff(belief) for name, belief in b.beliefs.items()})
+        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], believed=b.beliefs)
         self.intervals: list[KeyframeInterval] = []
         self._own_places: dict[float, int] = {}  # time of a landmark -> number of the place that it is by itself
         names = self.filter.unknowns.estimated

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.config import beliefs
 from rovgraph.engine.assembly import Assembler
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.dive_rows import DiveRows
@@ -55,7 +54,9 @@ class BatchSmoother:
 
     def __post_init__(self) -> None:
         b = self.initial
-        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], assumed=self.time_offsets)
+        self.assembler = Assembler(
+            b.config, b.instruments, b.prior.state.bias[0], believed=b.beliefs, assumed=self.time_offsets
+        )
         self.intervals: list[KeyframeInterval] = []
         self._log: Log | None = None
         self._rows: DiveRows | None = None
@@ -70,7 +71,7 @@ class BatchSmoother:
                 self.intervals += assembler.add(measurement)
             return self.finish()
         bias, offsets, left_out = b.prior.state.bias[0], assembler.time_offsets, assembler.left_out
-        dive = assemble_log(log, b.config, b.instruments, bias, offsets, left_out)
+        dive = assemble_log(log, b.config, b.instruments, bias, offsets, left_out, b.beliefs)
         self.intervals, self._rows = dive.intervals, dive.rows
         return dive.intervals
 
@@ -119,7 +120,7 @@ class BatchSmoother:
         states : State of its keyframes to begin with, calibration at the end of the dive; None = dead reckoning
         """
         b = self.initial
-        dive, priors = self, beliefs(b.config)
+        dive, priors = self, b.beliefs
         calibration = None if states is None else newest_calibration(states.calibration)
         for _ in range(MAX_PLACINGS):
             if states is None:
@@ -153,7 +154,7 @@ class BatchSmoother:
     def dead_reckoning(self) -> Estimate:
         """Dead reckoning over the same intervals: the baseline."""
         b = self.initial
-        means = {name: belief.mean for name, belief in beliefs(b.config).items()}
+        means = {name: belief.mean for name, belief in b.beliefs.items()}
         states = dead_reckon(self.intervals, b, means)
         trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame())

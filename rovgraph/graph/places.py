@@ -23,7 +23,6 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from rovgraph.config import beliefs as beliefs_of
 from rovgraph.engine.constant_velocity import gravity
 from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
@@ -53,7 +52,7 @@ def smooth_graph(
     intervals, initial : the dive
     states, calibration : of the keyframes to begin with, as `make_values` takes them
     """
-    config, instruments, beliefs = initial.config, initial.instruments, beliefs_of(initial.config)
+    config, instruments, beliefs = initial.config, initial.instruments, initial.beliefs
     given = initial.prior, config, beliefs, instruments
     apart = _apart(intervals)
     problem = make_problem(apart, *given)
@@ -83,7 +82,7 @@ def associated_optimum(
     intervals, initial : the dive
     states, calibration : of the keyframes to begin with, as `make_values` takes them
     """
-    beliefs = beliefs_of(initial.config)
+    beliefs = initial.beliefs
     problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments)
     values = make_values(problem, states, calibration)
     if (block := problem.blocks.get(PLACE)) is not None:

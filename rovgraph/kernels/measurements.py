@@ -6,8 +6,9 @@ call it through the models of `rovgraph.sensors`, the filter's kernel calls `pre
 ==============  =========================================================  ==================
 kind            equation                                                   source
 ==============  =========================================================  ==================
-DVL             z = (1 + k + e) R_sb (R_bn v_n + (w - b_g) x (l + dl))     (3.16), (3.17)
-DVL_WATER       the same with v_n - c_n, c the current, without e
+DVL             z = (1 + k + e) R_sb (R_bn (v_n - u_n) + (w - b_g)         (3.16), (3.17)
+                x (l + dl)), u the velocity of the bottom
+DVL_WATER       the same with c for u, c the current, without e
 DVL_COMPASS     z = h + A + e + B sin h + C cos h, h the DVL's heading     (3.17); deviation
                 less the declination, e an error that lasts                curve: Bowditch
 COMPASS         the same, with an x axis that is known
@@ -32,7 +33,8 @@ Arguments of `predict`, in the order of `rovgraph.kernels.layout`:
 Of ``H_out`` a kind writes the columns that it depends on, and always the same ones, so that a buffer which was zero
 at first can be used again and again:
 
-    DVL, DVL_WATER   rotation, velocity, gyro, dvl_roll to dvl_lever_arm; dvl_error, DVL_WATER: current
+    DVL, DVL_WATER   rotation, velocity, gyro, dvl_roll to dvl_lever_arm; dvl_error and
+                     bottom_velocity, DVL_WATER: current
     DVL_COMPASS      rotation, its offset, error and curve, dvl_roll to dvl_yaw
     COMPASS          rotation, its offset, error and curve
     MAGNETOMETER     rotation, mag_offset to field_scale
@@ -49,6 +51,7 @@ from rovgraph.geometry import Array
 from rovgraph.kernels.compass import compass, dvl_mount, magnetometer, tilt
 from rovgraph.kernels.compile import given, kernel, view_helper
 from rovgraph.kernels.layout import (
+    BOTTOM_VELOCITY,
     CURRENT,
     DVL_ERROR,
     DVL_LEVER_ARM,
@@ -93,9 +96,9 @@ def dvl_velocity(
         w[i] = rate[i] - b[3 + i]
         arm[i] = params[i] + c[DVL_LEVER_ARM + i]
         row[i] = v[i]
-    if water:
-        row[0] -= c[CURRENT]
-        row[1] -= c[CURRENT + 1]
+    below = CURRENT if water else BOTTOM_VELOCITY
+    row[0] -= c[below]
+    row[1] -= c[below + 1]
     rotate_back(R, row, body)
     cross(w, arm, v_b)
     for i in range(3):
@@ -114,10 +117,9 @@ def dvl_velocity(
         cross(row, v_b, turn)
         rotate_back(axes, turn, H_out[i, MOTION + DVL_ROLL : MOTION + DVL_ROLL + 3])
         H_out[i, MOTION + DVL_SCALE] = z_out[i] / gain
-        if water:
-            H_out[i, MOTION + CURRENT] = -H_out[i, VELOCITY]
-            H_out[i, MOTION + CURRENT + 1] = -H_out[i, VELOCITY + 1]
-        else:
+        H_out[i, MOTION + below] = -H_out[i, VELOCITY]
+        H_out[i, MOTION + below + 1] = -H_out[i, VELOCITY + 1]
+        if not water:
             H_out[i, MOTION + DVL_ERROR] = H_out[i, MOTION + DVL_SCALE]
 
 

@@ -73,7 +73,7 @@ class DvlVelocity:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        return (*_DVL, "current" if self.sensor == "dvl_water" else "dvl_error")
+        return (*_DVL, *(("current",) if self.sensor == "dvl_water" else ("dvl_error", "bottom_velocity")))
 
     @property
     def kind(self) -> int:

@@ -51,7 +51,9 @@ class ErrorStateFilter:
 
     def __post_init__(self) -> None:
         b = self.initial
-        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise)
+        self.assembler = Assembler(
+            b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise, believed=b.beliefs
+        )
         self.engine = FilterEngine(b)
         self.known = self.engine.start()
         self.history = FilterHistory(self.engine)

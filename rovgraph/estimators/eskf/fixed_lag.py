@@ -290,7 +290,9 @@ class FixedLag:
 
     def _fresh(self) -> Assembler:
         b = self.initial
-        return Assembler(b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise)
+        return Assembler(
+            b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise, believed=b.beliefs
+        )
 
 
 def _taken_over(old: FilterEngine, new: FilterEngine, known: Gaussian) -> Gaussian:
