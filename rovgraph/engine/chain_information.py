@@ -118,7 +118,7 @@ class SquareRoot:
         chain_posterior.back_substitute(self.conditionals, y[:, None], x)
         return x[..., 0]
 
-    def border_with(self, free: Index, y: Array, score: Array | None = None) -> Array:
+    def border_with(self, free: Index, y: Array, score: Array | None = None, unforced: bool = False) -> Array:
         """The border where the sum of squares is least, less twice its product with a score; shape (c,).
 
         Parameters
@@ -126,11 +126,12 @@ class SquareRoot:
         free : ndarray of int, components that may move
         y : ndarray, shape (c,), where the others are held; what it has of the free ones is ignored
         score : ndarray, shape (c,), log likelihood of a unit of each beyond that of the rows
+        unforced : of rows without right-hand sides: by how much the others move for those that are held
         """
         out, R, z = y.copy(), self.border[:, :-1], self.border[:, -1]
         out[free] = 0.0
         Q, own = np.linalg.qr(R[:, free])
-        rest = Q.T @ (z - R @ out)
+        rest = Q.T @ ((0.0 if unforced else z) - R @ out)
         if score is not None:
             rest += np.linalg.solve(own.T, score[free])
         out[free] = _solve_upper(own, rest)

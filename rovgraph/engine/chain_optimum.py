@@ -1,6 +1,6 @@
 """The optimum of a dive that closes no loop, as `rovgraph.engine.optimum` asks of any solver."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -22,6 +22,7 @@ from rovgraph.engine.stretches import Searches, at_rest, resume, solve
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.engine.widened_chain import widened
 from rovgraph.geometry import Array
+from rovgraph.kernels.chain_posterior import back_substitute
 from rovgraph.state import State
 
 SHORT = 6000  # keyframes whose conditionals take 40 MB
@@ -186,6 +187,23 @@ class ChainOptimum:
         del vars(self)["root"]
         known = at_rest(chain, begin, self.solution) or resume(chain, begin, self.solution, gauss_newton.REST)
         return ChainOptimum(chain, known).rested()
+
+    def sd_of_noise(self) -> dict[str, Array]:
+        """The sd of what is estimated and constant, were what is considered known: name -> ndarray, shape (dim,)."""
+        P, places = self._end.border_covariance(0.0 * self._believed), self.wide.layout.places
+        border = [name for name in self.unknowns.estimated if places[name][0]]
+        return {name: np.sqrt(np.diagonal(P[places[name][1], places[name][1]])) for name in border}
+
+    def moved_by_considered(self) -> Iterator[State]:
+        """The optimum with each component of what is considered one sd away, and all that is estimated along."""
+        root, held = self.root, len(self._believed)
+        for k in range(held):
+            y = np.zeros(len(root.border))
+            y[len(y) - held + k] = np.sqrt(self._believed[k, k])
+            y = root.border_with(np.arange(len(y) - held), y, unforced=True)
+            x = np.zeros_like(root.conditionals[:, :, -1:])
+            back_substitute(root.conditionals, y[:, None], x)
+            yield self.wide.moved(self.state, ChainStep(x[..., 0], y), 1.0)
 
     def relative_sd(self) -> dict[str, Array]:
         """As `rovgraph.engine.optimum.Optimum`."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.calibration import CONSIDERED, TABLE, Belief
+from rovgraph.calibration import AUTO, CONSIDERED, TABLE, Belief
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.constant_velocity import NO_BIAS_SD, has_constant_velocity, motion_model, ticks
 from rovgraph.engine.scale import SCALES
@@ -16,6 +16,8 @@ from rovgraph.instruments import heading_sources
 from rovgraph.log import Log
 
 TILT = "vehicle_tilt"
+BOTTOM = "bottom_velocity"
+BOAT_ACC = 0.5  # noise density of a boat's acceleration: less takes its turns for those of the bottom [m/s2/rtHz]
 
 
 def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple[Log, Config]:
@@ -39,6 +41,7 @@ def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple
         if asked:
             raise InputError(f"{log.source}: {key} needs an IMU, columns acc_x..acc_z and gyr_x..gyr_z")
     why = "the IMU is left out" if "imu" in log else "the log has no IMU"
+    config = _on_a_bed_that_may_move(log, config, assumptions)
     motion = config.motion
     assumptions.append(
         f"{why}: constant velocity between measurements, walking by {motion.acc:g} m/s2/rtHz, "
@@ -57,6 +60,25 @@ def with_motion_model(log: Log, config: Config, assumptions: list[str]) -> tuple
     environment = config.environment.model_copy(update={"earth_rotation": False})
     config = config.model_copy(update={"calibration": calibration, "environment": environment})
     return replace(log, streams={**log.streams, "imu": ticks(log)}), config
+
+
+def _on_a_bed_that_may_move(log: Log, config: Config, assumptions: list[str]) -> Config:
+    """A vehicle with neither IMU nor depth is a boat, and rivers move their beds: they are surveyed for that.
+
+    Nothing but position fixes would show it, so it is estimated unless the configuration says otherwise.
+    """
+    if "depth" in log or "dvl" not in log or getattr(config.calibration, BOTTOM).estimate != AUTO:
+        return config
+    bottom = getattr(config.calibration, BOTTOM).model_copy(update={"estimate": True})
+    calibration = config.calibration.model_copy(update={BOTTOM: bottom})
+    motion = config.motion
+    if "acc" not in motion.model_fields_set:
+        motion = motion.model_copy(update={"acc": BOAT_ACC})
+    assumptions.append(
+        f"no depth either, so it is a boat, under which the bed may move by {bottom.sd:g} m/s; "
+        f"calibration.{BOTTOM}: {{estimate: false}} if it rests"
+    )
+    return config.model_copy(update={"calibration": calibration, "motion": motion})
 
 
 def unseen(sensors: Collection[str]) -> list[str]:
