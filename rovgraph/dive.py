@@ -201,8 +201,8 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
             give_back()
     intervals = batch.intervals if best is None else best.intervals
     left_out = _left_out(batch, known.frozen, known.gaps)
-    evidence = Evidence(initial, estimates, intervals, best, known.frozen, log, known.gaps)
-    numbers = statistics(evidence)
+    seen = known.frozen, log, known.gaps, left_out, known.before, known.rivals
+    numbers = statistics(Evidence(initial, estimates, intervals, best, *seen))
     return Dive([*estimates, batch.dead_reckoning()], initial, left_out, known.frozen, numbers), best
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.special import ndtri
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, beliefs
@@ -17,6 +18,7 @@ from rovgraph.geometry import EARTH_RATE, Array
 from rovgraph.units import behind, shown
 
 NARROWED = 0.95  # times its prior sd: what did not narrow is its prior repeated
+LINEARISED = 0.2  # of a prior sd, by which linearisation may move what is hardly seen
 # errors in variables: what is released follows noise where it is less certain than this part of the default prior sd,
 SHOWN = 0.3
 SHOWN_OF = {"fix_time_offset": 1.0}  # the velocity that makes a late fix wrong is known well, whatever fixes scatter
@@ -36,13 +38,12 @@ BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(
 
 
 def moved(evidence: Evidence) -> Iterator[Statistic]:
-    """Calibration variables and first biases against their priors.
-
-    What data move of a healthy variable has at most the variance prior_sd^2 + sd^2 (`sds_moved`).
-    """
-    for c in evidence.main.calibration:
-        if c.estimated:
-            yield from moved_constant(c, evidence.start, evidence.end)
+    """Calibration variables, first biases and the start against their priors, in sds of the shift (`sds_moved`)."""
+    noise = _sd_of_noise(evidence)
+    several = [c for c in evidence.main.calibration if c.estimated]
+    for c in several:
+        yield from moved_constant(c, evidence.start, evidence.end, noise.get(c.label), len(several))
+    yield from _start_moved(evidence)
     prior = evidence.initial.prior
     for name, part, key in BIASES:
         history = evidence.main.history.get(name)
@@ -62,11 +63,46 @@ def moved(evidence: Evidence) -> Iterator[Statistic]:
         )
 
 
-def moved_constant(c: CalibrationEstimate, begin: float, end: float) -> Iterator[Statistic]:
-    """One that is estimated against its prior, where the data of a time [s] have narrowed it."""
-    off = float(sds_moved(np.array(c.value), np.array(c.sd), np.array(c.prior_mean), np.array(c.prior_sd)))
-    if c.sd > NARROWED * c.prior_sd:
+def _sd_of_noise(evidence: Evidence) -> dict[str, float]:
+    """Label of a constant -> its sd, were what is considered known; of a chain's smoothed estimate."""
+    best = evidence.optimum
+    if not isinstance(best, ChainOptimum) or evidence.main.kind != "smoothed":
+        return {}
+    pairs = (zip(TABLE[name].labels, sd.tolist(), strict=True) for name, sd in best.sd_of_noise().items())
+    return {label: sd for pair in pairs for label, sd in pair}
+
+
+def _start_moved(evidence: Evidence) -> Iterator[Statistic]:
+    """The first position against the start that the configuration states."""
+    start, track = evidence.initial.config.start, evidence.main.trajectory
+    if not start.located or evidence.main.kind != "smoothed" or "fix" not in evidence.residuals:
         return
+    stated = np.array([start.north_m or 0.0, start.east_m or 0.0])
+    off, sd = track.p_n[0, :2] - stated, track.p_sd[0, :2]
+    figure = sds_moved(off, sd, np.zeros(2), np.full(2, start.position_sd_m), sd)
+    worst = int(np.argmax(figure))
+    yield _moved(
+        evidence.start,
+        evidence.end,
+        "start",
+        float(figure[worst]),
+        f"the dive begins {np.linalg.norm(off):.2g} m from where it was believed to begin, {figure[worst]:.0f} sds of "
+        f"what start.position_sd_m {start.position_sd_m:.2g} allows",
+        "correct start.north_m and start.east_m, or leave them to the first fix",
+    )
+
+
+def moved_constant(
+    c: CalibrationEstimate, begin: float, end: float, sd_of_noise: float | None = None, several: int = 25
+) -> Iterator[Statistic]:
+    """One of several that are estimated against its prior, where the data of a time [s] have narrowed it.
+
+    ``sd_of_noise`` is its sd, were what is considered known; None = it is not known.
+    """
+    if c.sd > NARROWED * c.prior_sd and sd_of_noise is None:
+        return
+    noise = None if sd_of_noise is None else np.array(sd_of_noise)
+    off = float(sds_moved(np.array(c.value), np.array(c.sd), np.array(c.prior_mean), np.array(c.prior_sd), noise))
     factor, unit = shown(c.unit)
     name = next((n for n in TABLE if c.label in TABLE[n].labels), c.label)
     yield _moved(
@@ -78,20 +114,32 @@ def moved_constant(c: CalibrationEstimate, begin: float, end: float) -> Iterator
         f"{factor * c.prior_mean:.3g} ± {factor * c.prior_sd:.2g}{behind(unit)}",
         f"check {_key_of(name)}; if the estimate is right, state it as the mean, or state a larger "
         f"sd, in calibration.{name}",
+        several,
     )
 
 
-def sds_moved(value: Array, sd: Array, prior_mean: Array, prior_sd: Array) -> Array:
+def sds_moved(value: Array, sd: Array, prior_mean: Array, prior_sd: Array, sd_of_noise: Array | None = None) -> Array:
     """How far data have moved n constants, in sds of what they do to right ones; 0 where they hardly narrowed them.
 
-    Without anything considered that has the variance prior sd^2 - sd^2; what is considered adds to it and to sd^2.
+    With s the sd were what is considered known, an estimate that ignores what is considered shifts by a variance of
+    prior sd^2 - s^2, and what is considered adds sd^2 - s^2 to it. Where s is not known, it is at most
+    prior sd^2 + sd^2. Errors of linearisation move what is hardly seen by a part of its prior's sd.
     """
-    by_data = np.where(sd <= NARROWED * prior_sd, np.hypot(prior_sd, sd), np.inf)
+    if sd_of_noise is None:
+        by_data = np.where(sd <= NARROWED * prior_sd, np.hypot(prior_sd, sd), np.inf)
+    else:
+        variance = prior_sd**2 + sd**2 - 2.0 * sd_of_noise**2
+        by_data = np.sqrt(np.maximum(variance, (LINEARISED * prior_sd) ** 2))
     return np.asarray(np.abs(value - prior_mean) / by_data)
 
 
-def _moved(begin: float, end: float, sensor: str, figure: float, cause: str, remedy: str) -> Statistic:
-    return Statistic("moved", sensor, begin, end, figure, cause, remedy)
+def _moved(
+    begin: float, end: float, sensor: str, figure: float, cause: str, remedy: str, several: int = 25
+) -> Statistic:
+    """A shift in its sds, the largest of several: the fewer there are, the less of it is chance."""
+    rule = RULES["moved"]
+    factor = float(ndtri(1.0 - 0.5 * rule.rate / max(several, 1))) / rule.doubtful
+    return Statistic("moved", sensor, begin, end, figure, cause, remedy, factor)
 
 
 def held(evidence: Evidence) -> Iterator[Statistic]:

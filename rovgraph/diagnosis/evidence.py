@@ -1,7 +1,7 @@
 """What alarms look at: the estimates of a dive, its optimum, and the residuals of every sensor as arrays."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -9,12 +9,14 @@ import pandas as pd
 
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.lasting import Rival
 from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.attitude_gaps import AttitudeGap
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 from rovgraph.log.frozen import FrozenStretch
+from rovgraph.trajectory import Trajectory
 
 MINUTE = 60.0  # [s]
 
@@ -54,6 +56,9 @@ class Evidence:
     frozen : what was left out since a sensor repeated itself
     log : of the dive
     attitude_gaps : times without heading or tilt, of a dive without an IMU
+    left_out : (sensor, reason) -> count of measurements that never reached the graph
+    before : track before the dive was solved again with what it revealed; None = it was not
+    rivals : what explains the dive as clearly as what was found
     """
 
     initial: InitialConditions
@@ -63,6 +68,9 @@ class Evidence:
     frozen: Sequence[FrozenStretch]
     log: Log
     attitude_gaps: Sequence[AttitudeGap] = ()
+    left_out: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    before: Trajectory | None = None
+    rivals: Sequence[Rival] = ()
 
     def estimate(self, kind: str) -> Estimate | None:
         """The estimate of a kind, if it was made."""
@@ -87,6 +95,12 @@ class Evidence:
     def residuals(self) -> dict[str, SensorResiduals]:
         """Of the main estimate, by sensor."""
         return residuals_by_sensor(self.main.residuals)
+
+    @cached_property
+    def innovations(self) -> dict[str, SensorResiduals]:
+        """Of the filtered estimate, by sensor; empty where it was not made."""
+        filtered = self.estimate("filtered")
+        return {} if filtered is None else residuals_by_sensor(filtered.residuals)
 
     def since(self, time: float) -> float:
         """Seconds since the dive began."""

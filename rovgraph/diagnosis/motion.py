@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import chdtri
 
+from rovgraph.calibration import TABLE
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence, windows
 from rovgraph.diagnosis.rules import CHANCE
@@ -20,6 +21,7 @@ PARTS = (("its rotation about", slice(0, 3), "gyr"), ("its velocity along", slic
 BIASES = (("acc_bias", slice(9, 12), "acc", "m/s2", 1.0), ("gyr_bias", slice(12, 15), "gyr", "deg/s", np.rad2deg(1.0)))
 SETTLED_S = 10.0  # from which on the filter is asked
 COARSE = 300  # epochs at which both are compared
+LITTLE_M = 10.0  # an sd of so much may be all that a dive wants [m]
 
 
 def imu(evidence: Evidence) -> Iterator[Statistic]:
@@ -88,6 +90,80 @@ def _motion_residuals(evidence: Evidence) -> Array:
     return rows.motion_residuals(best.state)
 
 
+def _squares(a: Trajectory, b: Trajectory, P: Array, heading_variance: Array) -> dict[str, Array]:
+    """Squared differences of two tracks per degree of freedom, in units of a covariance, shape (n,) each."""
+    d, turned = a.p_n - b.p_n, wrap_angle(a.rpy[:, 2] - b.rpy[:, 2])
+    level = np.einsum("ni,nij,nj->n", d[:, :2], np.linalg.inv(P[:, :2, :2]), d[:, :2]) / 2.0
+    return {"position": level, "depth": d[:, 2] ** 2 / P[:, 2, 2], "heading": turned**2 / heading_variance}
+
+
+def rms_of(values: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def found(evidence: Evidence) -> Iterator[Statistic]:
+    """How far what was found in the dive has moved its track: noise that matters to nothing is no evidence of error."""
+    track, before = evidence.main.trajectory, evidence.before
+    if before is None or len(before) != len(track):
+        return
+    square = _squares(before, track, track.cov_p, track.cov_theta[:, 2, 2])["position"]
+    apart = np.linalg.norm((before.p_n - track.p_n)[:, :2], axis=1)
+    k = int(np.argmax(apart))
+    yield Statistic(
+        "found",
+        "dive",
+        float(track.time[k]),
+        float(track.time[k]),
+        rms_of(np.sqrt(square)),
+        f"what it revealed of its sensors (see what is assumed) moved the track by up to {apart[k]:.2g} m, "
+        f"{rms_of(np.sqrt(square)):.1f} of its sds (rms)",
+        "check the sensor that is named there, and state what you know of it",
+    )
+
+
+def rivals(evidence: Evidence) -> Iterator[Statistic]:
+    """How far apart the explanations put the track that are clear each by itself."""
+    track = evidence.main.trajectory
+    for rival in evidence.rivals:
+        if len(rival.p_n) != len(track) or evidence.optimum is None:
+            continue
+        d = (rival.p_n - evidence.optimum.state.p_n)[:, :2]
+        P = track.cov_p[:, :2, :2]
+        square = np.einsum("ni,nij,nj->n", d, np.linalg.inv(P), d) / 2.0
+        k = int(np.argmax(np.linalg.norm(d, axis=1)))
+        yield Statistic(
+            "rivals",
+            rival.error.sensor,
+            float(track.time[k]),
+            float(track.time[k]),
+            rms_of(np.sqrt(square)),
+            f"{TABLE[rival.error.variable].about} explains the dive as clearly as what was found, and puts the track "
+            f"up to {np.linalg.norm(d[k]):.2g} m elsewhere; the stated sd covers both",
+            f"find out which is so, and state the other as exact: calibration.{rival.error.variable}: "
+            "{estimate: false}",
+        )
+
+
+def uncertain(evidence: Evidence) -> Iterator[Statistic]:
+    """The sd itself: a track that is known to no better than a part of its length is of little use."""
+    track = evidence.main.trajectory
+    sd = np.sqrt(track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1])
+    if not np.isfinite(sd).any():
+        return
+    k = int(np.nanargmax(sd))
+    yield Statistic(
+        "uncertain",
+        "dive",
+        float(track.time[k]),
+        float(track.time[k]),
+        float(sd[k]) / max(LITTLE_M, 0.25 * track.distance),
+        f"the position is known to {sd[k]:.0f} m only, after {track.distance:.0f} m, "
+        f"at {evidence.since(float(track.time[k])):.0f} s",
+        "see which measurements are missing there (rovgraph check), and what was left out",
+    )
+
+
 def estimates(evidence: Evidence) -> Iterator[Statistic]:
     """Smoothed against filtered position, depth and heading, in joint sds.
 
@@ -106,18 +182,26 @@ def apart(s: Trajectory, f: Trajectory, start: float) -> Iterator[Statistic]:
     at = at[:: max(len(at) // COARSE, 1)]
     if not len(at):
         return
-    d, P = (f.p_n - s.p_n)[at], (f.cov_p + s.cov_p)[at]
-    turned = wrap_angle(f.take(at).rpy[:, 2] - s.take(at).rpy[:, 2])
-    heading = turned**2 / (f.cov_theta[at, 2, 2] + s.cov_theta[at, 2, 2])
-    level = np.einsum("ni,nij,nj->n", d[:, :2], np.linalg.inv(P[:, :2, :2]), d[:, :2])
-    depth = d[:, 2] ** 2 / P[:, 2, 2]
+    d, turned = (f.p_n - s.p_n)[at], wrap_angle(f.take(at).rpy[:, 2] - s.take(at).rpy[:, 2])
+    joint = _squares(f.take(at), s.take(at), (f.cov_p + s.cov_p)[at], (f.cov_theta + s.cov_theta)[at, 2, 2])
     sizes = {
-        "position": (level, np.linalg.norm(d[:, :2], axis=1), "m"),
-        "depth": (depth, np.abs(d[:, 2]), "m"),
-        "heading": (heading, np.rad2deg(np.abs(turned)), "deg"),
+        "position": (2.0 * joint["position"], np.linalg.norm(d[:, :2], axis=1), "m"),
+        "depth": (joint["depth"], np.abs(d[:, 2]), "m"),
+        "heading": (joint["heading"], np.rad2deg(np.abs(turned)), "deg"),
     }
+    own = _squares(f.take(at), s.take(at), f.take(at).cov_p, f.cov_theta[at, 2, 2])
     for what, (square, size, unit) in sizes.items():
-        k = int(np.argmax(square))
+        k, mean = int(np.argmax(square)), float(np.mean(own[what]))
+        yield Statistic(
+            "separation",
+            "dive",
+            start,
+            float(s.time[-1]),
+            mean,
+            f"smoothed and filtered {what} differ by {rms_of(size):.2g} {unit} (rms), {np.sqrt(mean):.1f} of "
+            "the filter's sds",
+            "later measurements contradict the filter all along: look at the calibration and at the residuals",
+        )
         yield Statistic(
             "estimates",
             "dive",

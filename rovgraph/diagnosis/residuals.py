@@ -6,6 +6,7 @@ only the filter's normalised innovations squared (NIS) can tell, whose expectati
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.special import bdtrc, chdtri
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import MINUTE, Evidence, SensorResiduals, span, windows
 from rovgraph.diagnosis.rules import CHANCE, RULES
+from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.geometry import Array
 
@@ -22,6 +24,8 @@ ENOUGH = 20  # measurements
 GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a minute
 USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 IN_A_MINUTE = 1.5  # times as much
+SETTLED_S = 20.0  # from which on the filter is asked
+REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are no fault, or have a rule
 LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
 OF_ONE = 8.0  # a single mean may be that much more
 SD_KEY = {
@@ -159,12 +163,89 @@ def too_small_in(sensor: str, begin: float, end: float, mean: float) -> Statisti
     )
 
 
+def innovations(evidence: Evidence) -> Iterator[Statistic]:
+    """Mean of the filter's normalised innovations squared, per dimension, that is far above 1.
+
+    A smoother follows what is wrong for long; the filter meets it first.
+    """
+    filtered = evidence.estimate("filtered")
+    for sensor, nis in ({} if filtered is None else filtered.summary.get("nis", {})).items():
+        if nis["mean"] is None or nis["count"] < ENOUGH:
+            continue
+        count = nis["count"] * nis["dim"]
+        mean = nis["mean"] / nis["dim"]
+        yield Statistic(
+            "innovations",
+            sensor,
+            evidence.start,
+            evidence.end,
+            mean,
+            f"it surprises the filter: its innovations are {np.sqrt(mean):.1f} times as large as their stated sd",
+            f"check the instrument, its mounting and clock (rovgraph check), or raise {sd_key(sensor)}",
+            chance=float(chdtri(count, CHANCE)) / count,
+        )
+
+
+def filter_alone(evidence: Evidence) -> Iterator[Statistic]:
+    """Share of a sensor's measurements, after the first seconds, that the filter rejected and the smoother took."""
+    if evidence.main.kind != "smoothed":
+        return
+    for sensor, met in evidence.innovations.items():
+        taken = evidence.residuals.get(sensor)
+        if taken is None or len(taken.time) != len(met.time) or len(met.time) < ENOUGH:
+            continue
+        late = met.time > evidence.start + SETTLED_S
+        apart = (met.weight <= 0.0) & (taken.weight > 0.0) & late
+        share = float(share_rejected(np.array([apart.sum()]), np.array([late.sum()]))[0])
+        first, last = (float(t) for t in (met.time[apart][[0, -1]] if apart.any() else (evidence.start, evidence.end)))
+        yield Statistic(
+            "filter alone",
+            sensor,
+            first,
+            last,
+            share,
+            f"{apart.sum()} of its measurements contradict what was known before and not what came after, "
+            f"{evidence.span(first, last)}: the smoothed track may have followed them",
+            "check the instrument at that time, and compare the filtered track",
+        )
+
+
+def left_out(evidence: Evidence) -> Iterator[Statistic]:
+    """Share of a sensor's measurements that were refused one by one before the estimate."""
+    for (sensor, why), count in evidence.left_out.items():
+        if sensor not in evidence.log or why.startswith(REPORTED):
+            continue
+        share = count / max(len(evidence.log[sensor]), 1)
+        yield Statistic(
+            "left out",
+            sensor,
+            evidence.start,
+            evidence.end,
+            share,
+            f"{share:.0%} of its measurements were left out: {why}",
+            "check its unit and that limit" if "." in why else "check the instrument and its driver",
+        )
+
+
 def lasting(evidence: Evidence) -> Iterator[Statistic]:
     """Residuals that keep their sign for seconds: the variance of means over a time, which is 1 for white noise."""
     if evidence.main.kind == "filtered":  # its innovations wander while it settles
         return
     for r in evidence.residuals.values():
-        yield from lasting_in(r, evidence.start, evidence.end)
+        for one in lasting_in(r, evidence.start, evidence.end):
+            yield from lasting_in(_allowing(r, evidence), evidence.start, evidence.end) if one.severity else (one,)
+
+
+def _allowing(r: SensorResiduals, evidence: Evidence) -> SensorResiduals:
+    """Residuals that allow for what is considered: each of its components moves all of a window alike."""
+    best = evidence.optimum
+    if not isinstance(best, ChainOptimum) or r.sensor not in best.blocks:
+        return r
+    block, shared = best.blocks[r.sensor], np.zeros_like(r.normalised)
+    here = block.normalised(best.state.at(block.keyframe))
+    for moved in best.moved_by_considered():
+        shared += (block.normalised(moved.at(block.keyframe)) - here) ** 2
+    return replace(r, shared=shared[np.argsort(block.time, kind="stable")])
 
 
 def lasting_in(r: SensorResiduals, start: float, end: float, began: float | None = None) -> Iterator[Statistic]:

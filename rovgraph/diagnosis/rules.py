@@ -64,6 +64,19 @@ _ROWS = (
         "check", "findings of `rovgraph check` that say that data are wrong, and that are not resolved", 0.0, rate=0.0
     ),
     Rule(
+        "innovations",
+        "mean square of the filter's innovations, in their stated sds",
+        4.0,
+        25.0,
+        live="as too large",
+    ),
+    Rule(
+        "filter alone",
+        "share of a sensor's measurements that the filter rejected and the smoother took",
+        0.05,
+        rate=1e-3,
+    ),
+    Rule(
         "held", "error of a constant that is not estimated, in its sds", 5.0, 30.0, live="of the smoothed dive so far"
     ),
     Rule(
@@ -99,6 +112,22 @@ _ROWS = (
         40.0,
         100.0,
         live="at each re-initialisation",
+    ),
+    Rule(
+        "separation",
+        "mean square of smoothed less filtered position, depth or heading over the dive, in the filter's sds",
+        9.0,
+        25.0,
+        rate=4e-4,
+    ),
+    Rule("found", "how far what was found in the dive moved the track, rms, in sds of the track", 2.0, rate=0.01),
+    Rule("rivals", "how far apart clear explanations put the track, rms, in its sds", 2.0, rate=1e-3),
+    Rule("left out", "share of a sensor's measurements that never reached the estimate", 0.1, 0.5, rate=1e-3),
+    Rule(
+        "uncertain",
+        "largest horizontal sd, in quarters of the distance travelled, or 10 m where that is more",
+        1.0,
+        rate=1e-3,
     ),
     Rule("halves", "difference of a constant between the halves of the dive, in sds", 10.0, 30.0),
     Rule("unstated", "noise, an error that lasts, or another place of the DVL, found but not used", 0.0, live="only"),
