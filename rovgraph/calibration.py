@@ -79,6 +79,7 @@ class Variable:
         return tuple(self.name + c for c in self.components)
 
 
+STEADY = 1e-4  # walk of what changes at known times, in its sd: next to none between them [1/rts]
 CONSIDERED = "considered"  # neither estimated nor exact
 AUTO = "auto"  # an error that lasts: estimated where a smoothed dive shows it, else exact
 
@@ -403,6 +404,17 @@ TABLE: dict[str, Variable] = {
             "position fixes; the IMU, where it changes",
             time_constant=60.0,
         ),
+        Variable(
+            "depth_error",
+            "8",
+            _ONE,
+            "m",
+            0.1,
+            ("depth",),
+            "error of the depth that lasts (air pressure, tide, a zero that was set under way)",
+            "motion up and down that the DVL measures better over its time constant",
+            time_constant=60.0,
+        ),
     )
 }
 
@@ -467,6 +479,7 @@ class Belief:
     time_constant : time in which what has walked returns to the mean [s]; infinite = it does not
     score : ndarray, shape (dim,), derivative of the log likelihood that noise has taken from the measurements
         (`rovgraph.engine.rate_noise`) [1/unit]
+    changes : times at which it takes another value, by its sd, from its mean on; it is constant otherwise [s]
     """
 
     variable: Variable
@@ -477,3 +490,9 @@ class Belief:
     considered: bool = False
     time_constant: float = np.inf
     score: Array | float = 0.0
+    changes: tuple[float, ...] = ()
+
+    @property
+    def first_sd(self) -> float:
+        """Where the dive begins: what changes later is at its mean [unit]."""
+        return STEADY * self.sd if self.changes else self.sd

@@ -29,7 +29,7 @@ from rovgraph.engine.initial_conditions import Beliefs
 from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting
 from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.rate_noise import ARM
-from rovgraph.gauss_markov import stationary_walk
+from rovgraph.engine.widened_chain import lasting_belief
 from rovgraph.geometry import Array
 from rovgraph.units import behind, shown
 
@@ -193,16 +193,21 @@ def _lasting(best: ChainOptimum, error: LastingError) -> UnstatedNoise:
     factor, unit = shown(variable.unit)
     sd, seconds = factor * error.sd, float(error.time_constant)
     key = f"calibration.{error.variable}"
-    constant = bool(np.isinf(seconds))
-    walk = 0.0 if constant else stationary_walk(error.sd, seconds)
-    believed = replace(best.beliefs[error.variable], estimate=True, considered=False, sd=error.sd, walk=walk)
-    beliefs = Beliefs({error.variable: replace(believed, time_constant=seconds)})
+    believed = lasting_belief(best.beliefs[error.variable], error.sd, seconds, tuple(time for time, _ in error.steps))
+    beliefs = Beliefs({error.variable: believed})
+    moves = error.variable == "bottom_velocity"
     values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd}
-    if constant:
+    if error.steps:
+        begin = best.intervals[0].time
+        sizes = ((time - begin, ", ".join(f"{factor * by:+.2g}" for by in step.tolist())) for time, step in error.steps)
+        when = " and ".join(f"at {since:.0f} s by {size}{behind(unit)}" for since, size in sizes)
+        what = "the bottom that it sees changes its velocity" if moves else "its error changes at once"
+        done = f"another value is taken from there on ({key})"
+        return UnstatedNoise(error.sensor, key, values, f"{what}, {when}", done, beliefs)
+    if np.isinf(seconds):
         cause = f"{variable.about}: the dive determines it better than its sd"
         return UnstatedNoise(error.sensor, key, values, cause, f"it is estimated ({key})", beliefs)
     size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"
-    moves = error.variable == "bottom_velocity"
     what = "the bottom moves, which is correlated" if moves else "its errors are correlated"
     cause = f"{what} over {seconds:.0f} s with an sd of {size}"
     values |= {"time_constant_s": seconds}

@@ -102,7 +102,13 @@ class Chain:
         for name in self.layout.walking:
             own = self.unknowns.walked(name, seconds[:, None])
             kept[:, self._walking(name)], sd[:, self._walking(name)] = own
+            for time in self.beliefs[name].changes:
+                sd[self._interval_of(time), self._walking(name)] = self.beliefs[name].sd
         return 1.0 / sd, kept
+
+    def _interval_of(self, time: float) -> int:
+        """The number of the walk over the interval that holds a time [s]."""
+        return int(np.clip(self.rows.time.searchsorted(time) - 1, 0, max(len(self.rows.time) - 2, 0)))
 
     def _walking(self, name: str) -> slice:
         part = self.layout.places[name][1]
@@ -262,7 +268,7 @@ class Chain:
             point.bias[0] - prior.state.bias[0],
         ]
         own = [
-            (np.atleast_2d(point.calibration[name])[0] - self.beliefs[name].mean) / self.beliefs[name].sd
+            (np.atleast_2d(point.calibration[name])[0] - self.beliefs[name].mean) / self.beliefs[name].first_sd
             for name in self.unknowns.estimated
         ]
         return self._prior_weight @ np.concatenate(parts), np.concatenate([np.empty(0), *own])
@@ -350,7 +356,7 @@ class Chain:
         """The prior of the first keyframe, that of what walks, and the tie of the first attitude's clone."""
         r, _ = self.prior_residuals(point)
         rows.put(0, -r[None], self._prior_jacobian(point)[None], np.empty((1, MOTION, 0)), NOTHING, _ONE)
-        sd = [np.full(TABLE[n].dim, self.beliefs[n].sd) for n in self.layout.walking]
+        sd = [np.full(TABLE[n].dim, self.beliefs[n].first_sd) for n in self.layout.walking]
         off = [self.beliefs[n].mean - point.calibration[n][0] for n in self.layout.walking]
         weight = 1.0 / np.concatenate([np.empty(0), *sd])
         own = np.concatenate([NOTHING, *(self.layout.target(n) for n in self.layout.walking)])

@@ -99,7 +99,7 @@ class FilterEngine:
         prior, layout = self.initial.prior, self.layout
         sd = np.zeros(layout.width)
         for name in self._wide.estimated:
-            sd[layout.columns[name]] = self.beliefs[name].sd
+            sd[layout.columns[name]] = self.beliefs[name].first_sd
         P = np.diag(sd[: layout.size] ** 2)
         P[:15, :15] = prior.covariance()
         B, L = np.zeros((layout.size, layout.width - layout.size)), np.diag(sd[layout.size :])
@@ -119,7 +119,7 @@ class FilterEngine:
         departed = transition = None
         predicted = before
         if interval.motion is not None:
-            departed = self._align(before, interval)
+            departed = self._changed(self._align(before, interval), interval)
             departed = self.correct(departed, interval.between, gates, processed)
             transition = self.predict(interval, departed)
             predicted = transition.predicted
@@ -248,6 +248,22 @@ class FilterEngine:
         B = np.zeros((len(known.P), len(other.L)))
         B[columns(size, ours)] = extended(basis, size + PLACE_DIM * len(ours)) @ other.B[columns(size, theirs)]
         return replace(known, B=B, L=other.L)
+
+    def changes_in(self, begin: float, end: float) -> list[str]:
+        """What of the calibration takes another value after one time and up to another [s]."""
+        return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
+
+    def _changed(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
+        """The keyframe before an interval, with the variance of what takes another value in it."""
+        assert interval.motion is not None
+        names = self.changes_in(interval.time - interval.motion.duration, interval.time)
+        if not names:
+            return known
+        P = known.P.copy()
+        for name in names:
+            own = np.arange(len(P))[self.layout.columns[name]]
+            P[own, own] += self.beliefs[name].sd ** 2
+        return replace(known, P=P)
 
     def _align(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
         """The keyframe before an interval; where its attitude is poorly known, with the one it is corrected to."""

@@ -20,9 +20,13 @@ Likelihood alone takes whatever bends most. So each error has a largest sd, by w
 receiver of 1 m is not 5 m off for minutes, a bed easily moves by 0.3 m/s. Explanations that are clear, each by itself,
 are rivals: how much likelier one is measures noise, not whether the right one is among them. Where they put the track
 elsewhere, a dive does not say which is right.
+
+An error may also take another value at once: a compass when a tool is carried, a depth that is zeroed, a receiver that
+switches its datum, a DVL that locks onto a hull. Jumps of a sensor's residuals propose when, those that were rejected
+included, and the likelihood of the dive with these steps then compares with that of an error that wanders.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -60,13 +64,18 @@ CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes t
 SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
 SMALLEST = 0.01  # sd, in that of the table
 # largest sd, in that of the table: a compass that is 10 degrees off for minutes is not swinging but broken or mirrored
-LARGEST = {"dvl_error": 10.0}
+LARGEST = {"dvl_error": 10.0, "depth_error": 10.0}
 LARGEST_OF_OTHERS = 5.0
-LARGEST_OF_FIXES = 5.0  # in their stated noise: of true ones 1.2 to 3.9 were found, where the bed moved 5.4 and more
+LARGEST_OF_FIXES = 4.0  # in their stated noise: of true ones 1.2 to 3.9 were found, where the bed moved 5.4 and more
 CONSTANT = np.array([1.0, 3.0])  # sds of constants that may be the cause, in those they are believed to have
 FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
 EVALUATIONS = 12  # of the likelihood in it
 AS_PROMISED = 0.1  # of a gain, by which that of the linear dive may differ
+STEP_S, LEAST_OF_STEP = 5.0, 4  # medians of residuals that are compared: a time, and measurements
+JUMP = 60.0  # of them, in chi-square
+MOST_STEPS = 3
+PART_OF_LARGEST = 0.1  # that a step has at least
+CHANCES_OF_STEP, CHANCES_OF_SIZE = 5.0, 3.0  # logs of the times at which one may be, and of the sizes of a component
 TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
 
 
@@ -79,6 +88,7 @@ class LastingError:
     sensor, variable : of `LASTING`, or a constant of that sensor
     sd, time_constant : of the process [unit of the variable, s]; infinite for a constant
     gain : of log likelihood
+    steps : when it takes another value, and ndarray, shape (dim,), by how much, where it is constant otherwise
     """
 
     sensor: str
@@ -86,6 +96,7 @@ class LastingError:
     sd: float
     time_constant: float
     gain: float
+    steps: tuple[tuple[float, Array], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -113,10 +124,13 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> tuple[lis
     found: list[LastingError] = []
     rivals: list[Rival] = []
     now, passed = _Baseline.of(best), {*without}
-    while candidates := [_most_likely(now, probe) for probe in _probes(now, passed)]:
+    while True:
+        candidates = [_most_likely(now, probe) for probe in _probes(now, passed)]
+        steps = _steps(now, passed)
         passed |= {c.variable for c in candidates if _implausible(now.chain, c)}  # they have another cause
         candidates = sorted((c for c in candidates if c.variable not in passed), key=lambda c: c.gain, reverse=True)
-        clear = [one for one in (_fit(now, candidate) for candidate in candidates) if one[0].gain >= CLEAR]
+        fits = [*(_fit(now, one) for one in candidates), *(_with_steps(now, one) for one in steps)]
+        clear = _clearest([one for one in fits if one[0].gain >= CLEAR])
         if not clear:
             break
         if not found:
@@ -164,6 +178,106 @@ class _Baseline:
         solution = resume(wider, begin_at(wider, self.solution.point), self.solution, TOLERANCE)
         root = wider.eliminate(solution.point, solution.gates, diagonal=True)
         return _Baseline(wider, solution, root.log_determinant(), root.left)
+
+    def with_steps(self, name: str, sd: float, steps: Sequence[tuple[float, Array]]) -> "_Baseline":
+        """The dive with an error that takes other values at some times, solved from where that is so.
+
+        All measurements are let in to begin with: without the steps the estimate has bent away from good ones.
+        """
+        wider = with_lasting(self.chain, name, sd, np.inf, tuple(time for time, _ in steps))
+        begin = begin_at(wider, self.solution.point)
+        values = begin.calibration[name].copy()
+        for time, step in steps:
+            values[self.chain.rows.time >= time] += step
+        begin = replace(begin, calibration={**begin.calibration, name: values})
+        known = replace(self.solution, gates=wider.initial_gates(), stretches=())
+        solution = resume(wider, begin, known, TOLERANCE)
+        root = wider.eliminate(solution.point, solution.gates, diagonal=True)
+        return _Baseline(wider, solution, root.log_determinant(), root.left)
+
+
+def _clearest(fits: list[tuple[LastingError, _Baseline]]) -> list[tuple[LastingError, _Baseline]]:
+    """The best explanation of each variable, the clearest first."""
+    best: dict[str, tuple[LastingError, _Baseline]] = {}
+    for one in sorted(fits, key=lambda fit: fit[0].gain, reverse=True):
+        best.setdefault(one[0].variable, one)
+    return [*best.values()]
+
+
+def _steps(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
+    """Errors by which a sensor's residuals jump at some times, far more than they do otherwise."""
+    out = []
+    for name, sensor in LASTING.items():
+        block = now.chain.blocks.get(sensor)
+        if block is None or len(block) < ENOUGH or name in {*now.chain.unknowns.estimated, *passed}:
+            continue
+        state = now.solution.point.at(block.keyframe)
+        steps = _jumps(block, state, block.by_calibration(state, name))
+        if steps:
+            sd = float(np.sqrt(np.mean(np.square([step for _, step in steps]))))
+            out.append(LastingError(sensor, name, sd, np.inf, 0.0, steps))
+    return out
+
+
+def _jumps(block: Block, state: State, H: Array) -> tuple[tuple[float, Array], ...]:
+    """When the residuals of a sensor jump, and by how much as an error; in the order of time.
+
+    Each measurement by itself says how large the error is. Medians of some seconds are compared with those after the
+    next: over so short a time the IMU knows the motion, however the estimate has bent to follow the sensor.
+
+    Parameters
+    ----------
+    block, state : measurements, and their keyframes' states
+    H : ndarray, shape (n, dim, k), whitened Jacobian by the error
+    """
+    usual = float(np.median(np.diff(block.time)))
+    size = max(round(STEP_S / max(usual, 1e-3)), LEAST_OF_STEP)
+    count = len(block) // size
+    information = np.einsum("nij,nik->njk", H, H)[: count * size]
+    if count < 2 * LEAST_OF_STEP or not np.median(np.linalg.det(information)) > 0.0:
+        return ()
+    single = _single(block, state, H)[: count * size]
+    e = np.median(single.reshape(count, size, -1), axis=1)  # an outlier counts as one
+    change = e[2:] - e[:-2]
+    noise = 1.0 / (size * np.median(np.einsum("njj->nj", information), axis=0))
+    variance = np.maximum((np.median(np.abs(change), axis=0) / 0.6745) ** 2, 2.0 * noise)
+    clear = np.sum(change**2 / variance, axis=1)
+    found: list[tuple[float, Array]] = []
+    while len(found) < MOST_STEPS and clear.max(initial=0.0) > JUMP:
+        k = int(np.argmax(clear))
+        near = slice(k * size, (k + 3) * size)
+        along = (single[near] - 0.5 * (e[k] + e[k + 2])) @ change[k]
+        at = near.start + int(np.argmin(np.cumsum(np.sign(along)))) + 1
+        when = 0.5 * float(block.time[at - 1] + block.time[min(at, len(block) - 1)])
+        found.append((when, change[k]))
+        clear[max(k - 3, 0) : k + 4] = 0.0
+    return tuple(sorted(found, key=lambda one: one[0]))
+
+
+def _single(block: Block, state: State, H: Array) -> Array:
+    """How large the error is by each measurement alone, shape (n, k)."""
+    r, information = block.normalised(state), np.einsum("nij,nik->njk", H, H)
+    tiny = 1e-12 * np.trace(information, axis1=1, axis2=2).max() * np.eye(H.shape[2])
+    return np.asarray(np.linalg.solve(information + tiny, np.einsum("nij,ni->nj", H, r)[..., None])[..., 0])
+
+
+def _with_steps(now: _Baseline, error: LastingError) -> tuple[LastingError, _Baseline]:
+    """Steps with what they take off the cost, less their chances, and the dive with them.
+
+    Costs compare where other measurements are taken out, which determinants do not.
+    """
+    stepped = now.with_steps(error.variable, error.sd, error.steps)
+    path, time = stepped.solution.point.calibration[error.variable], now.chain.rows.time
+    times = [when for when, _ in error.steps]
+    after = np.minimum(time.searchsorted(times), len(path) - 1)
+    sizes = path[after] - path[after - 1]
+    size = np.linalg.norm(sizes, axis=1)
+    real = size > PART_OF_LARGEST * size.max()
+    steps = tuple((when, step) for when, step, kept in zip(times, sizes, real, strict=True) if kept)
+    if not real.all():
+        return _with_steps(now, replace(error, steps=steps))
+    price = len(steps) * (CHANCES_OF_STEP + CHANCES_OF_SIZE * sizes.shape[1])
+    return replace(error, gain=now.solution.cost - stepped.solution.cost - price, steps=steps), stepped
 
 
 def _probes(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
@@ -217,7 +331,8 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     if abs(gain - candidate.gain) > AS_PROMISED * candidate.gain:  # the optimum has moved, and with it what is likely
         error = _most_likely(fitted, replace(candidate, gain=0.0))
         fitted = fitted.with_error(error.variable, error.sd, error.time_constant)
-    if _implausible(now.chain, error):
+    path = fitted.solution.point.calibration[error.variable]
+    if _implausible(now.chain, error) or np.sqrt(np.mean(path**2)) > _largest(now.chain, error.variable):
         return replace(error, gain=-np.inf), fitted
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
     unknowns = now.chain.unknowns
@@ -321,5 +436,5 @@ def _freedom(chain: Chain, log_determinant: float) -> float:
     ----------
     log_determinant : of its information
     """
-    priors = sum(TABLE[n].dim * float(np.log(chain.beliefs[n].sd)) for n in chain.unknowns.estimated)
+    priors = sum(TABLE[n].dim * float(np.log(chain.beliefs[n].first_sd)) for n in chain.unknowns.estimated)
     return 0.5 * log_determinant - float(np.sum(np.log(chain.walk[0]))) + priors

@@ -141,7 +141,9 @@ def joint_prior_sd(optimum: Optimum, keyframe: int) -> dict[str, Array]:
     """
     seconds = optimum.intervals[keyframe].time - optimum.intervals[0].time
     beliefs = optimum.beliefs
-    return {
-        name: np.full(beliefs[name].variable.dim, np.hypot(kept * beliefs[name].sd, walked))
-        for name, (kept, walked) in ((n, optimum.unknowns.walked(n, seconds)) for n in optimum.unknowns.estimated)
-    }
+    out = {}
+    for name in optimum.unknowns.estimated:
+        belief, (kept, walked) = beliefs[name], optimum.unknowns.walked(name, seconds)
+        stepped = belief.sd * np.sqrt(len(belief.changes))
+        out[name] = np.full(belief.variable.dim, np.linalg.norm([kept * belief.first_sd, walked, stepped]))
+    return out

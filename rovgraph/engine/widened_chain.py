@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rovgraph.calibration import TABLE, Belief
+from rovgraph.calibration import STEADY, TABLE, Belief
 from rovgraph.config import mount_matrix
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.measurements import Block
@@ -55,13 +55,20 @@ def begin_at(chain: Chain, point: State) -> State:
     return replace(point, calibration=calibration)
 
 
-def with_lasting(chain: Chain, name: str, sd: float, time_constant: float) -> Chain:
-    """The chain with an error that lasts among its unknowns; one of infinite time constant is constant."""
-    walk = stationary_walk(sd, time_constant)
-    believed = replace(
-        chain.beliefs[name], estimate=True, considered=False, sd=sd, walk=walk, time_constant=time_constant
-    )
+def with_lasting(chain: Chain, name: str, sd: float, time_constant: float, changes: tuple[float, ...] = ()) -> Chain:
+    """The chain with an error that lasts among its unknowns; one of infinite time constant is constant, or `changes`.
+
+    Parameters are those of `Belief`.
+    """
+    believed = lasting_belief(chain.beliefs[name], sd, time_constant, changes)
     return replace(chain, beliefs={**chain.beliefs, name: believed}, unknowns=chain.unknowns.with_lasting(believed))
+
+
+def lasting_belief(before: Belief, sd: float, time_constant: float, changes: tuple[float, ...] = ()) -> Belief:
+    """A belief in an error that lasts; parameters are those of `with_lasting`."""
+    walk = STEADY * sd if changes else stationary_walk(sd, time_constant)
+    more = replace(before, estimate=True, considered=False, sd=sd, walk=walk, time_constant=time_constant)
+    return replace(more, changes=changes)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ DVL_COMPASS     z = h + A + e + B sin h + C cos h, h the DVL's heading     (3.17
 COMPASS         the same, with an x axis that is known
 MAGNETOMETER    z = |H| ((1 + s) S R_sb R_bn u(declination - A - ...,      (3.11), (3.14),
                 dip + d) + iron)                                           S: (3.2)
-POSITION        some of (1 + k) (p + R_nb l) + offset, north, east, down
+POSITION        some of (1 + k) (p + R_nb l) + offset + e, north, east, down
 PLACE_OFFSET    z = (p + R_nb l)_north,east - m, m where the place is
 WATER_VELOCITY  z = (R_bn c_n)_forward,starboard
 TILT            z = roll and pitch of R_nb
@@ -38,7 +38,7 @@ at first can be used again and again:
     DVL_COMPASS      rotation, its offset, error and curve, dvl_roll to dvl_yaw
     COMPASS          rotation, its offset, error and curve
     MAGNETOMETER     rotation, mag_offset to field_scale
-    POSITION         rotation, translation, its scale and offset
+    POSITION         rotation, translation, its scale, offset and error
     PLACE_OFFSET     rotation, translation, the last two
     WATER_VELOCITY   rotation, current
     TILT             rotation
@@ -135,10 +135,10 @@ def _point(R: Array, p: Array, lever_arm_b: Array, axis: int, H_out: Array) -> f
 
 @view_helper
 def position(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: Array) -> None:
-    """Some of north, east, down of a point on the vehicle, with an error of scale and an offset."""
-    offset, scale = int(params[3]), int(params[4])
+    """Some of north, east, down of a point on the vehicle, with errors of scale, constant and lasting."""
+    offset, scale, error = int(params[3]), int(params[4]), int(params[5])
     for i in range(len(z_out)):
-        z_out[i] = _point(R, p, params[0:3], int(params[5 + i]), H_out[i])
+        z_out[i] = _point(R, p, params[0:3], int(params[6 + i]), H_out[i])
         if scale >= 0:
             larger = 1.0 + c[scale]
             for k in range(TRANSLATION + 3):
@@ -148,6 +148,9 @@ def position(R: Array, p: Array, c: Array, params: Array, z_out: Array, H_out: A
         if offset >= 0:
             z_out[i] += c[offset + i]
             H_out[i, MOTION + offset + i] = 1.0
+        if error >= 0:
+            z_out[i] += c[error + i]
+            H_out[i, MOTION + error + i] = 1.0
 
 
 @view_helper

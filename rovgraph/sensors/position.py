@@ -27,7 +27,8 @@ class Position:
     sensor : "depth" or "fix"
     lever_arm_b : ndarray, shape (3,), of the sensor relative to the state's origin [m]
     axes : indices of the components measured, (2,) for depth, (0, 1) for a fix
-    offset, scale : names of the calibration variables that are added, and of the scale's error, or None
+    offset, scale, error : names of the calibration variable that is added, of the scale's error, and of the error that
+        lasts, or None
     """
 
     sensor: str
@@ -35,6 +36,7 @@ class Position:
     axes: tuple[int, ...]
     offset: str | None = None
     scale: str | None = None
+    error: str | None = None
     angular = False
     state = (POSE, VELOCITY, BIAS)
     kind = kernels.POSITION
@@ -45,13 +47,14 @@ class Position:
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        return tuple(name for name in (self.offset, self.scale) if name is not None)
+        return tuple(name for name in (self.offset, self.scale, self.error) if name is not None)
 
     @cached_property
     def packed(self) -> Array:
-        """The lever arm, places of offset and scale in the calibration vector or -1, the components measured."""
-        offset, scale = (-1 if name is None else LAYOUT[name].start for name in (self.offset, self.scale))
-        return np.array([[*self.lever_arm_b, offset, scale, *self.axes]], dtype=float)
+        """The lever arm, places of offset, scale and error in the calibration vector or -1, the components measured."""
+        names = self.offset, self.scale, self.error
+        places = [-1 if name is None else LAYOUT[name].start for name in names]
+        return np.array([[*self.lever_arm_b, *places, *self.axes]], dtype=float)
 
     def predict(self, state: State, rate_b: Array) -> tuple[Array, Jacobians]:
         return evaluate(self, (POSE,), state, rate_b)
@@ -60,14 +63,15 @@ class Position:
 def pressure_sensor(config: Config, origin_b: Array) -> Instrument:
     """Depth, positive down."""
     depth = config.depth
-    model = Position("depth", np.array(depth.lever_arm_m) - origin_b, (2,), "depth_offset", "depth_scale")
+    arm = np.array(depth.lever_arm_m) - origin_b
+    model = Position("depth", arm, (2,), "depth_offset", "depth_scale", "depth_error")
     return instrument(depth, model, depth.sd_m, ("down",), time_offset="depth_time_offset")
 
 
 def positioning(config: Config, origin_b: Array) -> Instrument:
     """Fixes, north and east."""
     fix = config.fix
-    model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1), "fix_error")
+    model = Position("fix", np.array(fix.lever_arm_m) - origin_b, (0, 1), error="fix_error")
     return instrument(fix, model, fix.sd_m, ("north", "east"), time_offset="fix_time_offset")
 
 

@@ -123,8 +123,11 @@ class ErrorStateFilter:
         while (k := len(self.intervals)) < len(intervals):
             progress(k / len(intervals))
             end = min(k + PROGRESS_EVERY, self._due_at(rows.time, k))
+            if self.engine.changes_in(rows.time[max(k - 1, 0)], rows.time[end - 1]):
+                end = k + 1
             # of a filter that is not reinitialised, the smoother needs every step
-            if k > 0 and compiled and self.reinitialise_at and not self.known.places:
+            alone = k > 0 and compiled and self.reinitialise_at and not self.known.places
+            if alone and not self.engine.changes_in(rows.time[k - 1], rows.time[end - 1]):
                 run = self.engine.run(rows, k, end, self.known, self.gates)
                 self.known = run.known
                 self.history.extend(intervals[k : k + len(run)], run)
