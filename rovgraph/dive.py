@@ -201,9 +201,23 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
             give_back()
     intervals = batch.intervals if best is None else best.intervals
     left_out = _left_out(batch, known.frozen, known.gaps)
-    seen = known.frozen, log, known.gaps, left_out, known.before, known.rivals
+    revealed = [(one.sensor, one.cause) for one in known.found]
+    seen = known.frozen, log, known.gaps, left_out, revealed, known.before, known.rivals
     numbers = statistics(Evidence(initial, estimates, intervals, best, *seen))
+    if any(one.kind == "rivals" and one.severity for one in numbers) and best is not None:
+        estimates = [_covering(estimate, known.rivals, best) for estimate in estimates]
     return Dive([*estimates, batch.dead_reckoning()], initial, left_out, known.frozen, numbers), best
+
+
+def _covering(estimate: Estimate, rivals: Sequence[Rival], best: Optimum) -> Estimate:
+    """An estimate whose sd covers where rivals among the explanations put the track."""
+    track = estimate.trajectory
+    cov_p = track.cov_p.copy()
+    for rival in rivals:
+        if len(rival.p_n) == len(track):
+            d = (rival.p_n - best.state.p_n)[:, :2]
+            cov_p[:, :2, :2] += d[:, :, None] * d[:, None, :]
+    return replace(estimate, trajectory=replace(track, cov_p=cov_p))
 
 
 def _saying(dive: Dive, found: Sequence[UnstatedNoise]) -> Dive:

@@ -32,6 +32,7 @@ TINY = 1e-9  # a limit may be 0
 
 STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     dvl_cause,
+    motion.found,
     constants.held,
     constants.moved,
     constants.earth_rate,
@@ -48,7 +49,6 @@ STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     residuals.lasting,
     motion.imu,
     motion.bias_drift,
-    motion.found,
     motion.rivals,
     motion.estimates,
     motion.uncertain,

@@ -57,7 +57,8 @@ class Evidence:
     log : of the dive
     attitude_gaps : times without heading or tilt, of a dive without an IMU
     left_out : (sensor, reason) -> count of measurements that never reached the graph
-    before : track before the dive was solved again with what it revealed; None = it was not
+    revealed : sensor and cause of what the dive revealed, with which it was solved again
+    before : track before it was; None = it was not
     rivals : what explains the dive as clearly as what was found
     """
 
@@ -69,6 +70,7 @@ class Evidence:
     log: Log
     attitude_gaps: Sequence[AttitudeGap] = ()
     left_out: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    revealed: Sequence[tuple[str, str]] = ()
     before: Trajectory | None = None
     rivals: Sequence[Rival] = ()
 

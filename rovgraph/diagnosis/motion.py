@@ -109,17 +109,17 @@ def found(evidence: Evidence) -> Iterator[Statistic]:
         return
     square = _squares(before, track, track.cov_p, track.cov_theta[:, 2, 2])["position"]
     apart = np.linalg.norm((before.p_n - track.p_n)[:, :2], axis=1)
-    k = int(np.argmax(apart))
-    yield Statistic(
-        "found",
-        "dive",
-        float(track.time[k]),
-        float(track.time[k]),
-        rms_of(np.sqrt(square)),
-        f"what it revealed of its sensors (see what is assumed) moved the track by up to {apart[k]:.2g} m, "
-        f"{rms_of(np.sqrt(square)):.1f} of its sds (rms)",
-        "check the sensor that is named there, and state what you know of it",
-    )
+    k, moved = int(np.argmax(apart)), rms_of(np.sqrt(square))
+    for sensor, cause in evidence.revealed:
+        yield Statistic(
+            "found",
+            sensor,
+            float(track.time[k]),
+            float(track.time[k]),
+            moved,
+            f"{cause}; to believe so moved the track by up to {apart[k]:.2g} m, {moved:.1f} of its sds (rms)",
+            "check the instrument, and state what you know of it",
+        )
 
 
 def rivals(evidence: Evidence) -> Iterator[Statistic]:

@@ -102,13 +102,9 @@ class Chain:
         for name in self.layout.walking:
             own = self.unknowns.walked(name, seconds[:, None])
             kept[:, self._walking(name)], sd[:, self._walking(name)] = own
-            for time in self.beliefs[name].changes:
-                sd[self._interval_of(time), self._walking(name)] = self.beliefs[name].sd
+            ends = self.rows.time.searchsorted(self.beliefs[name].changes)  # of the intervals that hold changes
+            sd[ends[(ends > 0) & (ends < len(self.rows.time))] - 1, self._walking(name)] = self.beliefs[name].sd
         return 1.0 / sd, kept
-
-    def _interval_of(self, time: float) -> int:
-        """The number of the walk over the interval that holds a time [s]."""
-        return int(np.clip(self.rows.time.searchsorted(time) - 1, 0, max(len(self.rows.time) - 2, 0)))
 
     def _walking(self, name: str) -> slice:
         part = self.layout.places[name][1]

@@ -119,9 +119,9 @@ class FilterEngine:
         departed = transition = None
         predicted = before
         if interval.motion is not None:
-            departed = self._changed(self._align(before, interval), interval)
+            departed = self._align(before, interval)
             departed = self.correct(departed, interval.between, gates, processed)
-            transition = self.predict(interval, departed)
+            transition = self.predict(interval, self._changed(departed, interval))
             predicted = transition.predicted
         filtered = self.correct(predicted, interval.here, gates, processed)
         return FilterStep(departed, transition, filtered, processed)

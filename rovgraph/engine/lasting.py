@@ -72,7 +72,7 @@ FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
 EVALUATIONS = 12  # of the likelihood in it
 AS_PROMISED = 0.1  # of a gain, by which that of the linear dive may differ
 STEP_S, LEAST_OF_STEP = 5.0, 4  # medians of residuals that are compared: a time, and measurements
-JUMP = 60.0  # of them, in chi-square
+JUMP = 40.0  # of them, in chi-square
 MOST_STEPS = 3
 PART_OF_LARGEST = 0.1  # that a step has at least
 CHANCES_OF_STEP, CHANCES_OF_SIZE = 5.0, 3.0  # logs of the times at which one may be, and of the sizes of a component
@@ -204,12 +204,15 @@ def _clearest(fits: list[tuple[LastingError, _Baseline]]) -> list[tuple[LastingE
     return [*best.values()]
 
 
-def _steps(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
-    """Errors by which a sensor's residuals jump at some times, far more than they do otherwise."""
+def _steps(now: _Baseline, passed: Collection[str], beside: str = "") -> list[LastingError]:
+    """Errors by which a sensor's residuals jump at some times, far more than they do otherwise.
+
+    What is estimated is passed over, but for what has steps already.
+    """
     out = []
     for name, sensor in LASTING.items():
         block = now.chain.blocks.get(sensor)
-        if block is None or len(block) < ENOUGH or name in {*now.chain.unknowns.estimated, *passed}:
+        if block is None or len(block) < ENOUGH or name in {*now.chain.unknowns.estimated, *passed} - {beside}:
             continue
         state = now.solution.point.at(block.keyframe)
         steps = _jumps(block, state, block.by_calibration(state, name))
@@ -262,6 +265,21 @@ def _single(block: Block, state: State, H: Array) -> Array:
 
 
 def _with_steps(now: _Baseline, error: LastingError) -> tuple[LastingError, _Baseline]:
+    """Steps, with those that show only beside them, and the dive with them."""
+    best = _fit_steps(now, error)
+    while len(best[0].steps) < MOST_STEPS:
+        more = [one for one in _steps(best[1], (), error.variable) if one.variable == error.variable]
+        if not more:
+            break
+        steps = sorted([*best[0].steps, *more[0].steps], key=lambda one: one[0])[:MOST_STEPS]
+        further = _fit_steps(now, replace(error, steps=tuple(steps)))
+        if further[0].gain <= best[0].gain:
+            break
+        best = further
+    return best
+
+
+def _fit_steps(now: _Baseline, error: LastingError) -> tuple[LastingError, _Baseline]:
     """Steps with what they take off the cost, less their chances, and the dive with them.
 
     Costs compare where other measurements are taken out, which determinants do not.
@@ -275,7 +293,7 @@ def _with_steps(now: _Baseline, error: LastingError) -> tuple[LastingError, _Bas
     real = size > PART_OF_LARGEST * size.max()
     steps = tuple((when, step) for when, step, kept in zip(times, sizes, real, strict=True) if kept)
     if not real.all():
-        return _with_steps(now, replace(error, steps=steps))
+        return _fit_steps(now, replace(error, steps=steps)) if steps else (replace(error, gain=-np.inf), stepped)
     price = len(steps) * (CHANCES_OF_STEP + CHANCES_OF_SIZE * sizes.shape[1])
     return replace(error, gain=now.solution.cost - stepped.solution.cost - price, steps=steps), stepped
 
