@@ -605,7 +605,7 @@ NOISE = r"nois|scatter|mean square|chi-square|vibrat|autocorrel|correlat"
 
 MAG_AXES = r"(mag|heading|compass).*(ax[ei]s|swap|hand|mirror|sign|revers)"
 MOVED = r"bottom.*(mov|drift)|(mov|drift).*bottom|current|water"
-CHANGED = r"jump|step|chang|restart|another|from .* on"
+CHANGED = r"jump|\bstep|chang|restart|another|from [\d.]+ s on"
 
 EVENTS: dict[str, OnLog] = {
     "fixes end": silent("fix", 100.0, np.inf),
@@ -843,7 +843,7 @@ FAULTS: tuple[Case, ...] = (
     Case("moving bed, fixes of 100 s", "0.3 m/s over 60 s", f"{DVL_WRONG}|{MOVED}", "records of river ADCPs",
          scenario="survey of 4 minutes", aids=WITH_FIXES, fix_rate=1.0, event="fixes end",
          on_log=over_moving_ground("dvl", DVL, bed_load)),
-    Case("current turns", "by 0.2 m/s while the bottom is out of reach", r"current|water",
+    Case("current turns", "by 0.2 m/s while the bottom is out of reach", r"\bcurrent",
          aids=("ahrs", "depth", "dvl_water"), event="no bottom for 70 s",
          on_log=over_moving_ground("dvl_water", WATER, for_a_while(-0.16, 0.12, 90.0, 1000.0, within=10.0))),
     # single pings, and what stands for none
@@ -864,7 +864,7 @@ FAULTS: tuple[Case, ...] = (
          on_log=ahrs_turned(90.0, 8.0)),
     Case("compass beside a tool, FOG", "8 degrees from 90 s on", f"(ahrs|heading|compass).*({CHANGED})", grade="fog",
          on_log=ahrs_turned(90.0, 8.0)),
-    Case("depth zeroed", "under way, at 60 s", f"depth.*(zero|tare|offset|shift|{CHANGED})", "ArduPilot 11260",
+    Case("depth zeroed", "under way, at 60 s", f"depth.*(zero|tare|depth_offset|{CHANGED})", "ArduPilot 11260",
          scenario="dives", on_log=depth_zeroed),
     # ranges, axes and stamps
     Case("gyro clipped", "at 75 deg/s", r"gyr.*(clip|satur|range)|(clip|satur).*gyr", "PX4 19523, Reefwing-AHRS 2",

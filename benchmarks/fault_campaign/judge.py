@@ -149,15 +149,20 @@ def run_dive(dive: Dive, online: bool = False) -> Result:
     """Estimate a dive with `rovgraph smooth`, with ``online`` as a replay too, and compare it with the truth."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "vehicle.yaml").write_text(json.dumps(dive.configuration), encoding="utf-8")  # JSON is YAML
-        first = {sensor: table for sensor, table in dive.streams.items() if sensor not in dive.second_file}
-        _write(first, folder / "log.csv")
+        write_dive(dive, folder)
         result = Result(refused=True) if dive.second_file else _smooth(folder, dive)
-        if dive.second_file:
-            _write({sensor: dive.streams[sensor] for sensor in dive.second_file}, folder / "second.csv")
         if dive.second_file or (online and not result.refused):
             result = _online(folder, dive, result)
         return replace(result, said=tuple(line.replace(name, "") for line in result.said))
+
+
+def write_dive(dive: Dive, folder: Path) -> None:
+    """Write log.csv and vehicle.yaml; second.csv where some sensors have a file of their own."""
+    (folder / "vehicle.yaml").write_text(json.dumps(dive.configuration), encoding="utf-8")  # JSON is YAML
+    first = {sensor: table for sensor, table in dive.streams.items() if sensor not in dive.second_file}
+    _write(first, folder / "log.csv")
+    if dive.second_file:
+        _write({sensor: dive.streams[sensor] for sensor in dive.second_file}, folder / "second.csv")
 
 
 def _write(streams: dict[str, pd.DataFrame], path: Path) -> None:
@@ -222,11 +227,7 @@ def _compare(
     dive: Dive,
 ) -> None:
     """Add the errors of one estimate to a result; ``calibration`` are its rows of calibration.csv."""
-    times = track["time"].to_numpy()
-    wanted = np.arange(SETTLED_S, dive.motion.duration, 1.0)
-    wanted += dive.clock(wanted)
-    rows = np.unique(np.clip(np.searchsorted(times, wanted), 0, len(times) - 1))
-    result.nees[kind], result.rms[kind], result.sd[kind] = nees(track.iloc[rows], dive.motion, dive.clock)
+    result.nees[kind], result.rms[kind], result.sd[kind] = nees(settled_rows(track, dive), dive.motion, dive.clock)
     estimated = calibration[calibration["estimated"].astype(bool)].set_index("label")
     for name, true, turn in (("dvl_yaw", dive.hidden.dvl_yaw, 360.0), ("dvl_scale", dive.hidden.dvl_scale, np.inf)):
         if name in estimated.index:
@@ -234,6 +235,14 @@ def _compare(
             error = value - true
             error -= 0.0 if np.isinf(turn) else turn * round(error / turn)
             result.nees[kind][name] = float((error / sd) ** 2)
+
+
+def settled_rows(track: pd.DataFrame, dive: Dive) -> pd.DataFrame:
+    """Rows of a trajectory file 1 s apart, without the first ones."""
+    times = track["time"].to_numpy()
+    wanted = np.arange(SETTLED_S, dive.motion.duration, 1.0)
+    wanted += dive.clock(wanted)
+    return track.iloc[np.unique(np.clip(np.searchsorted(times, wanted), 0, len(times) - 1))]
 
 
 def nees(track: pd.DataFrame, motion: Motion, clock: Clock = on_time) -> tuple[dict[str, float], float, float]:
