@@ -16,15 +16,27 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import faults  # noqa: E402
 from fault_campaign import earth  # noqa: E402
-from fault_campaign.campaign import keep_dive, read_dives, run, run_case, table  # noqa: E402
-from fault_campaign.cases import CASES, FAULTS, HEALTHY  # noqa: E402
+from fault_campaign.campaign import keep_dive, make_dive, read_dives, run, run_case, table, verdicts  # noqa: E402
+from fault_campaign.cases import CASES, DVL, FAULTS, HEALTHY, WATER  # noqa: E402
 from fault_campaign.instruments import at_arm, dvl, log_table, sample  # noqa: E402
-from fault_campaign.judge import QUANTITIES, Dive, NoTrace, Result, honest_nees, judge, nees, run_dive  # noqa: E402
+from fault_campaign.judge import (  # noqa: E402
+    LIE_NEES,
+    QUANTITIES,
+    Dive,
+    NoTrace,
+    Result,
+    Tally,
+    honest_nees,
+    judge,
+    nees,
+    run_dive,
+)
 from fault_campaign.motion import Motion, Profile, mounting, strapdown  # noqa: E402
 from fault_campaign.scenarios import SCENARIOS, make_motion  # noqa: E402
-from fault_campaign.vehicle import configuration, make_vehicle  # noqa: E402
+from fault_campaign.vehicle import GRADES, configuration, make_vehicle  # noqa: E402
 
 AT_ONCE = np.zeros(1)
+AIDS = ("ahrs", "mag", "depth", "fix")
 REST = Motion(20.0, Profile(0.7), (Profile(), Profile(), Profile()), depth=3.0)
 
 
@@ -136,16 +148,108 @@ def test_every_fault_has_a_healthy_case_and_words_that_name_it():
 
 
 def test_every_fault_of_a_log_changes_it():
-    motion, rng = make_motion("dives", np.random.default_rng(1)), np.random.default_rng(2)
-    streams, _ = sample(motion, make_vehicle("mti", ("ahrs", "mag", "depth", "fix")), rng)
-    before = log_table(streams)
+    logs = {}
+    for scenario in ("dives", "brisk turns"):
+        motion, vehicle = make_motion(scenario, np.random.default_rng(1)), make_vehicle("mti", (*AIDS, "dvl_water"))
+        logs[scenario] = motion, sample(motion, vehicle, np.random.default_rng(2))[0]
     for case in FAULTS:
         if case.on_log is not None:
+            motion, streams = logs.get(case.scenario, logs["dives"])
             copies = {name: stream.copy() for name, stream in streams.items()}
             case.on_log(copies, motion, np.random.default_rng(3))
             after = log_table(copies)
             assert np.isfinite(after["time"]).all(), case.name
-            assert not after.equals(before), case.name
+            assert not after.equals(log_table(streams)), case.name
+
+
+def lost(name, *columns):
+    """What the fault of a case takes from a stream of its dive: time, and the difference to the healthy one."""
+    faulty, healthy = (make_dive(replace(CASES[name], on_log=on_log), 0) for on_log in (CASES[name].on_log, None))
+    sensor = "dvl_water" if columns == WATER else columns[0].split("_")[0]
+    a, b = (dive.streams[sensor] for dive in (healthy, faulty))
+    return faulty, a["time"].to_numpy(), a[list(columns)].to_numpy() - b[list(columns)].to_numpy()
+
+
+def test_a_dvl_on_a_hull_measures_against_the_hull():
+    """0.15 m/s towards north-west by west, of which nothing is left before and after."""
+    dive, t, taken = lost("dvl on a hull", *DVL)
+    velocity_n = np.einsum("nij,nj->ni", dive.motion.C_nb(t), taken @ mounting((180.0, 0.0, -45.0)).T)
+    assert velocity_n[(t > 42.0) & (t < 198.0)] == pytest.approx(np.array([[0.12, -0.09, 0.0]] * 780), abs=1e-9)
+    assert np.abs(velocity_n[(t < 40.0) | (t > 200.0)]).max() == 0.0
+
+
+def test_a_beam_at_half_its_velocity_bends_forward_and_vertical_velocity():
+    dive, t, taken = lost("dvl one beam", *DVL)
+    wrong = (t >= 80.0) & (t < 140.0)
+    along = dive.streams["dvl"][list(DVL)].to_numpy()[wrong] + taken[wrong]
+    along = along @ np.array([0.5, 0.0, np.sqrt(0.75)])
+    assert np.abs(taken[:, 1]).max() < 1e-12
+    assert taken[wrong, 0] == pytest.approx(0.5 * along, abs=1e-12)  # (b1 - b2) / (2 sin 30 degrees)
+    assert np.abs(taken[~wrong]).max() == 0.0
+
+
+def test_water_track_differs_from_bottom_track_by_the_current():
+    motion, vehicle = make_motion("survey", np.random.default_rng(1)), make_vehicle("mti", ("dvl_water",))
+    vehicle.dvl.sd = vehicle.dvl.water_sd = (0.0, 0.0, 0.0)
+    vehicle.dvl.yaw_sd = 0.0
+    streams, _ = sample(motion, vehicle, np.random.default_rng(2))
+    apart = streams["dvl"][list(DVL)].to_numpy() - streams["dvl_water"][list(WATER)].to_numpy()
+    t = streams["dvl"]["time"].to_numpy()
+    current_n = np.einsum("nij,nj->ni", motion.C_nb(t), apart @ mounting(vehicle.dvl.mount_rpy_deg).T)
+    assert np.ptp(current_n, axis=0).max() < 1e-12
+    assert 0.01 < np.linalg.norm(current_n[0, :2]) < 0.3
+    assert abs(current_n[0, 2]) < 1e-12
+
+
+def test_a_stated_start_and_a_key_left_out_are_as_the_case_says():
+    start = make_dive(CASES["start 20 m off"], 0).configuration["start"]
+    assert (start["north_m"], start["east_m"], start["position_sd_m"]) == (16.0, -12.0, 1.0)
+    found = make_dive(CASES["compass not calibrated"], 0).configuration
+    assert not {"ahrs_offset", "ahrs_deviation"} & set(found["calibration"])
+    assert "ahrs_sd_deg" not in found["heading"]
+
+
+def test_what_befalls_a_dive_befalls_the_healthy_one_too():
+    for name in ("fixes every second, of 100 s", "moving bed, fixes of 100 s"):
+        assert 90.0 < make_dive(CASES[name], 0).streams["fix"]["time"].max() < 100.0
+
+
+def sds_that_show(grade, velocity, dt=0.2):
+    """What the best test, which knows how the bottom moves, has to find it by, in sds.
+
+    One axis: error of velocity, tilt, gyro's bias, accelerometer's bias; the DVL measures the error of the velocity.
+    """
+    imu, dvl_sd = GRADES[grade], 0.005
+    A = np.zeros((4, 4))
+    A[0, 1], A[0, 3], A[1, 2] = 9.82, 1.0, 1.0
+    F = np.eye(4) + A * dt + A @ A * dt**2 / 2.0
+    Q = np.diag([imu.acc_noise, imu.gyr_noise, imu.gyr_walk, imu.acc_walk]) ** 2 * dt
+    Q = F @ Q @ F.T / 3.0 + 2.0 * Q / 3.0
+    P = np.diag([1.0, np.deg2rad(2.0), np.deg2rad(imu.gyr_bias_sd), imu.acc_bias_sd]) ** 2
+    x, total = np.zeros(4), 0.0
+    for measured in velocity:
+        x, P = F @ x, F @ P @ F.T + Q
+        innovation, variance = measured - x[0], P[0, 0] + dvl_sd**2
+        total += innovation**2 / variance
+        x, P = x + P[:, 0] * innovation / variance, P - np.outer(P[:, 0], P[0]) / variance
+    return np.sqrt(total)
+
+
+@pytest.mark.parametrize(
+    ("name", "grade", "least", "most"),
+    [
+        ("dvl on a cloud", "mti", 0.0, 2.0),  # without a trace
+        ("dvl on a cloud, FOG", "fog", 15.0, np.inf),
+        ("dvl on a hull", "mti", 10.0, np.inf),
+        ("dvl on a hull, tactical", "tactical", 30.0, np.inf),
+    ],
+)
+def test_a_bottom_that_moves_shows_where_a_case_says_that_it_does(name, grade, least, most):
+    dive, t, taken = lost(name, *DVL)
+    speed = np.linalg.norm(
+        np.einsum("nij,nj->ni", dive.motion.C_nb(t), taken @ mounting((180.0, 0.0, -45.0)).T), axis=1
+    )
+    assert least < sds_that_show(grade, speed) < most
 
 
 def test_scenarios_stay_in_the_water_and_differ_by_seed():
@@ -264,6 +368,62 @@ def test_what_no_log_can_show_is_neither_right_nor_a_lie(results, no_trace, verd
     assert judge(results, "frozen", dives(1.0, said=RESTS), no_trace).verdict == verdict
 
 
+DOUBT = ("alarm: dvl: frozen for 60.0 s; look at it", "alarm: ahrs: its noise is 3 times what is stated")
+
+
+def dive_of(value, verdict="trusted", said=(), quantity="position", kind="smoothed"):
+    values = {kind: {"position": 1.0, "depth": 1.0} for kind in ("smoothed", "filtered")}
+    values[kind] = {**values[kind], quantity: value}
+    sizes = dict.fromkeys(values, 1.0)
+    return Result(values, sizes, sizes, said, verdicts={"smooth": verdict})
+
+
+@pytest.mark.parametrize(
+    ("dive", "tally"),
+    [
+        (dive_of(LIE_NEES), Tally(dives=1)),
+        (dive_of(LIE_NEES + 0.01), Tally(dives=1, off=1, lies=1)),
+        (dive_of(9.0, quantity="heading", kind="filtered"), Tally(dives=1, off=1, lies=1)),
+        (dive_of(9.0, quantity="depth"), Tally(dives=1, off=1, lies=1)),
+        (dive_of(float("nan")), Tally(dives=1, off=1, lies=1)),
+        (dive_of(9.0, quantity="dvl_yaw"), Tally(dives=1)),  # a verdict is about the track
+        (dive_of(1.0, "doubtful", DOUBT), Tally(dives=1, doubted=1)),
+        (dive_of(9.0, "wrong", DOUBT), Tally(dives=1, doubted=1, off=1, named_first=1)),
+        (dive_of(9.0, "wrong", DOUBT[::-1]), Tally(dives=1, doubted=1, off=1)),
+        (dive_of(9.0, "trusted", ("warning: dvl: frozen",)), Tally(dives=1, off=1, lies=1, named_first=1)),
+        (dive_of(9.0, "trusted", ("advice: dvl: frozen",)), Tally(dives=1, off=1, lies=1)),
+        (Result(said=("dvl: frozen throughout",), refused=True), Tally(refused=1, named_first=1)),
+        (replace(dive_of(9.0), verdicts={}), Tally()),  # of an earlier campaign
+    ],
+)
+def test_a_dive_that_is_trusted_and_off_is_a_lie(dive, tally):
+    assert judge([dive], "frozen", [dive_of(1.0)]).tallies.get("smooth", Tally()) == tally
+
+
+def test_what_a_dive_without_the_fault_has_too_is_no_lie_nor_what_leaves_no_trace():
+    twin = dive_of(5.0, quantity="heading")
+    assert judge([twin], "frozen", [twin]).tallies["smooth"] == Tally(dives=1, chance=1)
+    assert judge([dive_of(5.0)], "frozen", [twin]).tallies["smooth"].lies == 1
+    hidden = judge([dive_of(5.0, said=RESTS)], "frozen", [dive_of(1.0, said=RESTS)], UNSEEN)
+    assert hidden.tallies["smooth"] == Tally(dives=1, hidden=1)
+    assert judge([dive_of(5.0)], "frozen", [dive_of(1.0)], UNSEEN).tallies["smooth"].lies == 1
+
+
+def test_the_campaign_says_how_good_the_verdict_is():
+    """Of 6 dives with a fault 4 are off, 3 of them not trusted; another one, and a healthy one, are not either."""
+    told, healthy = dive_of(9.0, "doubtful", DOUBT), [dive_of(1.0)] * 5 + [dive_of(1.0, "doubtful")]
+    faulty = [told, told, dive_of(9.0, "wrong"), dive_of(9.0), dive_of(1.0, "doubtful"), dive_of(1.0)]
+    cases = [CASES["survey"], CASES["dvl frozen"]]
+    outcomes = {"survey": judge(healthy, ""), "dvl frozen": judge(faulty, "frozen", healthy)}
+    (line,) = verdicts(cases, outcomes)
+    assert "`rovgraph smooth`: 1 of 6 dives with a fault are lies. 4 are off, 75% of them not trusted (recall)." in line
+    assert "5 dives are not trusted, 60% of them off (precision)." in line
+    assert "names the cause in 50% of those" in line
+    assert "Of 6 healthy dives 1 are not trusted, 0 are off." in line
+    row = table(cases, outcomes).splitlines()[3].split(" | ")
+    assert row[-5:-2] == ["50%", "67% (17%)", "**1**"]
+
+
 def test_the_page_gives_the_reason_of_a_fault_without_a_trace():
     case = CASES["depth of a wrong surface"]
     outcome = replace(judge(dives(9.0), "frozen"), nees={})
@@ -288,6 +448,14 @@ def test_the_exit_code_is_1_for_a_lie_and_for_a_healthy_dive_that_is_not_right(n
     monkeypatch.setattr(faults, "run", lambda *_: {name: outcome})
     monkeypatch.setattr(sys, "argv", ["faults.py", "--cases", name])
     assert faults.main() == code
+
+
+def test_the_exit_code_is_1_for_one_dive_that_is_a_lie(monkeypatch):
+    outcome = judge([dive_of(1.0)] * 19 + [dive_of(5.0)], "frozen", [dive_of(1.0)] * 20)
+    assert outcome.verdict == "right"
+    monkeypatch.setattr(faults, "run", lambda *_: {"dvl frozen": outcome})
+    monkeypatch.setattr(sys, "argv", ["faults.py", "--cases", "dvl frozen"])
+    assert faults.main() == 1
 
 
 def test_what_one_command_says_is_no_excuse_for_the_other():
@@ -331,7 +499,7 @@ def test_a_dive_that_was_replayed_too_counts_for_smooth_alone_without_what_the_r
     alone = Result({"online": {"position": 1.0}}, {"online": 1.0}, {"online": 1.0}, ("online: late",))
     keep_dive(tmp_path / "dives.jsonl", ("two files, online", 0, True), alone)
     found = read_dives(tmp_path / "dives.jsonl")
-    assert [found["survey", 3, False]] == dives(1.0, 1, said=NAMED)
+    assert [found["survey", 3, False]] == dives(1.0, 1, said=NAMED)  # written before verdicts were
     assert found["survey", 3, True].nees == both
     assert found["two files, online", 0, False].nees == alone.nees  # which no other command estimates
 
@@ -390,6 +558,8 @@ def test_online_ignores_a_depth_that_is_stuck_while_the_vehicle_dives():
     result = run_case(CASES["depth stuck"], 0, online=True)
     assert max(result.nees["online"].values()) < 2.0  # of the depth 765 where it was used
     assert any(line.startswith("online: ") and "depth: frozen" in line for line in result.said)
+    assert any(line.startswith("online: alarm: depth: ") for line in result.said)
+    assert result.verdicts == {"smooth": "doubtful", "online": "doubtful"}
 
 
 def test_online_names_correlated_fixes_with_the_keys_that_state_them():

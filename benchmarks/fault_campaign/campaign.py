@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from fault_campaign.cases import CASES, HEALTHY, Case
+from fault_campaign.cases import CASES, EVENTS, HEALTHY, Case
 from fault_campaign.instruments import sample
-from fault_campaign.judge import Dive, Outcome, Result, judge, run_dive
+from fault_campaign.judge import COMMANDS, Dive, Outcome, Result, Tally, judge, run_dive
 from fault_campaign.scenarios import make_motion
 from fault_campaign.vehicle import configuration, make_vehicle
 from rovgraph.workers import starting, workers
@@ -21,10 +21,12 @@ Task = tuple[str, int, bool]  # name of the case, seed, online too
 
 
 def merge(base: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
-    """Nested dictionaries, ``more`` over ``base``."""
+    """Nested dictionaries, ``more`` over ``base``; what is None there is left out."""
     merged = dict(base)
     for key, value in more.items():
         merged[key] = merge(merged[key], value) if isinstance(value, dict) and key in merged else value
+        if value is None:
+            del merged[key]
     return merged
 
 
@@ -35,14 +37,19 @@ def make_dive(case: Case, seed: int) -> Dive:
     motion, vehicle = make_motion(case.scenario, rng), make_vehicle(case.grade, case.aids)
     if case.dvl_rate is not None:
         vehicle.dvl.rate = case.dvl_rate
+    if case.fix_rate is not None:
+        vehicle.fix.rate = case.fix_rate
     vehicle.dvl.scale_sd = case.config.get("calibration", {}).get("dvl_scale", {}).get("sd", 0.0)
-    config = merge(merge(configuration(vehicle), case.config), case.wrong_config)
+    config = merge(configuration(vehicle), case.config)
     config["start"] |= dict(zip(("north_m", "east_m"), rng.normal(0.0, 0.1, 2).tolist(), strict=True))
+    config = merge(config, case.wrong_config)
     if case.on_vehicle is not None:
         case.on_vehicle(vehicle)
     streams, hidden = sample(motion, vehicle, rng)
     if case.on_log is not None:
         case.on_log(streams, motion, np.random.default_rng([setting, seed, 1]))
+    if case.event:
+        EVENTS[case.event](streams, motion, rng)
     return Dive(streams, config, motion, hidden, case.clock, tuple(case.second_file))
 
 
@@ -115,6 +122,9 @@ def table(cases: Sequence[Case], outcomes: dict[str, Outcome]) -> str:
         *(f"NEES {kind}" for kind in kinds),
         "rms (sd) [m]",
         "named",
+        "first line",
+        "not trusted",
+        "lies",
         "outcome",
         "reported by",
     ]
@@ -124,8 +134,46 @@ def table(cases: Sequence[Case], outcomes: dict[str, Outcome]) -> str:
         cells = [case.name, case.breaks, *(_nees(outcome, kind) for kind in kinds), _errors(outcome)]
         verdict = f"**{outcome.verdict}**" if outcome.verdict == "lie" else outcome.verdict
         named = f"{outcome.warned:.0%} warned" if case.healthy else _named(outcome)
-        lines.append("| " + " | ".join([*cells, named, verdict, "" if case.healthy else case.source]) + " |")
+        source = "" if case.healthy else case.source
+        lines.append("| " + " | ".join([*cells, named, *_counts(outcome), verdict, source]) + " |")
     return "\n".join(lines)
+
+
+def _counts(outcome: Outcome) -> list[str]:
+    """First lines that name the cause, dives that are not trusted beside healthy ones, and lies, by command."""
+    first, doubted, lies = [], [], []
+    for command, tally in outcome.tallies.items():
+        healthy = f" ({outcome.doubted_healthy[command]:.0%})" if command in outcome.doubted_healthy else ""
+        first.append(share(tally.named_first, tally.off + tally.refused))
+        doubted.append(share(tally.doubted, tally.dives) + healthy)
+        lies.append(f"**{tally.lies}**" if tally.lies else "0")
+    return [" / ".join(cells) or "–" for cells in (first, doubted, lies)]
+
+
+def share(part: int, whole: int) -> str:
+    """Per cent; a dash where there is nothing."""
+    return f"{part / whole:.0%}" if whole else "–"
+
+
+def verdicts(cases: Sequence[Case], outcomes: dict[str, Outcome]) -> list[str]:
+    """How good the verdict is, a line for each command."""
+    lines = []
+    for command in COMMANDS:
+        healthy, faulty = (
+            sum((outcomes[c.name].tallies.get(command, Tally()) for c in cases if c.healthy == wanted), Tally())
+            for wanted in (True, False)
+        )
+        every, told = healthy + faulty, faulty.off - faulty.lies
+        if every.dives:
+            lines.append(
+                f"`rovgraph {command}`: {faulty.lies} of {faulty.dives} dives with a fault are lies. "
+                f"{faulty.off} are off, {share(told, faulty.off)} of them not trusted (recall). "
+                f"{every.doubted} dives are not trusted, {share(told, every.doubted)} of them off (precision). "
+                f"The first line names the cause in {share(faulty.named_first, faulty.off + faulty.refused)} of those "
+                f"that are off or refused. {faulty.hidden} more are off without a trace, {faulty.chance} as without "
+                f"the fault. Of {healthy.dives} healthy dives {healthy.doubted} are not trusted, {healthy.off} are off."
+            )
+    return lines
 
 
 def _named(outcome: Outcome) -> str:

@@ -21,12 +21,14 @@ from fault_campaign.vehicle import Vehicle
 Rng = np.random.Generator
 OnVehicle = Callable[[Vehicle], None]
 OnLog = Callable[[Streams, Motion, Rng], None]
+Ground = Callable[[earth.Array, Rng], earth.Array]  # its velocity at some times, north and east, shape (n, 2) [m/s]
 ACC, GYR, MAG = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("acc", "gyr", "mag"))
-DVL = ("dvl_vx", "dvl_vy", "dvl_vz")
+DVL, WATER = (tuple(f"{name}_v{axis}" for axis in "xyz") for name in ("dvl", "dvl_water"))
+FIX = ("fix_north", "fix_east")
 AUDIT = "audit"  # found with another simulator and recorded dives
 AHRS_DEPTH = ("ahrs", "depth")
 WAVES = "survey, waves"
-WITH_FIXES = ("ahrs", "depth", "fix")
+WITH_FIXES, MAG_FIXES = ("ahrs", "depth", "fix"), ("mag", "depth", "fix")
 TURNED = NoTrace(
     "If the whole dive is rotated about the vertical, it obeys the same equations. Only position fixes, or a gyro that "
     "measures the Earth's rate, show where north is.",
@@ -44,6 +46,13 @@ LIFTED = NoTrace(
     "Only a start at a known depth shows the offset.",
     ("depth",),
     "constant error of the depth",
+)
+ADRIFT = NoTrace(
+    "A bottom that takes 20 s to reach 0.12 m/s changes the DVL's velocity by 6 mm/s². In that time the gyro's noise "
+    "tilts the vertical by 0.18°, which is 31 mm/s²: a test that knows when and how the bottom moves has 1.4 sds to "
+    "find it. Only position fixes, or a better gyro, show it.",
+    ("position",),
+    "bottom.*(rest|still|mov)",
 )
 OTHER_AXES = NoTrace(
     "A log shows the angles between its sensors, but only `imu.mount_rpy_deg` states which axes are the vehicle's. "
@@ -66,7 +75,8 @@ class Case:
     config : keys of the configuration beside those that describe the vehicle
     wrong_config : keys that are wrong; the healthy case does not have them
     clock : how late the clock is that stamps the estimate, as a function of the stamp [s]
-    dvl_rate : pings per second, where it is not 5
+    dvl_rate, fix_rate : pings per second, where they are not 5, and fixes, where they are not 0.5
+    event : of `EVENTS`: what befalls the healthy dive, too
     second_file : sensors in a file of their own, replayed by `rovgraph online` beside the other
     no_trace : why nothing in the log can show the fault
     """
@@ -84,6 +94,8 @@ class Case:
     wrong_config: dict[str, Any] = field(default_factory=dict)
     clock: Clock = on_time
     dvl_rate: float | None = None
+    fix_rate: float | None = None
+    event: str = ""
     second_file: Sequence[str] = ()
     no_trace: NoTrace | None = None
 
@@ -96,7 +108,7 @@ class Case:
     def setting(self) -> tuple[Any, ...]:
         """What a faulty case has in common with its healthy one."""
         common = self.scenario, self.grade, tuple(self.aids), repr(self.config), self.dvl_rate
-        return (*common, *self.second_file)
+        return (*common, *self.second_file, *(more for more in (self.fix_rate, self.event) if more))
 
 
 # --- what several faults share -------------------------------------------------------------------
@@ -254,6 +266,26 @@ def dvl_zeros(streams: Streams, motion: Motion, rng: Rng) -> None:
     table.loc[between(table, 90.0, 110.0), list(DVL)] = 0.0
 
 
+def dvl_single(share: float, factor: float) -> OnLog:
+    """Single pings times a factor."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        table = streams["dvl"]
+        table.loc[rng.random(len(table)) < share, list(DVL)] *= factor
+
+    return fault
+
+
+def dvl_one_beam(streams: Streams, motion: Motion, rng: Rng) -> None:
+    """Of four beams, 30 degrees from the vertical, the first measures half the velocity for 60 s."""
+    slant, upright = np.sin(np.pi / 6.0), np.cos(np.pi / 6.0)
+    beams = np.array([[slant, 0.0, upright], [-slant, 0.0, upright], [0.0, slant, upright], [0.0, -slant, upright]])
+    table = streams["dvl"]
+    rows = between(table, 80.0, 140.0)
+    along = table.loc[rows, list(DVL)].to_numpy() @ beams.T
+    table.loc[rows, list(DVL)] = along * np.array([0.5, 1.0, 1.0, 1.0]) @ np.linalg.pinv(beams).T
+
+
 def dvl_published_twice(streams: Streams, motion: Motion, rng: Rng) -> None:
     """A driver publishes at twice the rate of the pings, the old values with a new stamp in between."""
     again = streams["dvl"].copy()
@@ -268,13 +300,43 @@ def dvl_held_between(streams: Streams, motion: Motion, rng: Rng) -> None:
     table[list(DVL)] = table[list(DVL)].to_numpy()[latest]
 
 
-def dvl_on_water(streams: Streams, motion: Motion, rng: Rng) -> None:
-    """Bottom track falls back to water track in a current of 0.25 m/s."""
-    table = streams["dvl"]
-    rows = between(table, 80.0, 120.0)
-    t = table.loc[rows, "time"].to_numpy()
-    current_b = np.einsum("nji,j->ni", motion.C_nb(t), np.array([0.2, -0.15, 0.0]))
-    table.loc[rows, list(DVL)] -= current_b @ mounting((180.0, 0.0, -45.0))
+def over_moving_ground(sensor: str, columns: Sequence[str], velocity_n: Ground) -> OnLog:
+    """What the DVL measures against moves."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        table = streams[sensor]
+        t = table["time"].to_numpy()
+        v_n = np.column_stack([velocity_n(t, rng), np.zeros(len(t))])
+        table[list(columns)] -= np.einsum("nji,nj->ni", motion.C_nb(t), v_n) @ mounting((180.0, 0.0, -45.0))
+
+    return fault
+
+
+def for_a_while(north: float, east: float, begin: float, end: float, within: float = 0.0) -> Ground:
+    """A velocity between two times that comes and goes ``within`` some seconds."""
+
+    def velocity_n(t: earth.Array, rng: Rng) -> earth.Array:
+        size = np.clip(np.minimum(t - begin, end - t) / within, 0.0, 1.0) if within else (t >= begin) & (t < end)
+        return size[:, None] * np.array([north, east])
+
+    return velocity_n
+
+
+def bed_load(t: earth.Array, rng: Rng) -> earth.Array:
+    """Sand that the river carries: 0.3 m/s rms, over 60 s."""
+    return gauss_markov(rng, t, 0.3 / np.sqrt(2.0), 60.0, 2)
+
+
+def no_lock(begin: float, end: float) -> OnLog:
+    """The bottom is out of reach for a while."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        table = streams["dvl"]
+        rows = between(table, begin, end)
+        table.loc[rows, "dvl_valid"] = 0.0
+        table.loc[rows, list(DVL)] = np.nan
+
+    return fault
 
 
 def dvl_terrain(streams: Streams, motion: Motion, rng: Rng) -> None:
@@ -284,8 +346,11 @@ def dvl_terrain(streams: Streams, motion: Motion, rng: Rng) -> None:
     table[list(DVL)] *= 1.0 + scale
 
 
-def dvl_figure_of_merit(streams: Streams, motion: Motion, rng: Rng) -> None:
-    streams["dvl"]["dvl_sd"] = 0.0005
+def dvl_figure_of_merit(sd: float) -> OnLog:
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        streams["dvl"]["dvl_sd"] = sd
+
+    return fault
 
 
 def dvl_half_the_pings(streams: Streams, motion: Motion, rng: Rng) -> None:
@@ -314,6 +379,45 @@ def imu_clipped(streams: Streams, motion: Motion, rng: Rng) -> None:
     """Vibration beyond a range of 2 g, which cuts off what points along gravity."""
     imu_vibration(streams, motion, rng)
     streams["imu"][list(ACC)] = streams["imu"][list(ACC)].clip(-19.6, 19.6)
+
+
+def clipped(columns: Sequence[str], limit: float) -> OnLog:
+    """Values of the IMU beyond its range."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        streams["imu"][list(columns)] = streams["imu"][list(columns)].clip(-limit, limit)
+
+    return fault
+
+
+def acc_clipped(streams: Streams, motion: Motion, rng: Rng) -> None:
+    """A thruster's bearing fails at 90 s: 8 m/s^2 at 63 Hz, with a range of 1.5 g."""
+    table = streams["imu"]
+    t = table["time"].to_numpy()
+    phase = 2.0 * np.pi * 63.0 * t + np.cumsum(rng.normal(0.0, 0.3, len(t)))
+    for k, column in enumerate(ACC):
+        table[column] += (t > 90.0) * 8.0 * np.sin(phase + k)
+    clipped(ACC, 14.7)(streams, motion, rng)
+
+
+def imu_restarts(gyr_deg: float, acc: float) -> OnLog:
+    """Silent from 90 s to 93 s; then biases are others, by ``gyr_deg`` [deg/s] and ``acc`` [m/s^2] on each axis."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        for sensor in ("imu", "ahrs"):
+            silent(sensor, 90.0, 93.0)(streams, motion, rng)
+        signs = np.array([1.0, -1.0, 1.0])
+        add("imu", GYR, np.deg2rad(gyr_deg) * signs, 93.0, np.inf)(streams, motion, rng)
+        add("imu", ACC, acc * signs, 93.0, np.inf)(streams, motion, rng)
+
+    return fault
+
+
+def imu_in_batches(streams: Streams, motion: Motion, rng: Rng) -> None:
+    """A buffer of 20 samples, stamped when it is read, a microsecond apart."""
+    table = streams["imu"]
+    read = np.ceil(table["time"] / 0.2 - 1e-6) * 0.2
+    table["time"] = read + 1e-6 * table.groupby(read).cumcount()
 
 
 def imu_samples_lost(streams: Streams, motion: Motion, rng: Rng) -> None:
@@ -382,6 +486,34 @@ def ahrs_drifts(streams: Streams, motion: Motion, rng: Rng) -> None:
     table["ahrs_yaw"] = (table["ahrs_yaw"] + np.deg2rad(2.0) / 60.0 * table["time"]) % (2.0 * np.pi)
 
 
+def ahrs_turned(begin: float, degrees: float | None = None) -> OnLog:
+    """Another offset from some time on; None = the heading of that time becomes zero."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        table = streams["ahrs"]
+        rows = between(table, begin)
+        turned = -table.loc[rows, "ahrs_yaw"].iloc[0] if degrees is None else np.deg2rad(degrees)
+        table.loc[rows, "ahrs_yaw"] = np.mod(table.loc[rows, "ahrs_yaw"] + turned, 2.0 * np.pi)
+
+    return fault
+
+
+def mag_axes(change: Sequence[Sequence[float]]) -> OnLog:
+    """Axes of the magnetometer that are not those of the IMU."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        streams["mag"][list(MAG)] = streams["mag"][list(MAG)].to_numpy() @ np.array(change).T
+
+    return fault
+
+
+def depth_zeroed(streams: Streams, motion: Motion, rng: Rng) -> None:
+    """The autopilot restarts under water and takes the depth there for the surface."""
+    table = streams["depth"]
+    rows = between(table, 60.0)
+    table.loc[rows, "depth"] -= table.loc[rows, "depth"].iloc[0]
+
+
 def depth_spikes(streams: Streams, motion: Motion, rng: Rng) -> None:
     """An overflow now and then."""
     table = streams["depth"]
@@ -392,16 +524,30 @@ def depth_steps(streams: Streams, motion: Motion, rng: Rng) -> None:
     streams["depth"]["depth"] = streams["depth"]["depth"].round(1)
 
 
-def fix_late(streams: Streams, motion: Motion, rng: Rng) -> None:
-    streams["fix"]["time"] += 2.0
+def fix_rotated(angle: Callable[[earth.Array], earth.Array]) -> OnLog:
+    """The ship is 60 m away, and its heading wrong by as much [rad]."""
+
+    def fault(streams: Streams, motion: Motion, rng: Rng) -> None:
+        table, ship = streams["fix"], np.array([60.0, -20.0])
+        a = angle(table["time"].to_numpy())
+        north, east = (table[list(FIX)].to_numpy() - ship).T
+        turned = [np.cos(a) * north - np.sin(a) * east, np.sin(a) * north + np.cos(a) * east]
+        table[list(FIX)] = ship + np.column_stack(turned)
+
+    return fault
 
 
-def fix_rotated(streams: Streams, motion: Motion, rng: Rng) -> None:
-    """The ship's heading is 8 degrees wrong, and the ship 60 m away."""
-    table, ship, angle = streams["fix"], np.array([60.0, -20.0]), np.deg2rad(8.0)
-    C = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    columns = ["fix_north", "fix_east"]
-    table[columns] = ship + (table[columns].to_numpy() - ship) @ C.T
+def fix_by_heading(streams: Streams, motion: Motion, rng: Rng) -> None:
+    """The vehicle's frame bends the sound: 2.5 m off, in a direction that goes round twice as it turns once."""
+    table = streams["fix"]
+    heading = motion.heading(table["time"].to_numpy())
+    table[list(FIX)] += 2.5 * np.column_stack([np.cos(2.0 * heading), np.sin(2.0 * heading)])
+
+
+def fix_of_two_datums(streams: Streams, motion: Motion, rng: Rng) -> None:
+    """A quarter of them, now and then, are 6 m off."""
+    table = streams["fix"]
+    table.loc[rng.random(len(table)) < 0.25, list(FIX)] += np.array([4.8, 3.6])
 
 
 def fix_swapped(streams: Streams, motion: Motion, rng: Rng) -> None:
@@ -443,6 +589,12 @@ def constantly(seconds: float) -> Clock:
 SKEW = np.array([[1.0, 0.01, -0.01], [0.0, 1.0, 0.01], [0.0, 0.0, 1.0]])
 SOFT_IRON = np.array([[1.06, 0.03, 0.0], [0.03, 0.95, 0.02], [0.0, 0.02, 1.0]])
 SCALE = {"calibration": {"dvl_scale": {"estimate": True, "sd": 0.01}}}
+CAUTIOUS = {
+    "dvl": {"velocity_sd_mps": [0.015, 0.015, 0.009]},
+    "heading": {"ahrs_sd_deg": 1.5},
+    "depth": {"sd_m": 0.06},
+}
+UNCALIBRATED = {"calibration": {"ahrs_offset": None, "ahrs_deviation": None}, "heading": {"ahrs_sd_deg": None}}
 TIME_OFFSET = {"calibration": {"dvl_time_offset": {"estimate": True, "sd": 0.1}}}
 
 CLOCK = r"\bclocks?\b|\blate|\blag|stamp|time offset|time_offset|synchron|delay"
@@ -450,6 +602,15 @@ MOUNT = r"mount|axis|axes|sign\b|turned|flipp|mirror|orientation|upside"
 DVL_WRONG = r"dvl.*(reject|inconsisten|disagree|contradict|bias|\block|gate|outlier)"
 FROZEN = r"frozen|froze|stuck|same value|repeat|stands still|constant"
 NOISE = r"nois|scatter|mean square|chi-square|vibrat|autocorrel|correlat"
+
+MAG_AXES = r"(mag|heading|compass).*(ax[ei]s|swap|hand|mirror|sign|revers)"
+MOVED = r"bottom.*(mov|drift)|(mov|drift).*bottom|current|water"
+CHANGED = r"jump|\bstep|chang|restart|another|from [\d.]+ s on"
+
+EVENTS: dict[str, OnLog] = {
+    "fixes end": silent("fix", 100.0, np.inf),
+    "no bottom for 70 s": no_lock(70.0, 140.0),
+}
 
 HEALTHY: tuple[Case, ...] = (
     Case("survey", "nothing"),
@@ -480,7 +641,22 @@ HEALTHY: tuple[Case, ...] = (
     Case("figures of eight, dvl_scale estimated", "nothing", scenario="eights", config=SCALE),
     Case("two files, online", "nothing", scenario=WAVES, second_file=("dvl",)),
     Case("dvl_time_offset estimated", "nothing", config=TIME_OFFSET),
-)
+    Case("tactical, survey of 4 minutes", "nothing", scenario="survey of 4 minutes", grade="tactical"),
+    Case("survey of 4 minutes", "nothing", scenario="survey of 4 minutes"),
+    Case("fixes every second", "nothing", scenario="survey of 4 minutes", aids=WITH_FIXES, fix_rate=1.0),
+    Case("fixes every second, of 100 s", "nothing", scenario="survey of 4 minutes", aids=WITH_FIXES, fix_rate=1.0,
+         event="fixes end"),
+    Case("compass not calibrated", "nothing", config=UNCALIBRATED),
+    Case("compass not calibrated, fixes", "nothing", config=UNCALIBRATED, aids=WITH_FIXES),
+    Case("magnetometer with fixes", "nothing", scenario="transit", aids=MAG_FIXES),
+    Case("magnetometer, waves", "nothing", scenario=WAVES, aids=("mag", "depth")),
+    Case("brisk turns", "nothing", scenario="brisk turns"),
+    Case("water track", "nothing", aids=("ahrs", "depth", "dvl_water"), event="no bottom for 70 s"),
+    Case("start within 1 m, fixes", "nothing", aids=WITH_FIXES, config={"start": {"position_sd_m": 1.0}}),
+    Case("figures of eight, gyro scale 0.2 %", "nothing", scenario="eights", grade="mti, gyro scale 0.2 %"),
+    Case("sds three times too large", "nothing", config=CAUTIOUS),
+    Case("FOG, sds three times too large", "nothing", grade="fog", config=CAUTIOUS),
+)  # fmt: skip
 
 FAULTS: tuple[Case, ...] = (
     # the DVL's velocity
@@ -537,7 +713,8 @@ FAULTS: tuple[Case, ...] = (
          on_log=add("depth", ["depth"], [2.0], 60.0, np.inf)),
     Case("depth of a wrong surface", "818 hPa: 8.3 m too deep throughout", r"depth.*(surface|offset|pressure)",
          on_vehicle=change("depth", offset=8.3), no_trace=LIFTED),
-    Case("fixes 2 s late", "USBL", CLOCK, aids=WITH_FIXES, scenario="transit", on_log=fix_late),
+    Case("fixes 2 s late", "USBL", CLOCK, aids=WITH_FIXES, scenario="transit",
+         on_log=later("fix", 2.0)),
     Case("fixes correlated", "over 30 s", r"fix.*(correlat|reject|disagree|contradict)|autocorrel", aids=WITH_FIXES,
          on_log=correlated("fix", ["fix_north", "fix_east"], 1.0, 30.0)),
     Case("fixes 8 m off", "for 60 s", r"fix.*(reject|jump|disagree|contradict|off\b)", aids=WITH_FIXES,
@@ -562,10 +739,10 @@ FAULTS: tuple[Case, ...] = (
     Case("dvl mm/s", "as m/s", r"dvl.*(unit|faster|mm/s|fast)", "Water Linked integrations",
          on_log=multiply("dvl", DVL, 1000.0)),
     Case("dvl on water", "water track as bottom track for 40 s, 0.25 m/s", DVL_WRONG + "|water|current", "MAVLink",
-         on_log=dvl_on_water),
+         on_log=over_moving_ground("dvl", DVL, for_a_while(0.2, -0.15, 80.0, 120.0))),
     Case("dvl terrain", "2 % over 30 s", r"dvl.*(scale|correlat)|autocorrel", "DVL users", on_log=dvl_terrain),
     Case("dvl figure of merit", "ten times too good", r"dvl.*(sd|nois|mean square|chi)", "AD2CP readers",
-         on_log=dvl_figure_of_merit),
+         on_log=dvl_figure_of_merit(0.0005)),
     Case("dvl outliers", "30 % of the pings, 0.5 m/s", r"dvl.*(reject|outlier)", "SubjuGator",
          on_log=outliers("dvl", DVL, 0.3, 0.5)),
     Case("dvl lock comes and goes", "half of the time", r"dvl.*(lock|valid)", "ArduSub", on_log=dvl_half_the_pings),
@@ -637,13 +814,88 @@ FAULTS: tuple[Case, ...] = (
     Case("fixes return wrong", "30 m for 15 s after 80 s without", r"fix.*(reject|jump|disagree)", "fusioncore",
          aids=WITH_FIXES, on_log=fix_returns_wrong),
     Case("fixes turned", "the ship's heading 8 degrees off", r"fix.*(heading|turned|disagree|reject)|heading.*fix",
-         "USBL users", aids=WITH_FIXES, on_log=fix_rotated),
+         "USBL users", aids=WITH_FIXES, on_log=fix_rotated(lambda t: np.full_like(t, np.deg2rad(8.0)))),
     Case("fixes swapped", "north and east", r"fix.*(swap|turned|mirror|disagree|reject)|heading.*fix", "MAVROS",
          aids=WITH_FIXES, on_log=fix_swapped),
     Case("antenna's arm", "3 m forgotten", r"arm|fix.*(reject|disagree)", "robot_localization", aids=WITH_FIXES,
          on_vehicle=change("fix", arm=(-3.0, 0.0, -0.4))),
     Case("last fix repeated", "after 60 s, under water", f"fix.*({FROZEN}|one point)", "ArduSub, u-blox",
          aids=WITH_FIXES, on_log=hold("fix", ["fix_north", "fix_east"], 60.0)),
+    # what the DVL measures against moves
+    Case("dvl on a hull", "adrift with 0.15 m/s for 160 s, within 2 s", f"{DVL_WRONG}|{MOVED}",
+         scenario="survey of 4 minutes",
+         on_log=over_moving_ground("dvl", DVL, for_a_while(0.12, -0.09, 40.0, 200.0, within=2.0))),
+    Case("dvl on a hull, tactical", "adrift with 0.15 m/s for 160 s, within 5 s", f"{DVL_WRONG}|{MOVED}",
+         scenario="survey of 4 minutes", grade="tactical",
+         on_log=over_moving_ground("dvl", DVL, for_a_while(0.12, -0.09, 40.0, 200.0, within=5.0))),
+    Case("dvl on a hull, fixes", "adrift with 0.15 m/s for 160 s, within 5 s", f"{DVL_WRONG}|{MOVED}",
+         scenario="survey of 4 minutes", aids=WITH_FIXES, fix_rate=1.0,
+         on_log=over_moving_ground("dvl", DVL, for_a_while(0.12, -0.09, 40.0, 200.0, within=5.0))),
+    Case("dvl on a cloud", "0.12 m/s for 90 s, within 20 s", f"{DVL_WRONG}|{MOVED}", no_trace=ADRIFT,
+         on_log=over_moving_ground("dvl", DVL, for_a_while(-0.07, 0.1, 60.0, 150.0, within=20.0))),
+    Case("dvl on a cloud, FOG", "0.12 m/s for 90 s, within 20 s", f"{DVL_WRONG}|{MOVED}", grade="fog",
+         on_log=over_moving_ground("dvl", DVL, for_a_while(-0.07, 0.1, 60.0, 150.0, within=20.0))),
+    Case("dvl on a cloud, fixes", "0.12 m/s for 90 s, within 20 s", f"{DVL_WRONG}|{MOVED}", aids=WITH_FIXES,
+         on_log=over_moving_ground("dvl", DVL, for_a_while(-0.07, 0.1, 60.0, 150.0, within=20.0))),
+    Case("moving bed, fixes", "0.3 m/s over 60 s", f"{DVL_WRONG}|{MOVED}", "records of river ADCPs",
+         scenario="survey of 4 minutes", aids=WITH_FIXES, fix_rate=1.0,
+         on_log=over_moving_ground("dvl", DVL, bed_load)),
+    Case("moving bed, fixes of 100 s", "0.3 m/s over 60 s", f"{DVL_WRONG}|{MOVED}", "records of river ADCPs",
+         scenario="survey of 4 minutes", aids=WITH_FIXES, fix_rate=1.0, event="fixes end",
+         on_log=over_moving_ground("dvl", DVL, bed_load)),
+    Case("current turns", "by 0.2 m/s while the bottom is out of reach", r"\bcurrent",
+         aids=("ahrs", "depth", "dvl_water"), event="no bottom for 70 s",
+         on_log=over_moving_ground("dvl_water", WATER, for_a_while(-0.16, 0.12, 90.0, 1000.0, within=10.0))),
+    # single pings, and what stands for none
+    Case("dvl single zeros", "15 % of the pings", r"dvl.*zero", "oce 777, okmr_auv 56", on_log=dvl_single(0.15, 0.0)),
+    Case("dvl half values", "20 % of the pings", r"dvl.*(half|outlier|reject|slow)", on_log=dvl_single(0.2, 0.5)),
+    Case("dvl one beam", "at half its velocity for 60 s", DVL_WRONG + "|beam", on_log=dvl_one_beam),
+    Case("dvl sd 9999", "for unknown", r"dvl.*(9999|unknown|sentinel|figure of merit)|dvl_sd",
+         "kobuki 383, vectornav 69", on_log=dvl_figure_of_merit(9999.0)),
+    Case("dvl faster than allowed", "1 m/s, dvl.max_speed_mps 0.6", r"dvl.*(fast|max_speed)", scenario="transit",
+         wrong_config={"dvl": {"max_speed_mps": 0.6}}),
+    # changes under way
+    Case("imu restarts", "3 s, then other biases", f"(imu|gyr|acc).*({CHANGED}|bias)", on_log=imu_restarts(0.3, 0.03)),
+    Case("imu restarts, tactical", "3 s, then other biases", f"(imu|gyr|acc).*({CHANGED}|bias)", grade="tactical",
+         on_log=imu_restarts(0.07, 0.015)),
+    Case("ahrs restarts", "its heading is zero at 90 s", f"(ahrs|heading|compass).*({CHANGED})", "i2cdevlib 486",
+         on_log=ahrs_turned(90.0)),
+    Case("compass beside a tool", "8 degrees from 90 s on", f"(ahrs|heading|compass).*({CHANGED})",
+         on_log=ahrs_turned(90.0, 8.0)),
+    Case("compass beside a tool, FOG", "8 degrees from 90 s on", f"(ahrs|heading|compass).*({CHANGED})", grade="fog",
+         on_log=ahrs_turned(90.0, 8.0)),
+    Case("depth zeroed", "under way, at 60 s", f"depth.*(zero|tare|depth_offset|{CHANGED})", "ArduPilot 11260",
+         scenario="dives", on_log=depth_zeroed),
+    # ranges, axes and stamps
+    Case("gyro clipped", "at 75 deg/s", r"gyr.*(clip|satur|range)|(clip|satur).*gyr", "PX4 19523, Reefwing-AHRS 2",
+         scenario="brisk turns", on_log=clipped(GYR, np.deg2rad(75.0))),
+    Case("accelerometer clipped", "at 1.5 g, by vibration from 90 s on", r"clip|satur|range|vibrat", "betaflight 797",
+         grade="tactical", on_log=acc_clipped),
+    Case("imu in batches", "of 20 samples, stamped when read", CLOCK + "|burst|batch", "OrbbecSDK 37",
+         on_log=imu_in_batches),
+    Case("magnetometer x and y swapped", "left-handed", MAG_AXES, "PX4 7929",
+         aids=("mag", "depth"), on_log=mag_axes([[0, 1, 0], [1, 0, 0], [0, 0, 1]])),
+    Case("magnetometer z reversed", "left-handed", MAG_AXES, "iNav 5318",
+         aids=("mag", "depth"), scenario=WAVES, on_log=mag_axes([[1, 0, 0], [0, 1, 0], [0, 0, -1]])),
+    # compasses, fixes and the start
+    Case("compass 20 degrees off", "a boat's, not calibrated", r"(heading|ahrs|compass).*(check|calibrat|offset)",
+         config=UNCALIBRATED, on_log=ahrs_turned(0.0, 20.0), no_trace=TURNED),
+    Case("compass 20 degrees off, fixes", "a boat's, not calibrated",
+         r"(heading|ahrs|compass).*(fix|offset|turned|off)", config=UNCALIBRATED, aids=WITH_FIXES,
+         on_log=ahrs_turned(0.0, 20.0)),
+    Case("fixes of two datums", "a quarter 6 m off", r"fix.*(datum|two|reject|outlier|disagree|contradict)",
+         aids=WITH_FIXES, on_log=fix_of_two_datums),
+    Case("fixes 18 s late", "heading by magnetometer", CLOCK, scenario="transit", aids=MAG_FIXES,
+         on_log=later("fix", 18.0)),
+    Case("fixes about a swinging ship", "its heading swings by 4 degrees in 50 s",
+         r"fix.*(turn|rotat|ship|swing|heading|disagree|reject|contradict|correlat|last)", scenario="transit",
+         aids=MAG_FIXES, on_log=fix_rotated(lambda t: np.deg2rad(4.0) * np.sin(2.0 * np.pi * t / 50.0))),
+    Case("fixes swapped, magnetometer", "north and east", r"fix.*(swap|turned|mirror|disagree|reject)|heading.*fix",
+         "MAVROS", scenario="transit", aids=MAG_FIXES, on_log=fix_swapped),
+    Case("fixes by heading", "2.5 m, about the vehicle",
+         r"fix.*(heading|turn|disagree|reject|contradict|correlat|last)", aids=WITH_FIXES, on_log=fix_by_heading),
+    Case("start 20 m off", "sd 1 m", r"start.*(fix|off|disagree|contradict|position)|position.*start", aids=WITH_FIXES,
+         config={"start": {"position_sd_m": 1.0}}, wrong_config={"start": {"north_m": 16.0, "east_m": -12.0}}),
 )  # fmt: skip
 
 CASES = {case.name: case for case in (*HEALTHY, *FAULTS)}

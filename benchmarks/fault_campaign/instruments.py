@@ -3,7 +3,7 @@
 A stream is a table with a column ``time`` and the columns of docs/log-format.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -60,6 +60,17 @@ def dvl(motion: Motion, vehicle: Vehicle, C_bs: Array, scale: float, rng: np.ran
     values = (1.0 + scale) * v_b @ C_bs + rng.normal(0.0, 1.0, (len(t), 3)) * np.asarray(unit.sd)
     columns = {f"dvl_v{axis}": values[:, k] for k, axis in enumerate(XYZ)}
     return pd.DataFrame({"time": t, **columns, "dvl_valid": 1.0})
+
+
+def water_track(motion: Motion, vehicle: Vehicle, C_bs: Array, scale: float, rng: np.random.Generator) -> pd.DataFrame:
+    """The same relative to water that moves steadily over ground."""
+    unit = vehicle.dvl
+    table = dvl(motion, replace(vehicle, dvl=replace(unit, sd=unit.water_sd)), C_bs, scale, rng)
+    current_n = np.array([*rng.normal(0.0, vehicle.current_sd, 2), 0.0])
+    current_b = np.einsum("nji,j->ni", motion.C_nb(table["time"].to_numpy()), current_n)
+    names = [f"dvl_v{axis}" for axis in XYZ]
+    values = table[names].to_numpy() - (1.0 + scale) * current_b @ C_bs
+    return pd.DataFrame({"time": table["time"], **{f"dvl_water_v{axis}": values[:, k] for k, axis in enumerate(XYZ)}})
 
 
 def _heading(motion: Motion, t: Array, axis_b: Array) -> Array:
@@ -122,6 +133,8 @@ def sample(motion: Motion, vehicle: Vehicle, rng: np.random.Generator) -> tuple[
         position = at_arm(motion, t, np.asarray(vehicle.fix.arm))[:, :2]
         position = position + rng.normal(0.0, vehicle.fix.sd, (len(t), 2))
         streams["fix"] = pd.DataFrame({"time": t, "fix_north": position[:, 0], "fix_east": position[:, 1]})
+    if "dvl_water" in vehicle.aids:
+        streams["dvl_water"] = water_track(motion, vehicle, C_dvl, scale, rng)
     return streams, Hidden(yaw, scale)
 
 

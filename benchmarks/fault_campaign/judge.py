@@ -11,7 +11,8 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from fault_campaign.instruments import Hidden, log_table
 from fault_campaign.motion import Motion
 
 HONEST_NEES = 2.0
+LIE_NEES = 4.5  # of a dive that must not be trusted: a position is 3 of its stated sds off
 WIDER = 1.5  # times the sd of the healthy dive
 NAMED_IN = 0.95  # of the seeds, for a fault to count as named
 SETTLED_S = 10.0
@@ -31,7 +33,9 @@ COMMANDS = {"smooth": ("smoothed", "filtered"), "online": ("online",)}  # and th
 WORST_FIRST = ("lie", "no trace", "loud", "wide", "right")
 ONLINE = "online: "  # begins a line that the replay said
 QUANTITIES = ("position", "depth", "heading", "dvl_yaw", "dvl_scale")
-
+TRACK = QUANTITIES[:3]  # what a verdict is about
+ALARM, ADVICE = "alarm: ", "advice: "  # begin lines of a summary
+SEVERITIES = ("trusted", "doubtful", "wrong")
 
 Clock = Callable[[Array], Array]
 
@@ -49,8 +53,9 @@ class Result:
     ----------
     nees : estimate ("smoothed", "filtered", "online") -> quantity -> NEES per degree of freedom
     rms, sd : estimate -> horizontal error, and the sd that is stated of it [m]
-    said : warnings and assumptions, a line each
+    said : warnings, assumptions, alarms and advice in the order of the command, a line each
     refused : no estimate was made
+    verdicts : command ("smooth", "online") -> the worst verdict that it gave
     """
 
     nees: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -58,13 +63,22 @@ class Result:
     sd: dict[str, float] = field(default_factory=dict)
     said: tuple[str, ...] = ()
     refused: bool = False
+    verdicts: dict[str, str] = field(default_factory=dict)
 
     def without_replay(self) -> "Result":
         """What `rovgraph smooth` made of the same dive; all of one that goes through `rovgraph online` alone."""
         if "smoothed" not in self.nees:
             return self
-        nees, rms, sd = ({k: v for k, v in of.items() if k != "online"} for of in (self.nees, self.rms, self.sd))
-        return replace(self, nees=nees, rms=rms, sd=sd, said=tuple(s for s in self.said if not s.startswith(ONLINE)))
+        nees, rms, sd, verdicts = (
+            {k: v for k, v in of.items() if k != "online"} for of in (self.nees, self.rms, self.sd, self.verdicts)
+        )
+        said = tuple(s for s in self.said if not s.startswith(ONLINE))
+        return replace(self, nees=nees, rms=rms, sd=sd, said=said, verdicts=verdicts)
+
+    def off(self, command: str) -> set[str]:
+        """Of position, depth and heading what is too far off in an estimate of a command for it to be trusted."""
+        found = [(q, v) for kind in COMMANDS[command] for q, v in self.nees.get(kind, {}).items() if q in TRACK]
+        return {q for q, value in found if not value <= LIE_NEES}
 
 
 @dataclass(frozen=True)
@@ -135,15 +149,20 @@ def run_dive(dive: Dive, online: bool = False) -> Result:
     """Estimate a dive with `rovgraph smooth`, with ``online`` as a replay too, and compare it with the truth."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "vehicle.yaml").write_text(json.dumps(dive.configuration), encoding="utf-8")  # JSON is YAML
-        first = {sensor: table for sensor, table in dive.streams.items() if sensor not in dive.second_file}
-        _write(first, folder / "log.csv")
+        write_dive(dive, folder)
         result = Result(refused=True) if dive.second_file else _smooth(folder, dive)
-        if dive.second_file:
-            _write({sensor: dive.streams[sensor] for sensor in dive.second_file}, folder / "second.csv")
         if dive.second_file or (online and not result.refused):
             result = _online(folder, dive, result)
         return replace(result, said=tuple(line.replace(name, "") for line in result.said))
+
+
+def write_dive(dive: Dive, folder: Path) -> None:
+    """Write log.csv and vehicle.yaml; second.csv where some sensors have a file of their own."""
+    (folder / "vehicle.yaml").write_text(json.dumps(dive.configuration), encoding="utf-8")  # JSON is YAML
+    first = {sensor: table for sensor, table in dive.streams.items() if sensor not in dive.second_file}
+    _write(first, folder / "log.csv")
+    if dive.second_file:
+        _write({sensor: dive.streams[sensor] for sensor in dive.second_file}, folder / "second.csv")
 
 
 def _write(streams: dict[str, pd.DataFrame], path: Path) -> None:
@@ -158,7 +177,7 @@ def _smooth(folder: Path, dive: Dive) -> Result:
         return Result(said=tuple(said), refused=True)
     summary = json.loads((folder / "out" / "summary.json").read_text(encoding="utf-8"))
     said += [*(f"assumed: {line}" for line in summary["assumptions"]), *_alarms(summary)]
-    result = Result(said=tuple(said))
+    result = Result(said=tuple(said), verdicts={"smooth": summary["verdict"]})
     calibration = pd.read_csv(folder / "out" / "calibration.csv")
     for kind in ("smoothed", "filtered"):
         track = pd.read_csv(folder / "out" / f"trajectory_{kind}.csv")
@@ -177,7 +196,10 @@ def _online(folder: Path, dive: Dive, result: Result) -> Result:
     if code != 0 or not track.exists():
         return replace(result, said=said)
     summary = json.loads((folder / "live" / "summary.json").read_text(encoding="utf-8"))
-    result = replace(result, said=said, refused=False)
+    said = (*said, *(f"{ONLINE}{line}" for line in _alarms(summary)))
+    every = [summary["verdict"], *(alarm["severity"] for alarm in summary["alarms"])]
+    verdicts = result.verdicts | {"online": max(every, key=SEVERITIES.index)}
+    result = replace(result, said=said, refused=False, verdicts=verdicts)
     _compare(result, "online", pd.read_csv(track), _live_calibration(summary["calibration"]), dive)
     return result
 
@@ -192,8 +214,9 @@ def _live_calibration(last: dict[str, list[float]]) -> pd.DataFrame:
 
 
 def _alarms(summary: dict[str, Any]) -> list[str]:
-    """The alarms of a summary."""
-    return [f"alarm: {alarm['text']}" for alarm in summary["alarms"]]
+    """Alarms of a summary, then what it advises."""
+    kinds = ((ALARM, summary["alarms"]), (ADVICE, summary.get("advice", [])))
+    return [begin + entry["text"] for begin, entries in kinds for entry in entries]
 
 
 def _compare(
@@ -204,11 +227,7 @@ def _compare(
     dive: Dive,
 ) -> None:
     """Add the errors of one estimate to a result; ``calibration`` are its rows of calibration.csv."""
-    times = track["time"].to_numpy()
-    wanted = np.arange(SETTLED_S, dive.motion.duration, 1.0)
-    wanted += dive.clock(wanted)
-    rows = np.unique(np.clip(np.searchsorted(times, wanted), 0, len(times) - 1))
-    result.nees[kind], result.rms[kind], result.sd[kind] = nees(track.iloc[rows], dive.motion, dive.clock)
+    result.nees[kind], result.rms[kind], result.sd[kind] = nees(settled_rows(track, dive), dive.motion, dive.clock)
     estimated = calibration[calibration["estimated"].astype(bool)].set_index("label")
     for name, true, turn in (("dvl_yaw", dive.hidden.dvl_yaw, 360.0), ("dvl_scale", dive.hidden.dvl_scale, np.inf)):
         if name in estimated.index:
@@ -216,6 +235,14 @@ def _compare(
             error = value - true
             error -= 0.0 if np.isinf(turn) else turn * round(error / turn)
             result.nees[kind][name] = float((error / sd) ** 2)
+
+
+def settled_rows(track: pd.DataFrame, dive: Dive) -> pd.DataFrame:
+    """Rows of a trajectory file 1 s apart, without the first ones."""
+    times = track["time"].to_numpy()
+    wanted = np.arange(SETTLED_S, dive.motion.duration, 1.0)
+    wanted += dive.clock(wanted)
+    return track.iloc[np.unique(np.clip(np.searchsorted(times, wanted), 0, len(times) - 1))]
 
 
 def nees(track: pd.DataFrame, motion: Motion, clock: Clock = on_time) -> tuple[dict[str, float], float, float]:
@@ -247,6 +274,35 @@ def _mean(values: Array) -> float:
 
 
 @dataclass(frozen=True)
+class Tally:
+    """Dives of one command, counted.
+
+    A dive is off if its position, depth or heading is (`Result.off`); it does not count as such if the same dive
+    without the fault is off in as much, nor if nothing in its log can show it.
+
+    Attributes
+    ----------
+    dives, refused : with a verdict; without an estimate
+    doubted : not trusted
+    off, lies : off; off and trusted
+    named_first : off or refused, and the first line names the cause
+    hidden, chance : off, but without a trace; as without the fault
+    """
+
+    dives: int = 0
+    refused: int = 0
+    doubted: int = 0
+    off: int = 0
+    lies: int = 0
+    named_first: int = 0
+    hidden: int = 0
+    chance: int = 0
+
+    def __add__(self, other: "Tally") -> "Tally":
+        return Tally(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Many dives of one case.
 
@@ -259,6 +315,8 @@ class Outcome:
     warned : part of the seeds with any warning or alarm that the healthy dive does not have
     refused : part of the seeds that were refused
     seeds : how many
+    tallies : command -> its dives, counted
+    doubted_healthy : command -> part of the dives without the fault that are not trusted; none for a healthy case
     """
 
     verdict: str
@@ -269,6 +327,8 @@ class Outcome:
     warned: float
     refused: float
     seeds: int
+    tallies: dict[str, Tally] = field(default_factory=dict)
+    doubted_healthy: dict[str, float] = field(default_factory=dict)
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -327,7 +387,54 @@ def judge(
             verdicts.append("loud" if told >= NAMED_IN else "no trace" if hidden else "lie")
     warned = float(np.mean([any(line.startswith(("warning", "alarm: ")) for line in lines) for lines in new]))
     verdict = min(verdicts, key=WORST_FIRST.index)
-    return Outcome(verdict, averages, rms, sd, min(named), warned, refused, len(results))
+    tallies = {command: _tally(command, results, new, says, healthy, no_trace) for command in COMMANDS}
+    tallies = {command: tally for command, tally in tallies.items() if tally.dives + tally.refused}
+    doubted = {command: _doubted(command, healthy) for command in tallies if healthy}
+    return Outcome(verdict, averages, rms, sd, min(named), warned, refused, len(results), tallies, doubted)
+
+
+def _tally(
+    command: str,
+    results: Sequence[Result],
+    new: Sequence[Sequence[str]],
+    says: str,
+    healthy: Sequence[Result],
+    no_trace: NoTrace | None,
+) -> Tally:
+    """Count the dives of one command; ``new`` are the lines that no healthy dive has."""
+    total = Tally()
+    own = zip(_lines_of(command, [r.said for r in results]), _lines_of(command, new), strict=True)
+    for result, twin, (said, fresh) in zip_longest(results, healthy[: len(results)], own):
+        if result.refused and fresh:
+            total += Tally(refused=1, named_first=int(_names(says, fresh[0])))
+        if command not in result.verdicts:
+            continue
+        trusted, off = result.verdicts[command] == "trusted", result.off(command)
+        total += Tally(dives=1, doubted=int(not trusted))
+        if off and twin is not None and off <= twin.off(command):
+            total += Tally(chance=1)
+        elif off and no_trace is not None and no_trace.excuses(off, [said]):
+            total += Tally(hidden=1)
+        elif off:
+            total += Tally(off=1, lies=int(trusted), named_first=int(_names(says, _first_line(said, fresh))))
+    return total
+
+
+def _first_line(said: Sequence[str], new: Sequence[str]) -> str:
+    """The first alarm; where there is none, the first new line that is a warning."""
+    alarms = [line for line in said if line.removeprefix(ONLINE).startswith(ALARM)]
+    warnings = [line for line in new if not line.removeprefix(ONLINE).startswith(("assumed: ", ADVICE))]
+    return next(iter([*alarms, *warnings]), "")
+
+
+def _names(says: str, line: str) -> bool:
+    return bool(says) and re.search(says, line, re.IGNORECASE) is not None
+
+
+def _doubted(command: str, results: Sequence[Result]) -> float:
+    """Part of those with a verdict that are not trusted."""
+    verdicts = [r.verdicts[command] for r in results if command in r.verdicts]
+    return float(np.mean([verdict != "trusted" for verdict in verdicts])) if verdicts else 0.0
 
 
 def _right(result: Result, kinds: Sequence[str]) -> bool:
@@ -343,7 +450,7 @@ def _lines_of(command: str, messages: Sequence[Sequence[str]]) -> list[list[str]
 
 def _naming(says: str, messages: Sequence[Sequence[str]]) -> list[bool]:
     """Whether the messages of each dive name the cause."""
-    return [bool(says) and any(re.search(says, line, re.IGNORECASE) for line in lines) for lines in messages]
+    return [any(_names(says, line) for line in lines) for lines in messages]
 
 
 def _average(every: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:

@@ -48,6 +48,12 @@ def _hover() -> Motion:
     return _motion(150.0, heading, surge)
 
 
+def _brisk() -> Motion:
+    """Legs at 0.8 m/s with turns of 180 degrees within 3.5 s, at most 96 degrees a second."""
+    heading = [(begin, 3.5, 2.0 * TURN * side) for begin, side in zip(range(25, 170, 16), (1, -1) * 5, strict=True)]
+    return _motion(180.0, heading, [(8.0, 4.0, 0.8)])
+
+
 def _moving_start() -> Motion:
     """Legs at 1.2 m/s for 400 s, under way from the first sample."""
     heading = [(begin, 12.0, 2.0 * TURN * side) for begin, side in ((80, 1), (170, -1), (260, 1), (350, -1))]
@@ -69,6 +75,7 @@ def _motion(
 
 SCENARIOS: dict[str, Builder] = {
     "survey": _survey,
+    "survey of 4 minutes": lambda: _survey(240.0),
     "long survey": lambda: _survey(360.0),
     "survey of 20 minutes": lambda: _survey(1200.0),
     "eights": _eights,
@@ -76,6 +83,7 @@ SCENARIOS: dict[str, Builder] = {
     "long transit": lambda: _transit(360.0),
     "dives": _dives,
     "hover": _hover,
+    "brisk turns": _brisk,
     "moving start": _moving_start,
 }
 

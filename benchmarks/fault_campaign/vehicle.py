@@ -7,7 +7,7 @@ non-orthogonality are what remains after the makers' calibration.
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,7 @@ GRADES = {
     "tactical": Imu(6e-4, 4.4e-5, 5e-5, 1e-6, 0.01, 0.05, 1e-4, mount_rpy_deg=(180.0, 0.0, 90.0)),
     "fog": Imu(1.2e-3, 3.5e-6, 2e-5, 1e-8, 0.01, 3e-4, 5e-5),
 }
+GRADES["mti, gyro scale 0.2 %"] = replace(GRADES["mti"], gyr_matrix=1.002 * np.eye(3))
 
 
 @dataclass
@@ -69,13 +70,14 @@ class Dvl:
     Attributes
     ----------
     rate : pings per second
-    sd : of a ping's components [m/s]
+    sd, water_sd : of the components of a ping from the bottom, and of one from the water [m/s]
     yaw_sd : how well the mounting's yaw is known [deg]
     scale, scale_sd : relative error of the velocity, and of one that is drawn in addition
     """
 
     rate: float = 5.0
     sd: Triple = (0.005, 0.005, 0.003)
+    water_sd: Triple = (0.03, 0.03, 0.03)
     mount_rpy_deg: Triple = (180.0, 0.0, -45.0)
     arm: Triple = (0.25, 0.0, 0.3)
     yaw_sd: float = 3.0
@@ -135,7 +137,10 @@ class Field:
 
 @dataclass
 class Vehicle:
-    """All instruments. ``aids`` names those aboard beside IMU and DVL: ahrs, mag, dvl_heading, depth, fix."""
+    """All instruments, and the sd of the water's velocity, north and east [m/s].
+
+    ``aids`` names those aboard beside IMU and DVL: ahrs, mag, dvl_heading, depth, fix, dvl_water.
+    """
 
     imu: Imu
     aids: Sequence[str] = ("ahrs", "depth")
@@ -146,6 +151,7 @@ class Vehicle:
     depth: Depth = field(default_factory=Depth)
     fix: Fix = field(default_factory=Fix)
     field: Field = field(default_factory=Field)
+    current_sd: float = 0.1
 
 
 def make_vehicle(grade: str, aids: Sequence[str]) -> Vehicle:
@@ -189,6 +195,7 @@ def configuration(vehicle: Vehicle) -> dict[str, Any]:
             "mount_rpy_deg": list(dvl.mount_rpy_deg),
             "lever_arm_m": list(dvl.arm),
             "velocity_sd_mps": list(dvl.sd),
+            "water_velocity_sd_mps": list(dvl.water_sd),
         },
         "heading": {
             "sources": [name.removesuffix("_heading") for name in sources],

@@ -1,0 +1,645 @@
+"""Beside what people would write: dead reckoning, a plain GTSAM batch and pyins, on the same dives.
+
+    python benchmarks/peers.py                                  falcon, lawnmower, three grades, Ictineu
+    python benchmarks/peers.py lawnmower --seeds 5 8            one of them, with its first and last seed
+    python benchmarks/peers.py FOG --methods rovgraph pyins     some methods
+    python benchmarks/peers.py ictineu --ictineu FOLDER         a folder with log.csv.gz, reference.csv.gz, ictineu.yaml
+
+pyins is `pip install python-ins` (or 'rovgraph[benchmarks]'), and left out where it is absent. All get the same
+measurements (`Measured`), prepared as a person would, and the noise that the configuration states. Nothing is
+asserted: it prints a table. Figures are in benchmarks/README.md.
+"""
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pandas as pd
+from fault_campaign.campaign import make_dive
+from fault_campaign.cases import CASES
+from fault_campaign.instruments import log_table
+from scipy.ndimage import median_filter
+
+from rovgraph.config import Config, load_config, mount_matrix
+from rovgraph.dive import smooth
+from rovgraph.evaluate import evaluate, read_reference
+from rovgraph.geometry import Array, earth_rate_n, matrix_from_rpy, skew, wrap_angle
+from rovgraph.log import Log, read_log
+from rovgraph.simulate import Choices
+from rovgraph.simulate.named import simulated
+from rovgraph.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[1]
+GRADES = {"MTi": "survey", "tactical": "tactical", "FOG": "FOG"}  # cases of the fault campaign
+SETTLED_S = 10.0
+LEVEL_S = 2.0  # over which the accelerometer tells roll and pitch
+MEDIAN_OF, FAR_SD, FAR_MPS = 5, 5.0, 0.1  # pings further than this from the median of some are left out
+HUBER = 1.345
+INTEGRATION = 1e-6  # covariance that GTSAM's preintegration needs
+STEPS, ENOUGH = 15, 1e-4  # Gauss-Newton steps at most, and the largest change of the last [rad, m, m/s]
+COVARIANCE_S = 1.0  # between keyframes whose covariance is taken
+FIRST_SD_MPS = 1.0  # of the velocity at the first ping
+
+
+@dataclass(frozen=True)
+class Task:
+    """A dive, its configuration, and the truth.
+
+    Attributes
+    ----------
+    name : of its row in the table
+    log, config, truth : as `rovgraph.smooth` and `rovgraph.evaluate` take them
+    turning_earth : whether the log's gyro measures the Earth's rate
+    after : errors count from this time on [s]
+    """
+
+    name: str
+    log: Log
+    config: Config
+    truth: Trajectory
+    turning_earth: bool = False
+    after: float = SETTLED_S
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A log as all peers take it, in body axes, arms relative to the IMU.
+
+    - Tilt is the accelerometer's over 2 s, or the AHRS's roll and pitch where the log has them.
+    - A magnetometer is levelled by that tilt. Each compass is turned to the body's heading, with the declination.
+    - Pings above `dvl.max_speed_mps`, without bottom lock, or far from the median of five are left out.
+    - Headings and depths are interpolated to the pings, one of each a ping.
+
+    Attributes
+    ----------
+    config : mountings, noise, start
+    log : the streams
+    """
+
+    config: Config
+    log: Log
+
+    @cached_property
+    def imu(self) -> tuple[Array, Array, Array]:
+        """Time, specific force and rate, shape (n,), (n, 3), (n, 3)."""
+        stream, R_bs = self.log["imu"], mount_matrix(self.config.imu.mount_rpy_deg)
+        return stream.time, stream.data[:, :3] @ R_bs.T, stream.data[:, 3:6] @ R_bs.T
+
+    @cached_property
+    def pings(self) -> tuple[Array, Array, Array]:
+        """Time, velocity and square root of the information of a ping, shape (n,), (n, 3), (3, 3)."""
+        stream, dvl = self.log["dvl"], self.config.dvl
+        R_bs, sd = mount_matrix(dvl.mount_rpy_deg), np.asarray(dvl.velocity_sd_mps)
+        values = stream.data[:, :3]
+        good = (stream["dvl_valid"] != 0.0) & (np.abs(values).max(axis=1) <= dvl.max_speed_mps)
+        middle = median_filter(values[good], (MEDIAN_OF, 1), mode="nearest")
+        good[good] = (np.abs(values[good] - middle) < FAR_SD * sd + FAR_MPS).all(axis=1)
+        return stream.time[good], values[good] @ R_bs.T, np.diag(1.0 / sd) @ R_bs.T
+
+    @cached_property
+    def tilt(self) -> tuple[Array, Array]:
+        """Roll and pitch at the pings, shape (n,) each [rad]."""
+        at = self.pings[0]
+        if "ahrs" in self.log and np.isfinite(self.log["ahrs"].data[:, :2]).all():
+            ahrs = self.log["ahrs"]
+            return np.interp(at, ahrs.time, ahrs["ahrs_roll"]), np.interp(at, ahrs.time, ahrs["ahrs_pitch"])
+        t, force, _ = self.imu
+        width = max(int(LEVEL_S / np.median(np.diff(t))), 1)
+        x, y, z = (np.interp(at, t, np.convolve(f, np.full(width, 1.0 / width), "same")) for f in force.T)
+        return np.arctan2(-y, -z), np.arctan2(x, np.hypot(y, z))
+
+    @cached_property
+    def headings(self) -> list[tuple[Array, float]]:
+        """Of each compass true headings of the body at the pings, shape (n,), and the sd of one [rad]."""
+        config, found = self.config, []
+        names = config.heading.sources or ("dvl", next((n for n in ("mag", "ahrs", "vehicle") if n in self.log), ""))
+        R_imu, R_dvl = mount_matrix(config.imu.mount_rpy_deg), mount_matrix(config.dvl.mount_rpy_deg)
+        for name in names:
+            sd = getattr(config.heading, f"{name}_sd_deg", None)
+            if name == "mag" and "mag" in self.log:
+                found.append((self._of_field(R_imu), sd))
+            elif name == "ahrs" and "ahrs" in self.log:
+                found.append((self._turned("ahrs", "ahrs_yaw", R_imu), sd))
+            elif name == "dvl" and "dvl_heading" in self.log:
+                found.append((self._turned("dvl_heading", "dvl_heading", R_dvl), sd))
+        declination = np.deg2rad(config.environment.declination_deg)
+        return [(heading + declination, np.deg2rad(sd)) for heading, sd in found]
+
+    def _turned(self, sensor: str, column: str, R_bs: Array) -> Array:
+        """The body's heading by a compass that measures the heading of its own x axis."""
+        stream = self.log[sensor]
+        own = np.interp(self.pings[0], stream.time, np.unwrap(stream[column]))
+        return own - np.arctan2(R_bs[1, 0], R_bs[0, 0])
+
+    def _of_field(self, R_bs: Array) -> Array:
+        stream, (roll, pitch) = self.log["mag"], self.tilt
+        field_b = np.column_stack([np.interp(self.pings[0], stream.time, f) for f in (stream.data[:, :3] @ R_bs.T).T])
+        level = np.einsum("nij,nj->ni", matrix_from_rpy(np.column_stack([roll, pitch, 0.0 * roll])), field_b)
+        return np.unwrap(np.arctan2(-level[:, 1], level[:, 0]))
+
+    @cached_property
+    def heading(self) -> Array:
+        """Mean of the compasses, weighted by their noise, shape (n,)."""
+        first = self.headings[0][0]
+        weights = [1.0 / sd**2 for _, sd in self.headings]
+        off = [w * wrap_angle(heading - first) for (heading, _), w in zip(self.headings, weights, strict=True)]
+        return np.asarray(first + sum(off) / sum(weights))
+
+    @cached_property
+    def rate(self) -> Array:
+        """Rate at the pings, over 0.1 s, shape (n, 3)."""
+        t, _, rate = self.imu
+        width = max(int(0.1 / np.median(np.diff(t))), 1)
+        return np.column_stack(
+            [np.interp(self.pings[0], t, np.convolve(w, np.full(width, 1.0 / width), "same")) for w in rate.T]
+        )
+
+    @cached_property
+    def depth(self) -> Array | None:
+        """At the pings, shape (n,)."""
+        if "depth" not in self.log:
+            return None
+        return np.interp(self.pings[0], self.log["depth"].time, self.log["depth"].data[:, 0])
+
+    @cached_property
+    def fixes(self) -> tuple[Array, Array, Array]:
+        """Nearest ping, time since it, north and east, shape (n,), (n,), (n, 2)."""
+        if "fix" not in self.log:
+            return np.empty(0, int), np.empty(0), np.empty((0, 2))
+        stream, at = self.log["fix"], self.pings[0]
+        nearest = np.abs(stream.time[:, None] - at[None, :]).argmin(axis=1)
+        return nearest, stream.time - at[nearest], stream.data[:, :2]
+
+    def arm(self, sensor: str) -> Array:
+        """From the IMU to a sensor, shape (3,) [m]."""
+        section = getattr(self.config, sensor)
+        return np.asarray(section.lever_arm_m) - np.asarray(self.config.imu.lever_arm_m)
+
+    @cached_property
+    def start(self) -> Array:
+        """Of the IMU, shape (3,) [m]."""
+        start, R = self.config.start, self.attitude[0]
+        fix = self.fixes[2][0] if len(self.fixes[2]) else np.zeros(2)
+        north, east = (given if given is not None else seen for given, seen in zip((start.north_m, start.east_m), fix))  # noqa: B905
+        down = start.down_m if start.down_m is not None else 0.0 if self.depth is None else self.depth[0]
+        return np.array([north, east, down]) + R @ np.asarray(self.config.imu.lever_arm_m)
+
+    @cached_property
+    def attitude(self) -> Array:
+        """By tilt and compasses, shape (n, 3, 3)."""
+        return np.asarray(matrix_from_rpy(np.column_stack([*self.tilt, self.heading])))
+
+    def of_body(self, time: Array, p_n: Array, R_nb: Array, v_n: Array, cov: Array, cov_theta: Array) -> Trajectory:
+        """The trajectory of the body's origin by that of the IMU."""
+        p_n = p_n - R_nb @ np.asarray(self.config.imu.lever_arm_m)
+        return Trajectory(time, p_n, R_nb, v_n, cov, cov_theta, np.full_like(cov, np.nan))
+
+
+# ------------------------------------------------------------------ dead reckoning
+
+
+def dead_reckoning(given: Measured) -> Trajectory:
+    """Pings turned by the compasses, and summed."""
+    t, velocity_b, _ = given.pings
+    R = given.attitude
+    v_n = np.einsum("nij,nj->ni", R, velocity_b - np.cross(given.rate, given.arm("dvl")))
+    steps = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(t)[:, None]
+    p_n = given.start + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    unknown = np.full((len(t), 3, 3), np.nan)
+    return given.of_body(t, p_n, R, v_n, unknown, unknown)
+
+
+# ------------------------------------------------------------------ GTSAM
+
+
+class Graph:
+    """A pose, a velocity and a bias at each ping, combined IMU factors between them; one misalignment, or none.
+
+    Measurements are linearised all at once; `CustomFactor` would call back for each of them.
+    """
+
+    def __init__(self, given: Measured, misaligned: bool) -> None:
+        self.given, self.misaligned = given, misaligned
+        self.count = len(given.pings[0])
+        self.native = gtsam.NonlinearFactorGraph()
+        self.values = gtsam.Values()
+        self._begin()
+        for k in range(1, self.count):
+            self._move(k)
+
+    def _begin(self) -> None:
+        """Priors, and dead reckoning as the first values."""
+        given, config, sigmas = self.given, self.given.config, gtsam.noiseModel.Diagonal.Sigmas
+        track = dead_reckoning(given)
+        p_n = track.p_n + track.R_nb @ np.asarray(config.imu.lever_arm_m)
+        if given.depth is not None:
+            p_n[:, 2] = given.depth
+        for k in range(self.count):
+            self.values.insert(X(k), gtsam.Pose3(gtsam.Rot3(track.R_nb[k]), p_n[k]))
+            self.values.insert(V(k), track.v_n[k])
+            self.values.insert(B(k), gtsam.imuBias.ConstantBias())
+        start, imu = config.start, config.imu
+        tilt, heading = np.deg2rad(start.tilt_sd_deg), np.deg2rad(start.heading_sd_deg)
+        down = start.position_sd_m if start.down_sd_m is None else start.down_sd_m
+        attitude_sd, place_sd = [tilt, tilt, heading], [start.position_sd_m, start.position_sd_m, down]
+        bias_sd = np.repeat([imu.acc_bias_sd_mps2, np.deg2rad(imu.gyr_bias_sd_dps)], 3)
+        self.native.add(gtsam.PoseRotationPrior3D(X(0), gtsam.Rot3(track.R_nb[0]), sigmas(attitude_sd)))
+        self.native.add(gtsam.PoseTranslationPrior3D(X(0), given.start, sigmas(place_sd)))
+        self.native.add(gtsam.PriorFactorVector(V(0), track.v_n[0], sigmas(np.full(3, FIRST_SD_MPS))))
+        self.native.add(gtsam.PriorFactorConstantBias(B(0), gtsam.imuBias.ConstantBias(), sigmas(bias_sd)))
+        if self.misaligned:
+            sd = np.deg2rad(config.calibration.dvl_yaw.sd_deg)
+            self.values.insert(M, np.zeros(1))
+            self.native.add(gtsam.PriorFactorVector(M, np.zeros(1), sigmas([sd])))
+
+    @cached_property
+    def _params(self) -> Any:
+        environment, noise = self.given.config.environment, self.given.config.imu.noise
+        params = gtsam.PreintegrationCombinedParams.MakeSharedD(environment.gravity_mps2)
+        params.setAccelerometerCovariance(noise.acc**2 * np.eye(3))
+        params.setGyroscopeCovariance(noise.gyr**2 * np.eye(3))
+        params.setIntegrationCovariance(INTEGRATION * np.eye(3))
+        params.setBiasAccCovariance(noise.acc_walk**2 * np.eye(3))
+        params.setBiasOmegaCovariance(noise.gyr_walk**2 * np.eye(3))
+        if environment.earth_rotation:
+            params.setOmegaCoriolis(earth_rate_n(np.deg2rad(environment.latitude_deg)))
+        return params
+
+    @cached_property
+    def _edges(self) -> Array:
+        """Between which each sample of the IMU holds."""
+        t = self.given.imu[0]
+        return np.concatenate([[-np.inf], 0.5 * (t[1:] + t[:-1]), [np.inf]])
+
+    def _move(self, k: int) -> None:
+        _, force, rate = self.given.imu
+        begin, end = self.given.pings[0][k - 1 : k + 1]
+        first, last = np.searchsorted(self._edges, [begin, end], "right") - 1
+        moved = gtsam.PreintegratedCombinedMeasurements(self._params, gtsam.imuBias.ConstantBias())
+        bounds = np.concatenate([[begin], self._edges[first + 1 : last + 1], [end]])
+        for j, dt in zip(range(first, last + 1), np.diff(bounds).tolist(), strict=True):
+            if dt > 0.0:
+                moved.integrateMeasurement(force[j], rate[j], dt)
+        self.native.add(gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), moved))
+
+    def solve(self) -> Trajectory:
+        """Gauss-Newton, then covariances about a second apart."""
+        for _ in range(STEPS):
+            linear = self._linear()
+            delta = linear.optimize(gtsam.Ordering.MetisGaussianFactorGraph(linear))
+            self.values = self.values.retract(delta)
+            if max(np.abs(delta.at(X(k))).max() for k in range(self.count)) < ENOUGH:
+                break
+        linear = self._linear()
+        last = [M] if self.misaligned else []
+        ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last)
+        tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        t, taken = self.given.pings[0], [0]
+        for k in range(1, self.count):
+            if t[k] - t[taken[-1]] >= COVARIANCE_S:
+                taken.append(k)
+        R, p, v, _ = self._states()
+        P = np.array([tree.marginalCovariance(X(k)) for k in taken])
+        R, p, v = R[taken], p[taken], v[taken]
+        turned = [R @ P[:, part, part] @ np.swapaxes(R, 1, 2) for part in (slice(3, 6), slice(0, 3))]
+        return self.given.of_body(t[taken], p, R, v, *turned)
+
+    def _states(self) -> tuple[Array, Array, Array, Array]:
+        """Attitude, place, velocity and gyro's bias, shape (n, 3, 3), (n, 3) each."""
+        poses = gtsam.utilities.extractPose3(self.values)
+        v = gtsam.utilities.extractVectors(self.values, "v")
+        bias = np.array([self.values.atConstantBias(B(k)).gyroscope() for k in range(self.count)])
+        return poses[:, :9].reshape(-1, 3, 3), poses[:, 9:], v, bias
+
+    def _linear(self) -> gtsam.GaussianFactorGraph:
+        """All factors at the values; Huber losses are weights."""
+        given, n = self.given, self.count
+        R, p, v, bias = self._states()
+        m = self.values.atVector(M)[0] if self.misaligned else 0.0
+        blocks = [self._pings(R, v, bias, m)]
+        blocks += [self._headings(R, heading, sd) for heading, sd in given.headings]
+        if given.depth is not None:
+            arm, sd = given.arm("depth"), given.config.depth.sd_m
+            H = np.concatenate([-(R @ skew(arm))[:, 2:], R[:, 2:], np.zeros((n, 1, 10))], axis=2)
+            blocks.append(huber((given.depth - p[:, 2] - (R @ arm)[:, 2])[:, None] / sd, H / sd))
+        if len(given.fixes[0]):
+            blocks.append(self._fixes(R, p, v))
+        r, H = (np.concatenate([block[k] for block in blocks], axis=1) for k in (0, 1))
+        linear, unit = self.native.linearize(self.values), gtsam.noiseModel.Unit.Create(r.shape[1])
+        for k in range(n):
+            terms = [(X(k), H[k, :, :6]), (V(k), H[k, :, 6:9]), (B(k), H[k, :, 9:15])]
+            terms += [(M, H[k, :, 15:])] if self.misaligned else []
+            # a conditional is a Jacobian factor, and the only one the bindings make of more than three keys
+            linear.push_back(gtsam.GaussianConditional(terms, 1, r[k], unit))
+        return linear
+
+    def _pings(self, R: Array, v: Array, bias: Array, m: float) -> tuple[Array, Array]:
+        """The velocity at the DVL's arm, turned by the misalignment."""
+        _, measured, root = self.given.pings
+        arm, rate = self.given.arm("dvl"), self.given.rate
+        own = np.einsum("nji,nj->ni", R, v)
+        at_arm = own + np.cross(rate - bias, arm)
+        turn = matrix_from_rpy([0.0, 0.0, -m])
+        expected = at_arm @ turn.T
+        by_m = -np.cross([0.0, 0.0, 1.0], expected)[:, :, None]
+        by_bias = np.broadcast_to(turn @ skew(arm), (len(v), 3, 3))
+        none = np.zeros((len(v), 3, 3))
+        H = [turn @ skew(own), none, turn @ np.swapaxes(R, 1, 2), none, by_bias, by_m]
+        return huber((measured - expected) @ root.T, root @ np.concatenate(H, axis=2))
+
+    def _headings(self, R: Array, heading: Array, sd: float) -> tuple[Array, Array]:
+        cos2 = R[:, 0, 0] ** 2 + R[:, 1, 0] ** 2
+        H = np.zeros((len(R), 1, 16))
+        H[:, 0, 1], H[:, 0, 2] = R[:, 2, 1] / cos2, R[:, 2, 2] / cos2
+        off = wrap_angle(heading - np.arctan2(R[:, 1, 0], R[:, 0, 0]))
+        return huber(off[:, None] / sd, H / sd)
+
+    def _fixes(self, R: Array, p: Array, v: Array) -> tuple[Array, Array]:
+        """The last fix that is nearest to a ping."""
+        k, since, measured = self.given.fixes
+        arm, sd = self.given.arm("fix"), self.given.config.fix.sd_m
+        r, H = np.zeros((self.count, 2)), np.zeros((self.count, 2, 16))
+        expected = p[k] + R[k] @ arm + since[:, None] * v[k]
+        r[k] = (measured - expected[:, :2]) / sd
+        H[k, :, :3], H[k, :, 3:6] = -(R[k] @ skew(arm))[:, :2] / sd, R[k][:, :2] / sd
+        H[k, :, 6:9] = since[:, None, None] * np.eye(3)[:2] / sd
+        return huber(r, H)
+
+
+X, V, B = (lambda k, letter=letter: gtsam.symbol(letter, k) for letter in "xvb")
+M = gtsam.symbol("m", 0)
+
+
+def huber(r: Array, H: Array) -> tuple[Array, Array]:
+    """Whitened residuals and Jacobians, weighted."""
+    weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.linalg.norm(r, axis=1), 1e-9)))
+    return weight[:, None] * r, weight[:, None, None] * H
+
+
+# ------------------------------------------------------------------ pyins
+
+
+@dataclass
+class PingMatrices:
+    """What pyins takes for a measurement: data, and its matrices at a time; here of a ping."""
+
+    data: pd.DataFrame
+    arm: Array
+    cov: Array
+
+    def compute_matrices(self, time: float, pva: pd.Series, error_model: Any) -> tuple[Array, Array, Array] | None:
+        """Estimate less measurement, its derivative by the state, its noise; None where there is no measurement."""
+        if time not in self.data.index:
+            return None
+        own = attitude_of(pva).T @ pva[["VN", "VE", "VD"]] + np.cross(pva[["rate_x", "rate_y", "rate_z"]], self.arm)
+        z = np.asarray(own - self.data.loc[time].to_numpy(), float)
+        return z, error_model.body_velocity_error_jacobian(pva), self.cov
+
+
+@dataclass
+class HeadingMatrices:
+    """The same of a compass [deg]."""
+
+    data: pd.DataFrame
+    sd: float
+
+    def compute_matrices(self, time: float, pva: pd.Series, error_model: Any) -> tuple[Array, Array, Array] | None:
+        """As `PingMatrices`."""
+        if time not in self.data.index:
+            return None
+        z = (pva["heading"] - self.data.loc[time, "heading"] + 180.0) % 360.0 - 180.0
+        return np.array([z]), error_model.transform_to_output(pva)[[error_model.DHEADING]], np.array([[self.sd**2]])
+
+
+@dataclass
+class PlaceMatrices:
+    """The same of a depth (axis 2), or of north and east (0, 1), about an origin."""
+
+    data: pd.DataFrame
+    axes: list[int]
+    arm: Array
+    sd: float
+    origin: Array
+
+    def compute_matrices(self, time: float, pva: pd.Series, error_model: Any) -> tuple[Array, Array, Array] | None:
+        """As `PingMatrices`."""
+        from pyins.transform import lla_to_ned
+
+        if time not in self.data.index:
+            return None
+        own = (
+            lla_to_ned(np.asarray(pva[["lat", "lon", "alt"]], float)[None], self.origin)[0]
+            + attitude_of(pva) @ self.arm
+        )
+        z = own[self.axes] - self.data.loc[time].to_numpy()
+        return z, error_model.position_error_jacobian(pva, self.arm)[self.axes], self.sd**2 * np.eye(len(self.axes))
+
+
+def attitude_of(pva: pd.Series) -> Array:
+    """R_nb of a row of pyins."""
+    return np.asarray(matrix_from_rpy(np.deg2rad(pva[["roll", "pitch", "heading"]].to_numpy(float))))
+
+
+def pyins_measurements(given: Measured, origin: Array) -> list[Any]:
+    """Pings, headings, depths and fixes, each of a class of its own, by whose names pyins sorts them."""
+    config, (at, velocity_b, root) = given.config, given.pings
+    ping = PingMatrices(
+        pd.DataFrame(velocity_b, at, ["VX", "VY", "VZ"]), given.arm("dvl"), np.linalg.inv(root.T @ root)
+    )
+    found: list[Any] = [ping]
+    for heading, sd in given.headings:
+        found.append(HeadingMatrices(pd.DataFrame({"heading": np.rad2deg(heading)}, at), np.rad2deg(sd)))
+    if given.depth is not None:
+        depth = pd.DataFrame({"down": given.depth}, at)
+        found.append(PlaceMatrices(depth, [2], given.arm("depth"), config.depth.sd_m, origin))
+    if len(given.fixes[0]):
+        fixes = pd.DataFrame(given.fixes[2], given.log["fix"].time, ["north", "east"])
+        found.append(PlaceMatrices(fixes, [0, 1], given.arm("fix"), config.fix.sd_m, origin))
+    for k, one in enumerate(found):
+        one.__class__ = type(f"{type(one).__name__}{k}", (type(one),), {})
+    return found
+
+
+def pyins_filter(given: Measured, turning_earth: bool) -> Trajectory:
+    """`run_feedback_filter` with measurements of our own, as its documentation says to write them.
+
+    pyins always has a rotating ellipsoid. A log of a flat Earth at rest gets the latitude of its gravity, and the
+    Earth's rate added to its gyro's.
+    """
+    from pyins import earth, strapdown, transform
+    from pyins.filters import run_feedback_filter
+    from pyins.inertial_sensor import EstimationModel
+    from pyins.util import ACCEL_COLS, GYRO_COLS, LLA_COLS, RPH_COLS, VEL_COLS
+
+    config, (t, force, rate), at = given.config, given.imu, given.pings[0]
+    latitude = config.environment.latitude_deg
+    if not turning_earth:
+        latitudes = np.linspace(0.0, 90.0, 9001)
+        latitude = latitudes[np.abs(earth.gravity(latitudes, 0.0) - config.environment.gravity_mps2).argmin()]
+        R = given.attitude[np.clip(np.searchsorted(at, t), 0, len(at) - 1)]
+        rate = rate + np.einsum("nji,j->ni", R, earth.rate_n(latitude))
+    origin = np.array([latitude, 0.0, 0.0])
+    imu = pd.DataFrame(np.hstack([rate, force]), t, [*GYRO_COLS, *ACCEL_COLS]).loc[at[0] :]
+    rpy = np.rad2deg([given.tilt[0][0], given.tilt[1][0], given.heading[0]])
+    lla = transform.perturb_lla(origin, given.start)
+    columns = [*LLA_COLS, *VEL_COLS, *RPH_COLS]
+    pva = pd.Series([*lla, *dead_reckoning(given).v_n[0], *rpy], columns, name=float(imu.index[0]))
+    start, noise, unit = config.start, config.imu.noise, config.imu
+    found = run_feedback_filter(
+        pva,
+        *(start.position_sd_m, FIRST_SD_MPS, start.tilt_sd_deg, start.heading_sd_deg),
+        strapdown.compute_increments_from_imu(imu, "rate"),
+        EstimationModel(np.deg2rad(unit.gyr_bias_sd_dps), noise.gyr, noise.gyr_walk),
+        EstimationModel(unit.acc_bias_sd_mps2, noise.acc, noise.acc_walk),
+        pyins_measurements(given, origin),
+        time_step=COVARIANCE_S,
+    )
+    sd = found.trajectory_sd
+    track = found.trajectory.loc[sd.index]
+    cov = np.zeros((len(sd), 3, 3))
+    cov[:, [0, 1, 2], [0, 1, 2]] = sd[["north", "east", "down"]].to_numpy() ** 2  # it gives no correlations
+    p_n = transform.lla_to_ned(track[LLA_COLS].to_numpy(), origin)
+    R_nb = np.asarray(transform.mat_from_rph(track[RPH_COLS]))
+    return given.of_body(sd.index.to_numpy(), p_n, R_nb, track[VEL_COLS].to_numpy(), cov, np.full_like(cov, np.nan))
+
+
+# ------------------------------------------------------------------ the dives
+
+
+def falcon(seeds: range) -> Iterator[Task]:
+    """The dive that ships."""
+    folder = ROOT / "data" / "falcon"
+    config = load_config(folder / "config.yaml")
+    truth = read_reference(folder / "truth.csv.gz")
+    yield Task("data/falcon", read_log(folder / "log.csv.gz", config), config, truth)
+
+
+def lawnmower(seeds: range, minutes: float) -> Iterator[Task]:
+    """`rovgraph simulate lawnmower`: every calibration variable is drawn from its default prior."""
+    for seed in seeds:
+        dive, config = simulated("lawnmower", seed, choices=Choices(duration=60.0 * minutes))
+        truth = dive.truth.every(100)
+        name = f"lawnmower, {minutes:g} minutes, seeds {span(seeds)}"
+        yield Task(name, Log.from_frame(dive.log_frame, config), config, truth)
+
+
+def campaign(grade: str, seeds: range) -> Iterator[Task]:
+    """A healthy dive of the fault campaign."""
+    for seed in seeds:
+        dive = make_dive(CASES[GRADES[grade]], seed)
+        config = Config.model_validate(dive.configuration)
+        t = np.arange(0.0, dive.motion.duration, 1.0)
+        truth = Trajectory.certain(t, dive.motion.local(t), dive.motion.C_nb(t), dive.motion.v_n(t))
+        log = Log.from_frame(log_table(dive.streams), config)
+        yield Task(f"campaign, {grade}, seeds {span(seeds)}", log, config, truth, turning_earth=True)
+
+
+def ictineu(folder: Path) -> Iterator[Task]:
+    """The recorded dive; GPS of the first 600 s only, and all of it as the reference."""
+    config = load_config(folder / "ictineu.yaml")
+    log = read_log(folder / "log.csv.gz", config)
+    truth = read_reference(folder / "reference.csv.gz")
+    yield Task("Ictineu after 600 s", log, config, truth, turning_earth=True, after=600.0)
+
+
+def span(seeds: range) -> str:
+    return f"{seeds[0]} to {seeds[-1]}"
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of one method on one dive: horizontal rms error [m], NEES per degree of freedom, processor time [s]."""
+
+    rms: float
+    nees: float
+    seconds: float
+
+
+def score(task: Task, track: Trajectory, seconds: float) -> Score:
+    metrics = evaluate(track, task.truth, task.after)
+    return Score(metrics.rms_m, np.nan if metrics.nees is None else 0.5 * metrics.nees, seconds)
+
+
+def ours(task: Task) -> Iterator[tuple[str, Score]]:
+    """Both estimates of `rovgraph smooth`, which are made together."""
+    began = time.process_time()
+    estimates = smooth(task.log, task.config, "both").estimates
+    seconds = time.process_time() - began
+    for estimate in estimates:
+        if estimate.kind in ("smoothed", "filtered"):
+            yield f"rovgraph, {estimate.kind}", score(task, estimate.trajectory, seconds)
+
+
+PEERS: dict[str, Callable[[Measured, Task], Trajectory]] = {
+    "dead reckoning": lambda given, task: dead_reckoning(given),
+    "plain GTSAM": lambda given, task: Graph(given, misaligned=False).solve(),
+    "plain GTSAM with misalignment": lambda given, task: Graph(given, misaligned=True).solve(),
+    "pyins": lambda given, task: pyins_filter(given, task.turning_earth),
+}
+
+
+def by_peers(task: Task, methods: Sequence[str]) -> Iterator[tuple[str, Score]]:
+    """Some methods on a dive, by their names in the table."""
+    if "rovgraph" in methods:
+        yield from ours(task)
+    for name in (name for name in PEERS if name in methods):
+        began = time.process_time()
+        track = PEERS[name](Measured(task.config, task.log), task)
+        yield name, score(task, track, time.process_time() - began)
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    dives = ["falcon", "lawnmower", *GRADES, "ictineu"]
+    parser.add_argument("dives", nargs="*", metavar="DIVE", help=", ".join(dives))
+    parser.add_argument("--seeds", type=int, nargs=2, default=[5, 24], metavar=("FIRST", "LAST"))
+    parser.add_argument("--minutes", type=float, default=60.0, help="of lawnmower")
+    every = ["rovgraph", *PEERS]
+    parser.add_argument("--methods", nargs="+", choices=every, default=every, metavar="METHOD", help=", ".join(every))
+    parser.add_argument("--ictineu", type=Path, default=ROOT.parent / "shared" / "data" / "ictineu", metavar="FOLDER")
+    given = parser.parse_args()
+    if unknown := set(given.dives) - set(dives):
+        parser.error(f"unknown dive {min(unknown)}; known are {', '.join(dives)}")
+    warnings.simplefilter("ignore")
+    methods = [name for name in given.methods if name != "pyins" or find_spec("pyins") is not None]
+    if len(methods) < len(given.methods):
+        print("pyins is left out: pip install python-ins\n")
+    seeds = range(given.seeds[0], given.seeds[1] + 1)
+    print("| dive | method | rms [m] | median | NEES | processor time a dive |\n|---|---|---|---|---|---|")
+    for dive in given.dives or dives:
+        if dive == "ictineu" and not (given.ictineu / "log.csv.gz").is_file():
+            print(f"| Ictineu | absent: {given.ictineu}; name it with --ictineu | | | | |")
+            continue
+        makers = {
+            "falcon": falcon,
+            "lawnmower": lambda of: lawnmower(of, given.minutes),
+            "ictineu": lambda _: ictineu(given.ictineu),
+        }
+        tasks = makers[dive](seeds) if dive in makers else campaign(dive, seeds)
+        name, scores = dive, dict[str, list[Score]]()
+        for task in tasks:
+            name = task.name
+            for method, one in by_peers(task, methods):
+                scores.setdefault(method, []).append(one)
+        for method, rows in scores.items():
+            print(f"| {name} | {method} | {row(rows)} |", flush=True)
+
+
+def row(scores: list[Score]) -> str:
+    """Root of the mean square error, its median, mean NEES and mean time."""
+    rms, nees, seconds = (np.array([getattr(one, part) for one in scores]) for part in ("rms", "nees", "seconds"))
+    honest = "–" if np.isnan(nees).all() else f"{np.nanmean(nees):.2f}"
+    return f"{np.sqrt(np.mean(rms**2)):.2f} | {np.median(rms):.2f} | {honest} | {seconds.mean():.1f} s"
+
+
+if __name__ == "__main__":
+    main()
