@@ -64,6 +64,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     unfrozen = log_without(log, frozen)
     known: dict[Check, Check] = {
         dvl_and_imu: partial(dvl_and_imu, examined=examined),
+        regularity: partial(regularity, frozen=frozen),
         standstill: partial(standstill, frozen=frozen),
         **{check: partial(_of_motion, check, unfrozen) for check in MOTION_CHECKS if frozen},
     }

@@ -30,7 +30,10 @@ NOISE_STEPS = 4.0  # of a sensor's resolution, that its second differences excee
 ALIVE = 1e-6  # spread of an IMU's signals that are more than rounding [m/s^2, rad/s]
 CLEAR_SPEED = 0.1  # that is no standstill [m/s]
 AROUND_SECONDS, AROUND_PERIODS = 5.0, 6.0  # to measurements that tell of a zero between them, the longer of the two
-STOPPING = 0.3  # by which a velocity changes suddenly; of a REMUS' pings 1 in 500 does [m/s^2]
+STOPPING, BRAKING = (
+    0.3,
+    1.0,
+)  # change of velocity that vehicles seldom have (a REMUS 1 ping in 500), and hardly any has [m/s^2]
 VERTICALLY = 2.0  # fastest descent or climb [m/s]
 TURNING = np.deg2rad(60.0)  # fastest turn [rad/s]
 HALF, ABOUT = 0.5, 0.1  # of the speed of the pings around: half, and how far from it
@@ -97,7 +100,7 @@ class Company:
     ----------
     columns : count of the first ones, which are zero together
     least : distance of its neighbours from zero that is clear
-    rate : by which the vehicle may come closer to zero [1/s]
+    seldom, never : rates at which vehicles seldom and never come closer to zero [1/s]
     told : the neighbours' distance in words
     scale : to the unit of these
     rests : a vehicle at rest measures zero
@@ -106,7 +109,8 @@ class Company:
 
     columns: int
     least: float
-    rate: float
+    seldom: float
+    never: float
     told: str
     scale: float = 1.0
     rests: bool = False
@@ -130,24 +134,29 @@ class Company:
         """
         return self.size(near) - np.maximum(self.size(self.between(further, near)) - noise, 0.0)
 
-    def least_left(self, seconds: Array) -> Array:
-        """What is left at least where the vehicle cannot have come to zero in some time, shape (...)."""
-        return np.maximum(self.least, self.rate * seconds)
+    def cannot_stop(self, left: Array, seconds: Array) -> NDArray[np.bool_]:
+        """Whether so much distance from zero is left that no vehicle comes to it in some time, shape (...)."""
+        return np.asarray(left > np.maximum(self.least, self.never * seconds))
+
+    def seldom_stops(self, left: Array, seconds: Array) -> NDArray[np.bool_]:
+        """The same of most vehicles."""
+        return np.asarray(left > np.maximum(self.least, self.seldom * seconds))
 
 
 def companies(config: Config) -> Mapping[str, Company]:
     """Sensors whose exact zeros may be none, each with what tells."""
-    speed = Company(3, CLEAR_SPEED, STOPPING, "it moves at {:.2f} m/s", rests=True)
-    heading = Company(1, np.deg2rad(10.0), TURNING, "it is at {:.0f} deg", np.rad2deg(1.0), angle=True)
+    speed = Company(3, CLEAR_SPEED, STOPPING, BRAKING, "it moves at {:.2f} m/s", rests=True)
+    heading = Company(1, np.deg2rad(10.0), TURNING, TURNING, "it is at {:.0f} deg", np.rad2deg(1.0), angle=True)
+    fastest = config.dvl.max_speed_mps
     return {
         "dvl": speed,
         "dvl_water": speed,
-        "depth": Company(1, 0.5, VERTICALLY, "it is {:.1f} m deep"),
+        "depth": Company(1, 0.5, VERTICALLY, VERTICALLY, "it is {:.1f} m deep"),
         "ahrs": heading,
         "dvl_heading": heading,
         "vehicle_heading": heading,
         "vehicle_tilt": replace(heading, columns=2),
-        "fix": Company(2, max(FIX_DISTANCE, SURE * config.fix.sd_m), config.dvl.max_speed_mps, "it is {:.0f} m away"),
+        "fix": Company(2, max(FIX_DISTANCE, SURE * config.fix.sd_m), fastest, fastest, "it is {:.0f} m away"),
     }
 
 
@@ -174,12 +183,11 @@ def false_values(log: Log, config: Config) -> list[FrozenStretch]:
         if sensor not in log:
             continue
         stream = _valid(log[sensor])
-        zeros = [*_zeros(stream, company)]
-        found += zeros
+        found += _zeros(stream, company)
         if company.rests:
-            rest = without(stream.take(np.isfinite(stream.data[:, :3]).all(axis=1)), zeros)
-            halves = [*_halves(rest, company)]
-            found += [*halves, *_repeated(without(rest, halves))]
+            known = stream.take(np.isfinite(stream.data[:, :3]).all(axis=1) & stream.data[:, :3].any(axis=1))
+            halves = [*_halves(known, company)]
+            found += [*halves, *_repeated(without(known, halves))]
     return found
 
 
@@ -236,8 +244,9 @@ def _is_long(time: Array, runs: NDArray[np.int64], counts: NDArray[np.int64]) ->
 def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
     """Exact zeros that the vehicle cannot have come to, or gone from.
 
-    Where a sensor at rest shows no noise, it may have stopped at an obstacle: zeros have to begin and end abruptly.
-    Where it does, one side tells, and so do neighbours that move alike on both, if only a moment lies between.
+    Where resolution hides the noise, zeros have to begin and end abruptly, as it may have been stopped by an obstacle.
+    Where it does not, one side tells, and so do neighbours that move on both, if only a moment lies between. Where the
+    noise shows at rest, too, or many zeros are false by now, zeros are no rest, and less abruptness will do.
     """
     values, time = stream.data[:, : company.columns], stream.time
     zero = (values == 0.0).all(axis=1)
@@ -254,24 +263,33 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
         there = (np.minimum(near, further) >= 0) & (np.maximum(near, further) < len(known))
         near, further = (known[np.clip(k, 0, len(known) - 1)] for k in (near, further))
         there &= np.abs(time[further] - time[edge]) <= reach
-        left, seconds = company.left(values[near], values[further], noise), np.abs(time[near] - time[edge])
-        sides.append((near, there & (left > company.least), there & (left > company.least_left(seconds))))
-    near, moves, abrupt = (np.array(part) for part in zip(*sides, strict=True))
-    lasts = time[last] - time[first] >= MIN_SECONDS
+        left = np.where(there, company.left(values[near], values[further], noise), -np.inf)
+        sides.append((near, left, np.abs(time[near] - time[edge])))
+    near, left, seconds = (np.array(part) for part in zip(*sides, strict=True))
+    abrupt, counts, lasts = (
+        company.cannot_stop(left, seconds),
+        last - first + 1,
+        time[last] - time[first] >= MIN_SECONDS,
+    )
     if noisy:
         mean = _mean(values, time, near[0], first, near[1], company)
-        false = abrupt.any(axis=0) | (moves.all(axis=0) & (company.size(mean) > company.least) & ~lasts)
+        false = abrupt.any(axis=0) | (
+            (left > company.least).all(axis=0) & (company.size(mean) > company.least) & ~lasts
+        )
+        slow = (company.size(values[known]) < company.least).sum()
+        if 2 * (slow + counts[false].sum()) >= counts[~false].sum():
+            false |= company.seldom_stops(left, seconds).any(axis=0)
     else:
         false = abrupt.all(axis=0) if company.rests else abrupt.any(axis=0)
     size = company.scale * company.size(values[near])
-    long = false & lasts & (last - first + 1 >= MIN_REPEATS)
+    long = false & lasts & (counts >= MIN_REPEATS)
     for k in np.flatnonzero(long):
-        side = int(np.argmax(abrupt[:, k]))
+        side = int(np.argmax(left[:, k]))
         why = f"{company.told.format(size[side, k])} just {('before', 'after')[side]}"
         yield FrozenStretch(stream.sensor, "zero", time[first[k] : last[k] + 1], why)
     if (single := false & ~long).any():
         index = np.concatenate([np.arange(first[k], last[k] + 1) for k in np.flatnonzero(single)])
-        why = company.told.format(np.median(size[:, single][moves[:, single]]))
+        why = company.told.format(np.median(size[:, single][left[:, single] > company.least]))
         yield FrozenStretch(stream.sensor, "zero", time[index], f"{why} next to them", True)
 
 
