@@ -52,7 +52,7 @@ class Dive:
     estimates : "smoothed" and "filtered" as requested, and "dead_reckoning"
     initial : effective configuration, start and assumptions
     left_out : (sensor, reason) -> count of measurements that never reached the graph
-    frozen : intervals in which a sensor repeated its values; ignored too
+    frozen : measurements that are none, such as values that repeat; ignored too
     statistics : numbers that healthy dives keep small
     """
 
@@ -238,8 +238,8 @@ def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch], gaps: list[Atti
     """What never reached the graph, and why."""
     counts = dict(batch.assembler.left_out)
     for stretch in frozen:
-        why = (stretch.sensor, "frozen")
-        counts[why] = counts.get(why, 0) + stretch.count
+        why = (stretch.sensor, stretch.reason)
+        counts[why] = counts.get(why, 0) + len(stretch.time)
     for gap in gaps:
         if gap.pings:
             why = ("dvl", f"no {gap.part} for more than {LONGEST_CRUISED_S:g} s")

@@ -35,7 +35,7 @@ def held(log: Log, sensor: str) -> Log:
 @pytest.mark.parametrize("sensor", ["dvl", "mag", "dvl_heading", "ahrs", "depth"])
 def test_a_value_held_for_a_minute_is_frozen_and_no_other_is(case, sensor):
     (found,) = frozen_stretches(held(case.log, sensor), case.config)
-    assert (found.sensor, found.zero) == (sensor, False)
+    assert (found.sensor, found.kind) == (sensor, "held")
     assert found.first == pytest.approx(FROM, abs=0.5)
     assert found.last == pytest.approx(TO, abs=0.5)
     assert frozen_stretches(case.log, case.config) == []
@@ -43,7 +43,7 @@ def test_a_value_held_for_a_minute_is_frozen_and_no_other_is(case, sensor):
 
 def test_without_frozen_leaves_out_the_stretch_alone(case):
     log, (found,) = without_frozen(held(case.log, "dvl"), case.config)
-    assert len(log["dvl"]) == len(case.log["dvl"]) - found.count
+    assert len(log["dvl"]) == len(case.log["dvl"]) - len(found.time)
     assert not ((log["dvl"].time >= found.first) & (log["dvl"].time <= found.last)).any()
     assert without_frozen(case.log, case.config)[0] is case.log
 

@@ -11,7 +11,7 @@ from functools import partial
 from rovgraph.check.agreement import headings, vertical
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
-from rovgraph.check.fixes import repeated, track
+from rovgraph.check.fixes import track
 from rovgraph.check.frozen_sensors import standstill
 from rovgraph.check.jumps import Examined, bridge_jumps
 from rovgraph.check.outlook import plan
@@ -23,7 +23,7 @@ from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
 from rovgraph.log import Log
-from rovgraph.log.frozen import without_frozen
+from rovgraph.log.frozen import frozen_stretches, log_without
 from rovgraph.sensors import Level
 
 __all__ = ["Finding", "Level", "Report", "Timing", "bridge_jumps", "examine", "warn"]
@@ -42,7 +42,6 @@ CHECKS: tuple[Check, ...] = (
     frozen_imu,
     dvl_and_imu,
     vertical,
-    repeated,
     start,
     track,
     places,
@@ -61,9 +60,11 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
     examined : what `bridge_jumps` knows of the log with this configuration
     """
     config = Config() if config is None else config
-    unfrozen, frozen = without_frozen(log, config)
+    frozen = frozen_stretches(log, config)
+    unfrozen = log_without(log, frozen)
     known: dict[Check, Check] = {
         dvl_and_imu: partial(dvl_and_imu, examined=examined),
+        regularity: partial(regularity, frozen=frozen),
         standstill: partial(standstill, frozen=frozen),
         **{check: partial(_of_motion, check, unfrozen) for check in MOTION_CHECKS if frozen},
     }

@@ -25,12 +25,14 @@ class Finding:
     level : "error": cannot be worked with as it is
     text : one sentence, with the numbers it rests on
     clock : what it says of a clock: "epoch", "lag" or "jump"; empty where it is about something else
+    share : of the sensor's measurements, that an estimate leaves out for it; None where it is about something else
     """
 
     sensor: str
     level: Level
     text: str
     clock: Literal["", "epoch", "lag", "jump"] = ""
+    share: float | None = None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding, repeats, since, valid_pings
+from rovgraph.check.findings import Finding, valid_pings
 from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, matrix_from_rpy, rotate
@@ -32,34 +32,7 @@ LAG_WARNING = 0.5  # [s]
 SURE = 5.0  # standard deviations
 EVIDENCE = 40.0  # in chi-square
 CLIPPED = 4.0  # times the median residual, which counts no more
-HELD_SECONDS = 10.0  # for which a fix that repeats exactly is none
-HELD = 5  # fixes
 Complexes = NDArray[np.complex128]
-
-
-def repeated(log: Log, config: Config) -> Iterator[Finding]:
-    """Fixes that stay exactly where they were while the DVL moves."""
-    if not {"dvl", "fix"} <= log.sensors or len(log["fix"]) < HELD:
-        return
-    fix, pings = log["fix"], valid_pings(log["dvl"])
-    same = repeats(fix.data[:, :2])
-    begins = np.flatnonzero(~same)
-    counts = np.diff(np.append(begins, len(fix)))
-    longest = int(np.argmax(counts))
-    if counts[longest] < max(HELD, 3.0 * float(np.median(counts[counts > 0])) if len(counts) > 3 else HELD):
-        return
-    first, last = fix.time[begins[longest]], fix.time[begins[longest] + counts[longest] - 1]
-    during = (pings.time >= first) & (pings.time <= last)
-    speed = float(np.median(np.linalg.norm(pings.data[during, :3], axis=1))) if during.any() else 0.0
-    way = speed * (last - first)
-    if last - first >= HELD_SECONDS and way > max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
-        where = "one point throughout" if counts[longest] == len(fix) else "one point exactly"
-        yield Finding(
-            "fix",
-            "warning",
-            f"{counts[longest]} fixes repeat {where}, for {last - first:.0f} s from {since(log, first)} on, "
-            f"while the DVL moves by {way:.0f} m: the receiver probably repeats its last fix; remove these rows",
-        )
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from rovgraph.config import Config
 from rovgraph.errors import warn
 from rovgraph.log import Log, Stream
 from rovgraph.log.beams import BEAMS
+from rovgraph.log.frozen import false_values, without
 
 ENOUGH_PINGS = 50
 JUMP_REACH = 10.0  # largest jump that is looked for where there is no gap [s]
@@ -95,7 +96,8 @@ def compare(log: Log, config: Config) -> Comparison | None:
     """The DVL beside the IMU; None where there is too little of them, or gravity is not where it should be."""
     if not {"dvl", "imu"} <= log.sensors or tilt(log, config) > GRAVITY_ANGLE:
         return None
-    pings, motion = valid_pings(log["dvl"]), inertial_motion(log, config)
+    pings = valid_pings(without(log["dvl"], false_values(log, config)))
+    motion = inertial_motion(log, config)
     return None if motion is None or len(pings) < ENOUGH_PINGS else Comparison(motion, pings, config)
 
 

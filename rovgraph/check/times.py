@@ -1,6 +1,6 @@
 """Which sensors there are, and when their measurements came."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import motion_model
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
-from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, equal_runs
+from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, FrozenStretch, equal_runs, without
 from rovgraph.sensors import SENSORS
 
 GAP_PERIODS = 5.0  # longer than this many periods is a gap
@@ -84,8 +84,8 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
             )
 
 
-def regularity(log: Log, config: Config) -> Iterator[Finding]:
-    """Rates, gaps, jitter and repeated samples."""
+def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -> Iterator[Finding]:
+    """Rates, gaps, jitter and repeated samples; ``frozen`` are measurements that another check names."""
     for sensor, stream in log.streams.items():
         t = timing(stream)
         if np.isnan(t.rate):
@@ -112,7 +112,7 @@ def regularity(log: Log, config: Config) -> Iterator[Finding]:
                 f"times jitter by {t.jitter:.3g} s around a period of {1 / t.rate:.3g} s: "
                 "they may be times of arrival; log times of measurement",
             )
-        again = _repeated_for_a_moment(stream) / t.count if sensor in ("imu", "mag", "dvl") else 0.0
+        again = _repeated_for_a_moment(without(stream, frozen)) / t.count if sensor in ("imu", "mag", "dvl") else 0.0
         if again > REPEATED and _moves(stream):
             yield Finding(
                 sensor,
@@ -136,10 +136,10 @@ def _burst_period(stream: Stream) -> float | None:
 
 
 def _repeated_for_a_moment(stream: Stream) -> int:
-    """Measurements that repeat the one before, but for those of times in which the sensor may be frozen."""
+    """Measurements that repeat the one before, but for zeros, and times in which the sensor may be frozen."""
     values = told(stream)
     first, last = equal_runs(values).T
-    known = ~np.isnan(values[first]).all(axis=1)
+    known = ~np.isnan(values[first]).all(axis=1) & (values[first, :3] != 0.0).any(axis=1)
     if not known.any():
         return 0
     counts, seconds = (last - first + 1)[known], (stream.time[last] - stream.time[first])[known]

@@ -53,7 +53,7 @@ class Evidence:
     estimates : smoothed, filtered or both
     intervals : of the estimates' keyframes
     optimum : of the smoothed estimate, where a batch solver found it
-    frozen : what was left out since a sensor repeated itself
+    frozen : what was left out since it is none
     log : of the dive
     attitude_gaps : times without heading or tilt, of a dive without an IMU
     left_out : (sensor, reason) -> count of measurements that never reached the graph

@@ -16,10 +16,11 @@ OF_RESIDUALS = ("rejected", "too large", "lasting")
 
 
 def frozen(evidence: Evidence) -> Iterator[Statistic]:
-    """How long a sensor repeated itself; those measurements were left out."""
+    """How long a sensor repeated itself; those measurements were left out. Single ones between others cost nothing."""
     by_sensor: dict[str, list[tuple[float, float]]] = {}
     for stretch in evidence.frozen:
-        by_sensor.setdefault(stretch.sensor, []).append((stretch.first, stretch.last))
+        if not stretch.single:
+            by_sensor.setdefault(stretch.sensor, []).append((stretch.first, stretch.last))
     for sensor, times in by_sensor.items():
         seconds = sum(last - first for first, last in times)
         yield frozen_for(sensor, times[0][0], times[-1][1], seconds, len(times), evidence.start)

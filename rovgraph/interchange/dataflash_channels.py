@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.interchange.ardupilot import BODY, CLOCK, EARTH_FIELD_UT, MAGNETIC, declination, depth_of, thrusters
 from rovgraph.interchange.dataflash_messages import Messages
-from rovgraph.interchange.fixes import ONE_POINT, RANGE_SD_M, new_fixes, one_point
+from rovgraph.interchange.fixes import NO_DILUTION, ONE_POINT, RANGE_SD_M, new_fixes, one_point
 from rovgraph.interchange.recording import Channel
 from rovgraph.spilling import computed, every, holds
 
@@ -283,7 +283,8 @@ def fixes(source: Source) -> Channel | None:
         source.where(np.zeros(len(lat), dtype=bool), "one point that repeats")
         return None
     source = source.where(new_fixes(source.raw("GMS"), lat, lon), "nowhere on Earth, or the one before repeated")
-    sd = RANGE_SD_M * source.messages.value("HDop")
+    dilution = source.messages.value("HDop")
+    sd = np.where(dilution < NO_DILUTION, RANGE_SD_M * dilution, np.nan)
     columns = {"time": source.time(), "fix_lat": source.si("Lat"), "fix_lon": source.si("Lng"), "fix_sd": sd}
     return source.channel("fix", columns, "Lat, Lng; sd 3 m times HDop")
 

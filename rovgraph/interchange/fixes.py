@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 
+NO_DILUTION = 99.0  # and more: how receivers say that they do not know their dilution of precision
 RANGE_SD_M = 3.0  # of a satellite's range; with the dilution of precision that of a fix
 ONE_POINT = "all fixes are of one point, which no receiver does: the origin of the dive, and no fixes"
 FEW = 10  # fixes of one point that may be a vehicle at rest

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.fixes import RANGE_SD_M, new_fixes
+from rovgraph.interchange.fixes import NO_DILUTION, RANGE_SD_M, new_fixes
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 
@@ -40,7 +40,7 @@ class Gpx:
                 timeless += 1
                 continue
             dop = point.horizontal_dilution
-            sd = RANGE_SD_M * dop if dop is not None and 0.0 < dop < 99.0 else np.nan
+            sd = RANGE_SD_M * dop if dop is not None and 0.0 < dop < NO_DILUTION else np.nan
             rows.extend((point.time.timestamp(), point.latitude, point.longitude, sd))
         options.progress(1, 1)
         if not rows:

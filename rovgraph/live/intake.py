@@ -12,10 +12,12 @@ from rovgraph.config import Config, Mag
 from rovgraph.geometry import Array
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.log import Measurement
+from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 
 SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
 OTHERS_SPACING_S = 0.005
 _STREAM = {GEODETIC: "fix"}  # where a reading goes by another name
+ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
 PATCH_M = 10.0  # so far around a point latitude and longitude are linear, to a tenth of a millimetre up to 80 degrees
 
 
@@ -63,6 +65,7 @@ class Intake:
     Attributes
     ----------
     origin : latitude and longitude [deg] of north = east = 0; None until the first fix, unless it is configured
+    news : (sensor, text) to be told, since they were last taken
     """
 
     def __init__(self, config: Config, left_out: Counter[tuple[str, str]]) -> None:
@@ -71,7 +74,10 @@ class Intake:
         self._mag = None if config.imu.mag == Mag() else config.imu.mag
         self._left_out = left_out
         self._newest: dict[str, float] = {}
+        self.news: list[tuple[str, str]] = []
         self._sizes: dict[str, int] = {}
+        self._sds: dict[str, tuple[int, int]] = {}  # column -> how many sds it has stated, and placeholders of these
+        self._unknown: set[str] = set()  # columns of which that is told
         self._local = False  # whether fixes come in north and east
         self._patch: _Patch | None = None
 
@@ -102,7 +108,25 @@ class Intake:
             self._left_out[sensor, "more often than can be used"] += 1
             return None
         self._newest[sensor] = max(time, newest)
-        return Measurement(time, sensor, values, 0)
+        return Measurement(time, sensor, self._with_known_sd(sensor, values), 0)
+
+    def _with_known_sd(self, sensor: str, values: Array) -> Array:
+        """The values of a measurement; its own sd is NaN where it is a placeholder, as most of that sensor are."""
+        for column, sd in zip(SENSORS[sensor].columns, values.tolist(), strict=False) if sensor in SENSORS else ():
+            if not (column.is_sd and sd > 0.0):
+                continue
+            stated, held = self._sds.get(column.name, (0, 0))
+            is_held = bool(placeholders(column, np.array([sd]))[0])
+            self._sds[column.name] = stated, held = stated + 1, held + is_held
+            if is_held and stated >= ENOUGH_SDS and held > MOSTLY * stated:
+                if column.name not in self._unknown:
+                    self._unknown.add(column.name)
+                    text = f"{column.name} is {sd:g}, no sd that such an instrument has, and taken as unknown"
+                    self.news.append((sensor, f"{text}; the configuration's sd is used"))
+                return np.where(
+                    np.arange(len(values)) == SENSORS[sensor].column_names.index(column.name), np.nan, values
+                )
+        return values
 
     def fix(self, north: float, east: float, sd: float) -> Reading:
         """A fix at a place [m], in the form in which others come: of a recording with both, one form is ignored."""

@@ -137,6 +137,9 @@ class Navigator:
             for reading in own:
                 if (measurement := self._intake.measurement(at, reading)) is not None:
                     self._consider(measurement)
+        while self._intake.news:
+            sensor, text = self._intake.news.pop()
+            self.say(sensor, "assumed", text)
         return rows
 
     def take_fix(self, north: float, east: float, sd: float) -> tuple[Reading, ...]:

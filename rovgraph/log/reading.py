@@ -26,6 +26,7 @@ from rovgraph.log.streams import (
 )
 from rovgraph.log.table import Table
 from rovgraph.log.units import factors, near_miss, nearest
+from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
@@ -249,8 +250,9 @@ def _select(
     complete, partly = filled.all(axis=1), filled.any(axis=1)
     if sensor == "dvl":
         complete, partly = _pings(data, complete, partly, line, source)
-    for name in (c for c in columns if c.endswith("_sd") and is_optional(c)):
-        _known_sd(name, data[:, columns.index(name)], line, source)
+    for column in SENSORS[sensor].columns if sensor in SENSORS else ():
+        if column.is_sd:
+            _known_sd(column, data[:, columns.index(column.name)], line, source)
     if sensor == "place":
         partly = partly | ~np.isnan(data[:, 1])  # an sd that belongs to no place
     partly &= ~complete
@@ -277,15 +279,20 @@ def _pings(data: Array, complete: Bools, partly: Bools, line: Lines, source: str
     return complete | lost, partly
 
 
-def _known_sd(column: str, sd: Array, line: Lines, source: str) -> None:
-    """An sd of 0 or -1, as many instruments write it that do not know, becomes NaN."""
-    unknown = sd <= 0.0
-    if unknown.any():
-        warn(
-            f"{source}: {column}: {unknown.sum()} times 0 or less, taken as unknown; "
-            f"the configuration's sd is used; first in line {line[np.argmax(unknown)]}"
-        )
-        sd[unknown] = np.nan
+def _known_sd(column: Column, sd: Array, line: Lines, source: str) -> None:
+    """An sd of 0, -1, 9999 and the like, as many instruments write it that do not know, becomes NaN.
+
+    Placeholders among better sds stay: such a measurement is worth little.
+    """
+    held = placeholders(column, sd)
+    usual = bool(held.sum() > MOSTLY * (sd > 0.0).sum())
+    for unknown, what in ((sd <= 0.0, "0 or less"), (held & usual, "no sd that such an instrument has")):
+        if unknown.any():
+            warn(
+                f"{source}: {column.name}: {unknown.sum()} times {what}, taken as unknown; "
+                f"the configuration's sd is used; first in line {line[np.argmax(unknown)]}"
+            )
+            sd[unknown] = np.nan
 
 
 def _stream(sensor: str, cells: dict[str, Array], line: Lines, source: str) -> Stream | None:

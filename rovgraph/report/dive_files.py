@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from rovgraph.check.times import timing
 from rovgraph.config import Config
 from rovgraph.geometry import Array
-from rovgraph.log import Log, Stream
-from rovgraph.log.frozen import FrozenStretch
+from rovgraph.log import Log
+from rovgraph.log.frozen import FrozenStretch, are_in
 from rovgraph.sensors import SENSORS
 
 LIBRARIES = ("numpy", "scipy", "pandas", "numba", "gtsam")
@@ -60,7 +59,7 @@ def dvl_frame(log: Log, frozen: Sequence[FrozenStretch] = ()) -> pd.DataFrame | 
 
     Parameters
     ----------
-    frozen : times in which a sensor repeated itself: such a ping saw nothing
+    frozen : measurements that are none: such a ping saw nothing
     """
     if "dvl" not in log:
         return None
@@ -68,7 +67,7 @@ def dvl_frame(log: Log, frozen: Sequence[FrozenStretch] = ()) -> pd.DataFrame | 
     return pd.DataFrame(
         {
             "time": dvl.time,
-            "lock": ((dvl["dvl_valid"] != 0.0) & ~_in_stretches(dvl, frozen)).astype(int),
+            "lock": ((dvl["dvl_valid"] != 0.0) & ~are_in(dvl, frozen)).astype(int),
             "altitude": _altitude(log, dvl.time),
             "figure_of_merit": dvl["dvl_sd"],
             "row": dvl.row,
@@ -103,30 +102,22 @@ def left_out_frame(
     log, config : of the dive
     residuals : of the main estimate, where a weight of 0 means rejected
     stretches : times in which a sensor contradicted all others (``sensor``, ``begin``, ``end``)
-    frozen : times in which a sensor repeated itself
+    frozen : measurements that are none
     """
     parts = [*_refused(log, config, frozen), _rejected(residuals, stretches)]
     whole = pd.concat(parts, ignore_index=True)
     return whole.sort_values("time", kind="stable", ignore_index=True)
 
 
-def _in_stretches(stream: Stream, frozen: Sequence[FrozenStretch]) -> NDArray[np.bool_]:
-    """Which measurements of a stream repeat older ones."""
-    inside = np.zeros(len(stream), bool)
-    for stretch in frozen:
-        if stretch.sensor == stream.sensor:
-            inside |= (stream.time >= stretch.first) & (stream.time <= stretch.last)
-    return inside
-
-
 def _refused(log: Log, config: Config, frozen: Sequence[FrozenStretch]) -> list[pd.DataFrame]:
-    """What repeats older values, and what a sensor's own rules keep out; the first reason that holds counts."""
+    """What is none, and what a sensor's own rules keep out; the first reason that holds counts."""
     parts = []
     for name, stream in log.streams.items():
         if name not in SENSORS or not len(stream):
             continue
         taken = np.zeros(len(stream), bool)
-        for reason, bad in [("frozen", _in_stretches(stream, frozen)), *SENSORS[name].refused(stream.data, config)]:
+        none = [(stretch.reason, are_in(stream, [stretch])) for stretch in frozen if stretch.sensor == name]
+        for reason, bad in [*none, *SENSORS[name].refused(stream.data, config)]:
             new = bad & ~taken
             taken |= bad
             rows = {"time": stream.time[new], "sensor": name, "reason": reason, "row": stream.row[new]}

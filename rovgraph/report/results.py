@@ -61,7 +61,7 @@ def write_results(
     seconds : stage of the work -> wall time [s]
     alarms : what the estimates say against themselves, and advice
     warnings : what was said of the log, a line each
-    frozen : times in which a sensor repeated itself
+    frozen : measurements that are none
 
     Returns
     -------

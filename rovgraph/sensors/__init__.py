@@ -12,6 +12,7 @@ from rovgraph.sensors.model import CompiledModel, SensorModel, evaluate, innovat
 from rovgraph.sensors.place import SEEN_PLACE, PlaceOffset
 from rovgraph.sensors.position import DEPTH, FIX, Position
 from rovgraph.sensors.sensor import (
+    MOSTLY,
     SENSORS,
     Column,
     Instrument,
@@ -19,6 +20,7 @@ from rovgraph.sensors.sensor import (
     Observed,
     Sensor,
     instrument,
+    placeholders,
     register,
     settings,
     unregister,
@@ -28,6 +30,7 @@ from rovgraph.sensors.tilt import VEHICLE_TILT, Tilt
 
 __all__ = [
     "DEFAULT_DIP",
+    "MOSTLY",
     "SENSORS",
     "Column",
     "CompassHeading",
@@ -50,6 +53,7 @@ __all__ = [
     "hydrodynamics",
     "innovation",
     "instrument",
+    "placeholders",
     "register",
     "settings",
     "unregister",

@@ -164,7 +164,7 @@ DVL = Sensor(
     (
         *(Column(name, "speed") for name in VELOCITIES),
         Column("dvl_valid", optional=True),
-        Column("dvl_sd", "speed", optional=True),
+        Column("dvl_sd", "speed", optional=True, largest=5.0),
     ),
     over_ground,
     refused=_refused,

@@ -50,7 +50,7 @@ def recognition(config: Config, origin_b: Array) -> Instrument:
 
 SEEN_PLACE = Sensor(
     "place",
-    (Column("place_id"), Column("place_sd", "length", optional=True)),
+    (Column("place_id"), Column("place_sd", "length", optional=True, largest=5e3)),
     recognition,
     standard_deviation=own_sd(1),
     observes=Observed("position", (0, 1)),

@@ -113,7 +113,11 @@ DEPTH = Sensor(
 )
 FIX = Sensor(
     "fix",
-    (Column("fix_north", "length"), Column("fix_east", "length"), Column("fix_sd", "length", optional=True)),
+    (
+        Column("fix_north", "length"),
+        Column("fix_east", "length"),
+        Column("fix_sd", "length", optional=True, largest=5e3),
+    ),
     positioning,
     standard_deviation=own_sd(2),  # 0 is how receivers say that they do not know
     observes=Observed("position", (0, 1)),

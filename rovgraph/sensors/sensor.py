@@ -20,6 +20,11 @@ from rovgraph.sensors.model import SensorModel
 
 RESERVED = ("time", "received", "fix_lat", "fix_lon")  # columns of a log that are no sensor's
 LARGEST_SD = 1e6  # of a measurement's own: more says no more, and overflows
+NINES = tuple(10.0**n - 10.0**-d for n in range(2, 7) for d in range(3))  # 99, 99.9, 99.99, 999 ...
+PLACEHOLDERS = (*NINES, 65.535, 655.35)  # these and the largest of 16 bits stand for an sd or a variance of any size
+MOSTLY = (
+    0.5  # share of a sensor's sds, from which on they are placeholders; fewer are of measurements that tell nothing
+)
 
 Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length"]
 Frame = Literal["position", "velocity", "heading"]
@@ -36,16 +41,23 @@ class Column:
     quantity : what it measures, which says the units that a log may use; None = a number without a unit
     optional : a measurement is complete without it
     group : the name under which a log's unit is declared; None = the sensor's
+    largest : of a measurement's own sd, what no such instrument exceeds; None = it is none, or of any size
     """
 
     name: str
     quantity: Quantity | None = None
     optional: bool = False
     group: str | None = None
+    largest: float | None = None
 
     def __post_init__(self) -> None:
         if self.quantity is not None and self.quantity not in get_args(Quantity):
             raise ValueError(f"column {self.name}: {self.quantity!r} is none of {', '.join(get_args(Quantity))}")
+
+    @property
+    def is_sd(self) -> bool:
+        """Whether it is a measurement's own standard deviation."""
+        return self.optional and self.name.endswith("_sd")
 
 
 @dataclass(frozen=True)
@@ -145,6 +157,20 @@ def own_sd(column: int) -> Callable[[Array, Instrument, Config], Array]:
         return np.full(len(believed.sd), min(own, LARGEST_SD)) if own > 0.0 else believed.sd
 
     return standard_deviation
+
+
+def placeholders(column: Column, sd: Array) -> NDArray[np.bool_]:
+    """Which sds of measurements say that the instrument does not know: 9999, 99.99, 65.535, or beyond reason.
+
+    Parameters
+    ----------
+    column : that holds them
+    sd : ndarray, shape (n,), NaN where a measurement has none
+    """
+    known = np.array(PLACEHOLDERS)
+    stands = np.isclose(sd[:, None], known, rtol=1e-6, atol=0.0).any(axis=1)
+    stands |= np.isclose(np.square(sd)[:, None], known[known > 900.0], rtol=1e-6, atol=0.0).any(axis=1)  # a variance
+    return np.asarray(stands | (sd > (np.inf if column.largest is None else column.largest)))
 
 
 def nothing_found(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
