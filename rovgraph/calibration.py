@@ -44,8 +44,8 @@ class Variable:
         says otherwise
     time_constant : default time constant of an error that lasts, first-order Gauss-Markov with the prior's sd [s];
         infinite = no such error
-    unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, nobody calibrated it and
-        nothing checks it [unit]; None = there is no such case
+    unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, which nobody
+        calibrated and nothing checks [unit]; None = there is no such case
     """
 
     name: str

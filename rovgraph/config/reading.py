@@ -184,9 +184,7 @@ def beliefs(config: Config) -> dict[str, Belief]:
     return out
 
 
-def with_priors_stated(
-    config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None
-) -> Config:
+def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None) -> Config:
     """The configuration with the sds of priors that it leaves to the log.
 
     Parameters

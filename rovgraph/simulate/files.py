@@ -60,7 +60,7 @@ def write_log(log_frame: pd.DataFrame, path: Path) -> None:
 def known(dive: Dive, config: Config) -> Config:
     """What an estimator knows: the configuration with the planned start, for a log in rovgraph's own columns.
 
-    The simulated magnetometer needs no calibration, and stamps are not late. Compasses are as good as their priors, from
+    The simulated magnetometer needs no calibration, and stamps are not late. Compasses err as their priors say, from
     which their errors were drawn.
     """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
