@@ -64,9 +64,8 @@ def _sd_of(variable: Variable, scale: float, unit: str) -> tuple[Any, Any]:
     if variable.unchecked_sd is None:
         return Positive, Field(sd, description=about)
     wide = round(variable.unchecked_sd * scale, 12)
-    return Positive | None, Field(
-        None, description=f"{about}; null = {sd:g}, or {wide:g} where nothing checks the compass"
-    )
+    about += f"; null = {sd:g}, or {wide:g} where nothing checks the compass"
+    return Positive | None, Field(None, description=about)
 
 
 def _constant(entry: Any) -> Any:
