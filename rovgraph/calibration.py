@@ -13,7 +13,8 @@ sensor's offset) is considered by default: held at its mean, with its uncertaint
 The offset and the deviation of every compass are estimated by default, of a magnetometer its
 hard iron instead of the deviation: no compass in a vehicle is free of them, and holding them
 at zero pushes them into the DVL's misalignment and makes the track look far more certain than
-it is.
+it is. They have a second, wider sd, of a compass that nobody calibrated and nothing checks; which of the two holds
+depends on the log (`rovgraph.estimators.unchecked`), unless the configuration states one.
 """
 
 from dataclasses import dataclass
@@ -43,6 +44,8 @@ class Variable:
         says otherwise
     time_constant : default time constant of an error that lasts, first-order Gauss-Markov with the prior's sd [s];
         infinite = no such error
+    unchecked_sd : standard deviation of the prior where the heading rests on this compass alone, which nobody
+        calibrated and nothing checks [unit]; None = there is no such case
     """
 
     name: str
@@ -57,6 +60,7 @@ class Variable:
     walk: float = 0.0
     considered: bool = False
     time_constant: float = np.inf
+    unchecked_sd: float | None = None
 
     @property
     def dim(self) -> int:
@@ -105,6 +109,7 @@ def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "
         f"offset of {whose} (deviation A)",
         "position fixes, or a second compass whose offset is known better",
         estimate=True,
+        unchecked_sd=10 * _DEG,
     )
     deviation = Variable(
         prefix + "_deviation",
@@ -116,6 +121,7 @@ def _compass(prefix: str, letters: str, sensor: str, whose: str, beside: str = "
         f"deviation curve of {whose}{beside}: sine and cosine of heading (B, C)",
         "turning through all headings, against the gyro",
         estimate=not beside,
+        unchecked_sd=5 * _DEG,
     )
     return offset, deviation
 
@@ -229,6 +235,7 @@ TABLE: dict[str, Variable] = {
             "hard iron in IMU axes, as a fraction of the field's magnitude",
             "turning through all headings; roll and pitch for the vertical axis",
             estimate=True,
+            unchecked_sd=0.033,  # in the ratio of a deviation curve's
         ),
         Variable(
             "soft_iron",

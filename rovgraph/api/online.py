@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rovgraph.api.live_folder import prepare, settings_of, summarise
 from rovgraph.api.live_page import live_page
 from rovgraph.api.logs import given, warn_of_unused
-from rovgraph.config import Config, config_or_defaults
+from rovgraph.config import Config, Mag, config_or_defaults, with_priors_stated
 from rovgraph.errors import InputError, as_path, as_texts
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.feed import Feed
@@ -226,6 +226,8 @@ class Online:
         InputError : the log was read with other columns, or allows no estimate
         """
         config = given(log, self.config)
+        if config.imu.mag != Mag():  # its prior is that of a calibrated one, which the log's samples are
+            config = with_priors_stated(config, names=("hard_iron",))
         delays = {} if log.config is None else log.config.delay_s
         config = config.with_raw_magnetometer().model_copy(update={"delay_s": delays})  # the log holds the field
         feed = Feed([LogReplay(log.source, _as_it_arrived(log, delays), AS_FAST_AS_POSSIBLE)])

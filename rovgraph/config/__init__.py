@@ -18,6 +18,7 @@ from rovgraph.config.reading import (
     read_yaml,
     register_settings,
     unregister_settings,
+    with_priors_stated,
     yaml_text,
 )
 from rovgraph.config.sections import ImuNoise, Mag, SensorSettings
@@ -38,5 +39,6 @@ __all__ = [
     "read_yaml",
     "register_settings",
     "unregister_settings",
+    "with_priors_stated",
     "yaml_text",
 ]

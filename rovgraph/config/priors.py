@@ -58,6 +58,16 @@ def _estimate_of(variable: Variable) -> tuple[Any, Any, str]:
     return bool, variable.estimate, "estimate it"
 
 
+def _sd_of(variable: Variable, scale: float, unit: str) -> tuple[Any, Any]:
+    """Type and field of a prior's sd; null where it depends on the log."""
+    sd, about = round(variable.sd * scale, 12), f"prior sd [{unit}]"
+    if variable.unchecked_sd is None:
+        return Positive, Field(sd, description=about)
+    wide = round(variable.unchecked_sd * scale, 12)
+    about += f"; null = {sd:g}, or {wide:g} where nothing checks the compass"
+    return Positive | None, Field(None, description=about)
+
+
 def _constant(entry: Any) -> Any:
     """Refuses what is considered and changes."""
     if entry.estimate == CONSIDERED:
@@ -87,7 +97,7 @@ def calibration_entry(variable: Variable) -> type[BaseModel]:
             Annotated[float | tuple[float, ...] | None, BeforeValidator(_components(variable.dim))],
             Field(None, description=f"prior mean [{unit}]; null = " + ("the mounting" if mounted else "0")),
         ),
-        "sd" + tail: (Positive, Field(round(variable.sd * scale, 12), description=f"prior sd [{unit}]")),
+        "sd" + tail: _sd_of(variable, scale, unit),
         "walk" + tail: (
             NotNegative,
             Field(round(variable.walk * scale, 12), description=f"random walk [{unit}/rts]; 0 = constant"),

@@ -1,7 +1,7 @@
 """`Config`, and how it is read, written and described."""
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
@@ -169,7 +169,8 @@ def beliefs(config: Config) -> dict[str, Belief]:
         mean = getattr(entry, "mean" + tail)
         mean = mount.get(name, 0.0) if mean is None else mean
         values = np.atleast_1d(np.asarray(mean, dtype=float))
-        sd, walk = unit * getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
+        stated, walk = getattr(entry, "sd" + tail), unit * getattr(entry, "walk" + tail)
+        sd = variable.sd if stated is None else unit * stated
         lasts = entry.time_constant_s
         out[name] = Belief(
             variable,
@@ -181,6 +182,26 @@ def beliefs(config: Config) -> dict[str, Belief]:
             np.inf if lasts is None else lasts,
         )
     return out
+
+
+def with_priors_stated(config: Config, unchecked: Collection[str] = (), names: Collection[str] | None = None) -> Config:
+    """The configuration with the sds of priors that it leaves to the log.
+
+    Parameters
+    ----------
+    config : as stated
+    unchecked : calibration variables of a compass that nobody calibrated and nothing checks
+    names : calibration variables that are stated; None = all
+    """
+    given, entries = config.calibration, {}
+    for name in TABLE if names is None else names:
+        variable, entry = TABLE[name], getattr(given, name)
+        key = "sd_deg" if variable.angular else "sd"
+        if getattr(entry, key) is None:
+            sd = (name in unchecked and variable.unchecked_sd) or variable.sd
+            sd = round(float(np.rad2deg(sd)), 12) if variable.angular else sd
+            entries[name] = entry.model_copy(update={key: sd})
+    return config.model_copy(update={"calibration": given.model_copy(update=entries)})
 
 
 def load_config(path: Path | str | None = None) -> Config:

@@ -9,14 +9,14 @@ from collections.abc import Collection
 
 import numpy as np
 
-from rovgraph.config import Config, beliefs
+from rovgraph.config import Config, beliefs, with_priors_stated
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
 from rovgraph.engine.noise_floor import NOISIER
 from rovgraph.engine.preintegration import scatter
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
-from rovgraph.estimators.unchecked import unchecked
+from rovgraph.estimators.unchecked import nothing_checks, unchecked, unchecked_compass
 from rovgraph.estimators.without_imu import TILT, first_tilt, no_bias, with_motion_model
 from rovgraph.geometry import Array, earth_rate_n, level_from_force, matrix_from_rpy, rpy_from_matrix
 from rovgraph.instruments import Instrument, heading_sources, instruments
@@ -65,15 +65,19 @@ def initialise(log: Log, config: Config, expected: Collection[str] = ()) -> Init
         )
     config = _resolve_environment(log, config, assumptions)
     config = _resolve_noise(log, config, assumptions)
+    sources, present = heading_sources(config, log.sensors), log.sensors | set(expected)
+    compass = unchecked_compass(config, heading_sources(config, present), log.sensors)
+    config = with_priors_stated(config, compass)
     sensors = instruments(config, config.imu.lever_arm_m)
-    sources = heading_sources(config, log.sensors)
-    present = log.sensors | set(expected)
     elsewhere = {"thruster"} if has_constant_velocity(config) else {"thruster", TILT}
     own = [s for s in sensors if s in present - elsewhere and SENSORS[s].heading_source is None]
     used = own + heading_sources(config, present) + _thrusters(log, config, expected)
     sensors = {s: sensors[s] for s in used}
     assumptions.append("heading from " + (", ".join(sources) or "start.heading_deg alone: it will drift"))
-    assumptions += unchecked(config, sources, log.sensors, expected)
+    resting = unchecked(config, sources, log.sensors, expected)
+    if compass:
+        assumptions.insert(0, nothing_checks(resting.pop(0), turns_show=not has_constant_velocity(config)))
+    assumptions += resting
 
     first = level(log, config)
     bias, bias_sd = no_bias() if has_constant_velocity(config) else _bias(config, first, assumptions)

@@ -7,10 +7,12 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from rovgraph.calibration import CONSIDERED, TABLE, Belief
+from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
 from rovgraph.estimators.observability import verdict
+from rovgraph.estimators.unchecked import rests_on_doubtful_compass
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
 from rovgraph.sensors import innovation
 from rovgraph.state import State
@@ -22,7 +24,7 @@ _XYZ = ("_x", "_y", "_z")
 def body_trajectory(
     intervals: Sequence[KeyframeInterval],
     states: State,
-    lever_arm_b: ArrayLike,
+    initial: InitialConditions,
     cov_pose: Array | None = None,
     cov_velocity: Array | None = None,
 ) -> Trajectory:
@@ -32,11 +34,11 @@ def body_trajectory(
     ----------
     intervals : n, the keyframes
     states : State of n epochs, at the IMU
-    lever_arm_b : array_like, shape (3,), of the IMU [m]
+    initial : of the dive
     cov_pose : ndarray, shape (n, 6, 6), in GTSAM's tangent space, or None
     cov_velocity : ndarray, shape (n, 3, 3), in n, or None
     """
-    R, lever_arm_b = np.ascontiguousarray(states.R_nb), np.asarray(lever_arm_b, dtype=float)
+    R, lever_arm_b = np.ascontiguousarray(states.R_nb), np.asarray(initial.config.imu.lever_arm_m)
     time = np.array([i.time for i in intervals])
     rate_b = np.array([i.rate_b for i in intervals])
     rate_sd = np.array([i.rate_sd for i in intervals])[:, None, None]
@@ -46,15 +48,39 @@ def body_trajectory(
         return Trajectory.certain(time, p_n, R, v_n)
     arm = R @ skew(lever_arm_b)
     J = np.concatenate([arm, R], axis=-1)  # p - R l, right perturbation
+    cov_p = J @ cov_pose @ transpose(J)
+    if rests_on_doubtful_compass(initial):
+        by_rotation = J @ cov_pose[..., :3] @ transpose(R)
+        cov_p[:, :2, :2] += second_order(by_rotation[:, :2, 2])
     return Trajectory(
         time,
         p_n,
         R,
         v_n,
-        cov_p=J @ cov_pose @ transpose(J),
+        cov_p=cov_p,
         cov_theta=R @ cov_pose[:, :3, :3] @ transpose(R),
         cov_v=cov_velocity + rate_sd**2 * arm @ transpose(arm),
     )
+
+
+def second_order(cov_p_heading: Array) -> Array:
+    """What an error of the heading adds to the covariance of a position beyond its linear part, shape (n, 2, 2) [m^2].
+
+    An error theta that lasts the whole way turns it about the start, and what is d from there moves by
+
+        R(theta) d - d = theta J d - theta^2 / 2 d + ...,   J = (0 -1; 1 0)
+
+    The linear part has the covariance c = s^2 J d with a theta of variance s^2, and nothing along d. The other has the
+    second moment 3/4 s^4 d d' = 3/4 (J c)(J c)' of a normal theta, and is not correlated with the first. It is the
+    moment about the estimate, which is not moved by the mean, -s^2 / 2 d: a shorter way would contradict the DVL. What
+    of the heading's error does not last has next to no part in c, and neither has a position that a fix shows.
+
+    Parameters
+    ----------
+    cov_p_heading : ndarray, shape (n, 2), covariance of north and east with the heading [m rad]
+    """
+    along = cov_p_heading[:, ::-1] * (1.0, -1.0)
+    return np.asarray(0.75 * along[:, :, None] * along[:, None, :])
 
 
 def calibration_estimates(

@@ -156,7 +156,7 @@ class BatchSmoother:
         b = self.initial
         means = {name: belief.mean for name, belief in b.beliefs.items()}
         states = dead_reckon(self.intervals, b, means)
-        trajectory = body_trajectory(self.intervals, states, b.config.imu.lever_arm_m)
+        trajectory = body_trajectory(self.intervals, states, b)
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame())
 
 
@@ -169,9 +169,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
     best, relative = without_what_noise_moves(best)
     states, intervals = best.state, best.intervals
-    trajectory = body_trajectory(
-        intervals, states, b.config.imu.lever_arm_m, best.covariances(POSE), best.covariances(VELOCITY)
-    )
+    trajectory = body_trajectory(intervals, states, b, best.covariances(POSE), best.covariances(VELOCITY))
     bias_sd = np.sqrt(np.diagonal(best.covariances(BIAS), axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd, b.streams)
     final, spread = dict(best.unknowns.fixed), {}

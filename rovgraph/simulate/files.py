@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rovgraph.config import Config
+from rovgraph.config import Config, with_priors_stated
 from rovgraph.sensors import SENSORS
 from rovgraph.simulate.dive import Dive
 
@@ -60,11 +60,13 @@ def write_log(log_frame: pd.DataFrame, path: Path) -> None:
 def known(dive: Dive, config: Config) -> Config:
     """What an estimator knows: the configuration with the planned start, for a log in rovgraph's own columns.
 
-    The simulated magnetometer needs no calibration, and stamps are not late.
+    The simulated magnetometer needs no calibration, and stamps are not late. Compasses err as their priors say, from
+    which their errors were drawn.
     """
     north, east, _ = dive.truth.p_n[0] - dive.hidden["start_offset"]
     start = config.start.model_copy(update={"north_m": float(north), "east_m": float(east)})
-    return config.as_recorded().model_copy(update={"start": start, "columns": {}, "units": {}})
+    own = with_priors_stated(config.as_recorded())
+    return own.model_copy(update={"start": start, "columns": {}, "units": {}})
 
 
 def secrets(dive: Dive) -> dict[str, Any]:

@@ -250,9 +250,9 @@ class FixedLag:
         ----------
         intervals, known : the keyframes and what is known of them, n each
         """
-        columns, arm = self.filter.layout.columns, self.initial.config.imu.lever_arm_m
+        columns = self.filter.layout.columns
         pose, velocity = (np.array([k.covariance[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
-        return body_trajectory(intervals, states_of(np.array([k.x for k in known])), arm, pose, velocity)
+        return body_trajectory(intervals, states_of(np.array([k.x for k in known])), self.initial, pose, velocity)
 
     def _go_on(self, until: float) -> None:
         """Take measurements up to a time."""

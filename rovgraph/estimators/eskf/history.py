@@ -117,8 +117,7 @@ class FilterHistory:
         x, c, pose, velocity, sd = found
         engine, states = self._engine, states_of(x, c)
         columns, estimated = engine.layout.columns, engine.unknowns.estimated
-        arm = engine.initial.config.imu.lever_arm_m
-        trajectory = body_trajectory(self.intervals, states, arm, pose, velocity)
+        trajectory = body_trajectory(self.intervals, states, engine.initial, pose, velocity)
         history = bias_histories(trajectory.time, states.bias, sd[:, columns[BIAS]], engine.initial.streams)
         for name in estimated:
             history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[:, columns[name]])
