@@ -74,7 +74,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
 def _of_motion(check: Check, unfrozen: Log, log: Log, config: Config) -> Iterator[Finding]:
     """What a comparison of motions finds without the values that are frozen: a late clock makes values seem so."""
     found = [*check(log, config)]
-    yield from found if any(f.clock and f.level != "ok" for f in found) else check(unfrozen, config)
+    yield from found if any(f.of_clock and f.level != "ok" for f in found) else check(unfrozen, config)
 
 
 def warn(log: Log, config: Config | None = None, examined: Examined | None = None) -> None:

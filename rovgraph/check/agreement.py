@@ -132,7 +132,7 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b) < ENOUGH_TURNING:
         if beyond:
             largest = np.abs(log[sensor].data[:, 0]).max()
-            return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; {_if_degrees(sensor)}")
+            return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; {_if_degrees(sensor)}", "unit")
         return Finding(sensor, "ok", f"too little turning to compare {name} with the gyro")
     numbers = f"slope {f.slope:.3g}, correlation {f.correlation:.2f} over {f.windows} windows"
     if abs(f.correlation) < FOLLOWS and f.sd_a < NOISE_MARGIN * noise:
@@ -141,21 +141,22 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
         )
     if abs(f.correlation) < FOLLOWS:
         causes = "hard iron and the mounting" if sensor == "mag" else "its unit, mounting and clock"
-        return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); check {causes}")
+        return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); check {causes}", "contradiction")
     if 40.0 < abs(f.slope) < 80.0 or 1 / 80.0 < abs(f.slope) < 1 / 40.0:
         cause, remedy = _factor_of_57(log, sensor, f.slope)
-        return Finding(sensor, "error", f"{cause} ({numbers}); {remedy}")
+        return Finding(sensor, "error", f"{cause} ({numbers}); {remedy}", "unit")
     if f.slope < 0.0:
         return Finding(
             sensor,
             "warning",
             f"{name} turns opposite to the gyro ({numbers}): the heading counts anticlockwise, or the IMU's z axis "
             "points up (imu.mount_rpy_deg)",
+            "sign",
         )
     if 0.7 < f.slope < 1.4:
         return Finding(sensor, "ok", f"{name} turns with the gyro ({numbers})")
     text = f"{name} turns with the gyro, but not by the same angle ({numbers}); check the units and scales of both"
-    return Finding(sensor, "warning", text)
+    return Finding(sensor, "warning", text, "scale")
 
 
 def _factor_of_57(log: Log, sensor: str, slope: float) -> tuple[str, str]:
@@ -211,9 +212,8 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
                 "dvl", "ok", "depth changes too little, given its noise, to compare the vertical velocity with it"
             )
         elif f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
-            yield Finding(
-                "dvl", "warning", f"vertical velocity does not follow depth ({numbers}); check mounting and clock"
-            )
+            text = f"vertical velocity does not follow depth ({numbers}); check mounting and clock"
+            yield Finding("dvl", "warning", text, "contradiction")
         return
     if f.slope < 0.0:
         yield Finding(
@@ -221,6 +221,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             "warning",
             f"vertical velocity and the change of depth have opposite signs ({numbers}): {_flip(config)}; "
             "if depth counts upwards, state units: {depth: -m}",
+            "sign",
         )
     else:
         low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
@@ -228,7 +229,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("dvl", "ok", f"vertical velocity agrees with the change of depth ({numbers})")
         else:
             text = f"vertical velocity follows depth, but not by the same amount ({numbers}); check the units of both"
-            yield Finding("dvl", "warning", text)
+            yield Finding("dvl", "warning", text, "scale")
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
     yield from _clock(

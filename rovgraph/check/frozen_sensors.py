@@ -22,9 +22,9 @@ def standstill(log: Log, config: Config, frozen: Sequence[FrozenStretch] | None 
                 sensor,
                 "warning",
                 f"{what} for {s.last - s.first:.1f} s from {since(log, s.first)} on, although {s.why}",
+                "frozen",
             )
         if len(found) > SHOWN:
             total = sum(s.last - s.first for s in found)
-            yield Finding(
-                sensor, "warning", f"frozen {len(found)} times, {total:.0f} s in all, although the vehicle moves"
-            )
+            text = f"frozen {len(found)} times, {total:.0f} s in all, although the vehicle moves"
+            yield Finding(sensor, "warning", text, "frozen")

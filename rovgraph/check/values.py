@@ -34,7 +34,8 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
     low, high = GRAVITY_RANGE
     if not low <= size <= high:
         level: Level = "warning" if 5.0 < size < 15.0 else "error"
-        yield Finding("imu", level, f"mean specific force is {size:.4g} m/s2, expected about 9.8; {_acc_unit(size)}")
+        text = f"mean specific force is {size:.4g} m/s2, expected about 9.8; {_acc_unit(size)}"
+        yield Finding("imu", level, text, "unit")
     if size < 1e-6:
         return
     angle = tilt(log, config)
@@ -46,6 +47,7 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
             "warning",
             f"mean specific force points {np.rad2deg(angle):.0f} deg away from upwards (-z of the body): it is on the "
             f"IMU's {axis} axis; check imu.mount_rpy_deg, probably {list(UPRIGHT[axis])} with the yaw of your IMU",
+            "axes",
         )
     elif low <= size <= high:
         yield Finding("imu", "ok", f"mean specific force {size:.2f} m/s2, {np.rad2deg(angle):.1f} deg from upwards")
@@ -85,14 +87,14 @@ def turn_rates(log: Log, config: Config) -> Iterator[Finding]:
             "error",
             f"a tenth of the rates is above {usual:.3g} rad/s ({np.rad2deg(usual):.0f} deg/s); "
             "if they are in deg/s, state units: {gyr: deg/s}",
+            "unit",
         )
     elif fast:
         when = since(log, log["imu"].time[np.argmax(rate > FAST_SPIKE)])
-        yield Finding(
-            "imu", "warning", f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or a wrong unit"
-        )
+        text = f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or a wrong unit"
+        yield Finding("imu", "warning", text, "spikes")
     if not np.ptp(log["imu"].data[:, 3:], axis=0).any():
-        yield Finding("imu", "error", "the gyro's values never change; check its connection")
+        yield Finding("imu", "error", "the gyro's values never change; check its connection", "stuck")
 
 
 def angles(log: Log, config: Config) -> Iterator[Finding]:
@@ -106,14 +108,15 @@ def angles(log: Log, config: Config) -> Iterator[Finding]:
             "ahrs",
             "error",
             f"roll or pitch reaches {largest:.4g} rad; if they are in degrees, state units: {{ahrs: deg}}",
+            "unit",
         )
 
 
 def own(log: Log, config: Config) -> Iterator[Finding]:
     """What each sensor finds in its own values."""
     for sensor, stream in log.streams.items():
-        for level, text in SENSORS[sensor].look(stream.data, config):
-            yield Finding(sensor, level, text)
+        for said in SENSORS[sensor].look(stream.data, config):
+            yield Finding(sensor, *said)
 
 
 def frozen_imu(log: Log, config: Config) -> Iterator[Finding]:
@@ -135,4 +138,5 @@ def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]],
             "warning",
             f"{name} repeats one value exactly for {duration:.1f} s from {since(log, start)} on "
             f"({len(long)} such intervals); a working sensor always shows noise: check its connection and driver",
+            "stuck",
         )
