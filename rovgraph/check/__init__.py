@@ -18,7 +18,7 @@ from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
 from rovgraph.check.start import start
 from rovgraph.check.times import overlap, presence, regularity, timing
-from rovgraph.check.values import angles, frozen_imu, gravity, own, turn_rates
+from rovgraph.check.values import angles, frozen_imu, gravity, own, saturated, turn_rates
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
@@ -40,6 +40,7 @@ CHECKS: tuple[Check, ...] = (
     own,
     standstill,
     frozen_imu,
+    saturated,
     dvl_and_imu,
     vertical,
     repeated,
