@@ -18,7 +18,7 @@ from rovgraph.check.outlook import plan
 from rovgraph.check.places import places
 from rovgraph.check.start import start
 from rovgraph.check.times import overlap, presence, regularity, timing
-from rovgraph.check.values import angles, frozen_imu, gravity, own, turn_rates
+from rovgraph.check.values import angles, frozen_imu, gravity, own, saturated, turn_rates
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.errors import warn as issue_warning
@@ -40,6 +40,7 @@ CHECKS: tuple[Check, ...] = (
     own,
     standstill,
     frozen_imu,
+    saturated,
     dvl_and_imu,
     vertical,
     start,
@@ -75,7 +76,7 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
 def _of_motion(check: Check, unfrozen: Log, log: Log, config: Config) -> Iterator[Finding]:
     """What a comparison of motions finds without the values that are frozen: a late clock makes values seem so."""
     found = [*check(log, config)]
-    yield from found if any(f.clock and f.level != "ok" for f in found) else check(unfrozen, config)
+    yield from found if any(f.of_clock and f.level != "ok" for f in found) else check(unfrozen, config)
 
 
 def warn(log: Log, config: Config | None = None, examined: Examined | None = None) -> None:

@@ -7,12 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rovgraph.check.compasses import field_axes, magnetic_heading
 from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
 from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array, cross, rotate
+from rovgraph.geometry import Array, rotate
 from rovgraph.log import Log, Stream
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
@@ -32,6 +33,11 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
     sensors = [sensor for sensor in NAMES if sensor in log and len(log[sensor]) >= MIN_WINDOWS]
     gyro, motion = _gyro_yaw(log["imu"], config), inertial_motion(log, config) if sensors else None
     for sensor in sensors:
+        if sensor == "mag" and motion is not None and (found := [*field_axes(log, config, motion)]):
+            yield from found
+            if found[0].sensor == "imu":  # a gyro that is wrong tells nothing of other compasses
+                return
+            continue
         heading = _heading(log, config, sensor, motion)
         period = float(np.median(np.diff(heading.time)))
         window = max(2.0, 3.0 * period)
@@ -96,14 +102,8 @@ def _heading(log: Log, config: Config, sensor: str, motion: InertialMotion | Non
 
 def _magnetic_heading(log: Log, config: Config, motion: InertialMotion | None) -> Array:
     """Heading of the field's horizontal part, shape (n,) [rad]."""
-    stream = log["mag"]
-    field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), stream.data)
-    if motion is None:
-        return np.asarray(np.arctan2(-field_b[:, 1], field_b[:, 0]))
-    down_b = np.column_stack([np.interp(stream.time, motion.time, column) for column in motion.down_b.T])
-    starboard_b = cross(down_b, np.broadcast_to(np.eye(3)[0], down_b.shape))
-    forward_b = cross(starboard_b, down_b)
-    return np.asarray(np.arctan2(-np.sum(starboard_b * field_b, axis=1), np.sum(forward_b * field_b, axis=1)))
+    field_b = rotate(mount_matrix(config.imu.mount_rpy_deg), log["mag"].data)
+    return magnetic_heading(field_b, None if motion is None else motion.at(log["mag"].time, motion.down_b))
 
 
 def _circle(values: Array) -> float:
@@ -132,7 +132,7 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b) < ENOUGH_TURNING:
         if beyond:
             largest = np.abs(log[sensor].data[:, 0]).max()
-            return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; {_if_degrees(sensor)}")
+            return Finding(sensor, "warning", f"{name} reaches {largest:.4g} rad; {_if_degrees(sensor)}", "unit")
         return Finding(sensor, "ok", f"too little turning to compare {name} with the gyro")
     numbers = f"slope {f.slope:.3g}, correlation {f.correlation:.2f} over {f.windows} windows"
     if abs(f.correlation) < FOLLOWS and f.sd_a < NOISE_MARGIN * noise:
@@ -141,21 +141,24 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
         )
     if abs(f.correlation) < FOLLOWS:
         causes = "hard iron and the mounting" if sensor == "mag" else "its unit, mounting and clock"
-        return Finding(sensor, "warning", f"{name} does not follow the gyro ({numbers}); check {causes}")
+        return Finding(
+            sensor, "warning", f"{name} does not follow the gyro ({numbers}); check {causes}", "contradiction"
+        )
     if 40.0 < abs(f.slope) < 80.0 or 1 / 80.0 < abs(f.slope) < 1 / 40.0:
         cause, remedy = _factor_of_57(log, sensor, f.slope)
-        return Finding(sensor, "error", f"{cause} ({numbers}); {remedy}")
+        return Finding(sensor, "error", f"{cause} ({numbers}); {remedy}", "unit")
     if f.slope < 0.0:
         return Finding(
             sensor,
             "warning",
             f"{name} turns opposite to the gyro ({numbers}): the heading counts anticlockwise, or the IMU's z axis "
             "points up (imu.mount_rpy_deg)",
+            "sign",
         )
     if 0.7 < f.slope < 1.4:
         return Finding(sensor, "ok", f"{name} turns with the gyro ({numbers})")
     text = f"{name} turns with the gyro, but not by the same angle ({numbers}); check the units and scales of both"
-    return Finding(sensor, "warning", text)
+    return Finding(sensor, "warning", text, "scale")
 
 
 def _factor_of_57(log: Log, sensor: str, slope: float) -> tuple[str, str]:
@@ -211,9 +214,8 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
                 "dvl", "ok", "depth changes too little, given its noise, to compare the vertical velocity with it"
             )
         elif f.sd_b < 2.0 * f.sd_a:  # noise of the DVL would be larger
-            yield Finding(
-                "dvl", "warning", f"vertical velocity does not follow depth ({numbers}); check mounting and clock"
-            )
+            text = f"vertical velocity does not follow depth ({numbers}); check mounting and clock"
+            yield Finding("dvl", "warning", text, "contradiction")
         return
     if f.slope < 0.0:
         yield Finding(
@@ -221,6 +223,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             "warning",
             f"vertical velocity and the change of depth have opposite signs ({numbers}): {_flip(config)}; "
             "if depth counts upwards, state units: {depth: -m}",
+            "sign",
         )
     else:
         low, high = (0.7, 1.4) if abs(f.correlation) > CLOSELY else (0.4, 2.5)  # few pings a wave lower the slope
@@ -228,7 +231,7 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("dvl", "ok", f"vertical velocity agrees with the change of depth ({numbers})")
         else:
             text = f"vertical velocity follows depth, but not by the same amount ({numbers}); check the units of both"
-            yield Finding("dvl", "warning", text)
+            yield Finding("dvl", "warning", text, "scale")
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
     yield from _clock(

@@ -67,7 +67,7 @@ def _earth_axes(compared: Comparison, found: Search) -> Finding | None:
         f"IMU's acceleration (agreement {turning.not_at_all:.2f}, {best:.2f} along the vehicle's): log the DVL's own "
         "axes (instrument or ship coordinates)"
     )
-    return Finding("dvl", "warning", text)
+    return Finding("dvl", "warning", text, "axes")
 
 
 def _explanation(found: Search) -> tuple[int, int]:
@@ -120,7 +120,7 @@ def _mounting(config: Config, k: int, fit: Fit, better: str) -> Finding:
         better = "its acceleration shows this" if k == 0 else better
     else:
         cause, remedy = axes_remedy(ORIENTATIONS[k], R_bs)
-    return Finding("dvl", "warning", f"{cause}; {better} (agreement {fit.agreement:.2f}): {remedy}")
+    return Finding("dvl", "warning", f"{cause}; {better} (agreement {fit.agreement:.2f}): {remedy}", "axes")
 
 
 def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: float) -> Finding:

@@ -2,15 +2,19 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.config import Config
 from rovgraph.geometry import Array
+from rovgraph.instruments import HEADING_STREAMS, heading_sources
 from rovgraph.log import Log, Stream
-from rovgraph.sensors import Level
+from rovgraph.sensors import Fault, Kind, Level
 
+FAULTS: tuple[Fault, ...] = get_args(Fault)
+CLOCKS: tuple[Kind, ...] = ("epoch", "lag", "jump")
 SPIKE = 6.0  # times the usual distance from the median of five
 LEAST_SPIKE = 0.1  # [m/s, m]
 
@@ -24,15 +28,25 @@ class Finding:
     sensor : name of the stream, or "log", "configuration"
     level : "error": cannot be worked with as it is
     text : one sentence, with the numbers it rests on
-    clock : what it says of a clock: "epoch", "lag" or "jump"; empty where it is about something else
+    kind : in a word, which docs/check.md explains
     share : of the sensor's measurements, that an estimate leaves out for it; None where it is about something else
     """
 
     sensor: str
     level: Level
     text: str
-    clock: Literal["", "epoch", "lag", "jump"] = ""
+    kind: Kind = ""
     share: float | None = None
+
+    @property
+    def wrong(self) -> bool:
+        """The data are wrong, and an estimate is made of them all the same."""
+        return self.level != "ok" and self.kind in FAULTS
+
+    @property
+    def of_clock(self) -> bool:
+        """Whether it says that a clock is late, early or set."""
+        return self.kind in CLOCKS
 
 
 @dataclass(frozen=True)
@@ -80,9 +94,16 @@ class Report:
         """Findings of one level."""
         return [f for f in self.findings if f.level == level]
 
+    def faults(self, config: Config) -> list[Finding]:
+        """What is wrong with the data of sensors that an estimate uses."""
+        used = heading_sources(config, {t.sensor for t in self.timings})
+        return [f for f in self.findings if f.wrong and (f.sensor in used or f.sensor not in HEADING_STREAMS)]
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON; what is not known is None."""
         known: dict[str, Any] = _without_nan(asdict(self))
+        for finding, written in zip(self.findings, known["findings"], strict=True):
+            written["wrong"] = finding.wrong
         return known
 
 

@@ -83,13 +83,14 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             "north and east are swapped or mirrored; corrected, the fixes fit the DVL's track turned by "
             f"{angle:+d} deg (agreement {swapped.agreement:.2f} instead of {as_is.agreement:.2f}): "
             "correct the columns of the fixes",
+            "swapped",
         )
     elif _better(unlike, as_is) and unlike.agreement > 0.6:
-        yield Finding("dvl", "warning", _mirrored_text(config, as_is.agreement, unlike.agreement))
+        yield Finding("dvl", "warning", _mirrored_text(config, as_is.agreement, unlike.agreement), "axes")
     elif as_is.agreement < 0.6:
         if as_is.error > EVIDENCE + 2.0 * plane.count:
             text = f"velocities do not fit the fixes (agreement {as_is.agreement:.2f}); check mounting and heading"
-            yield Finding("dvl", "warning", text)
+            yield Finding("dvl", "warning", text, "contradiction")
     else:
         yield _turned(config, heading_sources(config, log.sensors), as_is, unlike)
         if late:
@@ -125,7 +126,7 @@ def _turned(config: Config, sources: Sequence[str], as_is: _Line, unlike: _Line)
     text = (
         f"its track fits the fixes when turned by {round(np.rad2deg(angle)) + 0:+d} deg and scaled by {scale:.2f}{tail}"
     )
-    return Finding("dvl", "warning" if wrong else "ok", text)
+    return Finding("dvl", "warning" if wrong else "ok", text, "turned")
 
 
 class _Plane:

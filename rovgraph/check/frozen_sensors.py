@@ -40,4 +40,4 @@ def standstill(log: Log, config: Config, frozen: Sequence[FrozenStretch] | None 
             f"{WHAT[kind]} {extent}, although {longest.why}; {count} of {of} measurements ({count / of:.1%}) are left "
             f"out: {remedy}"
         )
-        yield Finding(sensor, "warning", text, share=count / of)
+        yield Finding(sensor, "warning", text, "frozen", count / of)

@@ -57,6 +57,10 @@ class InertialMotion:
         """Rate about the vertical, shape (n,) [rad/s]."""
         return np.asarray(np.sum(self.rate_b * self.down_b, axis=1))
 
+    def at(self, times: Array, values: Array) -> Array:
+        """What is known at the even times (n, k), at others; shape (m, k)."""
+        return np.column_stack([np.interp(times, self.time, column) for column in values.T])
+
 
 def inertial_motion(log: Log, config: Config) -> InertialMotion | None:
     """What the IMU shows; None where its log is too short."""
@@ -68,7 +72,7 @@ def inertial_motion(log: Log, config: Config) -> InertialMotion | None:
     if len(edges) * step < ENOUGH_SECONDS:
         return None
     R_bs = mount_matrix(config.imu.mount_rpy_deg)
-    force_b, rate_b = (rotate(R_bs, _means(imu, imu.data[:, k : k + 3], edges)) for k in (0, 3))
+    force_b, rate_b = (rotate(R_bs, means(imu, imu.data[:, k : k + 3], edges)) for k in (0, 3))
     time = edges[:-1] + 0.5 * step
     known = ~in_gap(time, imu.time, GAP)
     force_b, rate_b = np.where(known[:, None], force_b, 0.0), np.where(known[:, None], rate_b, 0.0)
@@ -85,7 +89,7 @@ def inertial_motion(log: Log, config: Config) -> InertialMotion | None:
     return InertialMotion(time, step, rate_b, np.where(known[:, None], force_b - up_b, 0.0), R_gb, down_b, known)
 
 
-def _means(stream: Stream, values: Array, edges: Array) -> Array:
+def means(stream: Stream, values: Array, edges: Array) -> Array:
     """Means of a signal (n, k) between edges (m + 1,), shape (m, k)."""
     columns = [np.interp(edges, stream.time, integral(stream, column)) for column in values.T]
     return np.diff(np.column_stack(columns), axis=0) / np.diff(edges)[:, None]

@@ -19,7 +19,9 @@ def plan(log: Log, config: Config) -> Iterator[Finding]:
     wanted = {sensor.heading_source: sensor.name for sensor in SENSORS.values()}
     for source in config.heading.sources or ():
         if wanted[source] not in log:
-            yield Finding("configuration", "warning", f"heading.sources names {source}, but the log has none")
+            yield Finding(
+                "configuration", "warning", f"heading.sources names {source}, but the log has none", "missing"
+            )
     if "imu" in log:
         yield Finding("configuration", "ok", f"about {keyframes(log, config)} keyframes")
     for text in _assumptions(log, config, sources):

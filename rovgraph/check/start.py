@@ -42,6 +42,7 @@ def start(log: Log, config: Config) -> Iterator[Finding]:
             f"the first fixes lie {np.median(away):.1f} m from start.north_m and start.east_m, of which the vehicle "
             f"moved at most {np.median(way):.1f} m: check the start, the fixes' origin and, of a USBL, the ship's "
             "heading; or raise start.position_sd_m",
+            "start",
         )
 
 

@@ -51,14 +51,14 @@ def presence(log: Log, config: Config) -> Iterator[Finding]:
             used = "no IMU is used: velocity and attitude are nearly constant between measurements (motion.model)"
             yield Finding(sensor.name, "ok", used)
         elif sensor.if_missing is not None and sensor.name not in log:
-            yield Finding(sensor.name, *sensor.if_missing)
+            yield Finding(sensor.name, *sensor.if_missing, "missing")
     if not heading_sources(config, log.sensors):
         known = (
             "heading starts at start.heading_deg and drifts with the gyro"
             if config.start.heading_deg is not None
             else "give mag, ahrs_yaw, heading or dvl_heading, or at least start.heading_deg"
         )
-        yield Finding("log", "warning", f"no heading source in use: {known}")
+        yield Finding("log", "warning", f"no heading source in use: {known}", "missing")
 
 
 def overlap(log: Log, config: Config) -> Iterator[Finding]:
@@ -81,6 +81,7 @@ def overlap(log: Log, config: Config) -> Iterator[Finding]:
                 sensor,
                 "warning",
                 f"{1.0 - inside:.0%} of its measurements lie before or after the IMU's and are ignored",
+                "missing",
             )
 
 
@@ -96,13 +97,15 @@ def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -
         if period is not None:
             mean = (t.count - 1) / (t.last - t.first)
             bursts = f"{mean:.3g} Hz, but in bursts, most {1.0 / t.rate:.2g} s apart"
-            yield Finding(sensor, "warning", f"{bursts}: they may be times of arrival; log times of measurement")
+            text = f"{bursts}: they may be times of arrival; log times of measurement"
+            yield Finding(sensor, "warning", text, "bursts")
         elif not low <= t.rate <= high:
             yield Finding(
                 sensor,
                 "warning",
                 f"{t.rate:.4g} Hz, expected {low:g} to {high:g}; "
                 "if time is not in seconds, state its unit, such as units: {time: ms}",
+                "rate",
             )
         yield from _gaps(log, config, t, period or 1.0 / t.rate)
         if sensor == "imu" and period is None and t.jitter * t.rate > 0.5:
@@ -111,6 +114,7 @@ def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -
                 "warning",
                 f"times jitter by {t.jitter:.3g} s around a period of {1 / t.rate:.3g} s: "
                 "they may be times of arrival; log times of measurement",
+                "jitter",
             )
         again = _repeated_for_a_moment(without(stream, frozen)) / t.count if sensor in ("imu", "mag", "dvl") else 0.0
         if again > REPEATED and _moves(stream):
@@ -119,6 +123,7 @@ def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -
                 "warning",
                 f"{again:.0%} of the measurements repeat the previous one exactly: "
                 "the log is written faster than the sensor measures; log each measurement once",
+                "repeats",
             )
 
 
@@ -165,6 +170,6 @@ def _gaps(log: Log, config: Config, t: Timing, period: float) -> Iterator[Findin
     text = f"{gaps} longer than {limit:.3g} s, the longest {t.gap:.1f} s from {since(log, t.gap_at)} on"
     if t.sensor == "imu" and t.gap > config.imu.max_gap_s:
         text += f"; longer than imu.max_gap_s = {config.imu.max_gap_s:g}: split the log there or raise that key"
-        yield Finding(t.sensor, "error", text)
+        yield Finding(t.sensor, "error", text, "gap")
     else:
-        yield Finding(t.sensor, "warning", text)
+        yield Finding(t.sensor, "warning", text, "gap")

@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding, frozen_runs, since
+from rovgraph.check.findings import Finding, frozen_runs, repeats, since
 from rovgraph.config import Config, mount_matrix
+from rovgraph.geometry import Array
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import SENSORS, Level
 
@@ -14,6 +16,13 @@ GRAVITY_ANGLE = np.deg2rad(25.0)  # of mean specific force from upwards
 FAST_TURN = 3.0  # no vehicle of this kind turns faster for long [rad/s]
 FAST_SPIKE = 10.0  # nor for a moment [rad/s]
 FROZEN_SECONDS = 1.0  # a noisy signal never repeats for so long
+CLIPPED = 10  # samples at one extreme, which noise does not make
+PILED = 3.0  # times as many as at any of the values next to it
+NEAR = 5  # values
+STEPS = 3.0  # of the resolution, by which the samples around them are away
+RANGES = {"acc": (2.0, 4.0, 8.0, 16.0, 32.0), "gyr": (125.0, 250.0, 500.0, 1000.0, 2000.0)}  # of usual IMUs [g, deg/s]
+LIKE_A_RANGE = 0.03  # of it
+STANDARD_GRAVITY = 9.80665  # [m/s2]
 # specific force along this IMU axis, at rest -> mounting that turns it upwards
 UPRIGHT = {
     "+x": (0, 90, 0),
@@ -34,7 +43,8 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
     low, high = GRAVITY_RANGE
     if not low <= size <= high:
         level: Level = "warning" if 5.0 < size < 15.0 else "error"
-        yield Finding("imu", level, f"mean specific force is {size:.4g} m/s2, expected about 9.8; {_acc_unit(size)}")
+        text = f"mean specific force is {size:.4g} m/s2, expected about 9.8; {_acc_unit(size)}"
+        yield Finding("imu", level, text, "unit")
     if size < 1e-6:
         return
     angle = tilt(log, config)
@@ -46,6 +56,7 @@ def gravity(log: Log, config: Config) -> Iterator[Finding]:
             "warning",
             f"mean specific force points {np.rad2deg(angle):.0f} deg away from upwards (-z of the body): it is on the "
             f"IMU's {axis} axis; check imu.mount_rpy_deg, probably {list(UPRIGHT[axis])} with the yaw of your IMU",
+            "axes",
         )
     elif low <= size <= high:
         yield Finding("imu", "ok", f"mean specific force {size:.2f} m/s2, {np.rad2deg(angle):.1f} deg from upwards")
@@ -85,14 +96,14 @@ def turn_rates(log: Log, config: Config) -> Iterator[Finding]:
             "error",
             f"a tenth of the rates is above {usual:.3g} rad/s ({np.rad2deg(usual):.0f} deg/s); "
             "if they are in deg/s, state units: {gyr: deg/s}",
+            "unit",
         )
     elif fast:
         when = since(log, log["imu"].time[np.argmax(rate > FAST_SPIKE)])
-        yield Finding(
-            "imu", "warning", f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or a wrong unit"
-        )
+        text = f"{fast} rates above {FAST_SPIKE:g} rad/s, first at {when}: spikes, or a wrong unit"
+        yield Finding("imu", "warning", text, "spikes")
     if not np.ptp(log["imu"].data[:, 3:], axis=0).any():
-        yield Finding("imu", "error", "the gyro's values never change; check its connection")
+        yield Finding("imu", "error", "the gyro's values never change; check its connection", "stuck")
 
 
 def angles(log: Log, config: Config) -> Iterator[Finding]:
@@ -106,14 +117,15 @@ def angles(log: Log, config: Config) -> Iterator[Finding]:
             "ahrs",
             "error",
             f"roll or pitch reaches {largest:.4g} rad; if they are in degrees, state units: {{ahrs: deg}}",
+            "unit",
         )
 
 
 def own(log: Log, config: Config) -> Iterator[Finding]:
     """What each sensor finds in its own values."""
     for sensor, stream in log.streams.items():
-        for level, text in SENSORS[sensor].look(stream.data, config):
-            yield Finding(sensor, level, text)
+        for said in SENSORS[sensor].look(stream.data, config):
+            yield Finding(sensor, *said)
 
 
 def frozen_imu(log: Log, config: Config) -> Iterator[Finding]:
@@ -123,6 +135,55 @@ def frozen_imu(log: Log, config: Config) -> Iterator[Finding]:
     for name, first in (("acc", 0), ("gyr", 3)):
         stretches = frozen_runs(log["imu"].data[:, first : first + 3])
         yield from _longest(log, "imu", name, [r for r in stretches if r[1] - r[0] >= 9], FROZEN_SECONDS)
+
+
+def saturated(log: Log, config: Config) -> Iterator[Finding]:
+    """Accelerometer or gyro whose samples pile up at one extreme: what is beyond its range is cut off."""
+    if "imu" not in log:
+        return
+    imu = log["imu"]
+    for name, first, unit in (("acc", 0, "m/s2"), ("gyr", 3, "rad/s")):
+        data = imu.data[:, first : first + 3]
+        ends = [
+            (f"{name}_{axis} at {data[at[0], k]:.4g} {unit} in {len(at)} samples", at)
+            for k, axis in enumerate("xyz")
+            for values in (data[:, k], -data[:, k])
+            if len(at := _piled_up(values, data))
+        ]
+        if not ends:
+            continue
+        ends.sort(key=lambda end: -len(end[1]))
+        begin = min(int(at[0]) for _, at in ends)
+        limit = max(float(np.abs(data[at[0]]).max()) for _, at in ends)
+        text = f"{name} is clipped{_like_a_range(name, limit)}: {', '.join(said for said, _ in ends)}, first at "
+        text += f"{since(log, imu.time[begin])}; the rest is lost: set a larger range, or damp what shakes the IMU"
+        yield Finding("imu", "warning", text, "saturated")
+
+
+def _piled_up(values: Array, data: Array) -> NDArray[np.int64]:
+    """Which of n values are the largest and pile up there, as those of a clipped signal do; else none.
+
+    Of equal values that a coarse resolution makes, the neighbours in time are within a few of its steps.
+    """
+    largest = values == values.max()
+    none = np.empty(0, dtype=np.int64)
+    if np.count_nonzero(largest) < CLIPPED:
+        return none
+    fresh = ~repeats(data)  # a sample that is held is one
+    at = np.flatnonzero(largest & fresh)
+    levels, counts = np.unique(values[~largest & fresh], return_counts=True)
+    if len(at) < CLIPPED or len(levels) < NEAR or len(at) < PILED * counts[-NEAR:].max():
+        return none
+    around = np.concatenate([at[at > 0] - 1, at[at < len(values) - 1] + 1])
+    away = values[at[0]] - values[around[~largest[around]]]
+    return at if np.median(away) > STEPS * np.median(np.diff(levels)) else none
+
+
+def _like_a_range(name: str, limit: float) -> str:
+    """The usual range that a limit is, in brackets; "" if it is none."""
+    unit, size = ("g", STANDARD_GRAVITY) if name == "acc" else ("deg/s", float(np.deg2rad(1.0)))
+    near = [a for a in RANGES[name] if abs(limit / size - a) < LIKE_A_RANGE * a]
+    return f" ({near[0]:g} {unit})" if near else ""
 
 
 def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]], seconds: float) -> Iterator[Finding]:
@@ -135,4 +196,5 @@ def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]],
             "warning",
             f"{name} repeats one value exactly for {duration:.1f} s from {since(log, start)} on "
             f"({len(long)} such intervals); a working sensor always shows noise: check its connection and driver",
+            "stuck",
         )

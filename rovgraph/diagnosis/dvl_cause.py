@@ -66,7 +66,7 @@ def _as_checked(found: Statistic, log: Log, config: Config) -> Statistic:
     findings = [finding for finding in dvl_and_imu(log, config) if finding.level != "ok"]
     if not findings:
         return found
-    kind, cause = "clock" if findings[0].clock else "axes", "; ".join(finding.text for finding in findings)
+    kind, cause = "clock" if findings[0].of_clock else "axes", "; ".join(finding.text for finding in findings)
     return replace(found, kind=kind, cause=cause, remedy=UNTIL_THEN)
 
 

@@ -104,20 +104,20 @@ class Crosscheck:
             for f in check(log, self.config):
                 contradicted |= check is dvl_and_imu and f.level != "ok"
                 whole = check is not vertical and (f.sensor in used or f.sensor not in HEADING_STREAMS)
-                if f.level != "ok" and (f.clock or whole):
-                    found.setdefault((f.sensor, f.clock or check.__name__), f)
+                if f.level != "ok" and (f.of_clock or whole):
+                    found.setdefault((f.sensor, f.kind if f.of_clock else check.__name__), f)
             yield []
         self.dvl_contradicted = contradicted
-        if any(f.clock == "jump" for f in found.values()):  # a lag before and after is the mean of two
-            found = {key: f for key, f in found.items() if f.clock == "jump"}
-        late = {f.sensor for f in found.values() if f.clock}  # which explains what else disagrees
-        found = {key: f for key, f in found.items() if f.clock or f.sensor not in late}
+        if any(f.kind == "jump" for f in found.values()):  # a lag before and after is the mean of two
+            found = {key: f for key, f in found.items() if f.kind == "jump"}
+        late = {f.sensor for f in found.values() if f.of_clock}  # which explains what else disagrees
+        found = {key: f for key, f in found.items() if f.of_clock or f.sensor not in late}
         suspected = {key: self._suspected.get(key, 0) + 1 for key in found}
         for key, finding in found.items():
-            kind = "clock" if finding.clock else "check"
+            kind = "clock" if finding.of_clock else "check"
             if suspected[key] >= IN_A_ROW[kind] and now - self._said.get(key, -math.inf) > AGAIN_S:
                 self._said[key] = now
-                zero = f"; 0 s is {start:.1f} s" if finding.clock == "jump" else ""
+                zero = f"; 0 s is {start:.1f} s" if finding.kind == "jump" else ""
                 events.append(Event(now, finding.sensor, kind, f"{finding.text}{zero}"))
         self._suspected = suspected
         yield events

@@ -12,7 +12,7 @@ from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix, skew
 from rovgraph.kernels import measurements as kernels
 from rovgraph.sensors.model import evaluate
-from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Level, Observed, Sensor, instrument
+from rovgraph.sensors.sensor import LARGEST_SD, Column, Instrument, Observed, Said, Sensor, instrument
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
 VELOCITIES = ("dvl_vx", "dvl_vy", "dvl_vz")
@@ -140,20 +140,20 @@ def _standard_deviation(values: Array, believed: Instrument, config: Config) -> 
     return sd
 
 
-def _bottom_lock(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+def _bottom_lock(values: Array, config: Config) -> Iterator[Said]:
     """Share of valid pings, and their speed."""
     valid = values[:, 3] == 1.0
     share = float(valid.mean())
-    yield "ok" if share >= 0.8 else "warning", f"bottom lock {share:.1%} of {len(values)} pings"
+    yield "ok" if share >= 0.8 else "warning", f"bottom lock {share:.1%} of {len(values)} pings", "bottom lock"
     if not valid.any():
         return
     velocity = values[valid, :3]
     usual, limit = float(np.median(np.linalg.norm(velocity, axis=1))), config.dvl.max_speed_mps
     lost = int((np.abs(velocity).max(axis=1) > limit).sum())
     if usual > max(limit, 10.0):
-        yield "error", f"median speed {usual:.3g} m/s; if it is in mm/s or cm/s, state units: {{dvl: mm/s}}"
+        yield "error", f"median speed {usual:.3g} m/s; if it is in mm/s or cm/s, state units: {{dvl: mm/s}}", "unit"
     elif lost > 0.05 * len(velocity):
-        yield "warning", f"{lost} pings are faster than dvl.max_speed_mps = {limit:g} and are ignored"
+        yield "warning", f"{lost} pings are faster than dvl.max_speed_mps = {limit:g} and are ignored", "speed"
     else:
         tail = f"; {lost} faster than {limit:g} m/s are ignored" if lost else ""
         yield "ok", f"median speed {usual:.2f} m/s{tail}"

@@ -11,7 +11,7 @@ from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurements as kernels
 from rovgraph.sensors.model import evaluate
-from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Sensor, instrument
+from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Said, Sensor, instrument
 from rovgraph.state import BIAS, POSE, Jacobians, State
 
 # the mean field of the Earth in each unit; "1" where it was normalised
@@ -72,7 +72,7 @@ def _refused(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.bo
     yield "exactly zero", (values == 0.0).all(axis=1)
 
 
-def _magnitude(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+def _magnitude(values: Array, config: Config) -> Iterator[Said]:
     """The field's magnitude is the Earth's, and constant but for iron near the magnetometer."""
     low, middle, high = np.percentile(np.linalg.norm(values, axis=1), [5, 50, 95])
     spread = (high - low) / middle if middle > 0 else np.inf
@@ -86,8 +86,9 @@ def _magnitude(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
             "warning",
             f"field {middle:.4g} is not the Earth's in {said} (22 to 67 uT); if the unit is wrong, "
             "state it, such as units: {mag: nT}, or calibrate it (rovgraph calibrate magnetometer)",
+            "unit",
         )
-    yield level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}"
+    yield level, f"field {middle:.4g}, its middle 90 % within {spread:.0%}{hint}", "iron"
 
 
 MAG = Sensor(

@@ -12,7 +12,7 @@ from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurements as kernels
 from rovgraph.sensors.model import evaluate
-from rovgraph.sensors.sensor import Column, Instrument, Level, Observed, Sensor, instrument, own_sd
+from rovgraph.sensors.sensor import Column, Instrument, Observed, Said, Sensor, instrument, own_sd
 from rovgraph.state import BIAS, POSE, VELOCITY, Jacobians, State
 
 DEEPEST_M = 12e3  # no pressure sensor measures more, and a number like that overflows what comes after it
@@ -79,7 +79,7 @@ def _too_deep(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.b
     yield "deeper than any sea", np.abs(values[:, 0]) > DEEPEST_M
 
 
-def _range(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+def _range(values: Array, config: Config) -> Iterator[Said]:
     """Depth positive down, and in metres."""
     depth = values[:, 0]
     if np.median(depth) < -0.5:
@@ -87,6 +87,7 @@ def _range(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
             "warning",
             f"median depth {np.median(depth):.2f} m, but depth counts downwards; "
             "if its sign is reversed, state units: {depth: -m}",
+            "sign",
         )
     elif np.percentile(depth, 1) < -1.0:
         lowest = -float(np.percentile(depth, 1))
@@ -94,9 +95,10 @@ def _range(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
             "warning",
             f"it reaches {lowest:.1f} m above the surface; "
             "the first pressure was probably measured under water and taken for that at the surface",
+            "zero",
         )
     if np.ptp(depth) > 1000.0:
-        yield "warning", f"depth spans {np.ptp(depth):.4g} m; if it is in cm or mm, state units: {{depth: mm}}"
+        yield "warning", f"depth spans {np.ptp(depth):.4g} m; if it is in cm or mm, state units: {{depth: mm}}", "unit"
 
 
 DEPTH = Sensor(

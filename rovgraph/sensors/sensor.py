@@ -29,6 +29,16 @@ MOSTLY = (
 Quantity = Literal["acceleration", "rate", "field", "angle", "speed", "length"]
 Frame = Literal["position", "velocity", "heading"]
 Level = Literal["ok", "warning", "error"]
+# what a check may find: data that are wrong, and remain so in an estimate; or not
+Fault = Literal[
+    "axes", "sign", "unit", "scale", "swapped", "turned", "contradiction", "epoch", "lag", "jump", "bursts",
+    "saturated", "stuck", "zero", "start", "current",
+]  # fmt: skip
+Remark = Literal[
+    "", "missing", "frozen", "gap", "rate", "jitter", "repeats", "spikes", "bottom lock", "speed", "iron",
+]  # fmt: skip
+Kind = Fault | Remark
+Said = tuple[Level, str] | tuple[Level, str, Kind]  # a sensor of its own values
 
 
 @dataclass(frozen=True)
@@ -173,7 +183,7 @@ def placeholders(column: Column, sd: Array) -> NDArray[np.bool_]:
     return np.asarray(stands | (sd > (np.inf if column.largest is None else column.largest)))
 
 
-def nothing_found(values: Array, config: Config) -> Iterator[tuple[Level, str]]:
+def nothing_found(values: Array, config: Config) -> Iterator[Said]:
     """Nothing to say of the values."""
     yield from ()
 
@@ -202,7 +212,8 @@ class Sensor:
     occasional : it speaks only now and then, so a gap means nothing
     usual_rates : slowest and fastest that make sense [Hz]
     if_missing : what it means that a log has none
-    look : what is wrong or worth knowing of its values, from columns, shape (n, k), and the configuration
+    look : what is wrong or worth knowing of its values, from columns, shape (n, k), and the configuration: level, text
+        and kind, "" where that is left out
     simulated_hz : rate at which a simulated dive samples its model with white noise; None = the simulator has a
         sampler of its own for it, or none
     calibration : variables that come with it, beside the built-in ones
@@ -222,7 +233,7 @@ class Sensor:
     occasional: bool = False
     usual_rates: tuple[float, float] = (0.0, np.inf)
     if_missing: tuple[Level, str] | None = None
-    look: Callable[[Array, Config], Iterator[tuple[Level, str]]] = nothing_found
+    look: Callable[[Array, Config], Iterator[Said]] = nothing_found
     simulated_hz: float | None = None
     calibration: tuple[Variable, ...] = ()
     settings: type[SensorSettings] | None = None
