@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rovgraph.check import Finding
 from rovgraph.config import Config
 from rovgraph.diagnosis import (
     Alarm,
@@ -90,7 +91,13 @@ class Dive:
         return self.initial.assumptions + _taken_as_exact(self.initial) + left_out
 
 
-def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress = no_progress) -> Dive:
+def smooth(
+    log: Log,
+    config: Config,
+    estimate: str = "both",
+    progress: Progress = no_progress,
+    findings: Sequence[Finding] = (),
+) -> Dive:
     """Estimate a dive: what ``rovgraph smooth`` does.
 
     Parameters
@@ -98,6 +105,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     log, config : the dive, and what is believed of vehicle and sensors
     estimate : "smoothed", "filtered" or "both"
     progress : called now and then
+    findings : of the check of the log, which the verdict counts
 
     Raises
     ------
@@ -105,7 +113,7 @@ def smooth(log: Log, config: Config, estimate: str = "both", progress: Progress 
     """
     log, frozen = without_frozen(log, config)
     log, gaps = without_attitude_gaps(log, config)
-    known = _Known(log, initialise(log, config), frozen, gaps)
+    known = _Known(log, initialise(log, config), frozen, gaps, findings)
     dive, best = _solve(known, estimate, progress)
     for search in (find_noise, find_errors) if config.graph.find_noise else ():
         if not isinstance(best, ChainOptimum):
@@ -128,7 +136,7 @@ class _Known:
 
     Attributes
     ----------
-    log, initial, frozen, gaps : the dive
+    log, initial, frozen, gaps, findings : the dive
     found, rivals : what is believed since, and what would explain it as clearly
     states, before : of the solution before: State of its keyframes, and its track; None = there is none
     """
@@ -137,6 +145,7 @@ class _Known:
     initial: InitialConditions
     frozen: list[FrozenStretch]
     gaps: list[AttitudeGap]
+    findings: Sequence[Finding]
     found: tuple[UnstatedNoise, ...] = ()
     rivals: tuple[Rival, ...] = ()
     states: State | None = None
@@ -202,7 +211,7 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
     intervals = batch.intervals if best is None else best.intervals
     left_out = _left_out(batch, known.frozen, known.gaps)
     revealed = [(one.sensor, one.cause) for one in known.found]
-    seen = known.frozen, log, known.gaps, left_out, revealed, known.before, known.rivals
+    seen = known.frozen, log, known.gaps, left_out, known.findings, revealed, known.before, known.rivals
     numbers = statistics(Evidence(initial, estimates, intervals, best, *seen))
     if any(one.kind == "rivals" and one.severity for one in numbers) and best is not None:
         estimates = [_covering(estimate, known.rivals, best) for estimate in estimates]

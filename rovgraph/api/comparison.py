@@ -118,7 +118,7 @@ def compare(
             reference = read_reference(reference)
         if not isinstance(reference, Trajectory):
             raise InputError(f"reference: expected a path or a Trajectory, found {kind_of(reference)}")
-        runs = [Recorded(title, Case(prepared(log, config), config, reference))]
+        runs = [Recorded(title, Case(prepared(log, config)[0], config, reference))]
     began = time.perf_counter()
     comparison = library.compare(runs, names, jobs, lambda done: progress("comparing", done))
     about["seconds"] = time.perf_counter() - began

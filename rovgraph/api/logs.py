@@ -1,7 +1,7 @@
 """Logs for an estimate: reading with a configuration, checking, bridging of clock jumps."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -89,8 +89,8 @@ def check(log: Log, config: Config | None = None) -> Report:
     return report
 
 
-def prepared(log: Log, config: Config) -> Log:
-    """A log for an estimate: checked, with jumps of clocks bridged.
+def prepared(log: Log, config: Config) -> tuple[Log, Sequence[Finding]]:
+    """A log for an estimate: checked, with jumps of clocks bridged; and what the check found.
 
     Raises
     ------
@@ -102,8 +102,7 @@ def prepared(log: Log, config: Config) -> Log:
     """
     config = given(log, config)
     log, examined = bridge_jumps(log, config)
-    warn_of_findings(log, config, examined)
-    return log
+    return log, warn_of_findings(log, config, examined).findings
 
 
 def given(log: Log, config: Config | None) -> Config:

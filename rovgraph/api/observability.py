@@ -118,7 +118,7 @@ def observe(
     estimate = listed(estimate)
     config = estimating(given(log, config), estimate)
     with collected_warnings() as texts:
-        log = prepared(log, config)
+        log, _ = prepared(log, config)
         seen = library.observe(log, config, estimate, progress)
     about = {"log": log.source, "estimate": [*estimate]}
     return ObservabilityResult(seen, config, (*log.warnings, *texts), about)

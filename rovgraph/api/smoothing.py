@@ -238,9 +238,9 @@ def smooth(
     config = with_engine(given(log, config), engine)
     began = time.perf_counter()
     with collected_warnings() as texts:
-        log = prepared(log, config)
+        log, findings = prepared(log, config)
         checked = time.perf_counter()
-        dive = smooth_dive(log, config, estimate, progress)
+        dive = smooth_dive(log, config, estimate, progress, findings)
     seconds = {"checking": checked - began, "estimating": time.perf_counter() - checked}
     return Result(dive, log, (*log.warnings, *texts), seconds)
 

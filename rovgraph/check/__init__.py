@@ -79,8 +79,8 @@ def _of_motion(check: Check, unfrozen: Log, log: Log, config: Config) -> Iterato
     yield from found if any(f.of_clock and f.level != "ok" for f in found) else check(unfrozen, config)
 
 
-def warn(log: Log, config: Config | None = None, examined: Examined | None = None) -> None:
-    """Issue a `DataWarning` for whatever looks wrong.
+def warn(log: Log, config: Config | None = None, examined: Examined | None = None) -> Report:
+    """Issue a `DataWarning` for whatever looks wrong, and return all of it.
 
     Raises
     ------
@@ -90,6 +90,7 @@ def warn(log: Log, config: Config | None = None, examined: Examined | None = Non
     for finding in report.at("warning"):
         issue_warning(f"{report.source}: {finding.sensor}: {finding.text}")
     refuse(report)
+    return report
 
 
 def refuse(report: Report) -> None:

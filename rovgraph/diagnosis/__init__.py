@@ -32,6 +32,7 @@ TINY = 1e-9  # a limit may be 0
 
 STATISTICS: tuple[Callable[[Evidence], Iterator[Statistic]], ...] = (
     dvl_cause,
+    sensors.checked,
     motion.found,
     constants.held,
     constants.moved,

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from rovgraph.check import Finding
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.lasting import Rival
@@ -57,6 +58,7 @@ class Evidence:
     log : of the dive
     attitude_gaps : times without heading or tilt, of a dive without an IMU
     left_out : (sensor, reason) -> count of measurements that never reached the graph
+    findings : of the check of the log
     revealed : sensor and cause of what the dive revealed, with which it was solved again
     before : track before it was; None = it was not
     rivals : what explains the dive as clearly as what was found
@@ -70,6 +72,7 @@ class Evidence:
     log: Log
     attitude_gaps: Sequence[AttitudeGap] = ()
     left_out: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    findings: Sequence[Finding] = ()
     revealed: Sequence[tuple[str, str]] = ()
     before: Trajectory | None = None
     rivals: Sequence[Rival] = ()

@@ -60,9 +60,7 @@ CHANCE = 1e-6  # that a figure of a healthy sensor is beyond a limit that is a q
 _ROWS = (
     Rule("axes", "error of the DVL against the IMU, over that with other axes", 1.15, 1.15, live="as a `check` event"),
     Rule("clock", "the same, over that with shifted stamps", 1.15, 1.15, live="as a `clock` event"),
-    Rule(
-        "check", "findings of `rovgraph check` that say that data are wrong, and that are not resolved", 0.0, rate=0.0
-    ),
+    Rule("check", "findings of the check that the data are wrong, and that nothing has mended", 0.0, rate=0.0),
     Rule(
         "innovations",
         "mean square of the filter's innovations, in their stated sds",

@@ -15,6 +15,21 @@ MEASURE_THE_SAME = (
 OF_RESIDUALS = ("rejected", "too large", "lasting")
 
 
+def checked(evidence: Evidence) -> Iterator[Statistic]:
+    """What the check of the log says is wrong with the data, and neither the log's reader nor the estimate has mended.
+
+    A clock that was set is bridged, and late stamps are no matter where the offset is estimated.
+    """
+    beliefs = evidence.initial.beliefs
+    for finding in evidence.findings:
+        offset = beliefs.get(f"{finding.sensor}_time_offset")
+        mended = finding.kind == "jump" or (finding.kind == "lag" and offset is not None and offset.estimate)
+        if finding.wrong and not mended:
+            cause, _, remedy = finding.text.partition("; ")
+            remedy = remedy or "rovgraph check has all findings"
+            yield Statistic("check", finding.sensor, evidence.start, evidence.end, 1.0, cause, remedy)
+
+
 def frozen(evidence: Evidence) -> Iterator[Statistic]:
     """How long a sensor repeated itself; those measurements were left out. Single ones between others cost nothing."""
     by_sensor: dict[str, list[tuple[float, float]]] = {}
