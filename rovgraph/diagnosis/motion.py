@@ -8,7 +8,7 @@ from scipy.special import chdtri
 from rovgraph.calibration import TABLE
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence, windows
-from rovgraph.diagnosis.rules import CHANCE
+from rovgraph.diagnosis.rules import CHANCE, RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.geometry import Array, wrap_angle
@@ -39,11 +39,19 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
     full = count >= max(3.0, 0.3 * np.median(count))
     if not full.any():
         return
+
+    def means(residuals: Array) -> Array:
+        """Squared means of each axis over windows, in units of their noise, shape (windows, 15)."""
+        sums = np.column_stack([np.bincount(window, column) for column in residuals[kept].T])
+        return np.asarray((sums**2 / np.maximum(count, 1)[:, None])[full])
+
+    squares, n = means(r), int(full.sum())
+    by_chance = float(chdtri(n, CHANCE)) / n
+    if squares.mean(axis=0).max() > max(RULES["imu"].doubtful, by_chance):
+        squares = squares / (1.0 + sum(map(means, _moved_motions(evidence, r))))
     for part, columns, key in PARTS:
-        for axis, values in zip("xyz", r[kept, columns].T, strict=True):
-            square = (np.bincount(window, values) ** 2 / np.maximum(count, 1))[full]
-            n, ratio = len(square), float(square.mean())
-            by_chance = float(chdtri(n, CHANCE)) / n
+        for axis, square in zip("xyz", squares[:, columns].T, strict=True):
+            ratio = float(square.mean())
             begin = evidence.start + float(np.flatnonzero(full)[int(np.argmax(square))]) * IMU_S
             yield Statistic(
                 "imu",
@@ -80,6 +88,13 @@ def bias_drift(evidence: Evidence) -> Iterator[Statistic]:
             f"of what imu.noise.{key}_walk allows",
             f"let the IMU warm up before the dive, or raise imu.noise.{key}_walk",
         )
+
+
+def _moved_motions(evidence: Evidence, here: Array) -> Iterator[Array]:
+    """By how much what is considered, each component one sd away, moves the residuals, shape (n - 1, 15)."""
+    best = evidence.optimum
+    for state in best.moved_by_considered() if isinstance(best, ChainOptimum) else ():
+        yield best.wide.rows.motion_residuals(state) - here
 
 
 def _motion_residuals(evidence: Evidence) -> Array:

@@ -98,12 +98,12 @@ def rejected_in(sensor: str, begin: float, end: float, share: float, start: floa
 
 
 def too_large(evidence: Evidence) -> Iterator[Statistic]:
-    """Mean square of a sensor's normalised residuals, in the whole dive and in its worst minute."""
+    """Mean square of a sensor's weighted residuals, in the whole dive and in its worst minute."""
     if evidence.main.kind == "filtered":  # its innovations hold its own error, too
         return
     for r in evidence.residuals.values():
         used = r.weight > 0.0
-        square = np.mean(r.normalised[used] ** 2, axis=1)
+        square = r.weight[used] * np.mean(r.normalised[used] ** 2, axis=1)  # as far as it counts
         if len(square) < ENOUGH:
             continue
         window = windows(r.time[used], evidence.start, MINUTE)

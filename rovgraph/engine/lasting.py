@@ -61,6 +61,7 @@ WORTH_A_LOOK = {
     "fix": 1.0,
 }  # least `unity`; the track takes a DVL's error along
 CLEAR = 8.0  # gain that is no chance: of healthy dives one in a hundred comes to 6
+PART_OF_BEST = 0.25  # of the best explanation's gain, that a rival has: wrong ones had 0.46 of the right one's and more
 SHORTEST = 5.0  # time constant in intervals between measurements: what is shorter is noise
 SMALLEST = 0.01  # sd, in that of the table
 # largest sd, in that of the table: a compass that is 10 degrees off for minutes is not swinging but broken or mirrored
@@ -71,6 +72,8 @@ CONSTANT = np.array([1.0, 3.0])  # sds of constants that may be the cause, in th
 FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
 EVALUATIONS = 12  # of the likelihood in it
 AS_PROMISED = 0.1  # of a gain, by which that of the linear dive may differ
+STEPPING = {name: sensor for name, sensor in LASTING.items() if name != "dvl_error"}  # the bottom steps, not its slope
+LARGEST_STEP = {"bottom_velocity": 1.0}  # of what else has none: a zero may be set anywhere [unit of the variable]
 STEP_S, LEAST_OF_STEP = 5.0, 4  # medians of residuals that are compared: a time, and measurements
 JUMP = 40.0  # of them, in chi-square
 MOST_STEPS = 3
@@ -134,7 +137,8 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> tuple[lis
         if not clear:
             break
         if not found:
-            rivals = [Rival(error, fitted.solution.point.p_n) for error, fitted in clear[1:]]
+            least = PART_OF_BEST * clear[0][0].gain
+            rivals = [Rival(error, fitted.solution.point.p_n) for error, fitted in clear[1:] if error.gain > least]
         error, now = clear[0]
         found.append(error)
     beside = {error.variable for error in found}
@@ -210,13 +214,13 @@ def _steps(now: _Baseline, passed: Collection[str], beside: str = "") -> list[La
     What is estimated is passed over, but for what has steps already.
     """
     out = []
-    for name, sensor in LASTING.items():
+    for name, sensor in STEPPING.items():
         block = now.chain.blocks.get(sensor)
         if block is None or len(block) < ENOUGH or name in {*now.chain.unknowns.estimated, *passed} - {beside}:
             continue
         state = now.solution.point.at(block.keyframe)
         steps = _jumps(block, state, block.by_calibration(state, name))
-        if steps:
+        if steps and max(np.linalg.norm(step) for _, step in steps) < LARGEST_STEP.get(name, np.inf):
             sd = float(np.sqrt(np.mean(np.square([step for _, step in steps]))))
             out.append(LastingError(sensor, name, sd, np.inf, 0.0, steps))
     return out
