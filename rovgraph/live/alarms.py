@@ -68,6 +68,8 @@ class _Raised:
 class LiveAlarms:
     """Says once that an alarm begins, or becomes worse, and once that it is over.
 
+    One that comes and goes is in the verdict while it is there, and is not said again unless it is worse than it was.
+
     Attributes
     ----------
     events : since it was last emptied
@@ -90,6 +92,8 @@ class LiveAlarms:
         self._told: list[tuple[float, Statistic]] = []
         self._shown: list[Statistic] = []  # by the smoothed dive, at the newest re-initialisation
         self._raised: dict[tuple[str, str], _Raised] = {}
+        self._looks: dict[tuple[str, str], int] = {}  # in a row, in which an alarm was there
+        self._said: dict[tuple[str, str], set[str]] = {}  # of each alarm: severities, and that it is over
 
     @property
     def active(self) -> tuple[Alarm, ...]:
@@ -214,14 +218,17 @@ class LiveAlarms:
 
     def _look(self, statistics: list[Statistic], time: float) -> None:
         """Begin and end alarms."""
-        for alarm in find_alarms(statistics, self._start):
-            key = alarm.kind, alarm.sensor
+        found = {(alarm.kind, alarm.sensor): alarm for alarm in find_alarms(statistics, self._start)}
+        self._looks = {key: self._looks.get(key, 0) + 1 for key in found}
+        for key, alarm in found.items():
             raised = self._raised.get(key)
+            if raised is None and self._looks[key] < RULES[alarm.kind].looks:
+                continue
             if raised is None or (alarm.severity == "wrong" and raised.alarm.severity != "wrong"):
                 begin = time if raised is None else raised.alarm.begin
                 alarm = replace(alarm, begin=begin, end=time)
                 self._raised[key] = _Raised(alarm, time)
-                self._say(time, alarm.sensor, alarm.severity, alarm.text)
+                self._say_once(key, time, alarm.severity, alarm.text)
             else:
                 raised.last, raised.alarm = time, self._renewed(raised.alarm, alarm, time)
             self.history[(*key, self._raised[key].alarm.begin)] = self._raised[key].alarm
@@ -232,7 +239,7 @@ class LiveAlarms:
         for key, raised in list(self._raised.items()):
             if time - raised.last >= OVER_S:
                 del self._raised[key]
-                self._say(time, key[1], "over", f"{key[1]}: {key[0]}: within its limits for {OVER_S:g} s")
+                self._say_once(key, time, "over", f"{key[1]}: {key[0]}: within its limits for {OVER_S:g} s")
 
     def _renewed(self, before: Alarm, now: Alarm, time: float) -> Alarm:
         """An alarm that goes on: as it was at its worst, or with the figures that the smoothed dive has now."""
@@ -242,6 +249,12 @@ class LiveAlarms:
         elif now.figure <= before.figure or now.severity != before.severity:
             now = before
         return replace(now, begin=before.begin, end=time)
+
+    def _say_once(self, key: tuple[str, str], time: float, kind: str, text: str) -> None:
+        said = self._said.setdefault(key, set())
+        if kind not in said:
+            said.add(kind)
+            self._say(time, key[1], kind, text)
 
     def _say(self, time: float, sensor: str, kind: str, text: str) -> None:
         self.events.append(Event(time, sensor, kind, text))
