@@ -67,7 +67,8 @@ SMALLEST = 0.01  # sd, in that of the table
 # largest sd, in that of the table: a compass that is 10 degrees off for minutes is not swinging but broken or mirrored
 LARGEST = {"dvl_error": 10.0, "depth_error": 10.0}
 LARGEST_OF_OTHERS = 5.0
-LARGEST_OF_FIXES = 4.0  # in their stated noise: of true ones 1.2 to 3.9 were found, where the bed moved 5.4 and more
+ROUGHLY = 2.0  # times as large an sd goes with the same error over a time constant that is longer
+LARGEST_OF_FIXES = 4.6  # in their stated noise: of true ones 1.2 to 3.9 were found, where the bed moved 5.4 and more
 CONSTANT = np.array([1.0, 3.0])  # sds of constants that may be the cause, in those they are believed to have
 FIRST, LAST = 1.0, 0.1  # radius of the search, by logarithms
 EVALUATIONS = 12  # of the likelihood in it
@@ -346,7 +347,8 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
 
     Its gain is that over the same error as a constant, and over constants that are estimated but believed too well: a
     scale or an offset that is held wrongly is no error that lasts for a while. What of the sensor is considered is
-    found instead, where that makes the dive likelier.
+    found instead, where that makes the dive likelier; of another sensor it is the cause, and stays considered: a DVL
+    that is tilted drifts against the depth.
     """
     error, fitted = candidate, now.with_error(candidate.variable, candidate.sd, candidate.time_constant)
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
@@ -354,11 +356,11 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
         error = _most_likely(fitted, replace(candidate, gain=0.0))
         fitted = fitted.with_error(error.variable, error.sd, error.time_constant)
     path = fitted.solution.point.calibration[error.variable]
-    if _implausible(now.chain, error) or np.sqrt(np.mean(path**2)) > _largest(now.chain, error.variable):
+    if np.sqrt(np.mean(path**2)) > _largest(now.chain, error.variable):
         return replace(error, gain=-np.inf), fitted
     gain = now.minus_log_likelihood - fitted.minus_log_likelihood
     unknowns = now.chain.unknowns
-    own = [n for n in unknowns.considered if error.sensor in TABLE[n].sensors and not TABLE[n].time_offset]
+    own = [n for n in unknowns.considered if not TABLE[n].time_offset]
     if ARM in own and _noise_moves_arm(now):
         own.remove(ARM)
     known = [n for n, walk in unknowns.walks.items() if walk == 0.0]
@@ -366,7 +368,8 @@ def _fit(now: _Baseline, candidate: LastingError) -> tuple[LastingError, _Baseli
     constants = LinearConstants.of(now.chain, now.solution, [*own, *rivals])
     constant, held = _as_constant(now, error, own, constants)
     if constant.gain >= max(gain, CLEAR):
-        return constant, held
+        of_sensor = error.sensor in TABLE[constant.variable].sensors
+        return (constant, held) if of_sensor else (replace(error, gain=-np.inf), fitted)
     return replace(error, gain=gain - _as_constant(now, error, rivals, constants)[0].gain), fitted
 
 
@@ -402,7 +405,7 @@ def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
     from scipy.optimize import minimize  # takes 0.1 s to load; healthy dives do not need it
 
     name, seconds = begin.variable, _time_constants(now.chain, begin.sensor)
-    largest = _largest(now.chain, name)
+    largest = ROUGHLY * _largest(now.chain, name)
     sds = min(SMALLEST * TABLE[name].sd, 0.1 * largest), largest
     walks = stationary_walk(sds[0], seconds[1]), stationary_walk(sds[1], seconds[0])
 
@@ -447,8 +450,8 @@ def _largest(chain: Chain, name: str) -> float:
 
 
 def _implausible(chain: Chain, error: LastingError) -> bool:
-    """Whether an error has another cause: it is larger than such a sensor's can be."""
-    return error.sd > _largest(chain, error.variable)
+    """Whether an error has another cause: it is far larger than such a sensor's can be; its sd is known roughly."""
+    return error.sd > ROUGHLY * _largest(chain, error.variable)
 
 
 def _freedom(chain: Chain, log_determinant: float) -> float:
