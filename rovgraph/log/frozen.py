@@ -42,6 +42,7 @@ FULL_OF, FULL_RANK = 9, 3  # which is the third largest of nine
 ALIKE = 0.25  # part of the speed by which the pings around may differ
 OUTLIES, QUIET = 8.0, 0.25  # times the distance from the mean of both neighbours that a quarter of the pings keeps
 FEWEST = 3  # that tell of a habit
+ENOUGH_VALUES = 20  # that show whether there is noise
 CHANCE = 10.0  # times as many repetitions of the last value as of the one before it are no chance
 HELD_FIX, HELD_FIX_SECONDS = 5, 10.0  # of fixes that repeat
 SURE = 5.0  # standard deviations
@@ -255,8 +256,7 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
         return
     runs = equal_runs(zero[:, None])
     first, last = runs[zero[runs[:, 0]]].T
-    noisy = _noise_shows(np.unwrap(values[known], axis=0) if company.angle else values[known])
-    noise = 2.0 * float(np.median(_from_neighbours(values[known], time[known], company)[0])) if noisy else 0.0
+    noise = _noise(values[known], time[known], company)
     reach = max(AROUND_SECONDS, AROUND_PERIODS * float(np.median(np.diff(time))))
     sides, after = [], np.searchsorted(known, first)
     for edge, near, further in ((first, after - 1, after - 2), (last, after, after + 1)):
@@ -271,7 +271,7 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
         last - first + 1,
         time[last] - time[first] >= MIN_SECONDS,
     )
-    if noisy:
+    if noise:
         mean = _mean(values, time, near[0], first, near[1], company)
         false = abrupt.any(axis=0) | (
             (left > company.least).all(axis=0) & (company.size(mean) > company.least) & ~lasts
@@ -291,6 +291,13 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
         index = np.concatenate([np.arange(first[k], last[k] + 1) for k in np.flatnonzero(single)])
         why = company.told.format(np.median(size[:, single][left[:, single] > company.least]))
         yield FrozenStretch(stream.sensor, "zero", time[index], f"{why} next to them", True)
+
+
+def _noise(values: Array, time: Array, company: Company) -> float:
+    """Change from one measurement to the next that noise makes; 0 where resolution hides it."""
+    if not _noise_shows(np.unwrap(values, axis=0) if company.angle else values):
+        return 0.0
+    return 2.0 * float(np.median(_from_neighbours(values, time, company)[0]))
 
 
 def _from_neighbours(values: Array, time: Array, company: Company) -> tuple[Array, Array]:
@@ -367,6 +374,23 @@ def _repeated(pings: Stream) -> Iterator[FrozenStretch]:
     if again > CHANCE * (distinct[2:] == distinct[:-2]).all(axis=1).sum():
         index = np.concatenate([np.arange(a + 1, b + 1) for a, b in runs[short]])
         yield FrozenStretch(pings.sensor, "repeated", pings.time[index], "values hardly ever return otherwise", True)
+
+
+def is_false_zero(company: Company, at: float, time: Array, values: Array) -> bool:
+    """Whether an exact zero is none by what was measured before it, all that is known while a dive goes on.
+
+    Parameters
+    ----------
+    company : of the sensor
+    at : time of the zero [s]
+    time, values : ndarray, shape (n,) [s] and (n, columns), of the measurements before it that are not zero
+    """
+    if len(time) < 3 or abs(at - time[-2]) > max(AROUND_SECONDS, AROUND_PERIODS * float(np.median(np.diff(time)))):
+        return False
+    noise = _noise(values, time, company)
+    if company.rests and noise == 0.0 and len(time) >= ENOUGH_VALUES:
+        return False
+    return bool(company.cannot_stop(company.left(values[-1], values[-2], noise), np.abs(at - time[-1])))
 
 
 def _zeros_meanwhile(log: Log, found: Sequence[FrozenStretch]) -> Iterator[FrozenStretch]:
