@@ -17,14 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.check.findings import Finding
-from rovgraph.check.inertial import BIAS_SD, GAP, InertialMotion, in_gap, means
+from rovgraph.check.inertial import BIAS_SD, GAP, InertialMotion, in_gap, inertial_motion, means, smoothed
 from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Signal, fit
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
-from rovgraph.config import Config, mount_matrix
+from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, cross, rotate, signed_permutations, skew
+from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
 
-COMPASSES = ("ahrs", "dvl_heading", "vehicle_heading")  # that give a heading themselves
+COMPASSES = ("ahrs", "vehicle_heading", "dvl_heading")  # that give a heading themselves
+OFFSETS = {
+    "mag": "mag_offset",
+    "ahrs": "ahrs_offset",
+    "dvl_heading": "dvl_compass_offset",
+    "vehicle_heading": "vehicle_compass_offset",
+}
+FOLLOWS_GYRO = 10.0  # before and after, over which a magnetometer's heading is averaged against the gyro's [s]
 WINDOW = 2.0  # over which the field's change is compared [s]
 ENOUGH_WINDOWS = 30
 TELLING = 0.3  # of the largest changes, from which on a window tells two axes apart
@@ -59,14 +67,55 @@ def compass_heading(log: Log, config: Config, sensor: str) -> Array:
     return np.asarray(np.unwrap(log[sensor].data[:, 0]) - np.arctan2(axis[1], axis[0]))
 
 
+def body_heading(log: Log, config: Config) -> tuple[str, Array, Array] | None:
+    """The compass that tells the body's true heading best, its times and headings without jumps [rad].
+
+    One that is in use goes first, and of these one that gives a heading itself. That of a magnetometer is levelled by
+    the IMU, freed of hard iron within its prior, and follows the gyro from moment to moment.
+    """
+    used = heading_sources(config, log.sensors)
+    for sensor in sorted((*COMPASSES, "mag"), key=lambda sensor: (sensor not in used, sensor == "mag")):
+        if sensor not in log or len(log[sensor]) < 2:
+            continue
+        if sensor != "mag":
+            found: tuple[Array, Array] | None = log[sensor].time, compass_heading(log, config, sensor)
+        else:
+            found = _by_field(log, config)
+        if found is not None:
+            offset = float(beliefs(config)[OFFSETS[sensor]].mean[0])
+            return sensor, found[0], found[1] - offset + np.deg2rad(config.environment.declination_deg)
+    return None
+
+
+def _by_field(log: Log, config: Config) -> tuple[Array, Array] | None:
+    """Times and magnetic headings of the body by the magnetometer [rad]; None where its axes are wrong."""
+    stream, R_bs = log["mag"], mount_matrix(config.imu.mount_rpy_deg)
+    motion, iron = inertial_motion(log, config), beliefs(config)["hard_iron"]
+    if motion is None:
+        return stream.time, np.unwrap(magnetic_heading(rotate(R_bs, stream.data), None))
+    sd = iron.sd if iron.estimate else 0.0
+    found = turning(motion, stream, stream.data, R_bs.T, sd, ORIENTATIONS[:1])
+    if found is not None and found.square[0] > EXPLAINED:
+        every = turning(motion, stream, stream.data, R_bs.T, offset_sd=1.0)
+        if every is not None and every.contradicted:
+            return None
+    down_b = motion.at(stream.time, motion.down_b)
+    field_b = field_in_body(log, config, down_b, np.zeros(3) if found is None else found.offset[0])
+    by_gyro = np.cumsum(motion.turning) * motion.step
+    apart = np.unwrap(magnetic_heading(field_b, down_b) - np.interp(stream.time, motion.time, by_gyro))
+    known = ~in_gap(motion.time, stream.time, 2.0 * FOLLOWS_GYRO)
+    slow = smoothed(np.interp(motion.time, stream.time, apart)[:, None], known, FOLLOWS_GYRO, motion.step)
+    return motion.time[known], (by_gyro + slow[:, 0])[known]
+
+
 @dataclass(frozen=True)
 class Turning:
-    """How well a vector that is constant in n turns with the gyro, for each of `ORIENTATIONS` as A.
+    """How well a vector that is constant in n turns with the gyro, for each of m orientations as A, `ORIENTATIONS`.
 
     Attributes
     ----------
-    square : ndarray, shape (48,), mean squared residual, relative to that without any turn
-    offset : ndarray, shape (48, 3), constant part of the measured vector that does not turn
+    square : ndarray, shape (m,), mean squared residual, relative to that without any turn
+    offset : ndarray, shape (m, 3), constant part of the measured vector that does not turn
     windows : how many change enough to tell
     """
 
@@ -87,14 +136,17 @@ class Turning:
         return bool(len(self.alike) and better > BETTER and 3.0 * self.windows * np.log(better) > EVIDENCE)
 
 
-def turning(motion: InertialMotion, stream: Stream, values: Array, R_sb: Array, offset: bool = True) -> Turning | None:
+def turning(
+    motion: InertialMotion, stream: Stream, values: Array, R_sb: Array, offset_sd: float, every: Array = ORIENTATIONS
+) -> Turning | None:
     """Compare the changes of a vector with its rates; None where there is too little.
 
     Parameters
     ----------
     values : ndarray, shape (n, 3), of a stream, IMU axes
     R_sb : ndarray, shape (3, 3), body axes to IMU axes
-    offset : a part of it may not turn
+    offset_sd : how large a part of it may be that does not turn, as a fraction of its length; 0 = none
+    every : ndarray, shape (m, 3, 3), what is tried as A
     """
     edges = np.append(motion.time - 0.5 * motion.step, motion.time[-1] + 0.5 * motion.step)
     y, w = means(stream, values, edges), rotate(R_sb, motion.rate_b)
@@ -117,15 +169,17 @@ def turning(motion: InertialMotion, stream: Stream, values: Array, R_sb: Array, 
     telling = moved > TELLING * np.percentile(moved, 98)
     size = float(np.linalg.norm(y, axis=1).mean())
     still, _ = _fit(change, seconds * BIAS_SD * size, telling)
-    square, constant = np.empty(len(ORIENTATIONS)), np.zeros((len(ORIENTATIONS), 3))
-    for k, A in enumerate(ORIENTATIONS):
+    square, offset = np.empty(len(every)), np.zeros((len(every), 3))
+    for k, A in enumerate(every):
         of_rate = A @ wy
         crossed = np.stack([of_rate[:, i, j] - of_rate[:, j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
         # free are, in sds of a prior, the gyro's bias, the offset, and the product of both
-        J = [skew(total) * BIAS_SD, skew(rotate(A, turn)) * size, seconds * BIAS_SD * size][: 3 if offset else 1]
+        J = [skew(total) * BIAS_SD]
+        if offset_sd > 0.0:
+            J += [skew(rotate(A, turn)) * offset_sd * size, seconds * BIAS_SD * offset_sd * size]
         square[k], free = _fit(change + crossed, np.concatenate(J, axis=2), telling)
-        constant[k] = size * free[3:6] if offset else 0.0
-    return Turning(square / max(still, 1e-12), constant, int(telling.sum()))
+        offset[k] = offset_sd * size * free[3:6] if offset_sd > 0.0 else 0.0
+    return Turning(square / max(still, 1e-12), offset, int(telling.sum()))
 
 
 def _fit(left: Array, J: Array, telling: NDArray[np.bool_]) -> tuple[float, Array]:
@@ -145,7 +199,7 @@ def _fit(left: Array, J: Array, telling: NDArray[np.bool_]) -> tuple[float, Arra
 def field_axes(log: Log, config: Config, motion: InertialMotion) -> Iterator[Finding]:
     """Axes of magnetometer or gyro that contradict the field's turning or its dip, with what mends them."""
     R_sb = mount_matrix(config.imu.mount_rpy_deg).T
-    field = turning(motion, log["mag"], log["mag"].data, R_sb)
+    field = turning(motion, log["mag"], log["mag"].data, R_sb, offset_sd=1.0)
     if field is None or not len(field.alike):
         return
     if not field.contradicted:
@@ -156,7 +210,7 @@ def field_axes(log: Log, config: Config, motion: InertialMotion) -> Iterator[Fin
             wrong = f"the field points {sense}, which it does not at this latitude, and turns with the gyro as well"
             yield _of_magnetometer(log, config, motion, field, wrong)
         return
-    gravity = turning(motion, log["imu"], log["imu"].data[:, :3], R_sb, offset=False)
+    gravity = turning(motion, log["imu"], log["imu"].data[:, :3], R_sb, offset_sd=0.0)
     better = f"{_times(float(field.square[0] / field.square.min()))} better"
     if gravity is not None and gravity.contradicted and np.isin(gravity.alike, field.alike).all():
         yield _of_gyro(config, gravity.alike, f"gravity and the field turn with the rates {better}")

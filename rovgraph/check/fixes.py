@@ -7,19 +7,19 @@ fits better with the conjugate velocity. A cause is named where it explains the 
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.check.compasses import OFFSETS, body_heading
 from rovgraph.check.findings import Finding, valid_pings
 from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
-from rovgraph.geometry import Array, matrix_from_rpy, rotate
-from rovgraph.instruments import heading_sources
+from rovgraph.geometry import Array, rotate
+from rovgraph.instruments import DEFAULT_DIP, heading_sources
 from rovgraph.log import Log
-from rovgraph.sensors import SENSORS
 
 MIN_FIXES = 15
 STRETCH = 300.0  # over which the DVL's track drifts less than fixes scatter [s]
@@ -57,10 +57,11 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
     """Handedness, rotation, scale and clock of the DVL's velocities against the fixes."""
     if not {"dvl", "fix"} <= log.sensors:
         return
-    psi = _body_heading(log, config)
+    found = body_heading(log, config)
     pings = valid_pings(log["dvl"])
-    if psi is None or len(pings) < MIN_FIXES or len(log["fix"]) < MIN_FIXES:
+    if found is None or len(pings) < MIN_FIXES or len(log["fix"]) < MIN_FIXES:
         return
+    sensor, *psi = found
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     turn = np.exp(1j * np.interp(pings.time, *psi))
     arm = complex(*config.fix.lever_arm_m[:2])
@@ -70,7 +71,9 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
         return
     way, mirrored = (plane.way(turn * (v_b[:, 0] + sign * 1j * v_b[:, 1])) for sign in (1.0, -1.0))
     lag, lag_sd, lag_evidence = plane.lag(way)
-    late = bool(abs(lag) > max(LAG_WARNING, SURE * lag_sd) and lag_evidence > EVIDENCE)
+    offset = beliefs(config)["fix_time_offset"]
+    allowed = max(LAG_WARNING, SURE * lag_sd, BELIEVED_SDS * offset.sd if offset.estimate else 0.0)
+    late = bool(abs(lag - offset.mean[0]) > allowed and lag_evidence > EVIDENCE)
     as_is, unlike, swapped = (plane.fit(one, 0.0) for one in (way, mirrored, way.conj()))
     late &= plane.fit(way, lag).error < min(unlike.error, swapped.error)
     if late:
@@ -92,7 +95,7 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             text = f"velocities do not fit the fixes (agreement {as_is.agreement:.2f}); check mounting and heading"
             yield Finding("dvl", "warning", text, "contradiction")
     else:
-        yield _turned(config, heading_sources(config, log.sensors), as_is, unlike)
+        yield _turned(config, {sensor, *heading_sources(config, log.sensors)}, as_is, unlike)
         if late:
             sense = "late" if lag > 0.0 else "early"
             text = f"fixes come {abs(lag):.1f} s {sense} relative to the DVL's track (sd {lag_sd:.1f} s)"
@@ -107,15 +110,17 @@ def _better(one: _Line, other: _Line) -> bool:
     return one.error + EVIDENCE < other.error and one.error * 1.5 < other.error
 
 
-def _believed(config: Config, sources: Sequence[str]) -> float:
+def _believed(config: Config, compasses: Collection[str]) -> float:
     """How far heading and mounting may be off by what is believed of them [rad]."""
-    priors = beliefs(config)
-    offsets = (SENSORS[source].linear_in for source in sources)
-    names = ["dvl_yaw", *(name for name in offsets if name)]
-    return BELIEVED_SDS * math.hypot(*(priors[name].sd for name in names if priors[name].estimate))
+    priors = {name: belief for name, belief in beliefs(config).items() if belief.estimate}
+    sds = [priors[name].sd for name in ("dvl_yaw", *(OFFSETS[sensor] for sensor in compasses)) if name in priors]
+    if "mag" in compasses and "hard_iron" in priors:
+        dip = DEFAULT_DIP if config.environment.dip_deg is None else np.deg2rad(config.environment.dip_deg)
+        sds.append(priors["hard_iron"].sd / max(np.cos(dip), 0.1))
+    return BELIEVED_SDS * math.hypot(*sds)
 
 
-def _turned(config: Config, sources: Sequence[str], as_is: _Line, unlike: _Line) -> Finding:
+def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Line) -> Finding:
     angle, scale = float(np.angle(as_is.c)), float(abs(as_is.c))
     wrong = abs(angle) > max(MISALIGNED, _believed(config, sources)) + SURE * as_is.sd or (
         not 0.8 < scale < 1.25 and abs(np.log(scale)) > SURE * as_is.sd + 0.2
@@ -237,15 +242,3 @@ def _other_way_up(config: Config) -> str:
         f"if the DVL's z axis points {z} and y to {y}, state dvl.mount_rpy_deg: [{turned}, {pitch:g}, {yaw:g}] "
         "and determine its yaw again"
     )
-
-
-def _body_heading(log: Log, config: Config) -> tuple[Array, Array] | None:
-    """Times and headings without jumps of the first source but the magnetometer, in use or not [rad]."""
-    for sensor in (*heading_sources(config, log.sensors), "ahrs", "dvl_heading"):
-        if sensor == "mag" or sensor not in log or len(log[sensor]) < 2:
-            continue
-        mount = config.imu.mount_rpy_deg if sensor == "ahrs" else config.dvl.mount_rpy_deg
-        axis = matrix_from_rpy(np.deg2rad(mount))[:, 0]
-        psi = np.unwrap(log[sensor].data[:, 0]) - np.arctan2(axis[1], axis[0])
-        return log[sensor].time, psi + np.deg2rad(config.environment.declination_deg)
-    return None
