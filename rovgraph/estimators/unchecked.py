@@ -88,6 +88,8 @@ def unchecked(
         if "dvl" in {*present, *expected}:
             scale = _held_by(priors["dvl_scale"])
             lines.append(f"no fix{so_far} shows a constant error of the DVL's scale, which rests on {scale}")
+            if not priors["bottom_velocity"].estimate:
+                lines.append(f"no fix{so_far} shows a bottom that moves slowly: it is taken to be at rest")
     if "depth" in present and start.down_m is None:
         lines.append(f"nothing shows a constant error of the depth, which rests on {_held_by(priors['depth_offset'])}")
     return lines
