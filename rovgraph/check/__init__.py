@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from rovgraph.check.agreement import headings, vertical
+from rovgraph.check.current import current
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
 from rovgraph.check.fixes import repeated, track
@@ -46,10 +47,11 @@ CHECKS: tuple[Check, ...] = (
     repeated,
     start,
     track,
+    current,
     places,
     plan,
 )
-MOTION_CHECKS = (headings, vertical, track)
+MOTION_CHECKS = (headings, vertical, track, current)
 
 
 def examine(log: Log, config: Config | None = None, examined: Examined | None = None) -> Report:
