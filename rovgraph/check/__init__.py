@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from rovgraph.check.agreement import headings, vertical
+from rovgraph.check.current import current
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
 from rovgraph.check.fixes import track
@@ -45,10 +46,11 @@ CHECKS: tuple[Check, ...] = (
     vertical,
     start,
     track,
+    current,
     places,
     plan,
 )
-MOTION_CHECKS = (headings, vertical, track)
+MOTION_CHECKS = (headings, vertical, track, current)
 
 
 def examine(log: Log, config: Config | None = None, examined: Examined | None = None) -> Report:
