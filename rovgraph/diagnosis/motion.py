@@ -93,8 +93,9 @@ def bias_drift(evidence: Evidence) -> Iterator[Statistic]:
 def _moved_motions(evidence: Evidence, here: Array) -> Iterator[Array]:
     """By how much what is considered, each component one sd away, moves the residuals, shape (n - 1, 15)."""
     best = evidence.optimum
-    for state in best.moved_by_considered() if isinstance(best, ChainOptimum) else ():
-        yield best.wide.rows.motion_residuals(state) - here
+    if isinstance(best, ChainOptimum):
+        for state in best.moved_by_considered():
+            yield best.wide.rows.motion_residuals(state) - here
 
 
 def _motion_residuals(evidence: Evidence) -> Array:
