@@ -145,7 +145,7 @@ def rule_table() -> str:
     """`RULES` as a table in Markdown, as docs/alarms.md has it."""
     never, rows = "–", ["| kind | figure | doubtful | wrong | rate | live |", "|---|---|---|---|---|---|"]
     for r in RULES.values():
-        lower = never if r.doubtful == r.wrong else f"{r.doubtful:.3g}" + " (advice)" * r.advice
+        lower = f"{r.doubtful:.3g}" + " (advice)" * r.advice
         higher = never if r.wrong == inf else f"{r.wrong:.3g}"
         rows.append(f"| `{r.kind}` | {r.figure} | {lower} | {higher} | {r.rate:g} | {r.live or never} |")
     return "\n".join(rows)
