@@ -239,9 +239,7 @@ def differences(expected: Any, found: Any, where: str = "") -> Iterator[str]:
         yield f"{where}: {found!r}, was {expected!r}"
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in (*DIVES, *REPLAYS)]
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in (*DIVES, *REPLAYS)])
 def test_a_dive_is_estimated_and_judged_as_it_was(name):
     expected = json.loads((GOLDEN / f"{name}.json").read_text(encoding="utf-8"))
     assert not list(differences(expected, summary(name)))
