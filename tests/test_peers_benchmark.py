@@ -10,21 +10,21 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-import peers  # noqa: E402
-from fault_campaign.instruments import log_table, sample  # noqa: E402
-from fault_campaign.scenarios import make_motion  # noqa: E402
-from fault_campaign.vehicle import configuration, make_vehicle  # noqa: E402
+import peers
+from fault_campaign.instruments import log_table, sample
+from fault_campaign.scenarios import make_motion
+from fault_campaign.vehicle import configuration, make_vehicle
 
-from rovgraph.config import Config  # noqa: E402
-from rovgraph.evaluate import evaluate  # noqa: E402
-from rovgraph.log import Log  # noqa: E402
-from rovgraph.trajectory import Trajectory  # noqa: E402
+from rovgraph.config import Config
+from rovgraph.evaluate import evaluate
+from rovgraph.log import Log
+from rovgraph.trajectory import Trajectory
 
 TURNED_DEG, SECONDS = 3.0, 60.0
 
 
 def perfect(aids, turned_deg):
-    """A minute of a survey in waves with instruments without errors, but a DVL that is turned by as much."""
+    """A minute of a survey with instruments without errors, but a DVL that is turned by as much."""
     rng = np.random.default_rng(1)
     vehicle = make_vehicle("tactical", aids)
     config = Config.model_validate(configuration(vehicle))
@@ -36,7 +36,7 @@ def perfect(aids, turned_deg):
     vehicle.dvl.sd = (0.0, 0.0, 0.0)
     roll, pitch, yaw = vehicle.dvl.mount_rpy_deg
     vehicle.dvl.mount_rpy_deg = (roll, pitch, yaw + turned_deg)
-    motion = replace(make_motion("survey, waves", rng), duration=SECONDS)
+    motion = replace(make_motion("survey", rng), duration=SECONDS)
     streams, _ = sample(motion, vehicle, rng)
     t = np.arange(0.0, motion.duration, 1.0)
     truth = Trajectory.certain(t, motion.local(t), motion.C_nb(t), motion.v_n(t))
