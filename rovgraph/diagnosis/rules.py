@@ -139,3 +139,13 @@ _ROWS = (
     Rule("contradiction", "the smaller of two sensors' excesses over their limits", 1.0, 1.0, live="as above"),
 )
 RULES = {rule.kind: rule for rule in _ROWS}
+
+
+def rule_table() -> str:
+    """`RULES` as a table in Markdown, as docs/alarms.md has it."""
+    never, rows = "–", ["| kind | figure | doubtful | wrong | rate | live |", "|---|---|---|---|---|---|"]
+    for r in RULES.values():
+        lower = f"{r.doubtful:.3g}" + " (advice)" * r.advice
+        higher = never if r.wrong == inf else f"{r.wrong:.3g}"
+        rows.append(f"| `{r.kind}` | {r.figure} | {lower} | {higher} | {r.rate:g} | {r.live or never} |")
+    return "\n".join(rows)
