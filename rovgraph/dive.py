@@ -186,6 +186,8 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
     """The dive as it is believed to be, and the optimum of its smoothed estimate where a batch solver found it."""
     initial, log = known.initial, known.log
     batch = assemble(log, initial)
+    if known.states is not None and len(known.states) != len(batch.intervals):  # stamps stand elsewhere than they did
+        known = replace(known, states=None)
     if initial.config.graph.solver == "isam2":
         solver = _isam2(batch, progress)
         best = solver.optimum() if estimate != "filtered" else None

@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 from test_consistency import OVERCONFIDENT, band, drawn, nees
 
 from rovgraph.calibration import TABLE
-from rovgraph.config import Config
+from rovgraph.config import Config, beliefs
 from rovgraph.engine import error_layout
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement
@@ -392,10 +392,10 @@ def told(case: Simulated, part: float) -> Config:
     """The true start and calibration, with a part of their prior uncertainty."""
     calibration = {}
     for name, true in case.dive.hidden["calibration"].items():
-        entry, angular = getattr(case.config.calibration, name), TABLE[name].angular
+        belief, angular = beliefs(case.config)[name], TABLE[name].angular
         tail, unit = ("_deg", 1.0 / DEG) if angular else ("", 1.0)
-        if entry.estimate:
-            calibration[name] = {"mean" + tail: (unit * true).tolist(), "sd" + tail: part * getattr(entry, "sd" + tail)}
+        if belief.estimate or belief.considered:
+            calibration[name] = {"mean" + tail: (unit * true).tolist(), "sd" + tail: unit * part * belief.sd}
     start = case.config.start
     sd = {key: part * getattr(start, key) for key in ("heading_sd_deg", "tilt_sd_deg")}
     return started(case, calibration=calibration, start=sd)

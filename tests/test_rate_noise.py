@@ -147,11 +147,11 @@ def test_a_dvl_that_is_elsewhere_is_found_said_and_used(estimate):
     dive = moved_by_noise(0.2, estimate)
     said = [line for line in dive.assumptions if "elsewhere" in line]
     assert len(said) == 1 and "(calibration.dvl_lever_arm)" in said[0] and not dive.warnings
-    mean = np.array(dive.initial.config.calibration.dvl_lever_arm.mean)
+    mean = dive.initial.beliefs["dvl_lever_arm"].mean
     assert abs(mean[1] - 0.2) < 0.05
 
 
 def test_a_dvl_in_its_place_is_left_there():
     dive = moved_by_noise(0.0)
     assert not any("elsewhere" in line for line in dive.assumptions)
-    assert dive.initial.config.calibration.dvl_lever_arm.mean is None
+    assert not dive.initial.revealed.calibration

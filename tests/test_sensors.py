@@ -1,5 +1,7 @@
 """Every measurement model: its derivatives are those of its own prediction, its signs are right."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -194,7 +196,8 @@ def test_depth_and_fix_are_those_of_their_own_place():
     for sensor, rows in (("depth", [2]), ("fix", [0, 1])):
         arm = getattr(CONFIG, sensor).lever_arm_m
         c = state.calibration
-        offset, scale = (c["depth_offset"], c["depth_scale"]) if sensor == "depth" else (c["fix_error"], 0.0)
+        depth = c["depth_offset"] + c["depth_error"], c["depth_scale"]
+        offset, scale = depth if sensor == "depth" else (c["fix_error"], 0.0)
         expected = (1.0 + scale) * (state.p_n + rotate(state.R_nb, np.array(arm)))[:, rows] + offset
         np.testing.assert_allclose(sensors[sensor].model.predict(state, np.zeros((N, 3)))[0], expected)
 
@@ -243,8 +246,9 @@ def test_noise_of_the_rate_has_no_direction_where_the_yaw_of_the_dvl_is_unknown(
 
 
 def test_a_rotated_world_rotates_the_dvl_not():
-    """What a DVL measures does not depend on where north is."""
+    """What a DVL measures over a bottom at rest does not depend on where north is."""
     state, rate = random_state(), np.zeros((N, 3))
+    state = replace(state, calibration={**state.calibration, "bottom_velocity": np.zeros(2)})
     turn = exp_rotation(np.array([0.0, 0.0, 1.0]))
     turned = State(turn @ state.R_nb, state.p_n, rotate(turn, state.v_n), state.bias, state.calibration)
     model = SENSORS["dvl"].model

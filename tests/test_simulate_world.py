@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import periodogram
 
 from rovgraph.cli.app import main
-from rovgraph.config import beliefs, load_config
+from rovgraph.config import beliefs, load_config, with_priors_stated
 from rovgraph.geometry import rotate, transpose, wrap_angle
 from rovgraph.instruments import instruments
 from rovgraph.log import Log, read_log
@@ -262,7 +262,7 @@ def test_command_writes_a_driven_dive_with_everything_chosen(tmp_path, monkeypat
     told = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert told["current"] == [0.05, -0.02] and told["outlier_share"] == 0.1 and told["disturbances"] is False
     believed = load_config(tmp_path / "a" / "config.yaml")
-    assert believed.model_dump(exclude={"start"}) == lake().model_dump(exclude={"start"})
+    assert believed.model_dump(exclude={"start"}) == with_priors_stated(lake()).model_dump(exclude={"start"})
     assert abs(believed.start.north_m) < 1e-9  # planned; the dive began beside it
     assert np.linalg.norm(secret["start_offset_m"]) > 0.01
 

@@ -88,11 +88,11 @@ def find_noise(
     alarms : of the same dive
     likely : sds of what is believed of the DVL's place, up to which another is left to chance
     """
-    if _named_elsewhere(alarms):
-        return [], []
     place = _place(best, alarms)
     found = [_placed(best, place)] if place is not None and place.size > likely else []
-    return found + [larger for sensor in best.blocks if (larger := _larger(best, sensor, config)) is not None], []
+    if found or _named_elsewhere(alarms):
+        return found, []
+    return [larger for sensor in best.blocks if (larger := _larger(best, sensor, config)) is not None], []
 
 
 def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> tuple[list[UnstatedNoise], list[Rival]]:

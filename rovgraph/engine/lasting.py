@@ -389,7 +389,12 @@ def _as_constant(
         for sd in (CONSTANT * now.chain.beliefs[name].sd).tolist()
         if name not in now.chain.unknowns.walks or sd > now.chain.beliefs[name].sd
     ]
-    best = max(rivals, key=lambda rival: rival.gain, default=replace(error, gain=0.0))
+    believed = now.chain.beliefs  # more than is believed must explain more
+    best = max(
+        rivals,
+        key=lambda rival: rival.gain - LIKELY * (rival.sd > believed[rival.variable].sd),
+        default=replace(error, gain=0.0),
+    )
     if best.gain <= LIKELY:
         return replace(best, gain=0.0), now
     held = now.with_error(best.variable, best.sd, np.inf)
