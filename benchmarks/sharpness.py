@@ -6,33 +6,39 @@
     python benchmarks/sharpness.py noise --seeds 20
     python benchmarks/sharpness.py absent --seeds 20
     python benchmarks/sharpness.py scale --seeds 12
+    python benchmarks/sharpness.py compass --seeds 6
 
-Dives are those of `fault_campaign`. Figures are in benchmarks/README.md, those of `scale` in docs/uncertainty.md.
+Dives are those of `fault_campaign`. Figures are in benchmarks/README.md, those of `scale` and `compass` in
+docs/uncertainty.md.
 """
 
 import argparse
 import json
 import warnings
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pandas as pd
 from checkouts import ROOT, Checkout, checkout_of
 from fault_campaign.campaign import make_dive, merge
 from fault_campaign.cases import CASES, HEALTHY, Case, silent
-from fault_campaign.instruments import log_table, sample
+from fault_campaign.instruments import Streams, log_table, sample
 from fault_campaign.judge import SETTLED_S, Dive, nees, settled_rows, write_dive
+from fault_campaign.motion import Motion
 from fault_campaign.scenarios import make_motion
-from fault_campaign.vehicle import configuration, make_vehicle
+from fault_campaign.vehicle import Vehicle, configuration, make_vehicle
 from scipy.stats import chi2
 
 from rovgraph.config import Config
 from rovgraph.dive import smooth
+from rovgraph.estimators import results
+from rovgraph.geometry import rpy_from_matrix
 from rovgraph.log import Log
 from rovgraph.trajectory import Trajectory
 
@@ -50,6 +56,9 @@ PRIORS: dict[str, dict[str, Any]] = {
     **{str(sd): {"estimate": "considered", "sd": sd} for sd in (0.01, 0.02, 0.03)},
     "0.03, always estimated": {"estimate": True, "sd": 0.03},
 }
+
+OFF_DEG, DEVIATION_DEG, NOISE_DEG, TILT_DEG = 20.0, 1.5, 1.0, 0.5  # of a boat's compass, and of its roll and pitch
+COMPASSES = {"5° and 3°": (5.0, 3.0), "10° and 5°, linear": None, "10° and 5°": None}  # sds that are stated
 
 
 @dataclass(frozen=True)
@@ -231,10 +240,65 @@ def scale(seeds: int) -> None:
         print("| " + " | ".join([name, *cells]) + " |", flush=True)
 
 
+def compass(seeds: int) -> None:
+    """A boat whose only compass is off, without fixes, by the prior of its compass."""
+    cases = [boat(scenario, imu) for scenario in ("river", "river with turns") for imu in (False, True)]
+    print("| prior | " + " | ".join(f"{case.name}: NEES, sd, rms" for case in cases) + " |")
+    print("|---" * (1 + len(cases)) + "|")
+    for name, stated in COMPASSES.items():
+        linear = mock.patch.object(results, "rests_on_doubtful_compass", return_value=False)
+        cells = []
+        with linear if "linear" in name else nullcontext():
+            for case in cases:
+                rows = [errors(_with_priors(make_dive(case, seed), stated)) for seed in range(seeds)]
+                sd, rms = (np.sqrt(np.mean([getattr(r, part) for r in rows])) for part in ("variance", "square"))
+                cells.append(f"{np.mean([r.nees for r in rows]):.1f}, {sd:.1f}, {rms:.1f}")
+        print("| " + " | ".join([name, *cells]) + " |", flush=True)
+
+
+def boat(scenario: str, imu: bool) -> Case:
+    """A boat of which only the sensors' noise is stated, not its compass."""
+    source, noise = ("ahrs", "ahrs_sd_deg") if imu else ("vehicle", "vehicle_sd_deg")
+    unstated = {f"ahrs_{what}": {"sd_deg": None} for what in ("offset", "deviation")}
+    config = {
+        "heading": {"sources": [source], noise: NOISE_DEG},
+        "tilt": {"sd_deg": TILT_DEG},
+        "calibration": {**unstated, "dvl_yaw": {"estimate": "considered", "sd_deg": 1.0}},
+    }
+    name = f"{scenario}, {'IMU' if imu else 'no IMU'}"
+    on_log = None if imu else _without_imu
+    return Case(name, "compass off", scenario=scenario, on_vehicle=_off, on_log=on_log, config=config, dvl_rate=2.0)
+
+
+def _off(vehicle: Vehicle) -> None:
+    compass, vehicle.dvl.yaw_sd = vehicle.ahrs, 1.0
+    compass.offset, compass.offset_sd, compass.curve_sd, compass.sd = OFF_DEG, 0.0, DEVIATION_DEG, NOISE_DEG
+
+
+def _without_imu(streams: Streams, motion: Motion, rng: np.random.Generator) -> None:
+    """The vehicle's own attitude in place of the unit and its heading."""
+    del streams["imu"]
+    ahrs = streams.pop("ahrs").iloc[::5]
+    tilt = rpy_from_matrix(motion.C_nb(ahrs["time"].to_numpy()))[:, :2]
+    tilt += np.deg2rad(rng.normal(0.0, TILT_DEG, tilt.shape))
+    streams["vehicle"] = pd.DataFrame(
+        {"time": ahrs["time"], "heading": ahrs["ahrs_yaw"], "roll": tilt[:, 0], "pitch": tilt[:, 1]}
+    )
+
+
+def _with_priors(dive: Dive, stated: tuple[float, float] | None) -> Dive:
+    """The dive with sds of the compass's offset and deviation in its configuration."""
+    if stated is None:
+        return dive
+    sds = zip(("offset", "deviation"), stated, strict=True)
+    own = {f"{prefix}_{what}": {"sd_deg": sd} for what, sd in sds for prefix in ("ahrs", "vehicle_compass")}
+    return replace(dive, configuration=merge(dive.configuration, {"calibration": own}))
+
+
 def main() -> None:
     """Run one of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["healthy", "under-way", "noise", "absent", "scale"])
+    parser.add_argument("what", choices=["healthy", "under-way", "noise", "absent", "scale", "compass"])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--base", default=BASE, help="revision, or folder of a checkout, to compare healthy dives with")
     given = parser.parse_args()
@@ -242,7 +306,8 @@ def main() -> None:
     if given.what == "healthy":
         healthy(given.seeds, given.base)
     else:
-        {"under-way": under_way, "noise": noise, "absent": absent, "scale": scale}[given.what](given.seeds)
+        runs = {"under-way": under_way, "noise": noise, "absent": absent, "scale": scale, "compass": compass}
+        runs[given.what](given.seeds)
 
 
 if __name__ == "__main__":

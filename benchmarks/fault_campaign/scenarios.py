@@ -60,6 +60,12 @@ def _moving_start() -> Motion:
     return _motion(400.0, heading, [], speed=1.2)
 
 
+def _river(turns: bool) -> Motion:
+    """300 m at 1 m/s."""
+    heading = [(100.0, 10.0, TURN), (200.0, 10.0, TURN)] if turns else []
+    return _motion(306.0, heading, [(3.0, 6.0, 1.0)])
+
+
 def _motion(
     seconds: float,
     heading: list[tuple[float, float, float]],
@@ -85,6 +91,8 @@ SCENARIOS: dict[str, Builder] = {
     "hover": _hover,
     "brisk turns": _brisk,
     "moving start": _moving_start,
+    "river": lambda: _river(False),
+    "river with turns": lambda: _river(True),
 }
 
 
