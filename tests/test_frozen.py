@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 from dives import Simulated, altered, falcon, kept, position_errors, rms, simulated
 
+from rovgraph.check import examine
 from rovgraph.config import Config
 from rovgraph.dive import smooth
 from rovgraph.geometry import Array
-from rovgraph.log import Log
-from rovgraph.log.frozen import equal_runs, frozen_stretches, without_frozen
+from rovgraph.log import STREAMS, Log, Stream
+from rovgraph.log.frozen import (
+    BRAKING,
+    CLEAR_SPEED,
+    STOPPING,
+    are_in,
+    companies,
+    equal_runs,
+    false_values,
+    frozen_stretches,
+    without_frozen,
+)
 from rovgraph.simulate import CALM, Style
 
 FROM, TO = 60.0, 120.0
@@ -75,3 +86,205 @@ def test_a_frozen_dvl_costs_no_more_than_one_that_is_silent(case):
         error, least = position_errors(estimate.trajectory, case), position_errors(other.trajectory, case)
         assert rms(error) < 1.5 * rms(least) + 0.02
         assert (error < 4.0 * np.linalg.norm(estimate.trajectory.p_sd, axis=1) + 0.05).all()
+
+
+# --- single ones, by the company they keep ------------------------------------------------------------
+
+
+def spoilt(log: Log, share: float, factor: float | None, sensor: str = "dvl", seed: int = 2) -> tuple[Log, Array]:
+    """A log in which some measurements are a part of what they were, or (None) the one before; and which."""
+    data = log[sensor].data.copy()
+    bad = np.random.default_rng(seed).random(len(data)) < share
+    bad[0] = False
+    for k in np.flatnonzero(bad):
+        data[k, :3] = data[k - 1, :3] if factor is None else factor * data[k, :3]
+    return altered(log, sensor, data), bad
+
+
+def no_imu(log: Log) -> Log:
+    """The same without an IMU: none of this needs another sensor."""
+    return Log(log.source, {"dvl": log["dvl"]}, log.origin)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.15, 0.3, 0.5])
+@pytest.mark.parametrize("prepare", [lambda log: log, no_imu], ids=["with an IMU", "without"])
+def test_single_zeros_between_pings_at_speed_are_none(case, share, prepare):
+    log, bad = spoilt(prepare(case.log), share, 0.0)
+    found = false_values(log, case.config)
+    assert {(f.sensor, f.kind) for f in found} == {("dvl", "zero")}
+    none, speed = are_in(log["dvl"], found), np.linalg.norm(case.log["dvl"].data[:, :3], axis=1)
+    assert not none[~bad].any()
+    assert none[bad & (speed > 0.2)].mean() > 0.97
+    assert {f.reason for f in found} == {"exactly zero"}
+
+
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.3])
+def test_pings_at_half_the_speed_of_those_around_them_are_none(case, share):
+    log, bad = spoilt(case.log, share, 0.5)
+    (found,) = frozen_stretches(log, case.config)
+    none, speed = are_in(log["dvl"], [found]), np.linalg.norm(case.log["dvl"].data[:, :3], axis=1)
+    assert (found.kind, found.single, found.reason) == ("half", True, "half the speed")
+    assert not none[~bad].any()
+    assert none[bad & (speed > 0.3)].mean() > 0.8
+
+
+def test_pings_that_repeat_the_one_before_are_none(case):
+    log, bad = spoilt(case.log, 0.2, None)
+    (found,) = frozen_stretches(log, case.config)
+    assert (found.kind, found.single) == ("repeated", True)
+    np.testing.assert_array_equal(are_in(log["dvl"], [found]), bad)
+
+
+def test_what_is_none_is_left_out_and_counted_and_costs_no_more_than_silence(case):
+    log, bad = spoilt(case.log, 0.3, 0.0)
+    dive = smooth(log, case.config, "smoothed")
+    count = dive.left_out["dvl", "exactly zero"]
+    assert count == are_in(log["dvl"], dive.frozen).sum()
+    (said,) = [f for f in examine(log, case.config).at("warning") if f.sensor == "dvl"]
+    assert said.text.startswith("exactly zero now and then from ") and "dvl_valid 0" in said.text
+    assert f"{count} of {len(bad)} measurements" in said.text
+    assert said.share == pytest.approx(count / len(bad))
+    best = smooth(kept(case.log, "dvl", ~bad), case.config, "smoothed")
+    error, least = (position_errors(one.estimates[0].trajectory, case) for one in (dive, best))
+    assert rms(error) < 1.5 * rms(least) + 0.02
+    assert dive.verdict == "trusted"
+
+
+def pings(velocity: Array, rate: float) -> Log:
+    """A log of a DVL alone; ``velocity`` of shape (n, 3)."""
+    time = np.arange(len(velocity)) / rate
+    data = np.column_stack([velocity, np.ones(len(time)), np.full(len(time), np.nan)])
+    return Log("dive.csv", {"dvl": Stream("dvl", STREAMS["dvl"], time, data, np.arange(len(time)) + 2)})
+
+
+def ahead(speed: Array, noise: float = 0.0, step: float = 0.0) -> Array:
+    """Velocities forward with white noise, rounded to some resolution, shape (n, 3)."""
+    v = speed[:, None] * [1.0, 0.0, 0.0] + noise * np.random.default_rng(5).standard_normal((len(speed), 3))
+    return np.round(v / step) * step if step else v
+
+
+def zeros_found(velocity: Array, rate: float) -> int:
+    return sum(len(f.time) for f in false_values(pings(velocity, rate), Config()) if f.kind == "zero")
+
+
+def paused(speed: float, rate: float, seconds: float, noise: float, step: float = 0.0) -> Array:
+    """At a speed, but for exact zeros in the middle."""
+    v = ahead(np.full(round(100 * rate), speed), noise, step)
+    v[round(50 * rate) : round((50 + seconds) * rate)] = 0.0
+    return v
+
+
+@pytest.mark.parametrize("rate", [1.0, 4.0])
+def test_zeros_for_seconds_need_a_step_that_vehicles_seldom_make(rate):
+    """Beside pings at rest that show noise, so that zeros are no rest."""
+    limit = max(CLEAR_SPEED, STOPPING / rate)
+    for speed, expected in ((0.9 * limit, 0), (1.1 * limit, 10 * rate)):
+        v = np.vstack([ahead(np.zeros(100), 0.001), paused(speed, rate, 10.0, 0.001)])
+        assert zeros_found(v, rate) == expected
+
+
+@pytest.mark.parametrize("rate", [1.0, 4.0])
+def test_zeros_of_a_sensor_that_may_read_them_at_rest_need_a_step_that_hardly_any_vehicle_makes(rate):
+    for speed, expected in ((0.9 * BRAKING / rate, 0), (1.1 * BRAKING / rate, 10 * rate)):
+        assert zeros_found(paused(speed, rate, 10.0, 0.001), rate) == expected
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(0.09, 0), (0.11, 1)])
+def test_a_moment_of_zeros_needs_pings_on_both_sides_that_move(speed, expected):
+    assert zeros_found(paused(speed, 1.0, 1.0, 0.001), 1.0) == expected
+
+
+def coming_to_rest(rate: float, braking: float) -> Array:
+    """Speed of a vehicle that stops, stays and goes on, again and again."""
+    knots = np.cumsum([0.0, *[0.5 / braking, 10.0, 0.5 / braking, 10.0] * 10])
+    speed = np.array([0.0, *[0.5, 0.5, 0.0, 0.0] * 10])
+    return np.interp(np.arange(0.0, knots[-1], 1.0 / rate), knots, speed)
+
+
+@pytest.mark.parametrize("rate", [1.0, 5.0])
+@pytest.mark.parametrize("braking", [0.1, 0.3])
+@pytest.mark.parametrize(("noise", "step", "clamp"), [(0.002, 0.01, 0.0), (0.005, 0.001, 0.02), (0.0, 0.05, 0.0)])
+def test_a_vehicle_that_comes_to_rest_may_read_exact_zeros(rate, braking, noise, step, clamp):
+    v = ahead(coming_to_rest(rate, braking), noise, step)
+    v[np.linalg.norm(v, axis=1) < clamp] = 0.0
+    assert (v == 0.0).all(axis=1).sum() > 50
+    assert false_values(pings(v, rate), Config()) == []
+
+
+def test_a_vehicle_that_an_obstacle_stops_may_read_zeros_if_its_noise_is_hidden():
+    stopped = np.concatenate([np.full(250, 0.4), np.zeros(100), np.linspace(0.0, 0.4, 10), np.full(250, 0.4)])
+    assert zeros_found(ahead(stopped, 0.002, 0.01), 5.0) == 0
+    assert zeros_found(paused(0.4, 5.0, 20.0, 0.002, 0.01), 5.0) == 100
+
+
+def test_noise_around_zero_and_a_change_of_direction_are_no_false_zeros():
+    swaying = ahead(0.3 * np.sin(np.arange(2000) / 10.0), 0.001, 0.001)
+    swaying[np.abs(swaying).max(axis=1) < 0.02] = 0.0
+    assert (swaying == 0.0).all(axis=1).sum() > 5
+    assert false_values(pings(swaying, 5.0), Config()) == []
+
+
+@pytest.mark.parametrize(("part", "count"), [(0.5, 2), (0.3, 20), (0.7, 20)])
+def test_few_halves_and_other_parts_may_be_manoeuvres(part, count):
+    v = ahead(np.full(400, 0.5), 0.005)
+    v[10 : 10 + 15 * count : 15] *= part
+    assert false_values(pings(v, 2.0), Config()) == []
+    v[10:55:15] = 0.5 * ahead(np.full(3, 0.5), 0.005)
+    assert [f.kind for f in false_values(pings(v, 2.0), Config())] == (["half"] if count == 2 else [])
+
+
+def test_swell_that_halves_the_speed_is_no_half_speed():
+    swell = 0.4 + 0.2 * np.sin(np.pi / 2.0 * np.arange(400))  # one ping in four is half as fast
+    assert false_values(pings(ahead(swell, 0.005), 1.0), Config()) == []
+
+
+def test_pings_of_coarse_resolution_may_repeat():
+    assert false_values(pings(ahead(np.full(600, 0.5), 0.002, 0.001), 2.0), Config()) == []
+
+
+def alone(sensor: str, values: Array, rate: float = 2.0) -> Log:
+    data = np.full((len(values), len(STREAMS[sensor])), np.nan)
+    data[:, : values.shape[1]] = values
+    rows = np.arange(len(values)) + 2
+    return Log("dive.csv", {sensor: Stream(sensor, STREAMS[sensor], np.arange(len(values)) / rate, data, rows)})
+
+
+@pytest.mark.parametrize(
+    ("sensor", "columns", "inside", "outside", "noise"),
+    [
+        ("depth", 1, 0.9, 1.1, 0.01),  # 2 m/s over half a second
+        ("ahrs", 1, np.deg2rad(9.0), np.deg2rad(12.0), 0.002),
+        ("dvl_heading", 1, np.deg2rad(9.0), np.deg2rad(12.0), 0.002),
+        ("vehicle_heading", 1, np.deg2rad(9.0), np.deg2rad(12.0), 0.002),
+        ("vehicle_tilt", 2, np.deg2rad(6.0), np.deg2rad(9.0), 0.002),
+        ("fix", 2, 6.0, 9.0, 0.1),
+        ("dvl_water", 3, 0.05, 0.07, 0.001),
+    ],
+)
+def test_zeros_of_other_sensors_are_none_where_the_vehicle_cannot_have_been_there(
+    sensor, columns, inside, outside, noise
+):
+    if sensor == "depth":  # also where its resolution hides the noise
+        inside, outside, step = 0.9, 1.1, 0.1
+    else:
+        step = 1e-6
+    for away, expected in ((inside, 0), (outside, 10)):
+        values = away + noise * np.random.default_rng(1).standard_normal((200, columns))
+        values = np.round(values / step) * step
+        values[15::20] = 0.0
+        found = false_values(alone(sensor, values), Config())
+        assert sum(len(f.time) for f in found) == expected
+        assert all((f.sensor, f.kind) == (sensor, "zero") for f in found)
+
+
+def test_a_heading_that_turns_through_north_and_fixes_that_start_at_the_origin_are_right():
+    turning = np.deg2rad(np.arange(-180.0, 900.0, 3.0))[:, None] % (2.0 * np.pi)
+    assert (turning == 0.0).any()
+    assert false_values(alone("ahrs", turning), Config()) == []
+    leaving = np.cumsum(np.full((100, 2), 0.7), axis=0) - 0.7
+    assert false_values(alone("fix", leaving, 1.0), Config()) == []
+
+
+def test_limits_that_depend_on_the_configuration():
+    fix = companies(Config(fix={"sd_m": 4.0}, dvl={"max_speed_mps": 2.0}))["fix"]
+    assert (fix.least, fix.never) == (20.0, 2.0)

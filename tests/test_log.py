@@ -46,6 +46,31 @@ def test_a_unit_with_a_sign_turns_the_sign_and_leaves_an_sd(tmp_path):
         read_log(path, Config(units={"time": "-s"}))
 
 
+def read_sds(tmp_path: Path, column: str, sds: list[float]) -> list[float]:
+    rows = "".join(f"{k},1,2,3,{sd!r}\n" for k, sd in enumerate(sds))
+    names = "dvl_vx,dvl_vy,dvl_vz" if column == "dvl_sd" else "fix_north,fix_east,depth"
+    log = read_log(write(tmp_path, f"time,{names},{column}\n{rows}"))
+    return log[column.split("_")[0]][column].tolist()
+
+
+@pytest.mark.parametrize("column", ["dvl_sd", "fix_sd"])
+@pytest.mark.parametrize("sd", [9999.0, 99.99, 999.9, 65.535, 1e6, 9999.0**0.5, 99999.0**0.5])
+def test_an_sd_that_stands_for_an_unknown_one_is_unknown(tmp_path, column, sd):
+    with pytest.warns(DataWarning, match=f"{column}: 3 times no sd that such an instrument has, taken as unknown"):
+        np.testing.assert_array_equal(read_sds(tmp_path, column, [sd, 0.2, sd, sd]), [np.nan, 0.2, np.nan, np.nan])
+
+
+@pytest.mark.parametrize(("column", "largest"), [("dvl_sd", 5.0), ("fix_sd", 5e3)])
+def test_an_sd_is_unknown_from_what_no_such_instrument_has_on(tmp_path, column, largest):
+    assert read_sds(tmp_path, column, [0.99 * largest] * 3) == [0.99 * largest] * 3
+    with pytest.warns(DataWarning, match="taken as unknown"):
+        assert np.isnan(read_sds(tmp_path, column, [1.01 * largest] * 3)).all()
+
+
+def test_a_placeholder_among_better_sds_says_that_the_measurement_is_worth_little(tmp_path):
+    assert read_sds(tmp_path, "dvl_sd", [0.01, 10.0, 0.01, 9999.0]) == [0.01, 10.0, 0.01, 9999.0]
+
+
 ORIGIN = {"origin_lat_deg": 58.3, "origin_lon_deg": 14.5}
 
 

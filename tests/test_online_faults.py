@@ -261,6 +261,24 @@ def test_a_fix_in_degrees_is_as_late_as_one_in_metres(case):
     assert [time for time, _ in intake.timed(100.0, (local, geodetic))] == [99.5, 99.5]
 
 
+def sds_taken(sds: list[float]) -> tuple[list[float], list[tuple[str, str]]]:
+    """The sds of pings as the estimator takes them, and what is told of them."""
+    intake = Intake(Config(), Counter())
+    read = [Reading("dvl", np.array([0.4, 0.0, 0.0, 1.0, sd])) for sd in sds]
+    taken = [intake.measurement(0.2 * k, reading) for k, reading in enumerate(read)]
+    return [float(m.values[4]) for m in taken if m is not None], intake.news
+
+
+def test_a_figure_of_merit_that_is_a_placeholder_all_the_time_is_unknown_and_told_once():
+    sds, news = sds_taken([99.99] * 30)
+    np.testing.assert_array_equal(sds, [99.99] * 9 + [np.nan] * 21)
+    assert [sensor for sensor, _ in news] == ["dvl"] and "taken as unknown" in news[0][1]
+
+
+def test_a_figure_of_merit_that_is_large_now_and_then_says_that_the_ping_is_bad():
+    assert sds_taken([0.01, 10.0, 0.01] * 10) == ([0.01, 10.0, 0.01] * 10, [])
+
+
 @pytest.mark.parametrize("latitude", [0.0, 58.4, -78.0])
 def test_latitude_and_longitude_are_right_to_a_tenth_of_a_millimetre_wherever_the_vehicle_goes(latitude):
     intake, way = Intake(Config(), Counter()), np.cumsum(np.random.default_rng(0).normal(0.2, 2.0, (2000, 2)), axis=0)

@@ -39,7 +39,7 @@ TURNING = np.deg2rad(60.0)  # fastest turn [rad/s]
 HALF, ABOUT = 0.5, 0.1  # of the speed of the pings around: half, and how far from it
 FULL = 0.8  # part of the speed around that is the full one,
 FULL_OF, FULL_RANK = 9, 3  # which is the third largest of nine
-ALIKE = 0.25  # part of the speed by which the pings around may differ
+ALIKE = 0.5  # part of the speed by which the pings around may differ
 OUTLIES, QUIET = 8.0, 0.25  # times the distance from the mean of both neighbours that a quarter of the pings keeps
 FEWEST = 3  # that tell of a habit
 ENOUGH_VALUES = 20  # that show whether there is noise
@@ -247,7 +247,8 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
 
     Where resolution hides the noise, zeros have to begin and end abruptly, as it may have been stopped by an obstacle.
     Where it does not, one side tells, and so do neighbours that move on both, if only a moment lies between. Where the
-    noise shows at rest, too, or many zeros are false by now, zeros are no rest, and less abruptness will do.
+    noise shows at rest, too, or many zeros are false by now, less abruptness will do; and where it shows at rest and
+    some are false, all are.
     """
     values, time = stream.data[:, : company.columns], stream.time
     zero = (values == 0.0).all(axis=1)
@@ -279,6 +280,8 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
         slow = (company.size(values[known]) < company.least).sum()
         if 2 * (slow + counts[false].sum()) >= counts[~false].sum():
             false |= company.seldom_stops(left, seconds).any(axis=0)
+        if company.rests and false.sum() >= FEWEST and 2 * slow >= counts[~false].sum():
+            false[:] = True
     else:
         false = abrupt.all(axis=0) if company.rests else abrupt.any(axis=0)
     size = company.scale * company.size(values[near])
