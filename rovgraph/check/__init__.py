@@ -72,6 +72,8 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
         **{check: partial(_of_motion, check, unfrozen) for check in MOTION_CHECKS if frozen},
     }
     findings = [finding for check in CHECKS for finding in known.get(check, check)(log, config)]
+    bursts = {f.sensor for f in findings if f.kind == "bursts"}  # whose stamps are late, too
+    findings = [f for f in findings if f.kind != "lag" or not bursts & {"imu", f.sensor}]
     return Report(log.source, [timing(stream) for stream in log.streams.values()], findings)
 
 

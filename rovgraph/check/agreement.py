@@ -3,6 +3,7 @@
 Each comparison takes what two sensors say of the change within windows of some seconds (`rovgraph.check.signals`).
 """
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,15 +11,17 @@ import numpy as np
 from rovgraph.check.compasses import field_axes, magnetic_heading
 from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
 from rovgraph.check.inertial import InertialMotion, inertial_motion
-from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
+from rovgraph.check.signals import FOLLOWS, LAG_WARNING, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
-from rovgraph.config import Config, mount_matrix
+from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, rotate
+from rovgraph.instruments import instruments
 from rovgraph.log import Log, Stream
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
 CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
+BELIEVED_SDS = 3.0  # of a time offset that is estimated, within which it explains a lag
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
 EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
 WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
@@ -51,7 +54,8 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
             found = _heading_lag(gyro, _heading_by_gyro(log, config, motion), heading)
             delay = config.delay_s.get(sensor, 0.0) + found.seconds
             remedy = f"if it is late, state delay_s: {{{sensor}: {delay:.2g}}}"
-            yield from _clock(sensor, f"the turning of {NAMES[sensor]}", "the gyro's", found, EVIDENCE, remedy)
+            turn = f"the turning of {NAMES[sensor]}"
+            yield from _clock(sensor, turn, "the gyro's", found, EVIDENCE, remedy, _stated(config, found, sensor))
 
 
 def heading_lag(log: Log, config: Config, sensor: str) -> tuple[float, float] | None:
@@ -181,13 +185,25 @@ def _if_degrees(sensor: str) -> str:
     return f"if it is in degrees, state units: {{{sensor}: deg}}"
 
 
-def _clock(sensor: str, what: str, against: str, found: Lag, evidence: float, remedy: str) -> Iterator[Finding]:
-    """A lag, if there is one."""
+def _stated(config: Config, found: Lag, late: str, than: str | None = None) -> bool:
+    """Whether a lag of one sensor, than another, is what the configuration states or lets an estimate find."""
+    priors, every = beliefs(config), instruments(config)
+    own, other = (None if sensor is None else every[sensor].time_offset for sensor in (late, than))
+    known = {name: sign for name, sign in ((own, 1.0), (other, -1.0)) if name is not None}
+    offset = sum(sign * float(priors[name].mean[0]) for name, sign in known.items())
+    sd = math.hypot(*(priors[name].sd for name in known if priors[name].estimate))
+    return (offset != 0.0 or sd > 0.0) and abs(found.seconds - offset) < max(LAG_WARNING, BELIEVED_SDS * sd)
+
+
+def _clock(
+    sensor: str, what: str, against: str, found: Lag, evidence: float, remedy: str, stated: bool
+) -> Iterator[Finding]:
+    """A lag, if there is one that is not stated."""
     if np.isnan(found.seconds):
         return
     later = f"{abs(found.seconds):.2f} s {'later' if found.seconds > 0 else 'earlier'} than {against}"
     sd = f" (sd {found.sd:.2f} s)" if np.isfinite(found.sd) else ""
-    if found.significant(evidence):
+    if found.significant(evidence) and not stated:
         text = f"{what} comes {later}{sd}: the clocks disagree, or a filter delays it; {remedy}"
         yield Finding(sensor, "warning", text, "lag")
     else:
@@ -234,9 +250,9 @@ def vertical(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("dvl", "warning", text, "scale")
     found = lag(dvl, depth, window)  # the integral is the less noisy one
     behind = Lag(-found.seconds, found.sd, found.evidence)
-    yield from _clock(
-        "dvl", "vertical velocity", "the change of depth", behind, WAVE_EVIDENCE, "check the clocks of both"
-    )
+    stated = _stated(config, behind, "dvl", than="depth")
+    against, remedy = "the change of depth", "check the clocks of both"
+    yield from _clock("dvl", "vertical velocity", against, behind, WAVE_EVIDENCE, remedy, stated)
 
 
 def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Signal, Signal, float]:

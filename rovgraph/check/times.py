@@ -15,9 +15,10 @@ from rovgraph.sensors import SENSORS
 
 GAP_PERIODS = 5.0  # longer than this many periods is a gap
 BURST = 0.3  # of the mean period, below which most periods lie within bursts
-BURSTS = 0.1  # of all periods, at least, that lie between bursts
-REGULAR = 0.5  # spread of these, as a part of their median
+BURST_SECONDS = 3.0  # between bursts of a buffer that is read again and again; what is longer is silence
+WITHIN = 0.1  # of the time, that bursts last at most of sensors other than the IMU, which may measure now and then only
 ENOUGH_PERIODS = 20
+BATCHED = 0.5  # share of measurements that have the stamp of another, beyond which they come in batches
 REPEATED = 0.2  # share of repeated samples that a sensor does not produce by itself
 
 
@@ -96,7 +97,7 @@ def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -
         period = _burst_period(stream)
         if period is not None:
             mean = (t.count - 1) / (t.last - t.first)
-            bursts = f"{mean:.3g} Hz, but in bursts, most {1.0 / t.rate:.2g} s apart"
+            bursts = f"{mean:.3g} Hz, but in bursts, most {1.0 / t.rate:.2g} s apart and then none for {period:.2g} s"
             text = f"{bursts}: they may be times of arrival; log times of measurement"
             yield Finding(sensor, "warning", text, "bursts")
         elif not low <= t.rate <= high:
@@ -107,6 +108,12 @@ def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -
                 "if time is not in seconds, state its unit, such as units: {time: ms}",
                 "rate",
             )
+        if stream.same_time > BATCHED * (t.count + stream.same_time):
+            text = (
+                f"{stream.same_time} of {t.count + stream.same_time} measurements have the stamp of another, so that "
+            )
+            text += "only the first of each batch is used: they may be times of arrival; log times of measurement"
+            yield Finding(sensor, "warning", text, "bursts")
         yield from _gaps(log, config, t, period or 1.0 / t.rate)
         if sensor == "imu" and period is None and t.jitter * t.rate > 0.5:
             yield Finding(
@@ -130,14 +137,13 @@ def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -
 def _burst_period(stream: Stream) -> float | None:
     """Time between bursts of a sensor that samples all the time [s]; None where its measurements come one by one."""
     periods = np.diff(stream.time)
-    if SENSORS[stream.sensor].occasional or len(periods) < ENOUGH_PERIODS:
+    between = periods > periods.mean() if len(periods) else np.zeros(0, bool)
+    if SENSORS[stream.sensor].occasional or np.count_nonzero(between) < ENOUGH_PERIODS:
         return None
-    between = periods[periods > periods.mean()]
-    if np.median(periods) > BURST * periods.mean() or len(between) < BURSTS * len(periods):
+    usual = float(np.percentile(periods[between], 90))
+    if np.median(periods) > BURST * periods.mean() or usual > BURST_SECONDS:
         return None
-    low, high = np.percentile(between, [10, 90])
-    usual = float(np.median(between))
-    return usual if high - low < REGULAR * usual else None
+    return usual if stream.sensor == "imu" or periods[~between].sum() < WITHIN * periods.sum() else None
 
 
 def _repeated_for_a_moment(stream: Stream) -> int:

@@ -374,4 +374,4 @@ def _distinct_times(stream: Stream, source: str) -> Stream:
         if which.any():
             line = stream.row[np.argmax(which)]
             warn(f"{source}: {stream.sensor}: {which.sum()} measurements {what}; first in line {line}")
-    return stream.take(~again)
+    return replace(stream.take(~again), same_time=int(np.count_nonzero(again & ~same)))

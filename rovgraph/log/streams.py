@@ -96,6 +96,7 @@ class Stream:
     time : ndarray, shape (n,) [s], increasing
     data : ndarray, shape (n, k); optional columns that are missing are NaN (dvl_valid: 1)
     row : ndarray of int, shape (n,), lines of the file, 1 = header
+    same_time : others that were left out, as they have the stamp of one that is kept
     """
 
     sensor: str
@@ -103,6 +104,7 @@ class Stream:
     time: Array
     data: Array
     row: NDArray[np.int64]
+    same_time: int = 0
 
     def __len__(self) -> int:
         return len(self.time)
@@ -112,7 +114,7 @@ class Stream:
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Stream":
         """Some of its measurements, by index or by mask."""
-        return Stream(self.sensor, self.columns, self.time[index], self.data[index], self.row[index])
+        return replace(self, time=self.time[index], data=self.data[index], row=self.row[index])
 
 
 def joined(parts: Sequence[Stream]) -> Stream:
