@@ -36,9 +36,9 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
     sensors = [sensor for sensor in NAMES if sensor in log and len(log[sensor]) >= MIN_WINDOWS]
     gyro, motion = _gyro_yaw(log["imu"], config), inertial_motion(log, config) if sensors else None
     for sensor in sensors:
-        if sensor == "mag" and motion is not None and (found := [*field_axes(log, config, motion)]):
-            yield from found
-            if found[0].sensor == "imu":  # a gyro that is wrong tells nothing of other compasses
+        if sensor == "mag" and motion is not None and (wrong := [*field_axes(log, config, motion)]):
+            yield from wrong
+            if wrong[0].sensor == "imu":  # a gyro that is wrong tells nothing of other compasses
                 return
             continue
         heading = _heading(log, config, sensor, motion)

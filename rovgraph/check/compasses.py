@@ -193,7 +193,7 @@ def _fit(left: Array, J: Array, telling: NDArray[np.bool_]) -> tuple[float, Arra
         squares = np.sum((left - J @ found) ** 2, axis=1)
         limit = CLIPPED**2 * float(np.median(squares[telling]))
         keep, variance = squares <= limit, limit / CLIPPED**2 / 3.0
-    return float(np.minimum(squares, limit)[telling].mean()), found
+    return float(np.minimum(squares, limit)[telling].mean()), np.asarray(found, float)
 
 
 def field_axes(log: Log, config: Config, motion: InertialMotion) -> Iterator[Finding]:

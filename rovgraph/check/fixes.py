@@ -61,7 +61,8 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
     pings = valid_pings(log["dvl"])
     if found is None or len(pings) < MIN_FIXES or len(log["fix"]) < MIN_FIXES:
         return
-    sensor, *psi = found
+    sensor, *heading = found
+    psi = heading[0], heading[1]
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     turn = np.exp(1j * np.interp(pings.time, *psi))
     arm = complex(*config.fix.lever_arm_m[:2])

@@ -179,14 +179,15 @@ def frozen_stretches(log: Log, config: Config) -> list[FrozenStretch]:
 
 def false_values(log: Log, config: Config) -> list[FrozenStretch]:
     """Measurements that are none by those of the same sensor next to them: zeros, half speeds, repetitions."""
-    found = []
+    found: list[FrozenStretch] = []
     for sensor, company in companies(config).items():
         if sensor not in log:
             continue
         stream = _valid(log[sensor])
         found += _zeros(stream, company)
         if company.rests:
-            known = stream.take(np.isfinite(stream.data[:, :3]).all(axis=1) & stream.data[:, :3].any(axis=1))
+            told = np.isfinite(stream.data[:, :3]).all(axis=1) & stream.data[:, :3].any(axis=1)
+            known = stream.take(np.asarray(told))
             halves = [*_halves(known, company)]
             found += [*halves, *_repeated(without(known, halves))]
     return found
