@@ -121,6 +121,5 @@ def _sums(block: NDArray[np.int64], t: Array, v: Complexes) -> tuple[Array, Arra
 
     n = np.bincount(block).astype(float)
     some = n > 0
-    t_, tt = np.bincount(block, t)[some], np.bincount(block, t * t)[some]
-    sums: tuple[Array, Array, Complexes, Array, Complexes] = n[some], t_, total(v)[some], tt, total(t * v)[some]
-    return sums
+    t_, tt = (np.asarray(np.bincount(block, values)[some], float) for values in (t, t * t))
+    return n[some], t_, total(v)[some], tt, total(t * v)[some]
