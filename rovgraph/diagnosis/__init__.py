@@ -71,6 +71,8 @@ def find_alarms(numbers: Sequence[Statistic], start: float) -> list[Alarm]:
     start : when the dive began [s]
     """
     worst = [alarm for alarm in _worst(numbers) if alarm.severity != "advice"]
+    contradicted = {alarm.sensor for alarm in worst if alarm.kind in ("axes", "clock")}  # in the check's own words
+    worst = [alarm for alarm in worst if alarm.kind != "check" or alarm.sensor not in contradicted]
     return [*worst, *sensors.contradictions(worst, start)]
 
 
