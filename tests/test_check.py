@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from rovgraph.check import examine, warn
@@ -251,6 +252,16 @@ def test_noise_of_a_heading_is_not_taken_for_a_clock_that_is_late():
     assert len(late) > 20
 
 
+def test_a_lag_of_a_compass_that_is_stated_is_no_fault(sound):
+    late = replace(sound["ahrs"], time=sound["ahrs"].time + 0.8)
+    log = replace(sound, streams={**sound.streams, "ahrs": late})
+    stated = {"calibration": {"ahrs_time_offset": {"estimate": True, "mean": 0.8, "sd": 0.05}}}
+    assert "comes 0." in messages(log, sensor="ahrs")
+    assert messages(log, Config.model_validate(stated), sensor="ahrs") == ""
+    stated["calibration"]["ahrs_time_offset"]["mean"] = 0.3  # another one
+    assert "comes 0." in messages(log, Config.model_validate(stated), sensor="ahrs")
+
+
 def test_half_a_second_between_clocks_is_found_on_a_dive_that_turns(sound):
     for sensor in ("ahrs", "dvl_heading"):
         late = replace(sound[sensor], time=sound[sensor].time - 0.5)
@@ -353,6 +364,56 @@ def test_samples_written_twice_are_named(sound):
     assert "50% of the measurements repeat" in messages(changed(sound, "imu", twice), sensor="imu")
 
 
+@pytest.mark.parametrize(("axis", "column", "limit"), [("acc_x", 0, 0.03), ("gyr_z", 5, 0.15)])
+@pytest.mark.parametrize("end", [1.0, -1.0])
+def test_a_clipped_signal_is_named_with_axis_limit_count_and_time(sound, axis, column, limit, end):
+    values = end * sound["imu"].data[:, column]
+    clipped = changed(
+        sound, "imu", lambda data, _: data.__setitem__((slice(None), column), end * values.clip(max=limit))
+    )
+    (found,) = examine(clipped).at("warning")
+    assert (found.sensor, found.kind, found.wrong) == ("imu", "saturated", True)
+    assert f"{axis} at {end * limit:.4g} " in found.text
+    assert f"in {np.count_nonzero(values >= limit)} samples" in found.text
+    first = sound["imu"].time[np.argmax(values >= limit)] - sound["imu"].time[0]
+    assert f"first at {first:.1f} s" in found.text
+
+
+@pytest.mark.parametrize(("count", "named"), [(9, False), (10, True)])
+def test_a_few_samples_at_one_extreme_are_chance(sound, count, named):
+    limit = np.sort(sound["imu"].data[:, 1])[-count]
+    cut = changed(sound, "imu", lambda data, _: data.__setitem__((slice(None), 1), data[:, 1].clip(max=limit)))
+    assert ("is clipped" in messages(cut, sensor="imu")) == named
+
+
+def test_a_range_of_2_g_is_named_in_g(sound):
+    def shake(data, time):
+        data[:, 0] = (30.0 * np.sin(40.0 * time) + data[:, 0]).clip(-19.6, 19.6)
+
+    assert "acc is clipped (2 g): acc_x at " in messages(changed(sound, "imu", shake), sensor="imu")
+
+
+@pytest.mark.parametrize("resolution", [1e-4, 1e-3, 0.02, 0.1])
+def test_a_coarse_resolution_is_no_clipping(sound, resolution):
+    def coarse(data, _):
+        data[:, 3:] = np.round(data[:, 3:] / resolution) * resolution
+
+    assert "clipped" not in messages(changed(sound, "imu", coarse), sensor="imu")
+
+
+def test_findings_tell_what_is_wrong_from_remarks(sound):
+    """What smooth counts as evidence of an error."""
+    mirrored = scaled(sound, "dvl_heading", slice(0, 1), -1.0)
+    lost = changed(without(mirrored, "depth"), "dvl", lambda data, time: data.__setitem__((time < 100, 3), 0.0))
+    report = examine(lost)
+    assert {(f.sensor, f.kind, f.wrong) for f in report.at("warning")} == {
+        ("dvl_heading", "sign", True), ("depth", "missing", False), ("dvl", "bottom lock", False),
+    }  # fmt: skip
+    assert [f.kind for f in report.faults(Config())] == ["sign"]
+    assert report.faults(Config.model_validate({"heading": {"sources": ["mag"]}})) == []  # which does not use it
+    assert [f["wrong"] for f in report.as_dict()["findings"]] == [f.wrong for f in report.findings]
+
+
 def test_a_heading_that_stands_still_in_a_turn_is_named(sound):
     def hold(data, time):
         data[(time > 50) & (time < 70), 0] = 1.0
@@ -430,10 +491,52 @@ def test_bursts_are_said_to_be_bursts_and_have_no_gaps_in_between(sound, apart):
     assert not any("gap" in line or "time is not in seconds" in line for line in said)
 
 
+@pytest.mark.parametrize(("every", "sensor"), [(0.1, "imu"), (0.5, "imu"), (2.0, "dvl")])
+def test_batches_of_any_size_are_bursts_and_no_lag_is_said_beside_them(sound, every, sensor):
+    s = sound[sensor]
+    batch = np.ceil(s.time / every)
+    late = batch * every + 1e-4 * (np.arange(len(s)) - np.searchsorted(batch, batch))
+    log = replace(sound, streams={**sound.streams, sensor: replace(s, time=late)})
+    (found,) = examine(log).at("warning")
+    assert (found.sensor, found.kind, found.wrong) == (sensor, "bursts", True)
+
+
+def test_pings_now_and_then_are_gaps_and_no_bursts(sound):
+    """A DVL that pings for one second of four."""
+    s = sound["dvl"]
+    log = replace(sound, streams={**sound.streams, "dvl": s.take(s.time % 4.0 < 1.0)})
+    assert {f.kind for f in examine(log).at("warning")} == {"gap"}
+
+
+@pytest.mark.parametrize(("size", "named"), [(1, False), (2, False), (3, True), (10, True)])
+def test_samples_that_share_stamps_are_named_where_most_of_them_are_lost(size, named):
+    """Two with one stamp are a coarse clock."""
+    t = np.arange(0.0, 60.0, 0.01)
+    rng = np.random.default_rng(1)
+    signals = rng.normal(0.0, 0.01, (len(t), 6)) - 9.81 * np.eye(6)[2]
+    names = [f"{kind}_{axis}" for kind in ("acc", "gyr") for axis in "xyz"]
+    frame = pd.DataFrame({"time": t[np.arange(len(t)) // size * size], **dict(zip(names, signals.T, strict=True))})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        log = Log.from_frame(frame)
+    assert ("have the stamp of another" in messages(log, sensor="imu")) == named
+
+
 def test_spikes_of_the_depth_say_nothing_of_the_dvl(sound):
     spikes = changed(sound, "depth", lambda data, _: data.__setitem__((slice(7, None, 13), 0), 65.536))
     assert messages(spikes, sensor="dvl") == ""
     assert "vertical velocity agrees with the change of depth (slope 1" in messages(spikes, level="ok")
+
+
+@pytest.mark.parametrize("by", [1.0, -8.0])
+def test_a_depth_that_is_zeroed_under_way_does_not_blame_the_dvl(sound, by):
+    def zero(data, time):
+        data[time > 150, 0] += by
+
+    zeroed = changed(sound, "depth", zero)
+    assert messages(zeroed, sensor="dvl") == ""
+    assert "reversed" not in messages(zeroed, sensor="depth")
+    assert ("its zero was probably set under water" in messages(zeroed, sensor="depth")) == (by < 0.0)
 
 
 def test_invalid_zeros_are_not_frozen(sound):

@@ -1,10 +1,15 @@
 """What a log tells by comparing motions: axes, mountings, clocks and their jumps, and values that cannot be."""
 
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
-from dives import altered, falcon, simulated, without
+from dives import Simulated, altered, changed, falcon, merge, simulated, true_at, without
+from ruamel.yaml import YAML
 
 from rovgraph.check import Finding, bridge_jumps, examine
 from rovgraph.check.acceleration import ORIENTATIONS
@@ -13,7 +18,7 @@ from rovgraph.check.inertial import inertial_motion
 from rovgraph.config import Config, mount_matrix
 from rovgraph.errors import DataWarning
 from rovgraph.geometry import matrix_from_rpy, rotate, transpose
-from rovgraph.log import Log
+from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.simulate import CALM, Style
 
 LEVEL = Style(waves=CALM)
@@ -24,6 +29,15 @@ def dive(request) -> tuple[Log, Config]:
     more = {"style": LEVEL} if request.param == "level" else {}
     case = simulated(falcon(), 300.0, 3, "lawnmower", **more)
     return case.log, case.config
+
+
+@pytest.fixture(scope="module")
+def turned_dives() -> dict[str, Simulated]:
+    """Dives whose only headings are the magnetometer's and the DVL's, which is right."""
+    return {
+        "waves": simulated(falcon(), 120.0, 3, "lawnmower"),
+        "level": simulated(falcon(), 200.0, 3, "lawnmower", style=LEVEL),
+    }
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +131,103 @@ def test_a_turned_mounting_is_not_taken_for_earths_axes(scenario):
     assert "do not turn" not in said(renamed(case.log, H), case.config, "dvl")
 
 
+def renamed_columns(case: Simulated, sensor: str, H: np.ndarray) -> pd.DataFrame:
+    """A log's table whose magnetometer or gyro measures along other axes: H turns them back."""
+    frame = case.dive.log_frame.copy()
+    columns = [f"{sensor}_{axis}" for axis in "xyz"]
+    frame[columns] = frame[columns].to_numpy() @ H
+    return frame
+
+
+def pasted(config: Config, text: str) -> Config:
+    """A configuration with what a finding states."""
+    stated: dict[str, Any] = {}
+    for key in re.findall(r"imu\.mag\.matrix: \[\[.*?\]\]|columns: \{.*?\}|units: \{.*?\}", text):
+        path, value = key.split(": ", 1)
+        entry = YAML(typ="safe").load(value)
+        for name in reversed(path.split(".")):
+            entry = {name: entry}
+        merge(stated, entry)
+    assert stated
+    return changed(config, **stated)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, 6, 9, 16, 20, 31, 47])
+@pytest.mark.parametrize("style", ["waves", "level"])
+def test_axes_of_the_magnetometer_are_named_with_what_mends_them(turned_dives, style, k):
+    case = turned_dives[style]
+    frame = renamed_columns(case, "mag", ORIENTATIONS[k])
+    (found,) = complaints(Log.from_frame(frame), case.config, "mag")
+    assert (found.kind, found.wrong) == ("axes", True)
+    mended = pasted(case.config, found.text)
+    np.testing.assert_array_equal(mended.imu.mag.matrix, ORIENTATIONS[k])
+    assert said(Log.from_frame(frame, mended), mended, "mag") == ""
+
+
+@pytest.mark.parametrize("k", [1, 3, 16, 19])
+def test_axes_of_the_gyro_are_named_and_not_blamed_on_the_magnetometer(turned_dives, k):
+    case = turned_dives["waves"]
+    frame = renamed_columns(case, "gyr", ORIENTATIONS[k])
+    assert said(Log.from_frame(frame), case.config, "mag") == ""
+    (found,) = [f for f in complaints(Log.from_frame(frame), case.config, "imu") if f.kind == "axes"]
+    mended = pasted(case.config, found.text)
+    assert said(Log.from_frame(frame, mended), mended, "imu") == ""
+
+
+def test_axes_are_not_named_where_the_vehicle_hardly_turns():
+    case = simulated(falcon(), 120.0, 4, "straight", style=LEVEL)
+    flipped = altered(case.log, "mag", case.log["mag"].data * [1.0, -1.0, 1.0])
+    assert "axes are" not in said(flipped, case.config, "mag")
+
+
+@pytest.mark.parametrize("iron", [0.5, 3.0])
+def test_iron_is_not_taken_for_other_axes(turned_dives, iron):
+    """Hard iron of three times the field, and soft iron."""
+    case = turned_dives["waves"]
+    soft = np.eye(3) + 0.1 * np.array([[1.0, 0.5, -0.3], [0.5, -1.0, 0.4], [-0.3, 0.4, 0.5]])
+    bent = case.log["mag"].data @ soft + iron * np.array([0.6, -0.6, 0.5])
+    assert "axes are" not in said(altered(case.log, "mag", bent), case.config, "mag")
+
+
+@pytest.mark.parametrize(("latitude", "named"), [(58.0, True), (-30.0, False), (10.0, False)])
+def test_a_field_that_points_the_wrong_way_is_named_where_the_latitude_tells(turned_dives, latitude, named):
+    case = turned_dives["waves"]
+    config = changed(case.config, environment={"dip_deg": None, "latitude_deg": latitude})
+    assert ("points upwards" in said(altered(case.log, "mag", -case.log["mag"].data), config, "mag")) == named
+
+
+def with_current(case: Simulated, at: float, change_n: Sequence[float]) -> Log:
+    """A log whose water moves otherwise from some seconds on."""
+    water, R_bs = case.log["dvl_water"], mount_matrix(case.config.dvl.mount_rpy_deg)
+    later_n = np.outer(water.time - case.log["imu"].time[0] > at, [*change_n, 0.0])
+    data = water.data - rotate(transpose(true_at(case, water.time).R_nb), later_n) @ R_bs
+    return altered(case.log, "dvl_water", data)
+
+
+@pytest.fixture(scope="module")
+def over_water() -> Simulated:
+    return simulated(falcon(fix={"sd_m": 1.0}), 300.0, 1, "lawnmower", water_track=True, fix_interval=2.0)
+
+
+@pytest.mark.parametrize("lost", [(), ("dvl",)])
+def test_a_current_that_changes_is_named_with_time_and_what_lets_it(over_water, lost):
+    """By bottom track, or by fixes where there is none."""
+    log = without(with_current(over_water, 140.0, (-0.3, 0.2)), *lost)
+    (found,) = complaints(log, over_water.config, "dvl_water")
+    assert (found.kind, found.wrong) == ("current", True)
+    first, second = (float(part.split(" s")[0]) for part in found.text.split(" between ")[1].split(" and ")[:2])
+    assert first - 15.0 <= 140.0 <= second + 15.0
+    walk = float(found.text.split("{walk: ")[1].split("}")[0])
+    assert said(log, changed(over_water.config, calibration={"current": {"walk": walk}}), "dvl_water") == ""
+
+
+@pytest.mark.parametrize("change_n", [(0.0, 0.0), (0.06, 0.06)])
+def test_a_small_change_of_the_current_is_none(over_water, change_n):
+    for lost in ((), ("dvl",)):
+        log = without(with_current(over_water, 140.0, change_n), *lost)
+        assert said(log, over_water.config, "dvl_water") == ""
+
+
 @pytest.mark.parametrize("seconds", [-0.5, 0.3, 3.2, 40.0])
 def test_a_dvl_that_is_stamped_late_is_measured_against_the_imu(dive, seconds):
     log, config = dive
@@ -205,6 +316,60 @@ def test_swapped_fixes_are_named(with_fixes):
     data = log["fix"].data.copy()
     data[:, :2] = data[:, 1::-1]
     assert "north and east are swapped" in said(altered(log, "fix", data), config, "fix")
+
+
+@pytest.fixture(scope="module")
+def with_magnetometer_only() -> tuple[Log, Config]:
+    """Fixes, and no other heading than a magnetometer's."""
+    case = simulated(falcon(heading={"sources": ["mag"]}, fix={"sd_m": 0.5}), 180.0, 5, "lawnmower", fix_interval=2.0)
+    return without(case.log, "dvl_heading"), case.config
+
+
+def moved_fixes(log: Log, change: Callable[[np.ndarray], np.ndarray]) -> Log:
+    """A log with other fixes, as complex numbers."""
+    data = log["fix"].data.copy()
+    fixes = change(data[:, 0] + 1j * data[:, 1])
+    data[:, 0], data[:, 1] = fixes.real, fixes.imag
+    return altered(log, "fix", data)
+
+
+def test_fixes_are_compared_where_a_magnetometer_is_the_only_heading(with_magnetometer_only):
+    log, config = with_magnetometer_only
+    assert [f for f in examine(log, config).findings if f.level != "ok"] == []
+    late = said(later(log, "fix", 6.0), config, "fix")
+    assert float(late.split("fixes come ")[1].split(" s late")[0]) == pytest.approx(6.0, abs=1.0)
+    assert "north and east are swapped" in said(moved_fixes(log, lambda z: 1j * z.conj()), config, "fix")
+    turned = said(moved_fixes(log, lambda z: z * np.exp(0.9j)), config, "dvl")
+    assert abs(int(turned.split("turned by ")[1].split(" deg")[0]) - 52) < 8
+    (found,) = complaints(moved_fixes(log, lambda z: z * np.exp(0.9j)), config, "dvl")
+    assert (found.kind, found.wrong) == ("turned", True)
+
+
+def test_a_magnetometer_whose_axes_are_wrong_does_not_blame_the_dvl_for_the_fixes(with_magnetometer_only):
+    log, config = with_magnetometer_only
+    (found,) = [f for f in examine(altered(log, "mag", log["mag"].data * [-1, 1, 1]), config).findings if f.wrong]
+    assert (found.sensor, found.kind) == ("mag", "axes")
+
+
+def test_hard_iron_within_its_prior_does_not_turn_the_track(with_magnetometer_only):
+    """At a dip of 72 degrees, hard iron of a tenth of the field turns a heading by up to 20 degrees."""
+    log, config = with_magnetometer_only
+    iron = altered(log, "mag", log["mag"].data + np.array([0.1, -0.08, 0.05]))
+    assert said(iron, changed(config, calibration={"hard_iron": {"sd": 0.1}}), "dvl") == ""
+
+
+@pytest.mark.parametrize("mount_deg", [0.0, 40.0])
+def test_fixes_are_compared_with_the_vehicles_own_heading_without_an_imu(with_fixes, mount_deg):
+    """Which is that of the body, however the DVL is mounted."""
+    log, config = with_fixes
+    heading = log["ahrs"].data[:, :1]
+    own = Stream("vehicle_heading", STREAMS["vehicle_heading"], log["ahrs"].time, heading, log["ahrs"].row)
+    bare = without(log, "imu", "ahrs", "mag", "dvl_heading")
+    bare = replace(bare, streams={**bare.streams, "vehicle_heading": own})
+    turned = changed(config, heading={"sources": ["vehicle"]}, dvl={"mount_rpy_deg": [180, 0, -45 + mount_deg]})
+    text = said(bare, turned, "dvl")
+    assert ("turned by -4" in text or "turned by -3" in text) if mount_deg else text == ""
+    assert "swapped" in said(moved_fixes(bare, lambda z: 1j * z.conj()), turned, "fix")
 
 
 @pytest.mark.parametrize("begin", [0.0, 60.0])

@@ -22,6 +22,9 @@ ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
 CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
 BELIEVED_SDS = 3.0  # of a time offset that is estimated, within which it explains a lag
+LEAST_STEP = 0.3  # of a depth whose zero is set anew [m]
+STEPS = 10.0  # times its usual change against the DVL's way
+MOST_STEPS = 3
 NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two need not agree
 EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
 WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
@@ -259,8 +262,17 @@ def _descents(log: Log, pings: Stream, R_bs: Array, down_b: Array) -> tuple[Sign
     """Depth, the way downwards by a DVL with a mounting, and the window over which the two are compared [s]."""
     way = integral(pings, np.sum(rotate(R_bs, pings.data[:, :3]) * down_b, axis=1))
     window = max(4.0, 4.0 * float(np.median(np.diff(pings.time))))
-    depth = without_spikes(log["depth"])
-    return Signal(depth.time, depth["depth"]), Signal(pings.time, way), window
+    depth, dvl = without_spikes(log["depth"]), Signal(pings.time, way)
+    return _without_steps(Signal(depth.time, depth["depth"]), dvl, window), dvl, window
+
+
+def _without_steps(depth: Signal, dvl: Signal, window: float) -> Signal:
+    """A depth without changes of its zero, which the DVL's way does not have and which say nothing of the DVL."""
+    change = np.diff(depth.value - dvl.at(depth.time, window))
+    usual = float(np.nanmedian(np.abs(change))) if np.isfinite(change).any() else np.inf
+    steps = np.where(np.abs(change) > max(LEAST_STEP, STEPS * usual), change, 0.0)  # not where the DVL is lost
+    few = np.count_nonzero(steps) <= MOST_STEPS
+    return Signal(depth.time, depth.value - np.append(0.0, np.cumsum(steps))) if few else depth
 
 
 def dives_with_depth(log: Log, config: Config, R_bs: Array) -> float:

@@ -82,7 +82,7 @@ def _too_deep(values: Array, config: Config) -> Iterator[tuple[str, NDArray[np.b
 def _range(values: Array, config: Config) -> Iterator[Said]:
     """Depth positive down, and in metres."""
     depth = values[:, 0]
-    if np.median(depth) < -0.5:
+    if np.median(depth) < -0.5 and np.percentile(depth, 99) < 1.0:
         yield (
             "warning",
             f"median depth {np.median(depth):.2f} m, but depth counts downwards; "
@@ -94,7 +94,7 @@ def _range(values: Array, config: Config) -> Iterator[Said]:
         yield (
             "warning",
             f"it reaches {lowest:.1f} m above the surface; "
-            "the first pressure was probably measured under water and taken for that at the surface",
+            "its zero was probably set under water, at the first pressure or later",
             "zero",
         )
     if np.ptp(depth) > 1000.0:
