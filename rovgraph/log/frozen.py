@@ -268,32 +268,26 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
         left = np.where(there, company.left(values[near], values[further], noise), -np.inf)
         sides.append((near, left, np.abs(time[near] - time[edge])))
     near, left, seconds = (np.array(part) for part in zip(*sides, strict=True))
-    abrupt, counts, lasts = (
-        company.cannot_stop(left, seconds),
-        last - first + 1,
-        time[last] - time[first] >= MIN_SECONDS,
-    )
+    abrupt, moves, counts = company.cannot_stop(left, seconds), left > company.least, last - first + 1
+    lasts = time[last] - time[first] >= MIN_SECONDS
     if noise:
         mean = _mean(values, time, near[0], first, near[1], company)
-        false = abrupt.any(axis=0) | (
-            (left > company.least).all(axis=0) & (company.size(mean) > company.least) & ~lasts
-        )
+        false = abrupt.any(axis=0) | (moves.all(axis=0) & (company.size(mean) > company.least) & ~lasts)
         slow = (company.size(values[known]) < company.least).sum()
         if 2 * (slow + counts[false].sum()) >= counts[~false].sum():
             false |= company.seldom_stops(left, seconds).any(axis=0)
-        if company.rests and false.sum() >= FEWEST and 2 * slow >= counts[~false].sum():
-            false[:] = True
+        guilty = company.rests and false.sum() >= FEWEST and 2 * slow >= counts[~false].sum()
     else:
-        false = abrupt.all(axis=0) if company.rests else abrupt.any(axis=0)
+        false, guilty = abrupt.all(axis=0) if company.rests else abrupt.any(axis=0), False
     size = company.scale * company.size(values[near])
     long = false & lasts & (counts >= MIN_REPEATS)
     for k in np.flatnonzero(long):
         side = int(np.argmax(left[:, k]))
         why = f"{company.told.format(size[side, k])} just {('before', 'after')[side]}"
         yield FrozenStretch(stream.sensor, "zero", time[first[k] : last[k] + 1], why)
-    if (single := false & ~long).any():
+    if (single := (false | guilty) & ~long).any():
         index = np.concatenate([np.arange(first[k], last[k] + 1) for k in np.flatnonzero(single)])
-        why = company.told.format(np.median(size[:, single][left[:, single] > company.least]))
+        why = company.told.format(np.median(size[moves]))
         yield FrozenStretch(stream.sensor, "zero", time[index], f"{why} next to them", True)
 
 
