@@ -62,6 +62,7 @@ def test_the_misalignment_is_found_with_fixes():
     assert evaluate(found, truth, 5.0).rms_m < 0.1 < evaluate(plain, truth, 5.0).rms_m
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("pyins") is None, reason="pip install python-ins")
 def test_pyins_gets_the_true_track_of_perfect_instruments():
     given, truth = perfect(("ahrs", "depth"), 0.0)
