@@ -415,64 +415,79 @@ def huber(r: Array, H: Array) -> tuple[Array, Array]:
 
 
 @dataclass
-class PingMatrices:
-    """What pyins takes for a measurement: data, and its matrices at a time; here of a ping."""
+class Observation:
+    """What pyins takes for a measurement: data by time, and the matrices of an error of 9 states.
+
+    These are of position, velocity and attitude, in n; the last as ``phi`` of the "modified phi-angle" model.
+    """
 
     data: pd.DataFrame
+
+    def __post_init__(self) -> None:
+        self._rows = dict(zip(self.data.index.tolist(), self.data.to_numpy(), strict=True))
+
+    def compute_matrices(self, time: float, pva: pd.Series, error_model: Any) -> tuple[Array, Array, Array] | None:
+        """Estimate less measurement, its derivative by the error, its noise; None where there is no measurement."""
+        measured = self._rows.get(time)
+        return None if measured is None else self.matrices(measured, pva)
+
+    def matrices(self, measured: Array, pva: pd.Series) -> tuple[Array, Array, Array]:
+        """Of a measurement that there is."""
+        raise NotImplementedError
+
+
+@dataclass
+class PingMatrices(Observation):
+    """Velocity at the DVL's arm, body axes."""
+
     arm: Array
     cov: Array
 
-    def compute_matrices(self, time: float, pva: pd.Series, error_model: Any) -> tuple[Array, Array, Array] | None:
-        """Estimate less measurement, its derivative by the state, its noise; None where there is no measurement."""
-        if time not in self.data.index:
-            return None
-        own = attitude_of(pva).T @ pva[["VN", "VE", "VD"]] + np.cross(pva[["rate_x", "rate_y", "rate_z"]], self.arm)
-        z = np.asarray(own - self.data.loc[time].to_numpy(), float)
-        return z, error_model.body_velocity_error_jacobian(pva), self.cov
+    def matrices(self, measured: Array, pva: pd.Series) -> tuple[Array, Array, Array]:
+        R_bn, rate = attitude_of(pva).T, numbers(pva, "rate_x", "rate_y", "rate_z")
+        own = R_bn @ numbers(pva, "VN", "VE", "VD") + np.cross(rate, self.arm)
+        return own - measured, np.hstack([np.zeros((3, 3)), R_bn, np.zeros((3, 3))]), self.cov
 
 
 @dataclass
-class HeadingMatrices:
-    """The same of a compass [deg]."""
+class HeadingMatrices(Observation):
+    """A compass's [rad]."""
 
-    data: pd.DataFrame
     sd: float
 
-    def compute_matrices(self, time: float, pva: pd.Series, error_model: Any) -> tuple[Array, Array, Array] | None:
-        """As `PingMatrices`."""
-        if time not in self.data.index:
-            return None
-        z = (pva["heading"] - self.data.loc[time, "heading"] + 180.0) % 360.0 - 180.0
-        return np.array([z]), error_model.transform_to_output(pva)[[error_model.DHEADING]], np.array([[self.sd**2]])
+    def matrices(self, measured: Array, pva: pd.Series) -> tuple[Array, Array, Array]:
+        _, pitch, heading = np.deg2rad(numbers(pva, "roll", "pitch", "heading"))
+        H = np.zeros((1, 9))
+        H[0, 6:] = -np.cos(heading) * np.tan(pitch), -np.sin(heading) * np.tan(pitch), -1.0
+        return np.array([wrap_angle(heading - measured[0])]), H, np.array([[self.sd**2]])
 
 
 @dataclass
-class PlaceMatrices:
-    """The same of a depth (axis 2), or of north and east (0, 1), about an origin."""
+class PlaceMatrices(Observation):
+    """Depth (axis 2), or north and east (0, 1) about an origin."""
 
-    data: pd.DataFrame
     axes: list[int]
     arm: Array
     sd: float
     origin: Array
 
-    def compute_matrices(self, time: float, pva: pd.Series, error_model: Any) -> tuple[Array, Array, Array] | None:
-        """As `PingMatrices`."""
+    def matrices(self, measured: Array, pva: pd.Series) -> tuple[Array, Array, Array]:
         from pyins.transform import lla_to_ned
 
-        if time not in self.data.index:
-            return None
-        own = (
-            lla_to_ned(np.asarray(pva[["lat", "lon", "alt"]], float)[None], self.origin)[0]
-            + attitude_of(pva) @ self.arm
-        )
-        z = own[self.axes] - self.data.loc[time].to_numpy()
-        return z, error_model.position_error_jacobian(pva, self.arm)[self.axes], self.sd**2 * np.eye(len(self.axes))
+        arm_n = attitude_of(pva) @ self.arm
+        own = lla_to_ned(numbers(pva, "lat", "lon", "alt")[None], self.origin)[0] + arm_n
+        H = np.hstack([np.eye(3), np.zeros((3, 3)), skew(arm_n)])
+        return own[self.axes] - measured, H[self.axes], self.sd**2 * np.eye(len(self.axes))
+
+
+def numbers(pva: pd.Series, *names: str) -> Array:
+    """Some of a row, without what pandas takes to select them at once."""
+    return np.array([pva[name] for name in names], float)
 
 
 def attitude_of(pva: pd.Series) -> Array:
     """R_nb of a row of pyins."""
-    return np.asarray(matrix_from_rpy(np.deg2rad(pva[["roll", "pitch", "heading"]].to_numpy(float))))
+    return np.asarray(matrix_from_rpy(np.deg2rad(numbers(pva, "roll", "pitch", "heading"))))
 
 
 def pyins_measurements(given: Measured, origin: Array) -> list[Any]:
@@ -483,7 +498,7 @@ def pyins_measurements(given: Measured, origin: Array) -> list[Any]:
     )
     found: list[Any] = [ping]
     for heading, sd in given.headings:
-        found.append(HeadingMatrices(pd.DataFrame({"heading": np.rad2deg(heading)}, at), np.rad2deg(sd)))
+        found.append(HeadingMatrices(pd.DataFrame({"heading": heading}, at), sd))
     if given.depth is not None:
         depth = pd.DataFrame({"down": given.depth}, at)
         found.append(PlaceMatrices(depth, [2], given.arm("depth"), config.depth.sd_m, origin))

@@ -43,14 +43,15 @@ def perfect(aids, turned_deg):
     return peers.Measured(config, Log.from_frame(log_table(streams), config)), truth
 
 
-@pytest.mark.parametrize("aids", [("ahrs", "depth"), ("mag", "depth"), ("dvl_heading", "depth")])
-def test_perfect_instruments_give_the_true_track(aids):
-    given, truth = perfect(aids, 0.0)
+@pytest.mark.parametrize(("compass", "heading_deg"), [("ahrs", 1.0), ("dvl_heading", 1.0), ("mag", 2.5)])
+def test_perfect_instruments_give_the_true_track(compass, heading_deg):
+    """By a magnetometer where the field is steep, the heading errs three times as much as the tilt."""
+    given, truth = perfect((compass, "depth"), 0.0)
     for track in (peers.dead_reckoning(given), peers.Graph(given, misaligned=True).solve()):
         metrics = evaluate(track, truth, 5.0)
         assert metrics.distance_m > 8.0
         assert metrics.rms_m < 0.1
-        assert metrics.heading_rms_deg < 1.0
+        assert metrics.heading_rms_deg < heading_deg
 
 
 def test_the_misalignment_is_found_with_fixes():
@@ -62,6 +63,7 @@ def test_the_misalignment_is_found_with_fixes():
     assert evaluate(found, truth, 5.0).rms_m < 0.1 < evaluate(plain, truth, 5.0).rms_m
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("pyins") is None, reason="pip install python-ins")
 def test_pyins_gets_the_true_track_of_perfect_instruments():
     given, truth = perfect(("ahrs", "depth"), 0.0)
