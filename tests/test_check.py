@@ -404,7 +404,7 @@ def test_a_coarse_resolution_is_no_clipping(sound, resolution):
 def test_findings_tell_what_is_wrong_from_remarks(sound):
     """What smooth counts as evidence of an error."""
     mirrored = scaled(sound, "dvl_heading", slice(0, 1), -1.0)
-    lost = changed(without(mirrored, "depth"), "dvl", lambda data, time: data.__setitem__((time < 100, 3), 0.0))
+    lost = changed(without(mirrored, "depth", "fix"), "dvl", lambda data, time: data.__setitem__((time < 100, 3), 0.0))
     report = examine(lost)
     assert {(f.sensor, f.kind, f.wrong) for f in report.at("warning")} == {
         ("dvl_heading", "sign", True), ("depth", "missing", False), ("dvl", "bottom lock", False),

@@ -366,7 +366,7 @@ def test_fixes_are_compared_with_the_vehicles_own_heading_without_an_imu(with_fi
     own = Stream("vehicle_heading", STREAMS["vehicle_heading"], log["ahrs"].time, heading, log["ahrs"].row)
     bare = without(log, "imu", "ahrs", "mag", "dvl_heading")
     bare = replace(bare, streams={**bare.streams, "vehicle_heading": own})
-    turned = changed(config, heading={"sources": ["vehicle"]}, dvl={"mount_rpy_deg": [180, 0, -45 + mount_deg]})
+    turned = changed(config, heading={"sources": ["vehicle"]}, dvl={"mount_rpy_deg": [180, 0, 45 + mount_deg]})
     text = said(bare, turned, "dvl")
     assert ("turned by -4" in text or "turned by -3" in text) if mount_deg else text == ""
     assert "swapped" in said(moved_fixes(bare, lambda z: 1j * z.conj()), turned, "fix")

@@ -204,9 +204,11 @@ def field_axes(log: Log, config: Config, motion: InertialMotion) -> Iterator[Fin
         return
     if not field.contradicted:
         down_b = motion.at(log["mag"].time, motion.down_b)
-        dips = _dips(field_in_body(log, config, down_b, field.offset[0]), down_b)
-        if field.alike[0] == 0 and _dip_sense(log, config) * dips < -UPSIDE_DOWN:
-            sense = "upwards" if dips < 0.0 else "downwards"
+        field_b = field_in_body(log, config, down_b, field.offset[0])
+        freed_b = rotate(R_sb.T, log["mag"].data - field.offset[0])  # of all iron, as far as tilts show it
+        right = _dip_sense(log, config)
+        if field.alike[0] == 0 and max(right * _dips(b, down_b) for b in (field_b, freed_b)) < -UPSIDE_DOWN:
+            sense = "upwards" if right > 0.0 else "downwards"
             wrong = f"the field points {sense}, which it does not at this latitude, and turns with the gyro as well"
             yield _of_magnetometer(log, config, motion, field, wrong)
         return
