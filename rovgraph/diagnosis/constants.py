@@ -40,7 +40,8 @@ BIASES = (("acc_bias", slice(0, 3), "imu.acc_bias_sd_mps2"), ("gyr_bias", slice(
 def moved(evidence: Evidence) -> Iterator[Statistic]:
     """Calibration variables, first biases and the start against their priors, in sds of the shift (`sds_moved`)."""
     noise = _sd_of_noise(evidence)
-    several = [c for c in evidence.main.calibration if c.estimated]
+    revealed = {label for name in evidence.initial.revealed.calibration for label in TABLE[name].labels}
+    several = [c for c in evidence.main.calibration if c.estimated and c.label not in revealed]  # `found` has those
     for c in several:
         yield from moved_constant(c, evidence.start, evidence.end, noise.get(c.label), len(several))
     yield from _start_moved(evidence)

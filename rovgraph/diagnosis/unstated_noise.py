@@ -208,7 +208,8 @@ def _lasting(best: ChainOptimum, error: LastingError) -> UnstatedNoise:
         cause = f"{variable.about}: the dive determines it better than its sd"
         return UnstatedNoise(error.sensor, key, values, cause, f"it is estimated ({key})", beliefs)
     size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"
-    what = "the bottom moves, which is correlated" if moves else "its errors are correlated"
-    cause = f"{what} over {seconds:.0f} s with an sd of {size}"
+    what = "the bottom that it sees moves, its velocity is" if moves else "its errors are"
+    cause = f"{what} correlated over {seconds:.0f} s with an sd of {size}"
     values |= {"time_constant_s": seconds}
-    return UnstatedNoise(error.sensor, key, values, cause, f"they are estimated ({key})", beliefs)
+    done = f"{'it is' if moves else 'they are'} estimated ({key})"
+    return UnstatedNoise(error.sensor, key, values, cause, done, beliefs)

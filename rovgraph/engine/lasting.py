@@ -80,6 +80,7 @@ JUMP = 40.0  # of them, in chi-square
 MOST_STEPS = 3
 PART_OF_LARGEST = 0.1  # that a step has at least
 CHANCES_OF_STEP, CHANCES_OF_SIZE = 5.0, 3.0  # logs of the times at which one may be, and of the sizes of a component
+MUCH = 0.1  # of a sensor's measurements, rejected
 TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
 
 
@@ -134,6 +135,7 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> tuple[lis
         passed |= {c.variable for c in candidates if _implausible(now.chain, c)}  # they have another cause
         candidates = sorted((c for c in candidates if c.variable not in passed), key=lambda c: c.gain, reverse=True)
         fits = [*(_fit(now, one) for one in candidates), *(_with_steps(now, one) for one in steps)]
+        fits += _reopened(now, passed) if now.rejects else []
         clear = _clearest([one for one in fits if one[0].gain >= CLEAR])
         if not clear:
             break
@@ -167,6 +169,11 @@ class _Baseline:
         return _Baseline(best.chain, replace(best.solution, point=best.linearised_at), *best.linear)
 
     @property
+    def rejects(self) -> bool:
+        """Whether much of a sensor is rejected: what would let it in again, residuals and gates do not show."""
+        return any(gate.mean() < 1.0 - MUCH for gate in self.solution.gates.values() if len(gate))
+
+    @property
     def minus_log_likelihood(self) -> float:
         return self.solution.cost + _freedom(self.chain, self.log_determinant)
 
@@ -180,25 +187,29 @@ class _Baseline:
     def with_error(self, name: str, sd: float, time_constant: float) -> "_Baseline":
         """The dive with one more error, solved from here."""
         wider = with_lasting(self.chain, name, sd, time_constant)
-        solution = resume(wider, begin_at(wider, self.solution.point), self.solution, TOLERANCE)
-        root = wider.eliminate(solution.point, solution.gates, diagonal=True)
-        return _Baseline(wider, solution, root.log_determinant(), root.left)
+        return self._solved(wider, begin_at(wider, self.solution.point), self.solution)
+
+    def reopened(self, chain: Chain, begin: State) -> "_Baseline":
+        """The dive as another chain from a point, all measurements let in to begin with.
+
+        Without an error that is there the estimate may have bent away from good ones, which no gate lets in again.
+        """
+        return self._solved(chain, begin, replace(self.solution, gates=chain.initial_gates(), stretches=()))
+
+    @staticmethod
+    def _solved(chain: Chain, begin: State, known: Solution[State]) -> "_Baseline":
+        solution = resume(chain, begin, known, TOLERANCE)
+        root = chain.eliminate(solution.point, solution.gates, diagonal=True)
+        return _Baseline(chain, solution, root.log_determinant(), root.left)
 
     def with_steps(self, name: str, sd: float, steps: Sequence[tuple[float, Array]]) -> "_Baseline":
-        """The dive with an error that takes other values at some times, solved from where that is so.
-
-        All measurements are let in to begin with: without the steps the estimate has bent away from good ones.
-        """
+        """The dive with an error that takes other values at some times, solved from where that is so."""
         wider = with_lasting(self.chain, name, sd, np.inf, tuple(time for time, _ in steps))
         begin = begin_at(wider, self.solution.point)
         values = begin.calibration[name].copy()
         for time, step in steps:
             values[self.chain.rows.time >= time] += step
-        begin = replace(begin, calibration={**begin.calibration, name: values})
-        known = replace(self.solution, gates=wider.initial_gates(), stretches=())
-        solution = resume(wider, begin, known, TOLERANCE)
-        root = wider.eliminate(solution.point, solution.gates, diagonal=True)
-        return _Baseline(wider, solution, root.log_determinant(), root.left)
+        return self.reopened(wider, replace(begin, calibration={**begin.calibration, name: values}))
 
 
 def _clearest(fits: list[tuple[LastingError, _Baseline]]) -> list[tuple[LastingError, _Baseline]]:
@@ -301,6 +312,32 @@ def _fit_steps(now: _Baseline, error: LastingError) -> tuple[LastingError, _Base
         return _fit_steps(now, replace(error, steps=steps)) if steps else (replace(error, gain=-np.inf), stepped)
     price = len(steps) * (CHANCES_OF_STEP + CHANCES_OF_SIZE * sizes.shape[1])
     return replace(error, gain=now.solution.cost - stepped.solution.cost - price, steps=steps), stepped
+
+
+def _reopened(now: _Baseline, passed: Collection[str]) -> list[tuple[LastingError, _Baseline]]:
+    """Errors of the table's size, each with all measurements let in to begin with, and the dives with them.
+
+    Costs compare where other measurements are let in, and what an error's freedom costs where they are the same.
+    """
+    out, chain = [], now.chain
+    plain = now.reopened(chain, now.solution.point)
+    least = min(now.solution.cost, plain.solution.cost)
+    for name, sensor in LASTING.items():
+        if sensor not in chain.blocks or name in {*chain.unknowns.estimated, *passed}:
+            continue
+        sd = min(TABLE[name].sd, 0.5 * _largest(chain, name))
+        seconds = float(np.clip(TABLE[name].time_constant, *_time_constants(chain, sensor)))
+        wider = with_lasting(chain, name, sd, seconds)
+        fitted = now.reopened(wider, begin_at(wider, now.solution.point))
+        likely = _most_likely(fitted, LastingError(sensor, name, sd, seconds, 0.0))
+        fitted = fitted.with_error(name, likely.sd, likely.time_constant)
+        path = fitted.solution.point.calibration[name]
+        if np.sqrt(np.mean(path**2)) > _largest(chain, name):
+            continue
+        same = chain.eliminate(now.solution.point, fitted.solution.gates, diagonal=True).log_determinant()
+        price = _freedom(fitted.chain, fitted.log_determinant) - _freedom(chain, same)
+        out.append((replace(likely, gain=least - fitted.solution.cost - price), fitted))
+    return out
 
 
 def _probes(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
