@@ -64,9 +64,28 @@ def test_zeros_of_a_dvl_that_lost_the_bottom_for_10_s(case):
     lost = np.array([0.0, 0.0, 0.0, 1.0, np.nan])
     flight = flown(case, lambda m: [m._replace(values=lost) if during(m, 10.0, "dvl") else m])
     assert flight.events("dvl") == ["no lock", "back"]
-    assert flight.navigator.left_out["dvl", "no lock"] == 40
+    assert flight.navigator.left_out["dvl", "exactly zero"] == 40
     honest(flight)
     grown(flight, AT + 9.0, 1.5)
+
+
+@pytest.mark.parametrize(("sensor", "columns", "least"), [("dvl", 3, 0.7), ("depth", 1, 1.0)])
+def test_single_zeros_are_left_out_and_said_once_where_they_come_often(case, sensor, columns, least):
+    count = 0
+
+    def zeroed(m: Measurement) -> list[Measurement]:
+        nonlocal count
+        if m.sensor != sensor or m.time < AT or (round(4.0 * m.time) % 7):
+            return [m]
+        values = m.values.copy()
+        values[:columns] = 0.0
+        count += 1
+        return [m._replace(values=values)]
+
+    flight = flown(case, zeroed)
+    assert flight.navigator.left_out[sensor, "exactly zero"] >= least * count > 5.0  # it may come to rest in between
+    assert len(flight.events(sensor)) <= 2
+    honest(flight)
 
 
 def test_a_ping_that_is_repeated_for_5_s(case):

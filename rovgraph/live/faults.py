@@ -1,7 +1,7 @@
 """Sensors that fail while they go on talking, or fall silent.
 
-What is wrong is told from a sensor's own values and the IMU's: a DVL that reports exact
-zeros although it moved a moment ago, or turns; values that repeat exactly though they hardly
+What is wrong is told from a sensor's own values and the IMU's: exact zeros although those before
+were too far from zero for the vehicle to have come there; values that repeat exactly though they hardly
 ever did; a compass that stands still while the vehicle turns. A measurement that is part of
 such a failure is kept out, and those before it that were, taken back. What disagrees with the
 estimate is the filter's to reject.
@@ -15,19 +15,28 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.config import Config
+from rovgraph.geometry import Array
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.live.solution import Event
 from rovgraph.log import Measurement
-from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, shows_noise
+from rovgraph.log.frozen import (
+    ENOUGH_VALUES,
+    MIN_REPEATS,
+    MIN_SECONDS,
+    Company,
+    companies,
+    is_false_zero,
+    shows_noise,
+)
 
 SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
 SILENT_AT_FIRST_S = 30.0  # after a first measurement, as long as the period is not known
-MOVED = 0.1  # speed of a vehicle that does not stop within a ping [m/s]
-RECENT_S = 5.0
-TELL_S = 2.0  # a ping without bottom lock is not worth an event
+TELL_S = 2.0  # a ping without bottom lock is not worth an event, nor is a zero;
+OFTEN, OFTEN_S = 10, 60.0  # so many times zeros in such a time are
 FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
 NOISY = {"mag", "depth", "dvl_water"}  # sensors whose noise may show, so that values hardly ever repeat
-ENOUGH_VALUES, RECENT_VALUES = 20, 100  # different ones, that show it, and that are looked at
+RECENT_VALUES = 100  # different ones, that are looked at for it
 TURNED = np.deg2rad(15.0)  # of the vehicle, while its heading stands still
 LONGEST_STEP_S = 1.0  # of the gyro, over which a turn is reckoned
 OCCASIONAL = {"place"}  # sensors that speak when there is something to be seen
@@ -41,10 +50,12 @@ class Verdict:
     ----------
     use : give it to the estimator
     retract_since : take back the sensor's measurements from then on [s], or None
+    reason : why it is not used; empty = the sensor's state says it
     """
 
     use: bool = True
     retract_since: float | None = None
+    reason: str = ""
 
 
 _GOOD = Verdict()
@@ -76,6 +87,10 @@ class Watch:
     noisy: bool | None = None  # what `shows_noise` found, as long as values stay equal
     turned: tuple[float, ...] = (0.0, 0.0, 0.0)  # how far the vehicle had by then [rad]
     by_hand: bool = False  # no sensor has measured yet: nothing is late
+    known: deque[tuple[float, Array]] = field(default_factory=lambda: deque(maxlen=RECENT_VALUES))  # not zero
+    zero: bool = False  # the newest is an exact zero that is none
+    zeros: deque[float] = field(default_factory=lambda: deque(maxlen=OFTEN))  # when such began [s]
+    told: bool = False  # that they come often
 
     def count(self, first: float) -> None:
         """Note that other values follow the equal ones so far."""
@@ -99,19 +114,42 @@ class Faults:
     ----------
     watches : by sensor
     events : since it was last emptied
+    companies : by sensor, what tells that an exact zero is none
     """
 
     watches: dict[str, Watch] = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
+    companies: Mapping[str, Company] = field(default_factory=lambda: companies(Config()))
     _now: float = -np.inf
     _turned: tuple[float, ...] = (0.0, 0.0, 0.0)  # since the beginning, by the gyro [rad]
-    _speeds: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=3))
 
     def look(self, m: Measurement) -> Verdict:
         """Whether a measurement is one."""
         watch = self.watches.get(m.sensor)
         if watch is None or watch.by_hand:
             watch = self.watches[m.sensor] = Watch()
+        self._note(m, watch)
+        if m.sensor == "dvl" and m.values[3] == 0.0:
+            return self._verdict(m, watch, "no lock", "no bottom lock")
+        company = self.companies.get(m.sensor)
+        if company is not None and self._is_false_zero(m, watch, company):
+            return self._left_zero(m, watch)
+        at_rest = company is not None and company.rests and not m.values[: company.columns].any()
+        frozen = (watch.equal > 1 and not at_rest) and (
+            watch.equal >= FROZEN.get(m.sensor, math.inf)
+            or (
+                watch.equal > 2
+                and m.sensor in HEADING_STREAMS
+                and max(abs(now - then) for now, then in zip(self._turned, watch.turned, strict=True)) > TURNED
+            )
+            or (m.sensor in NOISY and self._has_lost_its_noise(m, watch))
+        )
+        if not frozen and watch.state == "ok" and not watch.reported:
+            return _GOOD
+        return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
+
+    def _note(self, m: Measurement, watch: Watch) -> None:
+        """Remember when it was measured, and how often these values came in a row."""
         values = m.values.tobytes()
         if values == watch.values:
             watch.equal += 1
@@ -130,20 +168,6 @@ class Faults:
         if m.time > watch.time:
             watch.time = m.time
         watch.heard, watch.values = self._now, values
-        if m.sensor == "dvl":
-            return self._ping(m, watch)
-        frozen = watch.equal > 1 and (
-            watch.equal >= FROZEN.get(m.sensor, math.inf)
-            or (
-                watch.equal > 2
-                and m.sensor in HEADING_STREAMS
-                and max(abs(now - then) for now, then in zip(self._turned, watch.turned, strict=True)) > TURNED
-            )
-            or (m.sensor in NOISY and self._has_lost_its_noise(m, watch))
-        )
-        if not frozen and watch.state == "ok" and not watch.reported:
-            return _GOOD
-        return self._verdict(m, watch, "frozen" if frozen else "ok", "the same values again and again")
 
     def _has_lost_its_noise(self, m: Measurement, watch: Watch) -> bool:
         """Whether a sensor repeats itself that hardly ever did, while the IMU goes on to show its own noise."""
@@ -199,21 +223,32 @@ class Faults:
                 watch.state = watch.reported = "silent"
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))
 
-    def _ping(self, m: Measurement, watch: Watch) -> Verdict:
-        if m.values[3] == 0.0:
-            return self._verdict(m, watch, "no lock", "no bottom lock")
-        if m.values[:3].any():
-            verdict = self._verdict(m, watch, "frozen" if watch.equal >= FROZEN["dvl"] else "ok", "the same ping again")
-            if verdict.use:
-                self._speeds.append((m.time, float(np.linalg.norm(m.values[:3]))))
-            return verdict
-        speeds = [speed for time, speed in self._speeds if m.time - time < RECENT_S]
-        moved = bool(speeds) and float(np.median(speeds)) > MOVED
-        return self._verdict(
-            m, watch, "no lock" if moved or watch.state == "no lock" else "ok", "exactly zero although it moves"
-        )
+    def _is_false_zero(self, m: Measurement, watch: Watch, company: Company) -> bool:
+        """Whether a measurement is an exact zero that is none; what is not zero is remembered."""
+        values = m.values[: company.columns]
+        if values.any():
+            watch.zero = False
+            if np.isfinite(values).all():
+                watch.known.append((m.time, values))
+        elif not watch.zero and watch.known:
+            time, known = zip(*watch.known, strict=True)
+            watch.zero = is_false_zero(company, m.time, np.array(time), np.array(known))
+            if watch.zero:
+                watch.zeros.append(m.time)
+        return watch.zero
 
-    def _verdict(self, m: Measurement, watch: Watch, state: str, text: str) -> Verdict:
+    def _left_zero(self, m: Measurement, watch: Watch) -> Verdict:
+        """What to do with such a zero, and an event where they last, or come again and again."""
+        state = "no lock" if m.sensor == "dvl" else "frozen"
+        self._verdict(m, watch, state, "exactly zero although it moves", at_once=False)
+        often = len(watch.zeros) == OFTEN and m.time - watch.zeros[0] < OFTEN_S
+        if often and not watch.told and not watch.reported:
+            watch.told = True
+            text = f"{m.sensor}: exactly zero again and again although it moves; these are left out"
+            self.events.append(Event(m.time, m.sensor, state, text))
+        return Verdict(False, reason="exactly zero")
+
+    def _verdict(self, m: Measurement, watch: Watch, state: str, text: str, at_once: bool = True) -> Verdict:
         before, watch.state = watch.state, state
         if before != state:
             watch.entered = m.time
@@ -222,7 +257,8 @@ class Faults:
                 self.events.append(Event(m.time, m.sensor, "back", f"{m.sensor}: measures again"))
             watch.reported = ""
             return _GOOD
-        if watch.reported != state and (state == "frozen" or m.time - watch.entered >= TELL_S):
+        at_once &= state == "frozen"
+        if watch.reported != state and (at_once or m.time - watch.entered >= TELL_S):
             watch.reported = state
             self.events.append(Event(m.time, m.sensor, state, f"{m.sensor}: {text}; left out"))
-        return Verdict(False, watch.since if state == "frozen" and before != state else None)
+        return Verdict(False, watch.since if at_once and before != state else None)

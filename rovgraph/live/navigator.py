@@ -33,6 +33,7 @@ from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.startup import Startup
 from rovgraph.log import Log, Measurement
+from rovgraph.log.frozen import companies
 
 if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
@@ -81,6 +82,7 @@ class Navigator:
     def __post_init__(self) -> None:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
+        self.faults.companies = companies(self.config)
         self._crosscheck = Crosscheck(self.config)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
@@ -275,7 +277,7 @@ class Navigator:
         if verdict.retract_since is not None and self.engine is not None:
             self.engine.retract(m.sensor, verdict.retract_since)
         if not verdict.use:
-            self.left_out[m.sensor, self.faults.watches[m.sensor].state] += 1
+            self.left_out[m.sensor, verdict.reason or self.faults.watches[m.sensor].state] += 1
             return
         self._events += self._crosscheck.add(m)
         if self._incoherence.keeps_out(m.sensor, m.time):

@@ -374,6 +374,24 @@ def _repeated(pings: Stream) -> Iterator[FrozenStretch]:
         yield FrozenStretch(pings.sensor, "repeated", pings.time[index], "values hardly ever return otherwise", True)
 
 
+def is_false_zero(company: Company, at: float, time: Array, values: Array) -> bool:
+    """Whether an exact zero is none by what was measured before it, all that is known while a dive goes on.
+
+    Parameters
+    ----------
+    company : of the sensor
+    at : time of the zero [s]
+    time, values : ndarray, shape (n,) [s] and (n, columns), of the measurements before it that are not zero
+    """
+    if len(time) < 3 or abs(at - time[-2]) > max(AROUND_SECONDS, AROUND_PERIODS * float(np.median(np.diff(time)))):
+        return False
+    noise = _noise(values, time, company)
+    if company.rests and noise == 0.0 and len(time) >= ENOUGH_VALUES:
+        return False
+    stops = company.seldom_stops if noise else company.cannot_stop  # at rest it would show its noise
+    return bool(stops(company.left(values[-1], values[-2], noise), np.abs(at - time[-1])))
+
+
 def _zeros_meanwhile(log: Log, found: Sequence[FrozenStretch]) -> Iterator[FrozenStretch]:
     """Zeros of the DVL for seconds, while other sensors show motion."""
     pings = without(_valid(log["dvl"]), found)
