@@ -136,7 +136,7 @@ _ROWS = (
     ),
     Rule("halves", "difference of a constant between the halves of the dive, in sds", 10.0, 30.0),
     Rule("unstated", "noise, an error that lasts, or another place of the DVL, found but not used", 0.0, live="only"),
-    Rule("contradiction", "the smaller of two sensors' excesses over their limits", 1.0, 1.0, live="as above"),
+    Rule("contradiction", "the smaller of two sensors' excesses over their limits", 1.0, 1.0, live="of both alarms"),
 )
 RULES = {rule.kind: rule for rule in _ROWS}
 
