@@ -196,19 +196,20 @@ def _lasting(best: ChainOptimum, error: LastingError) -> UnstatedNoise:
     believed = lasting_belief(best.beliefs[error.variable], error.sd, seconds, tuple(time for time, _ in error.steps))
     beliefs = Beliefs({error.variable: believed})
     moves = error.variable == "bottom_velocity"
+    bottom = f"{'if the fixes are right, ' if 'fix' in best.blocks else ''}the bottom that it sees"
     values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd}
     if error.steps:
         begin = best.intervals[0].time
         sizes = ((time - begin, ", ".join(f"{factor * by:+.2g}" for by in step.tolist())) for time, step in error.steps)
         when = " and ".join(f"at {since:.0f} s by {size}{behind(unit)}" for since, size in sizes)
-        what = "the bottom that it sees changes its velocity" if moves else "its error changes at once"
+        what = f"{bottom} changes its velocity" if moves else "its error changes at once"
         done = f"another value is taken from there on ({key})"
         return UnstatedNoise(error.sensor, key, values, f"{what}, {when}", done, beliefs)
     if np.isinf(seconds):
         cause = f"{variable.about}: the dive determines it better than its sd"
         return UnstatedNoise(error.sensor, key, values, cause, f"it is estimated ({key})", beliefs)
     size = f"{100.0 * sd:.2g} % of the velocity" if unit == "1" else f"{sd:.2g}{behind(unit)}"
-    what = "the bottom that it sees moves, its velocity is" if moves else "its errors are"
+    what = f"{bottom} moves; its velocity is" if moves else "its errors are"
     cause = f"{what} correlated over {seconds:.0f} s with an sd of {size}"
     values |= {"time_constant_s": seconds}
     done = f"{'it is' if moves else 'they are'} estimated ({key})"
