@@ -80,7 +80,7 @@ JUMP = 40.0  # of them, in chi-square
 MOST_STEPS = 3
 PART_OF_LARGEST = 0.1  # that a step has at least
 CHANCES_OF_STEP, CHANCES_OF_SIZE = 5.0, 3.0  # logs of the times at which one may be, and of the sizes of a component
-MUCH = 0.1  # of a sensor's measurements, rejected
+MUCH = 0.3  # of a sensor's measurements, rejected
 TOLERANCE = 0.3  # decrease of the cost that is left when likelihoods are compared
 
 
