@@ -373,6 +373,7 @@ def test_benchmark_runs_and_both_solvers_find_the_same_cost():
     assert ours == pytest.approx(gtsams, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_its_gate_keeps_out_altogether_does_no_harm(noisy):
     """Nothing is then left that ties its calibration variables to the rest of the graph."""
     far = noisy.log["mag"].data + np.where(np.arange(len(noisy.log["mag"]))[:, None] % 2, 0.5, -0.5)

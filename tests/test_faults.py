@@ -539,7 +539,7 @@ def test_a_dvls_arm_that_is_off_is_named_and_used_not_taken_for_an_error_that_la
     [
         ("dvl y flipped", "units: {dvl_vy: -m/s}"),  # its wrong estimate has a turn of 90 degrees in its place
         ("dvl y and z flipped", "dvl.mount_rpy_deg: [0.0, 0.0, -45.0]"),
-        ("dvl 3.2 s late", "mean: 3.188"),
+        pytest.param("dvl 3.2 s late", "mean: 3.188", marks=pytest.mark.slow),
     ],
 )
 def test_an_alarm_on_a_dvls_axes_or_clock_gives_the_remedy_of_the_check(case, remedy):
@@ -547,6 +547,7 @@ def test_an_alarm_on_a_dvls_axes_or_clock_gives_the_remedy_of_the_check(case, re
     assert len(told) == 1 and remedy in told[0] and "until that is mended the track is wrong" in told[0]
 
 
+@pytest.mark.slow
 def test_online_a_dvl_whose_clock_is_late_is_not_said_to_be_elsewhere():
     result = run_case(CASES["dvl 3.2 s late"], 0, online=True)
     told = [text for text in result.said if text.startswith("online: ") and "dvl: " in text]
@@ -562,6 +563,7 @@ def test_online_ignores_a_depth_that_is_stuck_while_the_vehicle_dives():
     assert result.verdicts == {"smooth": "doubtful", "online": "doubtful"}
 
 
+@pytest.mark.slow
 def test_online_names_correlated_fixes_with_the_keys_that_state_them():
     result = run_case(CASES["fixes correlated"], 0, online=True)
     assert any("correlated over" in line and "state calibration.fix_error: {" in line for line in result.said)

@@ -82,6 +82,7 @@ def test_an_alarm_is_said_once_when_it_begins_and_once_when_it_is_over(case):
     assert [a.kind for a in nav.alarms.history.values()] == ["frozen"]
 
 
+@pytest.mark.slow
 def test_what_the_smoothed_dive_shows_is_said_with_its_newest_figures_and_unless_nobody_asks():
     noisy = BROKEN["DVL noise three times as stated"]
     for find in (True, False):

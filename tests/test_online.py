@@ -125,6 +125,7 @@ def events_of(out: Path, kind: str) -> int:
     return sum(json.loads(line)["kind"] == kind for line in (out / "events.jsonl").read_text().splitlines())
 
 
+@pytest.mark.slow
 def test_killed_twice_and_resumed_it_goes_on_where_it_was(tmp_path):
     case = simulated(falcon(), 35.0, seed=2, dvl_rate=4.0)
     lines = [(m.time, row(m)) for m in case.log.measurements()]
