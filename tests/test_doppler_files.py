@@ -25,9 +25,10 @@ from doppler_files import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import first, read
+from recordings import close, first, read
 from ruamel.yaml import YAML
 from scipy.io import loadmat
+from wire import sentence
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import matrix_from_rpy
@@ -405,3 +406,17 @@ def test_an_ad2cp_file_agrees_with_its_makers_own_decoding():
     depth = first(recording, "depth").columns["depth"]
     np.testing.assert_allclose(depth * 9806.65, 1e4 * made["BottomTrack_Pressure"], rtol=1e-5)
     assert not first(recording, "dvl").columns["dvl_valid"].any()  # on a bench: figures of merit are none
+
+
+def test_a_tracker_650_is_read_with_and_without_checksums(tmp_path):
+    lines = [f"DVPDL,{k * 100_000},100000,0,0,0,0.05,0.001,-0.002,{95 if k % 10 else 0}" for k in range(1, 51)]
+    recording = read(b"".join(b"$" + line.encode() + b"\n" for line in lines[:25]) + b"$DVKFC,1,2\n", tmp_path)
+    assert recording.format == "cerulean"
+    dvl = first(recording, "dvl").columns
+    close(np.diff(dvl["time"]), 0.1)
+    valid = dvl["dvl_valid"] == 1.0
+    assert (~valid).sum() == 2 and np.isnan(dvl["dvl_vx"][~valid]).all()
+    close(dvl["dvl_vx"][valid], 0.5)
+    assert [(each.name, each.count) for each in recording.left] == [("DVKFC", 1)]
+    with_checksums = read(b"".join(map(sentence, lines)), tmp_path)
+    assert len(first(with_checksums, "dvl").columns["time"]) == 50

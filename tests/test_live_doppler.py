@@ -10,12 +10,12 @@ import pytest
 from doppler_files import EARTH, UNIX, nucleus_ahrs, nucleus_record, nucleus_track, pd4_frame, pd6_ping, trdi_values
 from hypothesis import given
 from hypothesis import strategies as st
-from wire import ARRIVAL, Heard, decoded
+from wire import ARRIVAL, Heard, decoded, sentence
 
 from rovgraph.errors import InputError
 from rovgraph.live.message import Message
 from rovgraph.live.sources import open_source
-from rovgraph.live.sources.doppler import NucleusDecoder, Pd4Decoder, pd6
+from rovgraph.live.sources.doppler import NucleusDecoder, Pd4Decoder, pd6, tracker
 from rovgraph.live.sources.source import Decoder
 from rovgraph.live.warnings import Warnings
 
@@ -35,6 +35,23 @@ SENT: dict[str, tuple[Callable[[str, Heard], Decoder], bytes]] = {
     "pd6": (pd6, pd6_ping(UNIX, MOVED, RPY) + pd6_ping(UNIX + 1, MOVED, RPY)),
     "nucleus": (NucleusDecoder, NUCLEUS + nucleus_track(UNIX + 1.2, MOVED)),
 }
+
+
+def test_ways_of_a_tracker_are_mean_velocities_in_the_middle_of_their_interval():
+    """Without confidence a ping is lost, whatever stands in it; other sentences of the instrument say nothing."""
+    heard = Heard()
+    data = (
+        b"$DVPDL,2000000,100000,0,0,0,0.05,0.01,-0.002,95\r\n"
+        + sentence("DVPDX,2100000,200000,0,0,0,0.1,0.02,-0.004,80,1,0.1,0.2,1.5")
+        + b"$DVPDL,2200000,100000,0,0,0,9.0,9.0,9.0,0\r\n$DVKFC,1,2,3\r\n"
+        + sentence("DVPDL,2300000,100000,0,0,0,0.05,0.01,-0.002,95").replace(b"0.05", b"0.07")
+    )
+    messages = decoded(tracker("u", heard), data)
+    assert [stamp for stamp, _ in pings(messages)] == pytest.approx([1.95, 2.0, 2.15])
+    (_, first), (_, second), (_, lost) = pings(messages)
+    np.testing.assert_allclose(first[:4], [0.5, 0.1, -0.02, 1.0])
+    np.testing.assert_allclose(second[:4], [0.5, 0.1, -0.02, 1.0])
+    assert lost[3] == 0.0 and np.isnan(lost[:3]).all() and not heard.kinds
 
 
 def pings(messages: list[Message]) -> list[tuple[float | None, np.ndarray]]:

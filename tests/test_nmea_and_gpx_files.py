@@ -12,6 +12,7 @@ from recordings import check_refused_or_whole, close, first, read
 from wire import sentence
 
 from rovgraph.errors import InputError
+from rovgraph.interchange.formats import recognise
 from rovgraph.interchange.recording import Recording
 
 MIDNIGHT = datetime(2024, 3, 2, tzinfo=UTC).timestamp()
@@ -152,10 +153,103 @@ def test_acoustic_positions_that_cannot_be_placed_are_counted(tmp_path):
         "not in Cartesian coordinates relative to a ship",
         "the ship's position, or her heading (HDT), is not known",
     }
-    without = read(under_way(usbl("1200??.00", "H", 1.0, 1.0), heading=b""), tmp_path)
-    assert first(without, "fix").source == "GPGGA"
+    without = under_way(usbl("1200??.00", "H", 1.0, 1.0), heading=b"")
+    with pytest.raises(InputError, match=r"none that can be placed .*heading .*--choose fix=GPGGA"):
+        read(without, tmp_path)  # the ship's own place is not the vehicle's
+    assert first(read(without, tmp_path, fix="GPGGA"), "fix").source == "GPGGA"
     with pytest.raises(InputError, match="neither fixes nor headings"):
         read(usbl("120019.00", "N", 1.0, 1.0) * 5, tmp_path)
+
+
+def ssb(clock: str, error: str = "", filtered: str = "M", x: float = 30.0, y: float = -40.0, axes: str = "N") -> bytes:
+    return sentence(f"PSIMSSB,{clock},M17,A,{error},C,{axes},{filtered},{x:.3f},{y:.3f},30.0,1.4,T,0.03,")
+
+
+def test_an_acoustic_position_that_is_no_reply_is_none_whatever_its_status(tmp_path):
+    sent = [
+        gga(f"1200{k:02d}.00", 1.0 + 1.5 * k / 1853.75)
+        + ssb(f"1200{k:02d}.40")
+        + ssb(f"1200{k:02d}.60", "NRy", "F", 0.0, 0.0)
+        + ssb(f"1200{k:02d}.70", "", "P", 300.0, 0.0)
+        for k in range(20)
+    ]
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    assert len(first(recording, "fix").columns["time"]) == 20 and off(recording, 30.0, -40.0) < 0.8
+    reasons = {each.reason: each.count for each in recording.left if each.name.startswith("PSIMSSB")}
+    assert reasons == {"error NRy: not a reply": 20, "predicted, not measured": 20}
+    assert "fix_error" not in recording.settings.get("calibration", {})
+
+
+def test_filtered_acoustic_positions_are_taken_with_an_error_that_lasts(tmp_path):
+    recording = read(under_way(ssb("1200??.40", filtered="F")), tmp_path)
+    assert sum("is filtered by the acoustic system" in line for line in recording.warnings) == 1
+    assert recording.settings["calibration"] == {"fix_error": {"estimate": True}}
+
+
+def test_the_acoustic_systems_own_heading_of_the_ship_turns_head_up_positions(tmp_path):
+    turn = np.deg2rad(120.0)
+    x, y = 30.0 * -np.sin(turn) + -40.0 * np.cos(turn), 30.0 * np.cos(turn) + -40.0 * np.sin(turn)
+    said = (f"PSIMSNS,1200{k:02d}.30,M17,1,1,-1.27,-1.13,-0.04,120.0,,a0,0.000,,M121" for k in range(20))
+    sent = [
+        gga(f"1200{k:02d}.00", 1.0 + 1.5 * k / 1853.75) + sentence(text) + ssb(f"1200{k:02d}.40", x=x, y=y, axes="H")
+        for k, text in enumerate(said)
+    ]
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    assert off(recording, 30.0, -40.0) < 0.8
+
+
+def test_a_ship_at_rest_keeps_its_fixes(tmp_path):
+    """Time decides, not the place: she lies at a jetty, and her vehicle is placed all along."""
+    sent = [
+        gga(f"12{k // 60:02d}{k % 60:02d}.00", 1.0) + sentence("HEHDT,120.0,T") + ssb(f"12{k // 60:02d}{k % 60:02d}.40")
+        for k in range(300)
+    ]
+    recording = read(b"".join([rmc("115959.00", "020324"), *sent]), tmp_path)
+    assert len(first(recording, "fix").columns["time"]) == 300
+    assert len(next(c for c in recording.channels if c.source == "GPGGA").columns["time"]) == 300
+
+
+@pytest.mark.parametrize(
+    ("text", "yaw", "roll", "pitch"),
+    [
+        ("PASHR,120001.500,085.90,T,-00.80,+00.90,-00.84,0.151,0.075,0.555,1,0", 85.9, -0.8, 0.9),
+        ("PTNTHTM,85.9,N,0.9,N,-0.8,N,62.0,1.0", 85.9, -0.8, 0.9),
+        ("PSXN,23,-0.80,0.90,85.90,0.02", 85.9, -0.8, 0.9),
+        ("PRDID,0.90,-0.80,85.90", 85.9, -0.8, 0.9),
+    ],
+)
+def test_attitudes_of_makers_are_read_with_roll_to_starboard_and_bow_up(text, yaw, roll, pitch, tmp_path):
+    data = rmc("120000.00", "020324") + sentence(text) + rmc("120002.00", "020324") + sentence(text) * 2
+    recording = read(data + rmc("120004.00", "020324"), tmp_path)
+    found = first(recording, "ahrs")
+    close(np.rad2deg(found.columns["ahrs_yaw"]), yaw)
+    close(np.rad2deg(found.columns["ahrs_roll"]), roll)
+    close(np.rad2deg(found.columns["ahrs_pitch"]), pitch)
+    assert ("true north" in found.frame) == text.startswith(("PASHR", "PSXN"))
+    if text.startswith("PASHR"):  # the one with a time of its own
+        close(found.columns["time"], MIDNIGHT + 12 * 3600.0 + 1.5)
+
+
+def test_pitch_and_roll_of_a_transducer_measurement_are_a_tilt(tmp_path):
+    data = rmc("120000.00", "020324") + sentence("YXXDR,A,1.5,D,PTCH,A,-2.5,D,ROLL,A,9.0,D,RUDDER")
+    found = first(read(data + rmc("120004.00", "020324"), tmp_path), "vehicle_tilt")
+    close(np.rad2deg([found.columns["pitch"][0], found.columns["roll"][0]]), [1.5, -2.5])
+
+
+def test_sentences_without_checksums_are_read_where_none_has_one(tmp_path):
+    bare = b"".join(line.partition(b"*")[0] + b"\r\n" for line in under_way().splitlines())
+    recording = read(bare, tmp_path)
+    assert len(first(recording, "fix").columns["time"]) == 20
+    assert any("no sentence has a checksum" in line for line in recording.warnings)
+    mixed = read(under_way() + b"$GPGGA,120100.00,5001.0000,N,00806.0000,E,1,9,1.0,1.0,M,48.0,M,,\r\n", tmp_path)
+    assert len(first(mixed, "fix").columns["time"]) == 20
+    assert any(each.name == "lines" and "checksum" in each.reason for each in mixed.left)
+
+
+def test_a_binary_recording_with_sentences_inside_is_not_nmea(tmp_path):
+    path = tmp_path / "dive.bin"
+    path.write_bytes(b"".join(line + b"\r\n" + bytes(range(20)) for line in under_way().splitlines()))
+    assert recognise(path) is None
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ OWN: tuple[str, ...] = (  # modules of this package, each with a `FORMAT`
     "pd0",
     "pd4",
     "pd6",
+    "cerulean",
     "ad2cp",
     "nucleus",
     "rosbag",

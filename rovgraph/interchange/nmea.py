@@ -1,6 +1,7 @@
 """Files of NMEA 0183 sentences: fixes and headings of a ship or of the vehicle.
 
-A heading has no time of its own: it is put between the sentences around it that have one, by its place in the file.
+Most headings have no time of their own: they are put between the sentences around them that have one, by their place in
+the file.
 """
 
 from array import array
@@ -14,31 +15,36 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.interchange import nmea_usbl as usbl
 from rovgraph.interchange.alternatives import preferred_first
-from rovgraph.interchange.fixes import new_fixes
-from rovgraph.interchange.formats import Options
+from rovgraph.interchange.formats import HEAD, Options
 from rovgraph.interchange.lines import Refused
 from rovgraph.interchange.nmea_sentences import (
+    ATTITUDES,
     DATES,
     FIXES,
     HEADINGS,
+    TILT,
+    TRUE,
     Times,
+    attitude_of,
     east,
     fix_of,
+    has_checksum,
     heading_of,
     library,
-    number,
     parsed,
     sentence_of,
 )
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 
 UTC, DAY = "UTC of the sentences", "time of day of the sentences"
-ATTITUDE = "PTNTHPR"  # True North's heading, pitch, roll
 SHIP = ("PSIMLBP", "PUSBA", "PSONLLD")  # of acoustic systems: relative to the ship, or not decoded
 NOON_S, DAY_S = 43_200.0, 86_400.0
 LONGEST = 1 << 12
 FEW = 3  # whole sentences that make a file one of these
+BINARY = 0.02  # of a file's bytes, that no text has: sentences within them are another format's
 _NORTH = "relative to magnetic north"
+NO_CHECKSUM = "no sentence has a checksum: all are taken as they stand, damaged ones too"
+FILTERED = "is filtered by the acoustic system, so its errors last: calibration.fix_error is estimated"
 
 
 class Nmea:
@@ -49,15 +55,19 @@ class Nmea:
     extra = "online"
 
     def recognise(self, path: Path, head: bytes) -> float:
-        lines = [line for line in head.split(b"\n")[:50] if line.strip()]
-        whole = sum(b"$" in line and b"," in line and b"*" in line[-6:] and _is_sentence(line) for line in lines)
+        if sum(byte < 9 or 13 < byte < 32 for byte in head) > BINARY * len(head):
+            return 0.0
+        lines = [line for line in head.split(b"\n")[:50] if line.strip() and not line.startswith(b"#")]
+        whole = sum(b"$" in line and b"," in line and _is_sentence(line) for line in lines)
         return 0.8 if whole >= min(FEW, len(lines)) and 2 * whole >= len(lines) > 0 else 0.0
 
     def read(self, path: Path, options: Options) -> Recording:
         library()
-        sentences = _Sentences()
         size = path.stat().st_size
         with path.open("rb") as file:
+            lines = [line.strip() for line in file.read(HEAD).split(b"\n")[:-1]] or [b""]
+            file.seek(0)
+            sentences = _Sentences(not any(has_checksum(line.decode("ascii", "replace")) for line in lines))
             while line := file.readline(LONGEST):
                 options.progress(min(file.tell(), size), size)
                 if line.strip():
@@ -83,9 +93,15 @@ def _ship(fixes: Channel, heading: Channel | None) -> usbl.Ship:
 
 
 class _Sentences:
-    """Takes sentences one by one; rows know their place in the file."""
+    """Takes sentences one by one; rows know their place in the file.
 
-    def __init__(self) -> None:
+    Attributes
+    ----------
+    bare : no sentence has a checksum
+    """
+
+    def __init__(self, bare: bool = False) -> None:
+        self.bare = bare
         self._times = Times()
         self._undated = 0  # rows of `_clock` before a date is known
         self._clock = array("d")  # place, time
@@ -99,14 +115,17 @@ class _Sentences:
         try:
             kind, text = sentence_of(line)
             name = text[1:].partition(",")[0]
-            if kind == usbl.KIND:
-                self._relative(name, text)
-                return
-            if kind not in (*FIXES, *HEADINGS, *DATES, ATTITUDE):
+            if kind in (usbl.KIND, usbl.SHIPS_ATTITUDE):
+                parsed(text, self.bare)
+                self._relative(kind, name, text)
+            elif kind in (*ATTITUDES, TILT):
+                parsed(text, self.bare)
+                self._attitude(kind, name, text)
+            elif kind in (*FIXES, *HEADINGS, *DATES):
+                self._sentence(kind, name, parsed(text, self.bare))
+            else:
                 why = "relative to a ship: no fix of the vehicle" if kind in SHIP else "no measurement that a log has"
                 self._left[name, why] += 1
-                return
-            self._sentence(kind, name, parsed(text))
         except Refused as refused:
             self._left["lines", f"{refused.kind}: skipped"] += 1
 
@@ -122,27 +141,29 @@ class _Sentences:
                 self._left[name, "no fix"] += 1
             else:
                 self._add("fix", name, *fix)
-        elif kind == ATTITUDE:
-            self._attitude(name, sentence)
         elif kind in HEADINGS and (heading := heading_of(sentence)) is not None:
             if kind == "HDG" and (variation := east(sentence.variation, sentence.var_dir)) is not None:
                 self._variation.append(variation)
             self._add("ahrs", name, *np.deg2rad([heading[0], np.nan, np.nan]))
 
-    def _attitude(self, name: str, sentence: Any) -> None:
-        """Degrees, which the instrument sends unless it was set to mils."""
-        cells = [*sentence.data, *[""] * 6]
-        values = [number(cells[k]) for k in (1, 3, 5)] if cells[0] == "HPR" else [number(cells[k]) for k in (0, 2, 4)]
-        if values[0] is None or not 0.0 <= values[0] <= 360.0:
-            self._left[name, "no heading"] += 1
+    def _attitude(self, kind: str, name: str, text: str) -> None:
+        found = attitude_of(text)
+        if found is None:
+            self._left[name, "no heading" if kind in ATTITUDES else "no pitch and roll"] += 1
             return
-        heading, pitch, roll = np.deg2rad([np.nan if v is None else v for v in values])
-        self._add("ahrs", name, heading, roll, pitch)
+        time, *angles = found
+        if time is not None:
+            last = self._times.last
+            self._clock.extend((self._place, self._times.near(time, NOON_S if last is None else last)))
+        heading, pitch, roll = np.deg2rad([np.nan if angle is None else angle for angle in angles])
+        self._add("vehicle_tilt" if kind == TILT else "ahrs", name, heading, roll, pitch)
 
-    def _relative(self, name: str, text: str) -> None:
-        """A position relative to the ship."""
-        parsed(text)
+    def _relative(self, kind: str, name: str, text: str) -> None:
+        """A position relative to the ship, or her heading as the acoustic system has it."""
         try:
+            if kind == usbl.SHIPS_ATTITUDE:
+                self._add(kind, name, usbl.ships_heading(text))
+                return
             transponder, values = usbl.relative_position(text, self._times.last)
         except Refused as refused:
             self._left[name, refused.text] += 1
@@ -171,17 +192,17 @@ class _Sentences:
             time[: self._undated] += DAY_S * round(step / DAY_S)
         channels = [
             channel
-            for sensor in ("ahrs", "fix")
+            for sensor in ("ahrs", "vehicle_tilt", "fix")
             for channel in self._channels(path, sensor, place, time, clock, options)
         ]
         notes = [] if self._times.dated else ["no sentence has a date: times count from midnight of the first day"]
-        said: list[str] = []
+        said = [NO_CHECKSUM] if self.bare else []
         if any(sensor == usbl.KIND for sensor, _ in self._rows):
-            channels, said = self._of_vehicle(path, channels, place, time, clock, options)
+            channels, more = self._of_vehicle(path, channels, place, time, clock, options)
+            said += more
         if not channels:
             raise InputError(f"{path}: holds neither fixes nor headings of the vehicle; other sentences: {found}")
-        settings, warnings = self._look(channels)
-        warnings = said + warnings
+        settings, warnings = self._look(channels, said)
         left = tuple(Left(name, count, why) for (name, why), count in sorted(self._left.items()))
         clocks = {clock.name: clock}
         return Recording(str(path), format_, tuple(channels), clocks, left, settings, tuple(notes), tuple(warnings))
@@ -190,8 +211,8 @@ class _Sentences:
         self, path: Path, sensor: str, place: Array, time: Array, clock: Clock, options: Options
     ) -> list[Channel]:
         names = {name: rows for (of, name), rows in self._rows.items() if of == sensor}
-        rank = (ATTITUDE, *HEADINGS, *FIXES)
-        order = sorted(names, key=lambda n: (rank.index(n if n == ATTITUDE else n[-3:]), -len(names[n])))
+        rank = (*ATTITUDES, *HEADINGS, TILT, *FIXES)
+        order = sorted(names, key=lambda n: (rank.index(n if n in ATTITUDES else n[-3:]), -len(names[n])))
         made = []
         later = sensor == "fix" and any(of == usbl.KIND for of, _ in self._rows)  # chosen beside the transponders
         for name in order if later else preferred_first(path, sensor, order, options.choose):
@@ -199,14 +220,18 @@ class _Sentences:
             table = table[(table[:, 0] >= place[0]) & (table[:, 0] <= place[-1])]
             when = np.interp(table[:, 0], place, time)
             if sensor == "fix":
-                new = new_fixes(when, table[:, 1], table[:, 2])
+                new = table[:, 1:3].any(axis=1)
+                new[1:] &= np.diff(when) > 0.0  # a ship at rest has the same place again
                 self._left[name, "nowhere on Earth, or the one before repeated"] += int((~new).sum())
                 table, when = table[new], when[new]
                 columns = {"fix_lat": table[:, 1], "fix_lon": table[:, 2], "fix_sd": table[:, 3]}
+            elif sensor == "vehicle_tilt":
+                columns = {"roll": table[:, 2], "pitch": table[:, 3]}
             else:
                 columns = {"ahrs_yaw": wrap_angle(table[:, 1]), "ahrs_roll": table[:, 2], "ahrs_pitch": table[:, 3]}
             if len(when):
-                frame = "" if sensor == "fix" else "the instrument's, " + ("true north" if "HDT" in name else _NORTH)
+                north = f", {'true north' if name.endswith(TRUE) else _NORTH}" if sensor == "ahrs" else ""
+                frame = "" if sensor == "fix" else f"the instrument's{north}"
                 made.append(Channel(sensor, {"time": when, **columns}, name, frame, clock.name))
         self._left = +self._left
         return made
@@ -220,16 +245,27 @@ class _Sentences:
         names = {name: rows for (of, name), rows in self._rows.items() if of == usbl.KIND}
         if not fixes:
             for name, rows in names.items():
-                self._left[name, "relative to a ship whose fixes are not in the file"] += len(rows) // 6
+                self._left[name, "relative to a ship whose fixes are not in the file"] += len(rows) // 7
             return channels, []
         own = next((name for name in fixes if name != options.choose.get("fix")), next(iter(fixes)))
-        true = next((channel for name, channel in headings.items() if name.endswith("HDT")), None)
-        made = self._transponders(names, _ship(fixes[own], true), place, time, clock)
+        true = next((channel for name, channel in headings.items() if name.endswith(TRUE)), None)
+        made = self._transponders(
+            names, _ship(fixes[own], true or self._ships_heading(place, time)), place, time, clock
+        )
+        if not made and options.choose.get("fix") not in fixes:
+            left = self._left.items()
+            why = "; ".join(f"{name}: {count} {reason}" for (name, reason), count in left if usbl.KIND in name)
+            raise InputError(
+                f"{path}: holds acoustic positions, but none that can be placed ({why}); record the ship's heading "
+                f"(HDT) beside them, or say --choose fix={own} if that receiver is the vehicle's"
+            )
         labels = [*sorted(made, key=lambda name: -len(names[name])), *fixes]
         order = preferred_first(path, "fix", labels, options.choose)
         said = []
         if order[0] in made:
             said.append(f"{order[0]} is added to {own}: see that it counts from the antenna of that receiver")
+            if np.frombuffer(names[order[0]]).reshape(-1, 7)[:, -1].any():
+                said.append(f"{order[0]} {FILTERED}")
         if "ahrs" in options.choose:
             return [*headings.values(), *((made | fixes)[name] for name in order)], said
         for name, channel in headings.items():
@@ -243,7 +279,7 @@ class _Sentences:
         """Fixes of each transponder."""
         made = {}
         for name, rows in names.items():
-            at, late, x, y, orientation, sd = np.frombuffer(rows).reshape(-1, 6).T
+            at, late, x, y, orientation, sd, _ = np.frombuffer(rows).reshape(-1, 7).T
             when = time[np.searchsorted(place, at, "right") - 1] + late
             lat, lon = usbl.positions(ship, when, x, y, orientation)
             known = np.isfinite(lat)
@@ -254,9 +290,17 @@ class _Sentences:
                 made[name] = Channel("fix", {"time": when[known], **columns}, name, "", clock.name)
         return made
 
-    def _look(self, channels: list[Channel]) -> tuple[dict[str, Any], list[str]]:
-        """Settings that the file knows, and what may be wrong."""
-        warnings, environment = [], {}
+    def _ships_heading(self, place: Array, time: Array) -> Channel | None:
+        """Of the acoustic system, where no gyrocompass speaks for itself."""
+        rows = next((rows for (of, _), rows in self._rows.items() if of == usbl.SHIPS_ATTITUDE), None)
+        if rows is None:
+            return None
+        at, heading = np.frombuffer(rows).reshape(-1, 2).T
+        return Channel("ahrs", {"time": np.interp(at, place, time), "ahrs_yaw": heading}, usbl.SHIPS_ATTITUDE)
+
+    def _look(self, channels: list[Channel], said: list[str]) -> tuple[dict[str, Any], list[str]]:
+        """Settings that the file knows, and what may be wrong beside what is ``said``."""
+        warnings, environment = [*said], {}
         talkers = [channel.source for channel in channels if channel.sensor == "fix"]
         if talkers:
             others = f" (also: {', '.join(talkers[1:])}; choose fix=NAME)" if len(talkers) > 1 else ""
@@ -265,12 +309,17 @@ class _Sentences:
             )
         heading = next((channel for channel in channels if channel.sensor == "ahrs"), None)
         if heading is not None:
-            warnings.append(
-                f"{heading.source}: stamped by its place between sentences with a time; see that it is of the vehicle"
-            )
-            if heading.source.endswith("HDT"):
-                warnings.append("HDT is relative to true north, a log's ahrs_yaw to magnetic: set declination_deg to 0")
+            stamped = "" if heading.source == "PASHR" else "stamped by its place between sentences with a time; "
+            warnings.append(f"{heading.source}: {stamped}see that it is of the vehicle")
+            if heading.source.endswith(TRUE):
+                kind = heading.source if heading.source in ATTITUDES else heading.source[-3:]
+                warnings.append(
+                    f"{kind} is relative to true north, a log's ahrs_yaw to magnetic: set declination_deg to 0"
+                )
                 environment["declination_deg"] = 0.0
             elif self._variation:
                 environment["declination_deg"] = float(np.median(self._variation))
-        return ({"environment": environment} if environment else {}), warnings
+        settings: dict[str, Any] = {"environment": environment} if environment else {}
+        if any(FILTERED in line for line in warnings):
+            settings["calibration"] = {"fix_error": {"estimate": True}}
+        return settings, warnings

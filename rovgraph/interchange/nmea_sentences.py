@@ -1,6 +1,10 @@
-"""NMEA 0183 sentences, live and in files: headings, fixes and times.
+"""NMEA 0183 sentences, live and in files: headings, attitudes, fixes and times.
 
-A sentence that was not received whole, as its checksum tells, is not read.
+A sentence that was not received whole, as its checksum tells, is not read. Where no sentence has a checksum, as loggers
+and terminals write them, they are taken as they stand.
+
+Sources of the proprietary ones: OxTS, NMEA 0183 description (PASHR); True North, Revolution (PTNTHPR, PTNTHTM);
+Kongsberg Seapath (PSXN,23); Teledyne TSS (PRDID).
 """
 
 import math
@@ -14,13 +18,19 @@ from rovgraph.interchange.lines import Refused, shown
 
 HEADINGS = ("HDT", "HDG", "HDM")  # best first
 FIXES = ("GGA", "RMC", "GLL")
+ATTITUDES = ("PASHR", "PTNTHPR", "PTNTHTM", "PSXN", "PRDID")  # heading, pitch and roll, best first
+TILT = "XDR"  # pitch and roll alone
+PITCH, ROLL = ("PTCH", "PITCH"), ("ROLL", "HEEL")  # how names of angles in an XDR begin
+TRUE = ("HDT", "PASHR", "PSXN")  # relative to true north
+WITHOUT_CHECKSUM = 10  # sentences in a row, with none that has one, from which on they are taken
 DATES = ("ZDA",)
 
 # GGA's quality -> error of a range [m], a choice; with the dilution of precision it gives the fix's sd
 RANGE_SD_M = {1: 3.0, 2: 1.0, 3: 3.0, 4: 0.02, 5: 0.3, 9: 1.0}
 GOOD_MODES = frozenset({None, "", "A", "D", "F", "P", "R"})  # not estimated, manual, simulated
 
-_SENTENCE = re.compile(r"[$!][A-Z]{2}([A-Z]{3}),|[$!]([A-Z0-9]{3,}),")
+_SENTENCE = re.compile(r"[$!](?!P)[A-Z]{2}([A-Z]{3}),|[$!]([A-Z0-9]{3,}),")  # a talker P is a maker
+_CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
 
 
 def sentence_of(line: bytes) -> tuple[str, str]:
@@ -38,8 +48,17 @@ def sentence_of(line: bytes) -> tuple[str, str]:
     return match[1] or match[2], text
 
 
-def parsed(text: str) -> Any:
+def has_checksum(text: str) -> bool:
+    """Whether a sentence ends with a checksum, right or wrong."""
+    return _CHECKSUM.search(text) is not None
+
+
+def parsed(text: str, bare: bool = False) -> Any:
     """A sentence's fields, as pynmea2 has them.
+
+    Parameters
+    ----------
+    bare : it may lack a checksum
 
     Raises
     ------
@@ -47,7 +66,7 @@ def parsed(text: str) -> Any:
     """
     pynmea2 = library()
     try:
-        return pynmea2.parse(text, check=True)
+        return pynmea2.parse(text, check=not bare)
     except pynmea2.ChecksumError:
         raise Refused("checksum", f"{shown(text)}: checksum missing or wrong; the sentence is skipped") from None
     except Exception:  # whatever a library of others meets in bytes of others
@@ -82,10 +101,15 @@ class Times:
             self.dated = True
             self.last = datetime.combine(day, time, UTC).timestamp()
         elif sentence.sentence_type in FIXES:
-            known = datetime.fromtimestamp(self.last if self.dated and self.last is not None else about, UTC)
-            near = datetime.combine(known.date(), time, UTC)
-            days = round((known - near) / timedelta(days=1))
-            self.last = (near + timedelta(days=days)).timestamp()
+            self.near(time, about)
+        return self.last
+
+    def near(self, time: clock_time, about: float) -> float:
+        """The time of a time of day that is nearest to what is known; ``about`` as of `stamp`."""
+        known = datetime.fromtimestamp(self.last if self.dated and self.last is not None else about, UTC)
+        there = datetime.combine(known.date(), time, UTC)
+        days = round((known - there) / timedelta(days=1))
+        self.last = (there + timedelta(days=days)).timestamp()
         return self.last
 
 
@@ -97,6 +121,52 @@ def heading_of(sentence: Any) -> tuple[float, bool] | None:
     if sentence.sentence_type == "HDG":
         return heading + (east(sentence.deviation, sentence.dev_dir) or 0.0), False
     return heading, sentence.sentence_type == "HDT"
+
+
+def attitude_of(text: str) -> tuple[clock_time | None, float | None, float | None, float | None] | None:
+    """Of a sentence of `ATTITUDES` or `TILT`: its time of day, heading, pitch and roll [deg]; None where it has none.
+
+    Pitch is positive with the bow up, roll with starboard down. The True North's may be set to mils: then it says so
+    nowhere.
+
+    Parameters
+    ----------
+    text : of the sentence, whose checksum is right
+    """
+    name, *cells = text.partition("*")[0].strip().split(",")
+    kind, cells = name[1:], [*cells, *[""] * 10]
+    time: clock_time | None = None
+    if kind == "PASHR":
+        time = day_time(cells[0])
+        heading, roll, pitch = (number(cells[k]) for k in (1, 3, 4))
+        if time is None or cells[2] != "T":  # another maker's, or not aligned yet
+            return None
+    elif kind in ("PTNTHPR", "PTNTHTM"):
+        heading, pitch, roll = (number(cells[k]) for k in (0, 2, 4))
+    elif kind == "PSXN":
+        if cells[0] != "23":
+            return None
+        roll, pitch, heading = (number(cells[k]) for k in (1, 2, 3))
+    elif kind == "PRDID":
+        pitch, roll, heading = (number(cells[k]) for k in (0, 1, 2))
+    else:
+        named = {cells[k + 3].upper(): number(cells[k + 1]) for k in range(0, len(cells) - 9, 4) if cells[k] == "A"}
+        pitch, roll = (next((v for n, v in named.items() if n.startswith(names)), None) for names in (PITCH, ROLL))
+        heading = None
+    heading = heading if heading is not None and 0.0 <= heading <= 360.0 else None
+    known = (heading is not None) if kind in ATTITUDES else None not in (pitch, roll)
+    return (time, heading, pitch, roll) if known else None
+
+
+def day_time(cell: str) -> clock_time | None:
+    """The time of day of ``hhmmss.sss``; None where it is none."""
+    if len(cell) < 6 or not cell[:6].isdigit() or number(cell) is None:
+        return None
+    try:
+        microsecond = round(1e6 * (float(cell) % 1.0))
+        return clock_time(int(cell[:2]), int(cell[2:4]), int(cell[4:6]), min(microsecond, 999_999))
+    except ValueError:
+        return None
 
 
 def fix_of(sentence: Any) -> tuple[float, float, float] | None:

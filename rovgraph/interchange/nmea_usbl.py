@@ -2,8 +2,10 @@
 
 ``$PSIMSSB,hhmmss.ss,transponder,status,error,coordinates,orientation,filter,x,y,depth,accuracy,...``: Cartesian
 coordinates (C) [m] along starboard and bow (H), north and east (N) or east and north (E). Its clock is UTC or local
-time, so that whole half hours of it do not count. Source: Kongsberg Simrad, HiPAP/HPR 400 NMEA 0183 sentences,
-850-160045.
+time, so that whole half hours of it do not count. Status A does not mean a reply: an error code does not (NRy: none),
+and the position is then a zero or an extrapolated one, as it is where the filter says P for predicted. M is measured, F
+filtered, which follows turns late. ``$PSIMSNS,hhmmss.ss,transponder,transceiver,transducer,roll,pitch,heave,heading,``
+has the ship's attitude at a ping. Source: Kongsberg Simrad, HiPAP/HPR 400 NMEA 0183 sentences, 850-160045.
 """
 
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ from rovgraph.geometry import Array
 from rovgraph.interchange.lines import Refused
 from rovgraph.interchange.nmea_sentences import number
 
-KIND = "PSIMSSB"
+KIND, SHIPS_ATTITUDE = "PSIMSSB", "PSIMSNS"
 HEAD_UP, NORTH_UP, EAST_FIRST = range(3)
 ORIENTATIONS = {"H": HEAD_UP, "N": NORTH_UP, "E": EAST_FIRST}
 HALF_HOUR_S = 1800.0
@@ -40,7 +42,10 @@ class Ship:
 
 
 def relative_position(text: str, last: float | None) -> tuple[str, tuple[float, ...]]:
-    """Name of the transponder; seconds since the last sentence with a time, x, y [m], orientation, accuracy [m].
+    """Name of the transponder, and numbers of a position relative to the ship.
+
+    They are seconds since the last sentence with a time, x, y [m], orientation, accuracy [m], and 1 where the system
+    has filtered it, else 0.
 
     Parameters
     ----------
@@ -52,9 +57,13 @@ def relative_position(text: str, last: float | None) -> tuple[str, tuple[float, 
     Refused : nothing that can be added to a ship's position
     """
     cells = [*text.partition("*")[0].split(",")[1:], *[""] * 14]
-    clock, name, status, _, coordinates, orientation = cells[:6]
+    clock, name, status, error, coordinates, orientation, filtered = cells[:7]
     if status != "A":
         raise Refused("no position", "the system marks it as not OK")
+    if error.strip():
+        raise Refused("no position", f"error {error.strip()}: not a reply")
+    if filtered == "P":
+        raise Refused("no position", "predicted, not measured")
     x, y, seconds = number(cells[7]), number(cells[8]), _seconds(clock)
     if coordinates != "C" or orientation not in ORIENTATIONS:
         raise Refused("no position", "not in Cartesian coordinates relative to a ship")
@@ -63,7 +72,21 @@ def relative_position(text: str, last: float | None) -> tuple[str, tuple[float, 
     late = (seconds - last + 0.5 * HALF_HOUR_S) % HALF_HOUR_S - 0.5 * HALF_HOUR_S
     accuracy = number(cells[10])
     sd = accuracy if accuracy is not None and accuracy > 0.0 else np.nan
-    return name, (late, x, y, float(ORIENTATIONS[orientation]), sd)
+    return name, (late, x, y, float(ORIENTATIONS[orientation]), sd, float(filtered == "F"))
+
+
+def ships_heading(text: str) -> float:
+    """Heading of the ship in a PSIMSNS, relative to true north [rad].
+
+    Raises
+    ------
+    Refused : it has none
+    """
+    cells = [*text.partition("*")[0].split(",")[1:], *[""] * 8]
+    heading = number(cells[7])
+    if heading is None or not 0.0 <= heading <= 360.0:
+        raise Refused("no heading", "without the ship's heading")
+    return float(np.deg2rad(heading))
 
 
 def positions(ship: Ship, time: Array, x: Array, y: Array, orientation: Array) -> tuple[Array, Array]:

@@ -1,13 +1,13 @@
-"""Doppler instruments, live: PD4, PD5 and PD6 of Teledyne and others, and Nortek's Nucleus.
+"""Doppler instruments, live: PD4, PD5 and PD6 of Teledyne and others, Cerulean's Tracker 650, and Nortek's Nucleus.
 
-Their bytes are read as those of their files are (`rovgraph.interchange.pd4`, `pd6` and `nucleus`).
+Their bytes are read as those of their files are (`rovgraph.interchange.pd4`, `pd6`, `cerulean` and `nucleus`).
 """
 
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from rovgraph.interchange import nucleus
+from rovgraph.interchange import cerulean, nucleus
 from rovgraph.interchange.lines import Refused, shown
 from rovgraph.interchange.nortek_records import NUCLEUS_FAMILIES, find_records
 from rovgraph.interchange.pd4 import SIZES, Frames, decoded
@@ -62,6 +62,20 @@ def pd6(url: str, notify: Notify) -> LineDecoder:
             raise Refused("malformed", f"expected a PD6 sentence, got {shown(line)}; it is skipped")
         found = readings(cells)
         return Message(url, arrival, sentences.time, found) if found else None
+
+    return LineDecoder(parse, notify)
+
+
+def tracker(url: str, notify: Notify) -> LineDecoder:
+    """Decoder of a Tracker 650's sentences, stamped by the time since it was switched on."""
+
+    def parse(line: bytes, arrival: float) -> Message | None:
+        said = cerulean.ping(line)
+        if said is None:
+            if cerulean.SENTENCE.search(line) is None:
+                raise Refused("malformed", f"expected a sentence of a Tracker 650, got {shown(line)}; it is skipped")
+            return None
+        return Message(url, arrival, said[0], readings(said[1]))
 
     return LineDecoder(parse, notify)
 

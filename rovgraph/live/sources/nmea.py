@@ -1,10 +1,10 @@
-"""NMEA 0183, live: headings and fixes; `rovgraph.interchange.nmea_sentences` reads the sentences.
+"""NMEA 0183, live: headings, attitudes and fixes; `rovgraph.interchange.nmea_sentences` reads the sentences.
 
 Headings become the log's `ahrs_yaw`, which is of a compass: one that is relative to true north is
 turned by the configuration's declination.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,17 @@ from rovgraph.config import Config
 from rovgraph.geometry import wrap_angle
 from rovgraph.interchange.lines import Refused
 from rovgraph.interchange.nmea_sentences import (
+    ATTITUDES,
     DATES,
     FIXES,
     HEADINGS,
+    TRUE,
+    WITHOUT_CHECKSUM,
     Times,
+    attitude_of,
     east,
     fix_of,
+    has_checksum,
     heading_of,
     library,
     parsed,
@@ -53,7 +58,9 @@ class Sentences:
         self._declination = config.environment.declination_deg
         self._recorded = recorded
         self._times = Times()
-        self._headings = Preferred(HEADINGS, notify)
+        self._notify = notify
+        self._bare: int | None = 0  # sentences so far, as long as none has a checksum
+        self._headings = Preferred((*ATTITUDES, *HEADINGS), notify)
         self._fixes = Preferred(FIXES, notify)
         self._read: dict[str, Callable[[Any, float], Reading | None]] = {
             **dict.fromkeys(HEADINGS, self._heading),
@@ -69,16 +76,42 @@ class Sentences:
         Refused : it is none, or not whole
         """
         kind, text = sentence_of(line)
-        if kind not in self._read:
+        if kind not in self._read and kind not in ATTITUDES:
             return None
-        sentence = parsed(text)
-        stamp = self._times.stamp(sentence, arrival)
+        sentence = parsed(text, self._takes_without_checksum(text))
+        attitude = attitude_of(text) if kind in ATTITUDES else None
+        if attitude is not None and attitude[0] is not None:
+            stamp: float | None = self._times.near(attitude[0], arrival)
+        else:
+            stamp = self._times.stamp(sentence, arrival)
         if self._recorded:
             if self._times.last is None:
                 raise Refused("no time", "sentences before the first one with a time are left out")
             arrival = self._times.last
-        reading = self._read[kind](sentence, arrival)
+        if kind in ATTITUDES:
+            reading = None if attitude is None else self._attitude(kind, attitude[1:], arrival)
+        else:
+            reading = self._read[kind](sentence, arrival)
         return None if reading is None else Message(self._url, arrival, stamp, (reading,))
+
+    def _takes_without_checksum(self, text: str) -> bool:
+        """Whether sentences are taken without a checksum: many came, and none had one."""
+        if has_checksum(text):
+            self._bare = None
+        elif self._bare is not None:
+            self._bare += 1
+            if self._bare == WITHOUT_CHECKSUM:
+                self._notify(
+                    "no checksum", "no sentence has a checksum: all are taken as they stand from here on", True
+                )
+        return self._bare is not None and self._bare >= WITHOUT_CHECKSUM
+
+    def _attitude(self, kind: str, angles: Sequence[float | None], arrival: float) -> Reading | None:
+        if not self._headings.takes(kind, arrival):
+            return None
+        heading, pitch, roll = np.deg2rad([np.nan if angle is None else angle for angle in angles])
+        heading -= np.deg2rad(self._declination) if kind in TRUE else 0.0
+        return Reading("ahrs", np.array([wrap_angle(heading), roll, pitch]))
 
     def _heading(self, sentence: Any, arrival: float) -> Reading | None:
         found = heading_of(sentence)

@@ -11,7 +11,7 @@ from rovgraph.errors import InputError, kind_of
 from rovgraph.interchange.mavlink import IMUS
 from rovgraph.live.sources import waterlinked
 from rovgraph.live.sources.address import LOOPBACK, Address, one_of, parse_address, positive, whole
-from rovgraph.live.sources.doppler import NucleusDecoder, Pd4Decoder, pd6
+from rovgraph.live.sources.doppler import NucleusDecoder, Pd4Decoder, pd6, tracker
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.links import SerialLink, StandardInput, TcpLink, UdpLink
 from rovgraph.live.sources.mavlink import MavlinkDecoder, Options
@@ -34,6 +34,7 @@ FORMS = {
     "nmea": "nmea:/dev/ttyUSB0",
     "pd4": "pd4:tcp://host:port",
     "pd6": "pd6:/dev/ttyUSB0",
+    "cerulean": "cerulean:udp://:27000",
     "nucleus": "nucleus:tcp://host:port",
     "file": "file:log.csv",
 }
@@ -246,6 +247,7 @@ _OPENERS: dict[str, Opener] = {
     "nmea": _nmea,
     "pd4": _doppler(Pd4Decoder),
     "pd6": _doppler(pd6, end=b"\n"),
+    "cerulean": _doppler(tracker, end=b"\n"),
     "nucleus": _doppler(NucleusDecoder),
     "file": _file,
 }
