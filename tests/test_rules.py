@@ -1,7 +1,7 @@
 """Each rule's limits, just below and just above, and the time that is said; no dive is estimated here."""
 
 from dataclasses import replace
-from math import inf, isfinite, nan, sqrt
+from math import hypot, inf, isfinite, nan, sqrt
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -397,7 +397,7 @@ def test_the_start_is_compared_with_where_it_is_stated(limit, times, severity):
         return one
 
     figure = times * getattr(said(0.0), limit)
-    one = said(figure * sqrt(2.0**2 - 0.5**2))
+    one = said(figure * hypot(2.0, 0.5))  # how much of its sd is considered is not known
     assert (one.sensor, one.figure, one.severity) == ("start", pytest.approx(figure), severity)
 
 

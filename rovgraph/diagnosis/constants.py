@@ -80,7 +80,7 @@ def _start_moved(evidence: Evidence) -> Iterator[Statistic]:
         return
     stated = np.array([start.north_m or 0.0, start.east_m or 0.0])
     off, sd = track.p_n[0, :2] - stated, track.p_sd[0, :2]
-    figure = sds_moved(off, sd, np.zeros(2), np.full(2, start.position_sd_m), sd)
+    figure = sds_moved(off, sd, np.zeros(2), np.full(2, start.position_sd_m))
     worst = int(np.argmax(figure))
     yield _moved(
         evidence.start,
