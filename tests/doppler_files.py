@@ -3,6 +3,7 @@
 import struct
 import time
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -60,8 +61,12 @@ def pd0_ensemble(
     alignment: float = 0.0,
     bottom: bool = True,
     date: Sequence[int] | None = None,
+    more: Sequence[bytes] = (),
 ) -> bytes:
-    """An ensemble, its velocities those of the bottom [m/s]; roll, pitch, heading [rad], bias and alignment [deg]."""
+    """An ensemble, its velocities those of the bottom [m/s]; roll, pitch, heading [rad], bias and alignment [deg].
+
+    ``more`` are other records.
+    """
     fixed = bytearray(59)
     struct.pack_into("<HBBHxxB", fixed, 0, 0x0000, 50, 40, 0x4249 | (0x80 if up else 0) | 0x08, 4)
     struct.pack_into("<BhhB", fixed, 25, (system << 3) | 0b111, round(100 * alignment), round(100 * bias), source)
@@ -78,7 +83,32 @@ def pd0_ensemble(
     struct.pack_into("<12B", track, 32, *[heard] * 4, *[80] * 4, *[100] * 4)
     struct.pack_into("<4h", track, 50, *in_mm(water))
     struct.pack_into("<4B", track, 77, *(r >> 16 for r in far))
-    return ensemble(bytes(fixed), bytes(variable), struct.pack("<H8h", 0x0100, *range(8)), *[bytes(track)] * bottom)
+    return ensemble(
+        bytes(fixed), bytes(variable), struct.pack("<H8h", 0x0100, *range(8)), *[bytes(track)] * bottom, *more
+    )
+
+
+def winriver_gga(clock: str, before: float, lat: float, lon: float, quality: int = 2, hdop: float = 0.9) -> bytes:
+    """Record 0x2022 of a fix, as WinRiver decodes it."""
+    place = struct.pack("<dcdc", abs(lat), b"N" if lat >= 0 else b"S", abs(lon), b"E" if lon >= 0 else b"W")
+    head = struct.pack("<HHHd7s10s", 0x2022, 104, 57, before, b"$GPGGA", clock.encode())
+    return head + place + struct.pack("<BBf", quality, 9, hdop) + bytes(16)
+
+
+def winriver_hdt(before: float, heading: float) -> bytes:
+    """Record 0x2022 of a heading [deg]."""
+    return struct.pack("<HHHd7sdc", 0x2022, 107, 16, before, b"$GPHDT", heading, b"T")
+
+
+def vmdas_navigation(unix: float, lat: float, lon: float) -> bytes:
+    """Record 0x2000 of VmDas; its first fix is a second before its last."""
+    record, day = bytearray(78), datetime.fromtimestamp(unix, UTC)
+    struct.pack_into("<HBBH", record, 0, 0x2000, day.day, day.month, day.year)
+    of_day = (unix % 86400.0) * 1e4
+    struct.pack_into("<I", record, 6, round(of_day - 1e4))
+    angles = (round(angle * 2**31 / 180.0) for angle in (lat, lon))
+    struct.pack_into("<Iii", record, 22, round(of_day), *angles)
+    return bytes(record)
 
 
 def ensemble(*records: bytes) -> bytes:

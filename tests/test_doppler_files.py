@@ -2,6 +2,7 @@
 
 import gzip
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,9 @@ from doppler_files import (
     pd6_ping,
     signature_record,
     trdi_values,
+    vmdas_navigation,
+    winriver_gga,
+    winriver_hdt,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -420,3 +424,59 @@ def test_a_tracker_650_is_read_with_and_without_checksums(tmp_path):
     assert [(each.name, each.count) for each in recording.left] == [("DVKFC", 1)]
     with_checksums = read(b"".join(map(sentence, lines)), tmp_path)
     assert len(first(with_checksums, "dvl").columns["time"]) == 50
+
+
+CASES = Path(__file__).parents[2] / "shared" / "cases" / "pd0-navigation"
+LATE = 28801.5  # s: an instrument's clock on the time of its zone, and off
+
+
+def with_receiver(k: int, *more: bytes, lat: float = 64.5) -> bytes:
+    """The ping of a second, k s after UNIX, by a clock that is late, with a fix half a second before it."""
+    clock = f"{datetime.fromtimestamp(UNIX + k - 0.5, UTC):%H%M%S.%f}"[:9]
+    gga = winriver_gga(clock, 0.5, lat + 1e-5 * k, -149.0)
+    return pd0_ensemble(UNIX + k - LATE, more=(gga, gga, *more))
+
+
+def test_fixes_beside_the_pings_have_their_own_time_and_tell_how_late_the_instruments_clock_is(tmp_path):
+    recording = read(b"".join(with_receiver(k, winriver_hdt(0.25, 120.0)) for k in range(20)), tmp_path)
+    fix = first(recording, "fix")
+    close(fix.columns["time"], UNIX + np.arange(20) - 0.5, atol=0.01)
+    close(fix.columns["fix_lat"], 64.5 + 1e-5 * np.arange(20))
+    close(fix.columns["fix_lon"], -149.0)
+    close(fix.columns["fix_sd"], 0.9, atol=1e-6)
+    dvl = recording.clocks[first(recording, "dvl").clock]
+    assert dvl.unix_offset == pytest.approx(LATE, abs=0.02) and dvl.offset_sd < 0.1
+    heading = first(recording, "ahrs")
+    close(np.rad2deg(heading.columns["ahrs_yaw"]), 120.0)
+    close(heading.columns["time"], UNIX + np.arange(20) - 0.25, atol=0.02)
+    assert recording.settings["environment"]["declination_deg"] == 0.0
+
+
+def test_fixes_of_vmdas_are_read_and_those_that_jump_or_lie_at_a_pole_refused(tmp_path):
+    def file(*places: tuple[float, float]) -> bytes:
+        return b"".join(
+            pd0_ensemble(UNIX + k - LATE, more=(vmdas_navigation(UNIX + k - 0.2, *place),))
+            for k, place in enumerate(places)
+        )
+
+    fix = first(read(file(*((48.08 + 1e-5 * k, -123.04) for k in range(9))), tmp_path), "fix")
+    close(fix.columns["fix_lat"], 48.08 + 1e-5 * np.arange(9), atol=1e-7)
+    close(fix.columns["time"], UNIX + np.arange(9) - 0.2, atol=1e-3)
+    jumping = read(file(*((48.0 + 7.0 * (k % 3), 10.0 * k) for k in range(9))), tmp_path)
+    assert not [c for c in jumping.channels if c.sensor == "fix"] and any("jump about" in w for w in jumping.warnings)
+    assert "origin_lat_deg" not in jumping.settings.get("environment", {})
+    assert not [c for c in read(file(*[(-89.9, 5.0)] * 9), tmp_path).channels if c.sensor == "fix"]
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason=f"no {CASES}")
+def test_fixes_of_a_river_survey_are_those_of_its_sentences(tmp_path):
+    """What WinRiver has decoded (0x2022) equals the text that it keeps beside it (0x2101)."""
+    recording = read_recording(CASES / "tanana_002_head.PD0.gz")
+    fix = first(recording, "fix").columns
+    assert len(fix["time"]) == 838
+    of_day = 22 * 3600.0 + 28 * 60.0 + 17.2  # 222817.20: 6433.654203 N, 14904.007018 W
+    k = int(np.argmin(np.abs(fix["time"] % 86400.0 - of_day)))
+    close([fix["fix_lat"][k], fix["fix_lon"][k]], [64 + 33.654203 / 60, -(149 + 4.007018 / 60)], atol=1e-9)
+    assert recording.clocks["DVL's clock"].unix_offset == pytest.approx(28801.46, abs=0.1)
+    of_vmdas = first(read_recording(CASES / "vmdas01_part.ENX.gz"), "fix").columns
+    close([of_vmdas["fix_lat"][0], of_vmdas["fix_lon"][0]], [48.0805, -123.0440], atol=2e-3)

@@ -60,7 +60,9 @@ MADE: dict[str, Callable[[], bytes]] = {
     "dvl.pd4": lambda: b"".join(pd4_frame(float(k)) for k in range(9)),
     "dvl.pd5": lambda: b"".join(pd4_frame(float(k), rpy=(0.0, 0.1, 0.2)) for k in range(9)),
     "dvl.pd6": lambda: b"".join(pd6_ping(START + k) for k in range(9)),
-    "tracker.nmea": lambda: b"".join(b"$DVPDL,%d,100000,0,0,0,0.05,0.001,-0.002,95\n" % (k * 100_000) for k in range(9)),
+    "tracker.nmea": lambda: b"".join(
+        b"$DVPDL,%d,100000,0,0,0,0.05,0.001,-0.002,95\n" % (k * 100_000) for k in range(9)
+    ),
     "dvl.ad2cp": lambda: b"".join(dvl_record(START + k, (0.5, 0.0, 0.0)) for k in range(9)),
     "nucleus.bin": nucleus,
     "ship.nmea": lambda: rmc("120000.00", "020324") + b"".join(gga(f"1200{k:02d}.00", 0.001 * k) for k in range(9)),

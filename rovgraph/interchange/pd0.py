@@ -2,10 +2,15 @@
 
 Bottom track is the velocity of the bottom against the instrument; a log has the instrument's over the bottom. Axes are
 forward (beam 3, or the ship's bow), starboard, down, whatever the file's are (`rovgraph.interchange.trdi_axes`).
+
+WinRiver and VmDas write a receiver's fixes beside the pings, with their time of day (UTC) and how long before the ping
+they came. So the file tells how far the instrument's clock is off. Sources: Teledyne RD Instruments, WinRiver II User's
+Guide, General NMEA data; VmDas User's Guide, navigation data.
 """
 
 import mmap
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +18,24 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.interchange.binary_records import gathered, layout
 from rovgraph.interchange.formats import Options
+from rovgraph.interchange.nmea_sentences import RANGE_SD_M, day_time, number
 from rovgraph.interchange.pd0_ensembles import (
     BOTTOM,
     FIXED,
+    GGA,
+    HEADING,
     NAVIGATION,
     OTHERS,
+    SENTENCES,
     SYNC,
     VARIABLE,
     Ensembles,
     ensemble_end,
     find_ensembles,
 )
-from rovgraph.interchange.recording import Clock, Left, Recording
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.stamps import unix_of_calendar
 from rovgraph.interchange.trdi_axes import BEAM, EARTH, Attitude, forward_starboard_down
 from rovgraph.interchange.trdi_recording import CLOCK, Pings, recording
@@ -35,6 +45,36 @@ BAD = -32768
 ANGLES = 15.0, 20.0, 30.0, 25.0  # of beams, by the system's configuration [deg]
 LEVEL_SENSORS = 0b1100  # pitch and roll come from sensors of its own
 SEMICIRCLE = 180.0 / 2**31  # [deg]
+DAY_S = 86_400.0
+UTC = "UTC of the receiver"
+RECORDED_SD_S = 0.05  # of when a sentence came, which the recording computer tells
+POLE_DEG = 89.5
+FASTEST = 60.0  # median speed between positions, that no vehicle has and wrong numbers easily have [m/s]
+DEG_M = 111_195.0
+BY_WINRIVER = layout(
+    ("kind", "<u2", 2),
+    ("before", "<f8", 6),  # the ping [s]
+    ("name", "S7", 14),
+    ("time", "S10", 21),
+    ("lat", "<f8", 31),
+    ("north", "S1", 39),
+    ("lon", "<f8", 40),
+    ("east", "S1", 48),
+    ("quality", "u1", 49),
+    ("hdop", "<f4", 51),
+)
+HEADING_BY_WINRIVER = layout(("kind", "<u2", 2), ("before", "<f8", 6), ("name", "S7", 14), ("heading", "<f8", 21))
+TEXT = layout(("text", "S120", 4))
+BY_VMDAS = layout(
+    ("day", "u1", 2),
+    ("month", "u1", 3),
+    ("year", "<u2", 4),
+    ("first", "<u4", 6),  # [1e-4 s]
+    ("last", "<u4", 22),
+    ("lat", "<i4", 26),  # at the last time
+    ("lon", "<i4", 30),
+)
+OF_VMDAS = 78  # bytes of a navigation record and more; a REMUS writes 54
 
 
 class PD0:
@@ -60,10 +100,173 @@ class PD0:
             )
         pings = decoded(content, found)
         clock = Clock(CLOCK, 0.0, ZONE_SD_S, "its calendar, taken for UTC")
-        return recording(path, self.name, pings, clock, tuple(_left(found)), tuple(_warnings(found)))
+        receiver, warnings = _receiver(content, found, pings.time), [*_warnings(found)]
+        if receiver is not None and _jumps(receiver.time, receiver.lat, receiver.lon):
+            warnings.append(f"{len(receiver.time)} fixes of {receiver.source} jump about, and are left out")
+            receiver = None
+        if _jumps(pings.time, *pings.position.T):
+            warnings.append("positions of record 0x2000 jump about, and are left out")
+            pings = replace(pings, position=np.full_like(pings.position, np.nan))
+        if receiver is not None:
+            clock = Clock(CLOCK, receiver.offset, receiver.offset_sd, f"{receiver.source}, written with the pings")
+        made = recording(path, self.name, pings, clock, tuple(_left(found)), tuple(warnings))
+        return made if receiver is None else _with(made, receiver)
 
 
 FORMAT = PD0()
+
+
+@dataclass(frozen=True)
+class _Receiver:
+    """Fixes that were written beside the pings, and headings.
+
+    Attributes
+    ----------
+    source : in words
+    time, lat, lon, sd : shape (n,), Unix time [s], [deg], [m]; an sd may be NaN
+    offset, offset_sd : what the instrument's clock lacks of Unix time [s]
+    heading_time, heading : shape (m,), relative to true north [s], [rad]
+    """
+
+    source: str
+    time: Array
+    lat: Array
+    lon: Array
+    sd: Array
+    offset: float
+    offset_sd: float
+    heading_time: Array
+    heading: Array
+
+
+def _receiver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _Receiver | None:
+    """What the file holds of a receiver, of its most telling records; None = nothing that lies somewhere."""
+    told = _by_winriver(content, found, stamps) or _by_text(content, found, stamps) or _by_vmdas(content, found, stamps)
+    if told is None:
+        return None
+    source, time, before, ensemble, lat, lon, sd = told
+    ok = np.isfinite(time + stamps[ensemble]) & (np.abs(lat) <= POLE_DEG) & (np.abs(lon) <= 180.0)
+    ok &= (lat != 0.0) | (lon != 0.0)
+    if not ok.any():
+        return None
+    late = (time + before - stamps[ensemble])[ok]
+    offset = float(np.median(late))
+    spread = 1.4826 * float(np.median(np.abs(late - offset)))
+    first = np.unique(time[ok], return_index=True)[1]  # the newest sentence is in several ensembles
+    fixes = [values[ok][first] for values in (time, lat, lon, sd)]
+    heading_time, heading = _headings(content, found, stamps + offset)
+    return _Receiver(source, *fixes, offset, max(spread, RECORDED_SD_S), heading_time, heading)
+
+
+Told = tuple[str, Array, Array, NDArray[np.int64], Array, Array, Array]
+
+
+def _by_winriver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> Told | None:
+    """Source, time, how long before the ping, number of the ensemble, latitude, longitude and sd."""
+    rows, ensemble = found.records_of(content, SENTENCES, BY_WINRIVER)
+    own = (rows["kind"] >= 100) & np.char.endswith(rows["name"], b"GGA")
+    rows, ensemble = rows[own], ensemble[own]
+    if not len(rows):
+        return None
+    time = _of_day([cell.decode("ascii", "replace") for cell in rows["time"]], stamps[ensemble])
+    lat = np.where(rows["north"] == b"S", -rows["lat"], rows["lat"])
+    lon = np.where(rows["east"] == b"W", -rows["lon"], rows["lon"])
+    sd = np.array([RANGE_SD_M.get(int(quality), np.nan) for quality in rows["quality"]]) * rows["hdop"]
+    lat[~np.isin(rows["quality"], [*RANGE_SD_M])] = np.nan
+    return "record 0x2022 (GGA)", time, rows["before"], ensemble, lat, lon, np.where(sd > 0.0, sd, np.nan)
+
+
+def _by_text(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> Told | None:
+    """The same of sentences as they came, which tell no delay."""
+    rows, ensemble = found.records_of(content, GGA, TEXT)
+    cells = [[*text.decode("ascii", "replace").split(","), *[""] * 9] for text in rows["text"]]
+    if not cells:
+        return None
+    time = _of_day([row[1] for row in cells], stamps[ensemble])
+    lat, lon = (
+        np.array([_degrees(row[k], digits) * (-1.0 if row[k + 1] == away else 1.0) for row in cells])
+        for k, digits, away in ((2, 2, "S"), (4, 3, "W"))
+    )
+    range_sd = [RANGE_SD_M.get(int(row[6]) if row[6].isdigit() else 0, np.nan) for row in cells]
+    sd = np.array([own * (number(row[8]) or np.nan) for own, row in zip(range_sd, cells, strict=True)])
+    lat[np.isnan(range_sd)] = np.nan
+    return "record 0x2101 (GGA)", time, np.zeros(len(time)), ensemble, lat, lon, sd
+
+
+def _by_vmdas(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> Told | None:
+    at, length = found.at[NAVIGATION], found.length[NAVIGATION]
+    rows, there = gathered(content, BY_VMDAS, at, length, OF_VMDAS)
+    ensemble = np.flatnonzero(there)
+    rows = rows[there]
+    if not len(rows):
+        return None
+    date = (rows[name].astype(np.int64) for name in ("year", "month", "day"))
+    day = unix_of_calendar(*date, *np.zeros((3, len(rows)), np.int64))
+    time = day + 1e-4 * rows["last"] + DAY_S * (rows["last"] < rows["first"])
+    lat, lon = SEMICIRCLE * rows["lat"], SEMICIRCLE * rows["lon"]
+    return "record 0x2000 of VmDas", time, np.zeros(len(rows)), ensemble, lat, lon, np.full(len(rows), np.nan)
+
+
+def _headings(content: bytes | mmap.mmap, found: Ensembles, pinged: Array) -> tuple[Array, Array]:
+    """Times and headings [rad] of HDT sentences; ``pinged`` is the Unix time of each ensemble [s]."""
+    rows, ensemble = found.records_of(content, SENTENCES, HEADING_BY_WINRIVER)
+    own = (rows["kind"] >= 100) & np.char.endswith(rows["name"], b"HDT")
+    time, degrees = (pinged[ensemble] - rows["before"])[own], rows["heading"][own]
+    if not own.any():
+        rows, ensemble = found.records_of(content, HEADING, TEXT)
+        cells = [text.decode("ascii", "replace").split(",") for text in rows["text"]]
+        told = [number(row[1]) if len(row) > 2 and row[0].endswith("HDT") else None for row in cells]
+        degrees = np.array(told, float)
+        time = pinged[ensemble]
+    ok = np.isfinite(time) & (degrees >= 0.0) & (degrees <= 360.0)
+    return time[ok], np.deg2rad(degrees[ok])
+
+
+def _of_day(clocks: list[str], about: Array) -> Array:
+    """Unix time of times of day as ``hhmmss.ss``, on the day nearest to what the instrument's clock says."""
+    days = [day_time(clock) for clock in clocks]
+    seconds = [
+        np.nan if t is None else 3600.0 * t.hour + 60.0 * t.minute + t.second + 1e-6 * t.microsecond for t in days
+    ]
+    time = np.array(seconds)
+    return np.asarray(time + DAY_S * np.round((about - time) / DAY_S))
+
+
+def _degrees(cell: str, digits: int) -> float:
+    """Of degrees and minutes as a sentence has them; NaN for what is none."""
+    degrees, minutes = number(cell[:digits]), number(cell[digits:])
+    return np.nan if degrees is None or minutes is None else degrees + minutes / 60.0
+
+
+def _jumps(time: Array, lat: Array, lon: Array) -> bool:
+    """Whether positions are further apart than any vehicle goes."""
+    ok = np.isfinite(time + lat + lon)
+    if ok.sum() < 3:
+        return False
+    way = np.hypot(np.diff(lat[ok]), np.diff(lon[ok]) * np.cos(np.deg2rad(lat[ok][1:]))) * DEG_M
+    seconds = np.maximum(np.abs(np.diff(time[ok])), 0.1)
+    return bool(np.median(way / seconds) > FASTEST)
+
+
+def _with(made: Recording, receiver: _Receiver) -> Recording:
+    """A recording with what it holds of a receiver."""
+    columns = {"time": receiver.time, "fix_lat": receiver.lat, "fix_lon": receiver.lon, "fix_sd": receiver.sd}
+    more = [Channel("fix", columns, receiver.source, "", UTC)]
+    settings = {**made.settings}
+    warnings = [f"fixes are those of {receiver.source}: see that it is the vehicle's, and state fix.lever_arm_m"]
+    if len(receiver.heading):
+        pointing = {"time": receiver.heading_time, "ahrs_yaw": receiver.heading}
+        more.append(Channel("ahrs", pointing, "HDT sentences", "the vessel's, true north", UTC))
+        settings["environment"] = {**settings.get("environment", {}), "declination_deg": 0.0}
+        warnings.append("HDT is relative to true north, a log's ahrs_yaw to magnetic: set declination_deg to 0")
+    clocks = {**made.clocks, UTC: Clock(UTC, 0.0, 0.0, "its stamps are Unix time")}
+    return replace(
+        made,
+        channels=(*made.channels, *more),
+        clocks=clocks,
+        settings=settings,
+        warnings=(*made.warnings, *warnings),
+    )
 
 
 def decoded(content: bytes | mmap.mmap, found: Ensembles) -> Pings:
@@ -83,7 +286,8 @@ def decoded(content: bytes | mmap.mmap, found: Ensembles) -> Pings:
     through, _ = forward_starboard_down(water, system, attitude)
     ranges = 0.01 * (bottom["range"] + 65536.0 * bottom["range_high"])
     position = SEMICIRCLE * np.column_stack([navigation["lat"], navigation["lon"]])
-    nowhere = ~navigated | (np.abs(position[:, 0]) > 90.0) | ~np.any(position, axis=1)
+    navigated &= np.array(found.length[NAVIGATION]) < OF_VMDAS
+    nowhere = ~navigated | (np.abs(position[:, 0]) > POLE_DEG) | ~np.any(position, axis=1)
     position[nowhere] = np.nan
     return Pings(
         time=_time(variable["date"], variable["century"]),

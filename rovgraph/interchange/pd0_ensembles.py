@@ -18,7 +18,8 @@ from rovgraph.interchange.binary_records import gathered, layout
 
 SYNC = b"\x7f\x7f"
 FIXED, VARIABLE, BOTTOM, NAVIGATION = 0x0000, 0x0080, 0x0600, 0x2000
-
+SENTENCES, GGA, HEADING = 0x2022, 0x2101, 0x2104  # of receivers: decoded by WinRiver, and as text
+SEVERAL = (SENTENCES, GGA, HEADING)
 
 LAYOUTS = {
     FIXED: layout(
@@ -56,7 +57,9 @@ OTHERS = {
     0x0300: "echo intensity profile",
     0x0400: "percent-good profile",
     0x0500: "status profile",
-    0x2022: "navigation sentences",
+    0x2100: "depth sentences (DBT)",
+    0x2102: "course and speed over ground (VTG)",
+    0x2103: "sentences of a satellite receiver",
 }
 
 
@@ -68,6 +71,7 @@ class Ensembles:
     ----------
     at : kind -> first byte of its record in each ensemble, -1 = it has none
     length : kind -> bytes of it
+    several : kind -> number of the ensemble, first byte and bytes of each record, one after the other
     others : kind -> how many records there are of those that `LAYOUTS` does not know
     failed : ensembles with a wrong checksum
     skipped : bytes that belong to no whole ensemble
@@ -75,6 +79,7 @@ class Ensembles:
 
     at: dict[int, "array[int]"] = field(default_factory=lambda: {kind: array("q") for kind in LAYOUTS})
     length: dict[int, "array[int]"] = field(default_factory=lambda: {kind: array("q") for kind in LAYOUTS})
+    several: dict[int, "array[int]"] = field(default_factory=lambda: {kind: array("q") for kind in SEVERAL})
     others: Counter[int] = field(default_factory=Counter)
     failed: int = 0
     skipped: int = 0
@@ -85,6 +90,13 @@ class Ensembles:
     def records(self, content: bytes | mmap.mmap, kind: int) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
         """Records of a kind, shape (n,), with zeros where an ensemble has none or a short one, and which have it."""
         return gathered(content, LAYOUTS[kind], self.at[kind], self.length[kind], LEAST[kind])
+
+    def records_of(
+        self, content: bytes | mmap.mmap, kind: int, fields: np.dtype[np.void]
+    ) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+        """All records of one of `SEVERAL`, shape (m,), and the numbers of their ensembles."""
+        ensemble, at, length = np.array(self.several[kind], np.int64).reshape(-1, 3).T
+        return gathered(content, fields, at, length, 1)[0], ensemble
 
 
 def find_ensembles(content: bytes | mmap.mmap, progress: Callable[[int], None] = lambda done: None) -> Ensembles:
@@ -140,8 +152,11 @@ def _table(content: bytes | mmap.mmap, start: int, end: int) -> list[tuple[int, 
 def _keep(found: Ensembles, table: list[tuple[int, int]], end: int) -> None:
     bounds = [at for at, _ in table[1:]] + [end]
     known = {kind: (at, bound - at) for (at, kind), bound in zip(table, bounds, strict=True)}
+    for (at, kind), bound in zip(table, bounds, strict=True):
+        if kind in SEVERAL:
+            found.several[kind].extend((len(found), at, bound - at))
     for kind in LAYOUTS:
         at, length = known.get(kind, (-1, 0))
         found.at[kind].append(at)
         found.length[kind].append(length)
-    found.others.update(kind for _, kind in table if kind not in LAYOUTS)
+    found.others.update(kind for _, kind in table if kind not in LAYOUTS and kind not in SEVERAL)
