@@ -153,9 +153,9 @@ def _receiver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _R
     offset = float(np.median(late))
     spread = 1.4826 * float(np.median(np.abs(late - offset)))
     first = np.unique(time[ok], return_index=True)[1]  # the newest sentence is in several ensembles
-    fixes = [values[ok][first] for values in (time, lat, lon, sd)]
-    heading_time, heading = _headings(content, found, stamps + offset)
-    return _Receiver(source, *fixes, offset, max(spread, RECORDED_SD_S), heading_time, heading)
+    time, lat, lon, sd = (values[ok][first] for values in (time, lat, lon, sd))
+    offset_sd = max(spread, RECORDED_SD_S)
+    return _Receiver(source, time, lat, lon, sd, offset, offset_sd, *_headings(content, found, stamps + offset))
 
 
 Told = tuple[str, Array, Array, NDArray[np.int64], Array, Array, Array]

@@ -96,7 +96,7 @@ class Ensembles:
     ) -> tuple[NDArray[np.void], NDArray[np.int64]]:
         """All records of one of `SEVERAL`, shape (m,), and the numbers of their ensembles."""
         ensemble, at, length = np.array(self.several[kind], np.int64).reshape(-1, 3).T
-        return gathered(content, fields, at, length, 1)[0], ensemble
+        return gathered(content, fields, at.tolist(), length.tolist(), 1)[0], ensemble
 
 
 def find_ensembles(content: bytes | mmap.mmap, progress: Callable[[int], None] = lambda done: None) -> Ensembles:
