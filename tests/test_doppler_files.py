@@ -32,6 +32,7 @@ from hypothesis import strategies as st
 from recordings import close, first, read
 from ruamel.yaml import YAML
 from scipy.io import loadmat
+from scipy.spatial.transform import Rotation
 from wire import sentence
 
 from rovgraph.errors import InputError
@@ -265,12 +266,16 @@ def test_a_signatures_bottom_track_is_the_bottoms_velocity_along_its_beams(tmp_p
     beams = [round(-1e4 * v) for v in toward]  # the bottom comes nearer
     own = [round(-1e4 * v) for v in (forward, starboard, down, down)]
     data = signature_record(UNIX, beams) + signature_record(UNIX + 1, own, system=1)
-    recording = read(
-        data + signature_record(UNIX + 2, beams, heard=False) + signature_record(UNIX + 3, own, 0), tmp_path
-    )
-    np.testing.assert_allclose(velocity(recording)[:2], [[forward, starboard, down]] * 2, atol=2e-4)
-    assert first(recording, "dvl").columns["dvl_valid"].tolist() == [1.0, 1.0, 0.0, 0.0]
-    assert any("ENU" in text for text in recording.warnings)
+    # X is turned by heading 90, lifted by pitch 1 and rolled by -2 deg: those of the record
+    enu = Rotation.from_euler("ZYX", [0.0, -1.0, -2.0], degrees=True).apply([forward, starboard, down])
+    east = [round(-1e4 * v) for v in (*enu, enu[2])]
+    lost = signature_record(UNIX + 2, beams, heard=False) + signature_record(UNIX + 3, own, system=3)
+    recording = read(data + lost + signature_record(UNIX + 4, east, system=0), tmp_path)
+    np.testing.assert_allclose(velocity(recording)[[0, 1, 4]], [[forward, starboard, down]] * 3, atol=2e-4)
+    assert first(recording, "dvl").columns["dvl_valid"].tolist() == [1.0, 1.0, 0.0, 0.0, 1.0]
+    assert [text for text in recording.warnings if "velocities" in text] == [
+        "1 velocities are in unknown coordinates and left out; record beams or XYZ"
+    ]
 
 
 def test_a_nucleus_gives_all_its_sensors(tmp_path):

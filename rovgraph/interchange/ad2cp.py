@@ -28,7 +28,7 @@ from rovgraph.log.beams import BEAMS
 SIGNATURE, DVL_BOTTOM, DVL_WATER = 0x17, 0x1B, 0x1D
 CLOCK = "instrument's clock"
 ZONE_SD_S = 6 * 3600.0  # of a clock whose time zone nobody states
-BEAM, XYZ = 2, 1  # coordinates of a Signature's velocities
+ENU, XYZ, BEAM = range(3)  # coordinates of a Signature's velocities
 BEAM_ANGLE = np.deg2rad(25.0)  # of a Signature, as its own transformation matrix has it
 NO_MERIT = 65535  # figure of merit of a beam that heard nothing
 HAS_VELOCITY, HAS_DISTANCE, HAS_MERIT = 1 << 5, 1 << 8, 1 << 9
@@ -121,13 +121,28 @@ def decoded_signature(content: bytes | mmap.mmap, found: Records) -> tuple[Track
     raw = np.where(heard, parts["velocity"] * 10.0 ** said["scale"][:, None].astype(float), np.nan)
     system = (said["beams"] >> 10) & 3
     velocity = np.where((system == BEAM)[:, None], _of_beams(raw), np.column_stack([raw[:, :2], _either(raw[:, 2:])]))
-    known = (system == BEAM) | (system == XYZ)
+    turned = system == ENU
+    rpy = np.deg2rad(0.01 * np.column_stack([said[name].astype(float) for name in ("roll", "pitch", "heading")]))
+    velocity[turned] = _of_enu(velocity[turned], rpy[turned])
+    known = system <= BEAM
     velocity[~known] = np.nan
     time = _time(said["date"], said["fraction"])
     merit = np.where(heard, 1e-3 * parts["merit"], np.nan)
     distance = np.where(heard, 1e-3 * parts["distance"], np.nan)
     track = Track(time, np.zeros(count), -velocity, empty[:, :3], distance, raw, merit)
     return track, int(np.count_nonzero(~known))
+
+
+def _of_enu(velocity: Array, rpy: Array) -> Array:
+    """X, Y and Z, shape (n, 3), of east, north and up, by roll, pitch and heading of the record.
+
+    Pitch lifts X. Source: Nortek, Coordinate transformations, support FAQ.
+    """
+    (sr, sp, sh), (cr, cp, ch) = np.sin(rpy.T), np.cos(rpy.T)
+    zero = np.zeros(len(rpy))
+    heading = np.array([[sh, -ch, zero], [ch, sh, zero], [zero, zero, zero + 1.0]])
+    tilt = np.array([[cp, -sp * sr, -cr * sp], [zero, cr, -sr], [sp, sr * cp, cp * cr]])
+    return np.asarray(np.einsum("ikn,kjn,ni->nj", heading, tilt, velocity))
 
 
 def _of_beams(beams: Array) -> Array:
@@ -198,7 +213,7 @@ def _left(found: Records, refused: int) -> Iterator[Left]:
     if found.failed:
         yield Left("record", found.failed, "a wrong checksum, or cut off")
     if refused:
-        yield Left("velocity", refused, "coordinates ENU; record beams or XYZ")
+        yield Left("velocity", refused, "unknown coordinates; record beams or XYZ")
 
 
 def _warnings(found: Records, refused: int, channels: list[Channel]) -> Iterator[str]:
@@ -207,7 +222,8 @@ def _warnings(found: Records, refused: int, channels: list[Channel]) -> Iterator
     if found.skipped:
         yield f"{found.skipped} bytes belong to no whole record"
     if refused:
-        yield f"{refused} velocities are in ENU coordinates and left out; record beams or XYZ"
+        yield f"{refused} velocities are in unknown coordinates and left out; record beams or XYZ"
+        return
     dvl = [channel for channel in channels if channel.sensor == "dvl"]
     if not any(np.any(channel.columns["dvl_valid"]) for channel in dvl):
         yield "no bottom track: the instrument did not look for the bottom, or never saw it"
