@@ -485,3 +485,18 @@ def test_fixes_of_a_river_survey_are_those_of_its_sentences(tmp_path):
     assert recording.clocks["DVL's clock"].unix_offset == pytest.approx(28801.46, abs=0.1)
     of_vmdas = first(read_recording(CASES / "vmdas01_part.ENX.gz"), "fix").columns
     close([of_vmdas["fix_lat"][0], of_vmdas["fix_lon"][0]], [48.0805, -123.0440], atol=2e-3)
+
+
+def test_the_ahrs_of_a_nucleus_without_imu_data_is_the_vehicles_attitude(tmp_path):
+    parts = [
+        nucleus_ahrs(UNIX + k, (0.1, -0.05, 1.0), 5.0, declination=3.0)
+        + nucleus_track(UNIX + k, (0.5, 0.0, 0.0))
+        + nucleus_track(UNIX + k, (0.4, 0.0, 0.0), status=0x7FFF if k % 2 else 0, kind=0xBE)
+        for k in range(6)
+    ]
+    recording = read(b"".join(parts), tmp_path)
+    assert sensors(recording) == {"vehicle_heading", "vehicle_tilt", "depth", "dvl", "dvl_altitude", "dvl_water"}
+    close(first(recording, "vehicle_heading").columns["heading"], 1.0 - np.deg2rad(3.0), atol=1e-6)
+    tilt = first(recording, "vehicle_tilt").columns
+    close([tilt["roll"][0], tilt["pitch"][0]], [0.1, -0.05], atol=1e-6)
+    assert [(each.name, each.count) for each in recording.left] == [("water track", 3)]

@@ -88,7 +88,7 @@ class Nucleus:
         stamped = [each.common["flags"] & 1 for each in said.values() if len(each.time)]
         unix = bool(stamped) and all(flags.all() for flags in stamped)
         clock = Clock(POSIX, 0.0, 1.0, "its stamps are Unix time") if unix else Clock(BOOT)
-        channels = tuple(channels_of(said, clock.name))
+        channels = tuple(channels_of(said, clock.name, alone=not len(said[IMU].time)))
         if not channels:
             raise InputError(f"{path}: holds no measurement of a sensor; switch on the IMU, AHRS and bottom track data")
         settings: dict[str, Any] = {}
@@ -99,7 +99,7 @@ class Nucleus:
         more = ["its clock was set meanwhile: stamps are of two clocks"] if mixed else []
         tables = {BEAMS: beam_table(track_of(said[BOTTOM]))} if len(said[BOTTOM].time) else {}
         return Recording(
-            str(path), self.name, channels, {clock.name: clock}, tuple(_left(found)), settings,
+            str(path), self.name, channels, {clock.name: clock}, tuple(_left(found, said)), settings,
             warnings=(*more, *_warnings(found, channels)), tables=tables,
         )  # fmt: skip
 
@@ -136,8 +136,13 @@ def track_of(said: Said) -> Track:
     )
 
 
-def channels_of(said: Mapping[int, Said], clock: str) -> Iterator[Channel]:
-    """Channels of all sensors, by the kinds of records."""
+def channels_of(said: Mapping[int, Said], clock: str, alone: bool = False) -> Iterator[Channel]:
+    """Channels of all sensors, by the kinds of records.
+
+    Parameters
+    ----------
+    alone : there is no IMU, so its attitude is the vehicle's roll, pitch and heading
+    """
 
     def channel(sensor: str, of: Said, source: str, frame: str, **columns: Array) -> Iterator[Channel]:
         if len(of.time):
@@ -154,7 +159,11 @@ def channels_of(said: Mapping[int, Said], clock: str) -> Iterator[Channel]:
     roll, pitch, heading = np.deg2rad(ahrs.values["rpy"].astype(float)).T
     declination = np.deg2rad(np.nan_to_num(ahrs.values["declination"].astype(float)))
     yaw = wrap_angle(heading - declination)
-    yield from channel("ahrs", ahrs, "AHRS", FRAME, ahrs_roll=roll, ahrs_pitch=pitch, ahrs_yaw=yaw)
+    if alone:
+        yield from channel("vehicle_heading", ahrs, "AHRS", FRAME, heading=yaw)
+        yield from channel("vehicle_tilt", ahrs, "AHRS", FRAME, roll=roll, pitch=pitch)
+    else:
+        yield from channel("ahrs", ahrs, "AHRS", FRAME, ahrs_roll=roll, ahrs_pitch=pitch, ahrs_yaw=yaw)
     yield from channel("depth", ahrs, "AHRS", "", depth=ahrs.values["depth"])
     if len(said[BOTTOM].time):
         yield from bottom_channels(track_of(said[BOTTOM]), "bottom track", clock)
@@ -162,7 +171,9 @@ def channels_of(said: Mapping[int, Said], clock: str) -> Iterator[Channel]:
         yield from water_channels(track_of(said[WATER]), "water track", clock)
 
 
-def _left(found: Records) -> Iterator[Left]:
+def _left(found: Records, said: Mapping[int, Said]) -> Iterator[Left]:
+    if len(said[WATER].time) and (invalid := int((~track_of(said[WATER]).valid).sum())):
+        yield Left("water track", invalid, "marked as invalid")
     for kind, at in sorted(found.at.items()):
         if kind not in KINDS:
             yield Left(OTHERS.get(kind, f"record {kind:#04x}"), len(at), "no measurement of a sensor")
@@ -177,6 +188,6 @@ def _warnings(found: Records, channels: tuple[Channel, ...]) -> Iterator[str]:
         yield f"{found.skipped} bytes belong to no whole record"
     sensors = {channel.sensor: channel for channel in channels}
     if "imu" not in sensors:
-        yield "no IMU in the file; switch on its data"
+        yield "no IMU in the file; switch on its data. Roll, pitch and heading are those of its AHRS"
     if "dvl" not in sensors or not np.any(sensors["dvl"].columns["dvl_valid"]):
         yield "no bottom track: the instrument did not look for the bottom, or never saw it"
