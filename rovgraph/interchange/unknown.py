@@ -8,6 +8,13 @@ from rovgraph.config import Config
 
 TRACK = {"time", "north", "east"}
 SUMMARY = "summary.json"
+BEGINNINGS = {  # formats that are known by name and not read
+    b"PK\x03\x04": "is a ZIP archive; unpack it first",
+    b"ULog\x01\x12\x35": "is a PX4 ULog; convert it with ulog2csv (pip install pyulog) and give its tables with columns",
+    b"\x80" * 16: "is a recording of a Rowe DVL or ADCP, which is not read; export it as PD0 with Rowe's software",
+    b"%time,": "is a topic of a ROS bag as text (rostopic echo -p); give the bag itself",
+}
+FOXGLOVE = (b'"topic"', b'"message"', b'"receiveTime"')  # of a message exported as JSON
 
 
 def purpose(path: Path, head: bytes) -> str:
@@ -23,8 +30,11 @@ def purpose(path: Path, head: bytes) -> str:
                 f"is a results folder; rovgraph evaluate {path / 'trajectory_smoothed.csv'} REFERENCE reads its track"
             )
         return ""
-    if head.startswith(b"PK\x03\x04"):
-        return "is a ZIP archive; unpack it first"
+    for beginning, what in BEGINNINGS.items():
+        if head.startswith(beginning):
+            return what
+    if all(word in head for word in FOXGLOVE):
+        return "is an export of Foxglove as JSON; give the bag or MCAP file that it comes from"
     text = head.decode("utf-8", errors="replace")
     lines = text.splitlines()
     header = {name.strip() for name in next(csv.reader(lines[:1]), [])}
