@@ -13,10 +13,12 @@ from rovgraph.config import Config, beliefs, parse_config
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
 from rovgraph.engine.lasting import LASTING
 from rovgraph.errors import InputError
+from rovgraph.estimators import optimum as optimum_module
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, transpose
+from rovgraph.simulate import scenario
 from rovgraph.simulate.path import Style
 from rovgraph.state import POSE, VELOCITY, State
 
@@ -137,6 +139,34 @@ def test_what_a_dive_shows_is_estimated_and_the_rest_is_considered():
     assert arm.estimated and abs(arm.value - 0.15) < 4.0 * arm.sd + 0.02
     assert not scale.estimated and (scale.verdict, scale.sd) == ("considered", scale.prior_sd)
     assert estimate.summary["considered"] == ["dvl_scale"]
+
+
+TILTED = 5.0  # deg, 2.5 sds
+
+
+def tilted(pitch_deg: float) -> tuple[Simulated, Config]:
+    """A fast dive with a good gyro whose DVL is tilted by more than its gate allows for."""
+    considered = {"dvl_pitch": {"estimate": "considered", "sd_deg": 2.0}}
+    config, path = falcon(calibration=considered, imu={"noise": {"gyr": 2e-5}}), scenario("lawnmower", 60.0, 1.5)
+    case = simulated(config, 60.0, 1, path, dvl_rate=2.0, calibration={"dvl_pitch": np.deg2rad(pitch_deg)})
+    return case, started(case)
+
+
+def test_a_tilt_within_its_prior_is_estimated_though_it_has_all_pings_rejected_where_it_is_held():
+    case, config = tilted(TILTED)
+    best = batch(case.log, config).optimum()
+    assert best.solution.gates["dvl"].mean() > 0.98 and "dvl_pitch" in best.unknowns.estimated
+    sd = np.sqrt(best.covariances("dvl_pitch")[-1, 0, 0])
+    assert abs(best.state.calibration["dvl_pitch"][0] - np.deg2rad(TILTED)) < 4.0 * sd
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(optimum_module, "_contradicted", lambda best: False)
+        assert batch(case.log, config).optimum().solution.gates["dvl"].mean() < 0.8
+
+
+def test_a_tilt_far_beyond_its_prior_is_not():
+    """A mounting that is named wrongly is no mounting that is known badly: alarms say so."""
+    case, config = tilted(12.0)
+    assert "dvl_pitch" in batch(case.log, config).optimum().unknowns.considered
 
 
 def test_a_silent_dvl_leaves_its_constants_out_of_what_follows():

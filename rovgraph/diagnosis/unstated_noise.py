@@ -115,7 +115,11 @@ def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> 
 
 def _named_elsewhere(alarms: Sequence[Alarm]) -> bool:
     """Whether alarms name another cause, of which late stamps of a sensor that stands alone are a rival only."""
-    return any(a.kind in NAMED and not (a.kind == "held" and a.sensor in ALONE) for a in alarms)
+    return any(
+        (a.kind in NAMED and not (a.kind == "held" and a.sensor in ALONE))
+        or (a.kind == "bias drift" and a.severity == "wrong")
+        for a in alarms
+    )
 
 
 def _place(best: ChainOptimum, alarms: Sequence[Alarm]) -> DvlPlace | None:

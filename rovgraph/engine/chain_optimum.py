@@ -294,6 +294,7 @@ def smooth_chain(
     calibration: Mapping[str, Array] | None = None,
     rows: DiveRows | None = None,
     searches: Searches | None = None,
+    freed: bool = False,
 ) -> ChainOptimum:
     """Solve a dive that closes no loop.
 
@@ -304,6 +305,7 @@ def smooth_chain(
     calibration : to begin with, its prior means where it is None
     rows : the dive as arrays, where they are at hand
     searches : of other solutions of the dive, as configured the same
+    freed : what is considered is estimated
 
     Raises
     ------
@@ -311,8 +313,8 @@ def smooth_chain(
     """
     beliefs, rows = initial.beliefs, rows or DiveRows.of(intervals, [*initial.instruments])
     wanted = unknowns(beliefs, rows.used)
-    chain = Chain(intervals, initial, beliefs, wanted, rows)
-    held = [name for name in wanted.considered if not beliefs[name].variable.time_offset]
-    freed = partial(widened, chain, names=tuple(held)) if held else None
-    solution = solve(chain, chain.start(states, calibration), freed, window, searches, gauss_newton.REST)
+    chain = Chain(intervals, initial, beliefs, wanted.estimating(wanted.considered) if freed else wanted, rows)
+    held = [name for name in chain.unknowns.considered if not beliefs[name].variable.time_offset]
+    free = partial(widened, chain, names=tuple(held)) if held else None
+    solution = solve(chain, chain.start(states, calibration), free, window, searches, gauss_newton.REST)
     return ChainOptimum(chain, solution).rested()

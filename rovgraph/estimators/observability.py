@@ -119,13 +119,17 @@ def shown(best: Optimum) -> list[str]:
     """What is considered and the dive shows, so that it is better estimated."""
     if not best.unknowns.considered:
         return []
-    limit = dict.fromkeys(SPURIOUSLY_OBSERVABLE, DOUBTFUL_ABOVE)
-    if "fix" in best.blocks:
-        limit["dvl_scale"] = OBSERVABLE_BELOW  # fixes show it, which noise does not feign
     relative = best.relative_sd()
     if ARM in relative and noise_moves_arm(best, relative[ARM] * best.beliefs[ARM].sd):
         del relative[ARM]
-    return [name for name, ratio in relative.items() if (ratio < limit.get(name, OBSERVABLE_BELOW)).all()]
+    return [name for name, ratio in relative.items() if (ratio < shown_below(best, name)).all()]
+
+
+def shown_below(best: Optimum, name: str) -> float:
+    """The sd of a constant, as a part of the prior's, below which a dive shows it: less where noise may feign it."""
+    if name == "dvl_scale" and "fix" in best.blocks:  # which noise does not feign
+        return OBSERVABLE_BELOW
+    return DOUBTFUL_ABOVE if name in SPURIOUSLY_OBSERVABLE else OBSERVABLE_BELOW
 
 
 def spuriously_observable(unknowns: Unknowns, claimed: Mapping[str, Array], relative: Mapping[str, Array]) -> list[str]:
