@@ -41,11 +41,13 @@ from wire import (
 from rovgraph.config import Config
 from rovgraph.errors import InputError
 from rovgraph.live.feed import Feed
+from rovgraph.live.files import Known
 from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.sources import Source, links, open_source, open_sources
 from rovgraph.live.sources.json_lines import json_lines
 from rovgraph.live.sources.lines import LONGEST
 from rovgraph.live.sources.links import StandardInput
+from rovgraph.live.sources.mavlink import MavlinkDecoder, Options
 from rovgraph.live.sources.nmea import nmea
 from rovgraph.live.sources.preferred import PATIENCE_S
 from rovgraph.live.sources.source import LinkSource, paced
@@ -624,13 +626,46 @@ def test_attitude_is_turned_from_true_to_magnetic_north(heard):
 
 
 def test_depth_is_from_the_first_pressure_or_from_the_surface_that_is_given(heard):
-    config = Config.model_validate({"environment": {"gravity_mps2": 9.82}})
-    ten_metres = 1025.0 * 9.82 * 10.0 / 100.0
-    first = decoded(autopilot(heard, config), packed(pressure2(hpa=1000.0)), packed(pressure2(hpa=1000.0 + ten_metres)))
+    ten_metres = 1000.0 * 9.80665 * 10.0 / 100.0
+    first = decoded(autopilot(heard), packed(pressure2(hpa=1000.0)), packed(pressure2(hpa=1000.0 + ten_metres)))
     np.testing.assert_allclose(by_sensor(first)["depth"], [[0.0], [10.0]], atol=1e-4)
     assert heard.kinds == {"surface": 1}
-    given = decoded(autopilot(heard, config, surface=900.0, density=1000.0), packed(pressure2(hpa=900.0 + ten_metres)))
-    np.testing.assert_allclose(by_sensor(given)["depth"], [[10.25]], atol=1e-4)
+    given = decoded(autopilot(heard, surface=900.0, density=1025.0), packed(pressure2(hpa=900.0 + ten_metres)))
+    np.testing.assert_allclose(by_sensor(given)["depth"], [[10.0 / 1.025]], atol=1e-4)
+
+
+def parameter(name: str, value: float):
+    return mavlink.MAVLink_param_value_message(name.encode(), value, 9, 1, 0)
+
+
+def test_depth_is_by_the_parameters_that_the_autopilot_tells_as_from_a_recording(heard):
+    told = [packed(parameter("BARO2_GND_PRESS", 99_000.0)), packed(parameter("BARO_SPEC_GRAV", 1.025))]
+    said = decoded(autopilot(heard), *told, packed(pressure2(hpa=990.0 + 1025.0 * 9.80665 * 0.1)))
+    np.testing.assert_allclose(by_sensor(said)["depth"], [[10.0]], atol=1e-4)
+
+
+def test_a_pressure_that_no_air_has_is_no_surface(heard):
+    said = decoded(autopilot(heard), packed(pressure2(hpa=1818.0)))
+    np.testing.assert_allclose(by_sensor(said)["depth"], [[100.0 * (1818.0 - 1013.25) / 9806.65]], atol=1e-4)
+    assert heard.kinds == {"surface": 1}
+
+
+def test_a_resumed_run_goes_on_with_the_surface_of_before(heard, tmp_path):
+    known = Known(tmp_path, False, Warnings())
+    decoded(MavlinkDecoder("m", heard, Config(), Options(), known), packed(pressure2(hpa=1000.0)))
+    again = Known(tmp_path, True, Warnings())
+    under_water = packed(pressure2(hpa=1000.0 + 98.0665))
+    said = decoded(MavlinkDecoder("m", heard, Config(), Options(), again), under_water)
+    np.testing.assert_allclose(by_sensor(said)["depth"], [[1.0]], atol=1e-4)
+    assert heard.kinds == {"surface": 1}
+    (tmp_path / "sources.json").write_text("{", encoding="utf-8")
+    assert Known(tmp_path, True, Warnings()) == {}
+
+
+def test_an_imu_that_is_sent_twice_a_second_is_said_to_be_too_slow(heard):
+    messages = [packed(raw_imu(usec=round(5e5 * k) + 1)) for k in range(30)]
+    decoded(autopilot(heard), *messages)
+    assert heard.kinds == {"slow": 1}
 
 
 def test_only_the_pressure_sensor_that_was_asked_for_is_read(heard):

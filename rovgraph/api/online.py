@@ -14,7 +14,7 @@ from rovgraph.config import Config, Mag, config_or_defaults, with_priors_stated
 from rovgraph.errors import InputError, as_path, as_texts
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.feed import Feed
-from rovgraph.live.files import Files
+from rovgraph.live.files import Files, Known
 from rovgraph.live.marks import Marks
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs import Output, open_output
@@ -183,7 +183,7 @@ class Online:
             )
         config = self.config or (settings_of(folder) if resume and folder is not None else Config())
         warnings = Warnings(on_warning)
-        opened = open_sources(sources, warnings, config, speed)
+        opened = open_sources(sources, warnings, config, speed, Known(folder, resume, warnings))
         if resume and any(source.pace == 1.0 for source in opened):
             raise InputError("--resume cannot continue a replay at speed 1; add --speed max")
         feed = Feed(opened, warnings)

@@ -42,13 +42,22 @@ def depth_of(instance: int, pressure: Array, parameters: Mapping[str, float], la
     -------
     depth, ndarray, shape (n,) [m]; what it rests on, for people; whether that is the autopilot's own word
     """
-    names = [f"BARO{instance + 1}_GND_PRESS", *(["BARO_GND_PRESS"] if instance == 0 else [])]
-    stated = next((parameters[name] for name in names if name in parameters), None)
-    surface, found, good = surface_pressure(stated, pressure)
-    density = FRESH * parameters.get("BARO_SPEC_GRAV", 1.0)
+    surface, found, good = surface_of(instance, pressure, parameters)
+    density = density_of(parameters)
     water = f"water of {density:.0f} kg/m3" + ("" if "BARO_SPEC_GRAV" in parameters else " for want of BARO_SPEC_GRAV")
     said = f"{label}: surface pressure {surface / 100.0:.1f} hPa ({found}), {water}"
     return depth(pressure, surface, density), said, good and "BARO_SPEC_GRAV" in parameters
+
+
+def surface_of(instance: int, pressure: Array, parameters: Mapping[str, float]) -> tuple[float, str, bool]:
+    """Pressure at the surface [Pa], as `rovgraph.interchange.pressure.surface_pressure`; arguments of `depth_of`."""
+    names = [f"BARO{instance + 1}_GND_PRESS", *(["BARO_GND_PRESS"] if instance == 0 else [])]
+    return surface_pressure(next((parameters[name] for name in names if name in parameters), None), pressure)
+
+
+def density_of(parameters: Mapping[str, float]) -> float:
+    """Of the water, as an autopilot's parameters state it; else fresh [kg/m3]."""
+    return FRESH * parameters.get("BARO_SPEC_GRAV", 1.0)
 
 
 def thrusters(outputs: Mapping[int, Array], parameters: Mapping[str, float]) -> dict[str, Array]:

@@ -13,6 +13,7 @@ from rovgraph.interchange.fixes import RANGE_SD_M
 
 IMUS = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")  # best first
 PRESSURES = ("SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3")  # by instance
+SLOW = "raise the stream rate of RAW_IMU (SRn_RAW_SENS), or use the autopilot's own log (.BIN)"
 MILLI_G = 9.80665e-3  # [m/s2]
 MICROTESLA = {"milligauss": 0.1, "gauss": 100.0}
 UNIX_USEC = 1e15  # times above this, in microseconds, are since 1970, those below since the start

@@ -22,7 +22,7 @@ from rovgraph.interchange.ardupilot import (
 )
 from rovgraph.interchange.fixes import ONE_POINT, new_fixes, one_point
 from rovgraph.interchange.formats import Options
-from rovgraph.interchange.mavlink import PRESSURES, UNIX_USEC
+from rovgraph.interchange.mavlink import PRESSURES, SLOW, UNIX_USEC
 from rovgraph.interchange.mavlink_rows import OF_PARAMETERS, Gatherer, Rows, Sender
 from rovgraph.interchange.rates import SLOWEST_HZ, rate_hz, too_slow
 from rovgraph.interchange.receiver import ReceiverClock, longest_boot, receiver_clock
@@ -79,11 +79,10 @@ def recording(path: Path, format_: str, gatherer: Gatherer, receiver: str, optio
 
 
 def _imu_warnings(imu: Channel | None) -> list[str]:
-    remedy = "raise the stream rate of RAW_IMU (SRn_RAW_SENS), or use the autopilot's own log (.BIN)"
     if imu is None:
         return ["no IMU in the file; record RAW_IMU, or use the autopilot's own log (.BIN)"]
     measured = computed(np.isfinite, imu.columns["acc_x"])
-    return too_slow(taken(imu.columns["time"], measured), imu.source.partition(":")[0], remedy)
+    return too_slow(taken(imu.columns["time"], measured), imu.source.partition(":")[0], SLOW)
 
 
 class _Vehicle:

@@ -1,7 +1,6 @@
 """MAVLink, live: what an autopilot tells of its sensors; `rovgraph.interchange.mavlink` reads the messages."""
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,13 +8,17 @@ import numpy as np
 
 from rovgraph.config import Config
 from rovgraph.geometry import wrap_angle
-from rovgraph.interchange.mavlink import IMUS, PRESSURES, READERS, UNIX_USEC, usec
+from rovgraph.interchange.ardupilot import density_of, surface_of
+from rovgraph.interchange.mavlink import IMUS, PRESSURES, READERS, SLOW, UNIX_USEC, usec
 from rovgraph.interchange.mavlink_frames import Frames, dialect
+from rovgraph.interchange.pressure import depth
+from rovgraph.interchange.rates import too_slow
 from rovgraph.live.message import GEODETIC, Message, Reading
 from rovgraph.live.sources.preferred import Preferred
 from rovgraph.live.sources.source import Chunk, Notify
 
 VEHICLE_COMPONENT = 1
+ENOUGH = 20  # samples of an IMU that tell its rate
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,8 @@ class Options:
     system, component : whose messages are read; system None = the first one heard
     imu : one of `IMUS`, None = the best one heard
     pressure : 1 to 3, the sensor of SCALED_PRESSURE, SCALED_PRESSURE2, SCALED_PRESSURE3
-    surface : pressure at depth 0 [hPa], None = the first one heard
-    density : of the water [kg/m3]
+    surface : pressure at depth 0 [hPa], None = as the autopilot states it, or the first one heard
+    density : of the water [kg/m3], None = as the autopilot states it, or fresh
     """
 
     system: int | None = None
@@ -36,7 +39,7 @@ class Options:
     imu: str | None = None
     pressure: int = 2
     surface: float | None = None
-    density: float = 1025.0
+    density: float | None = None
 
 
 class MavlinkDecoder:
@@ -46,22 +49,31 @@ class MavlinkDecoder:
     ----------
     url : of the source
     notify : takes warnings
-    config : for declination and gravity
+    config : for the declination
     options : of the URL
+    known : source and quantity -> what a run that is resumed has found out: the pressure at the surface
 
     Raises
     ------
     InputError : pymavlink is not installed
     """
 
-    def __init__(self, url: str, notify: Notify, config: Config, options: Options) -> None:
+    def __init__(
+        self,
+        url: str,
+        notify: Notify,
+        config: Config,
+        options: Options,
+        known: MutableMapping[str, float] | None = None,
+    ) -> None:
         self._url = url
         self._notify = notify
         self._options = options
         self._frames = Frames(dialect(), notify)
         self._system = options.system
-        self._surface = options.surface
-        self._density_gravity = options.density * config.environment.gravity_mps2
+        self._known: MutableMapping[str, float] = {} if known is None else known
+        self._parameters: dict[str, float] = {}
+        self._samples: list[float] = []  # when the first ones were made [s]
         self._declination = np.deg2rad(config.environment.declination_deg)
         self._imus = Preferred(IMUS if options.imu is None else (options.imu,), notify)
         self._fix_time: int | None = None
@@ -71,6 +83,7 @@ class MavlinkDecoder:
             PRESSURES[options.pressure - 1]: self._pressure,
             "GPS_RAW_INT": self._fix,
             "VISION_POSITION_DELTA": self._velocity,
+            "PARAM_VALUE": self._parameter,
         }
 
     def feed(self, chunk: Chunk) -> Iterator[Message]:
@@ -114,6 +127,11 @@ class MavlinkDecoder:
         found = [Reading(sensor, np.array(values)) for sensor, values in READERS[kind](message)]
         if not any(r.sensor == "imu" for r in found) or not self._imus.takes(kind, arrival):
             return None
+        if len(self._samples) < ENOUGH:
+            self._samples.append(1e-6 * usec(message) or arrival)
+            if len(self._samples) == ENOUGH:
+                for text in too_slow(np.array(self._samples), kind, SLOW):
+                    self._notify("slow", text, once=True)
         return self._said_usec(arrival, usec(message), *found)
 
     def _attitude(self, message: Any, arrival: float) -> Message | None:
@@ -121,12 +139,25 @@ class MavlinkDecoder:
         magnetic = float(wrap_angle(yaw - self._declination))  # from true to magnetic north, as a compass has it
         return self._said_usec(arrival, usec(message), Reading("ahrs", np.array([magnetic, roll, pitch])))
 
+    def _parameter(self, message: Any, arrival: float) -> None:
+        """Of the autopilot, which tells them to whoever asks for them."""
+        name = message.param_id
+        self._parameters[name.rstrip("\0") if isinstance(name, str) else name.decode("ascii", "replace")] = float(
+            message.param_value
+        )
+
     def _pressure(self, message: Any, arrival: float) -> Message | None:
-        if self._surface is None and math.isfinite(message.press_abs):
-            self._surface = message.press_abs
-            self._notify("surface", f"the first pressure, {message.press_abs:.1f} hPa, is taken as that at the surface")
-        depth = 100.0 * (message.press_abs - (self._surface or math.nan)) / self._density_gravity
-        return self._said_usec(arrival, usec(message), Reading("depth", np.array([depth])))
+        pascal, key = np.array([100.0 * message.press_abs]), f"{self._url}: surface [Pa]"
+        parameters, stated = self._parameters, self._options.surface
+        if stated is not None:
+            self._known[key] = 100.0 * stated
+        elif key not in self._known and np.isfinite(pascal[0]):
+            surface, said, _ = surface_of(self._options.pressure - 1, pascal, parameters)
+            self._known[key] = surface
+            self._notify("surface", f"{surface / 100.0:.1f} hPa is taken as the pressure at the surface ({said})")
+        density = density_of(parameters) if self._options.density is None else self._options.density
+        below = float(depth(pascal, self._known.get(key, np.nan), density)[0])
+        return self._said_usec(arrival, usec(message), Reading("depth", np.array([below])))
 
     def _fix(self, message: Any, arrival: float) -> Message | None:
         found = READERS["GPS_RAW_INT"](message)

@@ -1,7 +1,7 @@
 """From a URL to a source."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,8 @@ from rovgraph.log.units import nearest
 
 MAVLINK_BAUD, NMEA_BAUD, DOPPLER_BAUD = 115200, 4800, 115200
 DEVICES = ("/dev/", "COM")
-Opener = Callable[[Address, Notify, Config, float], Source]
+Known = MutableMapping[str, float]  # what a source has found out and a run that is resumed goes on with
+Opener = Callable[[Address, Notify, Config, float, Known], Source]
 FORMS = {
     "-": "-",
     "tcp": "tcp://host:port",
@@ -47,6 +48,7 @@ def open_sources(
     warnings: Warnings | None = None,
     config: Config | None = None,
     speed: str = "1",
+    known: Known | None = None,
 ) -> tuple[Source, ...]:
     """Sources of URLs; see `open_source`.
 
@@ -62,7 +64,7 @@ def open_sources(
         if urls.count(url) > 1:
             raise InputError(f"{url}: given twice; each source can be read once")
     warnings = warnings or Warnings()
-    opened = tuple(open_source(url, warnings, config, speed) for url in urls)
+    opened = tuple(open_source(url, warnings, config, speed, known) for url in urls)
     logs = [source for source in opened if isinstance(source, LogReplay)]
     refuse_other_epochs(logs)
     begin = min((log.span[0] for log in logs), default=None)
@@ -74,6 +76,7 @@ def open_source(
     warnings: Warnings | None = None,
     config: Config | None = None,
     speed: str = "1",
+    known: Known | None = None,
 ) -> Source:
     """The source of a URL; docs/online-sources.md says which there are.
 
@@ -83,6 +86,7 @@ def open_source(
     warnings : where those of the source go
     config : for columns, units, declination and gravity
     speed : of files, a number or "max"; their option ``speed`` goes before it
+    known : what sources have found out, such as the pressure at the surface; they add to it
 
     Raises
     ------
@@ -95,7 +99,7 @@ def open_source(
     if opener is None:
         raise _unknown(address)
     notify = partial((warnings or Warnings()).complain, url)
-    return opener(address, notify, config or Config(), pace_of(speed))
+    return opener(address, notify, config or Config(), pace_of(speed), {} if known is None else known)
 
 
 def pace_of(speed: str) -> float:
@@ -136,17 +140,17 @@ def _unknown(address: Address) -> InputError:
     return InputError(f"{address.url}: unknown kind of source; did you mean {meant}? {known}")
 
 
-def _standard_input(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+def _standard_input(address: Address, notify: Notify, config: Config, pace: float, known: Known) -> Source:
     address.take({})
     return LinkSource(address.url, StandardInput(), json_lines(address.url, notify, config))
 
 
-def _network(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+def _network(address: Address, notify: Notify, config: Config, pace: float, known: Known) -> Source:
     address.take({})
     return _networked(address, notify, json_lines(address.url, notify, config), end=b"\n")
 
 
-def _waterlinked(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+def _waterlinked(address: Address, notify: Notify, config: Config, pace: float, known: Known) -> Source:
     address.take({})
     link = TcpLink(*address.host_port(default_port=waterlinked.PORT), notify)
     return LinkSource(address.url, link, waterlinked.waterlinked(address.url, notify))
@@ -155,7 +159,7 @@ def _waterlinked(address: Address, notify: Notify, config: Config, pace: float) 
 def _doppler(make: Callable[[str, Notify], Decoder], end: bytes = b"") -> Opener:
     """Opener of a Doppler instrument at a TCP or UDP port, or a serial one."""
 
-    def opener(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+    def opener(address: Address, notify: Notify, config: Config, pace: float, known: Known) -> Source:
         inner, decoder = address.inner(), make(address.url, notify)
         if inner.scheme in ("tcp", "udp"):
             address.take({})
@@ -169,12 +173,12 @@ def _doppler(make: Callable[[str, Notify], Decoder], end: bytes = b"") -> Opener
     return opener
 
 
-def _file(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+def _file(address: Address, notify: Notify, config: Config, pace: float, known: Known) -> Source:
     pace = address.take({"speed": _pace}).get("speed", pace)
     return log_replay(address.url, address.place.removeprefix("//"), config, pace)
 
 
-def _nmea(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+def _nmea(address: Address, notify: Notify, config: Config, pace: float, known: Known) -> Source:
     inner = address.inner()
     if inner.scheme in ("tcp", "udp"):
         address.take({})
@@ -188,7 +192,7 @@ def _nmea(address: Address, notify: Notify, config: Config, pace: float) -> Sour
     return LinkSource(address.url, FileLink(path), nmea(address.url, notify, config, recorded=True), pace=pace)
 
 
-def _mavlink(address: Address, notify: Notify, config: Config, pace: float) -> Source:
+def _mavlink(address: Address, notify: Notify, config: Config, pace: float, known: Known) -> Source:
     inner = address.inner()
     recorded = address.place.lower().endswith((".tlog", ".tlog.gz"))
     serial = _is_device(address.place)
@@ -201,7 +205,7 @@ def _mavlink(address: Address, notify: Notify, config: Config, pace: float) -> S
         _MAVLINK_OPTIONS | ({"speed": _pace} if recorded else {}) | ({"baud": _baud} if serial else {})
     )
     pace, baud = options.pop("speed", pace), options.pop("baud", MAVLINK_BAUD)
-    decoder = MavlinkDecoder(address.url, notify, config, Options(**options))
+    decoder = MavlinkDecoder(address.url, notify, config, Options(**options), known)
     if recorded:
         return LinkSource(address.url, TelemetryLog(_existing(address)), decoder, pace=pace)
     if serial:
