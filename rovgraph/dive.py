@@ -212,7 +212,7 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
             give_back()
     intervals = batch.intervals if best is None else best.intervals
     left_out = _left_out(batch, known.frozen, known.gaps)
-    revealed = [(one.sensor, one.cause) for one in known.found]
+    revealed = [(one.sensor, one.cause) for one in reversed(known.found)]  # what moves the track most: errors that last
     seen = known.frozen, log, known.gaps, left_out, known.findings, revealed, known.before, known.rivals
     numbers = statistics(Evidence(initial, estimates, intervals, best, *seen))
     if any(one.kind == "rivals" and one.severity for one in numbers) and best is not None:

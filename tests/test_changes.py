@@ -8,6 +8,7 @@ import pytest
 from dives import Simulated, altered, batch, changed, falcon, kept, simulated, true_at, without
 
 from rovgraph.calibration import LAYOUT
+from rovgraph.check import examine
 from rovgraph.config import mount_matrix
 from rovgraph.dive import _covering, smooth
 from rovgraph.engine.filter import FilterEngine
@@ -165,3 +166,13 @@ def test_the_sd_covers_where_rivals_put_the_track(case):
     more = wide.trajectory.cov_p - estimate.trajectory.cov_p
     np.testing.assert_allclose(more[:, :2, :2], np.broadcast_to([[9.0, -12.0], [-12.0, 16.0]], (len(more), 2, 2)))
     assert not more[:, 2].any() and not more[:, :, 2].any()
+
+
+def test_a_bed_that_moves_is_no_turned_dvl_to_the_check(case):
+    """A turn explains fixes down to their noise, a bottom that moves leaves a multiple of it."""
+    moving = examine(over_a_moving_bed(case, (0.2, -0.25)), case.config)
+    (found,) = [f for f in moving.at("warning") if f.sensor == "dvl"]
+    assert found.kind == "contradiction" and "the bottom moves, or the fixes wander" in found.text
+    turned = changed(case.config, dvl={"mount_rpy_deg": [180, 0, 90]})
+    (found,) = [f for f in examine(case.log, turned).at("warning") if f.kind == "turned"]
+    assert "turned by -4" in found.text or "turned by +4" in found.text

@@ -32,6 +32,13 @@ LAG_WARNING = 0.5  # [s]
 SURE = 5.0  # standard deviations
 EVIDENCE = 40.0  # in chi-square
 CLIPPED = 4.0  # times the median residual, which counts no more
+STRETCHED = 0.1  # logarithm of a scale that no turn leaves
+MIRRORED = 3.0  # times less error, that a mirrored axis leaves
+LIKE = 0.9  # agreement, below which fixes and track go different ways where noise is not the reason
+UNEXPLAINED, CLOSELY = (
+    1.6,
+    0.995,
+)  # of the fixes' variance, left by what is no cause; agreement that is one all the same
 Complexes = NDArray[np.complex128]
 
 
@@ -89,14 +96,17 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             "correct the columns of the fixes",
             "swapped",
         )
-    elif _better(unlike, as_is) and unlike.agreement > 0.6:
+    elif _better(unlike, as_is, MIRRORED) and unlike.agreement > 0.6 and plane.explained(unlike):
         yield Finding("dvl", "warning", _mirrored_text(config, as_is.agreement, unlike.agreement), "axes")
     elif as_is.agreement < 0.6:
         if as_is.error > EVIDENCE + 2.0 * plane.count:
             text = f"velocities do not fit the fixes (agreement {as_is.agreement:.2f}); check mounting and heading"
             yield Finding("dvl", "warning", text, "contradiction")
     else:
-        yield _turned(config, {sensor, *heading_sources(config, log.sensors)}, as_is, unlike)
+        turned = _turned(config, {sensor, *heading_sources(config, log.sensors)}, as_is, unlike)
+        stretched = turned.level != "ok" and abs(np.log(abs(as_is.c))) > STRETCHED
+        apart = not plane.explained(as_is) and (stretched or as_is.agreement < LIKE)
+        yield _contradicted(as_is) if apart else turned
         if late:
             sense = "late" if lag > 0.0 else "early"
             text = f"fixes come {abs(lag):.1f} s {sense} relative to the DVL's track (sd {lag_sd:.1f} s)"
@@ -106,9 +116,9 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             yield Finding("fix", "warning", f"{text}: {remedy}", "lag")
 
 
-def _better(one: _Line, other: _Line) -> bool:
+def _better(one: _Line, other: _Line, times: float = 1.5) -> bool:
     """Whether it explains the fixes beyond chance, and beyond what a drift of the track may do."""
-    return one.error + EVIDENCE < other.error and one.error * 1.5 < other.error
+    return one.error + EVIDENCE < other.error and one.error * times < other.error
 
 
 def _believed(config: Config, compasses: Collection[str]) -> float:
@@ -119,6 +129,16 @@ def _believed(config: Config, compasses: Collection[str]) -> float:
         dip = DEFAULT_DIP if config.environment.dip_deg is None else np.deg2rad(config.environment.dip_deg)
         sds.append(priors["hard_iron"].sd / max(np.cos(dip), 0.1))
     return BELIEVED_SDS * math.hypot(*sds)
+
+
+def _contradicted(as_is: _Line) -> Finding:
+    """What neither a turn nor a scale explains."""
+    turn = round(np.rad2deg(np.angle(as_is.c))) + 0
+    text = (
+        f"its track and the fixes do not show the same motion: turned by {turn:+d} deg and scaled by "
+        f"{abs(as_is.c):.2f} it still misses them; the bottom moves, or the fixes wander"
+    )
+    return Finding("dvl", "warning", text, "contradiction")
 
 
 def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Line) -> Finding:
@@ -152,6 +172,10 @@ class _Plane:
     @property
     def count(self) -> int:
         return int(self.inside.sum())
+
+    def explained(self, line: _Line) -> bool:
+        """Whether what a fit leaves of the fixes is about their noise, or next to nothing."""
+        return line.error < UNEXPLAINED * self.count or line.agreement > CLOSELY
 
     @property
     def spread(self) -> float:

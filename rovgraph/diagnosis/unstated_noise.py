@@ -26,7 +26,7 @@ from rovgraph.diagnosis.dvl_place import DvlPlace, other_place
 from rovgraph.diagnosis.residuals import SD_KEY
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.initial_conditions import Beliefs
-from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting
+from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting, rejects_much
 from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.widened_chain import lasting_belief
@@ -90,7 +90,7 @@ def find_noise(
     """
     place = _place(best, alarms)
     found = [_placed(best, place)] if place is not None and place.size > likely else []
-    if found or _named_elsewhere(alarms):
+    if found or _named_elsewhere(alarms, best):
         return found, []
     return [larger for sensor in best.blocks if (larger := _larger(best, sensor, config)) is not None], []
 
@@ -100,7 +100,7 @@ def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> 
 
     Parameters are those of `find_noise`.
     """
-    if _named_elsewhere(alarms):
+    if _named_elsewhere(alarms, best):
         return [], []
     late = {alarm.sensor: alarm.figure for alarm in alarms if alarm.kind == "held" and alarm.sensor in ALONE}
     stated = [name for name in LASTING if getattr(config.calibration, name).estimate != AUTO]
@@ -113,13 +113,19 @@ def find_errors(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> 
     return [_lasting(best, error) for error in clear], rivals if clear else []
 
 
-def _named_elsewhere(alarms: Sequence[Alarm]) -> bool:
-    """Whether alarms name another cause, of which late stamps of a sensor that stands alone are a rival only."""
-    return any(
-        (a.kind in NAMED and not (a.kind == "held" and a.sensor in ALONE))
-        or (a.kind == "bias drift" and a.severity == "wrong")
-        for a in alarms
-    )
+def _named_elsewhere(alarms: Sequence[Alarm], best: ChainOptimum) -> bool:
+    """Whether alarms name another cause, of which late stamps of a sensor that stands alone are a rival only.
+
+    Where much is rejected the estimate is bent, and what it holds seems to be off.
+    """
+    bent = rejects_much(best.solution.gates)
+    for alarm in alarms:
+        if alarm.kind == "held":
+            if alarm.sensor not in ALONE and not (bent and alarm.severity == "doubtful"):
+                return True
+        elif alarm.kind in NAMED or (alarm.kind == "bias drift" and alarm.severity == "wrong"):
+            return True
+    return False
 
 
 def _place(best: ChainOptimum, alarms: Sequence[Alarm]) -> DvlPlace | None:

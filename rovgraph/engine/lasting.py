@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from rovgraph.calibration import TABLE
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.gauss_newton import Solution
+from rovgraph.engine.gauss_newton import Gates, Solution
 from rovgraph.engine.linear_constants import LinearConstants
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.rate_noise import ARM, noise_moves_arm
@@ -136,7 +136,7 @@ def find_lasting(best: ChainOptimum, without: Collection[str] = ()) -> tuple[lis
         passed |= {c.variable for c in candidates if _implausible(now.chain, c)}  # they have another cause
         candidates = sorted((c for c in candidates if c.variable not in passed), key=lambda c: c.gain, reverse=True)
         fits = [*(_fit(now, one) for one in candidates), *(_with_steps(now, one) for one in steps)]
-        fits += _reopened(now, passed) if now.rejects else []
+        fits += _reopened(now, passed) if rejects_much(now.solution.gates) else []
         clear = _clearest([one for one in fits if one[0].gain >= CLEAR])
         if not clear:
             break
@@ -168,11 +168,6 @@ class _Baseline:
     def of(best: ChainOptimum) -> "_Baseline":
         """A dive as it was solved."""
         return _Baseline(best.chain, replace(best.solution, point=best.linearised_at), *best.linear)
-
-    @property
-    def rejects(self) -> bool:
-        """Whether much of a sensor is rejected: what would let it in again, residuals and gates do not show."""
-        return any(gate.mean() < 1.0 - MUCH for gate in self.solution.gates.values() if len(gate))
 
     @property
     def minus_log_likelihood(self) -> float:
@@ -211,6 +206,11 @@ class _Baseline:
         for time, step in steps:
             values[self.chain.rows.time >= time] += step
         return self.reopened(wider, replace(begin, calibration={**begin.calibration, name: values}))
+
+
+def rejects_much(gates: Gates) -> bool:
+    """Whether much of a sensor is rejected: what would let it in again, residuals and gates do not show."""
+    return any(gate.mean() < 1.0 - MUCH for gate in gates.values() if len(gate))
 
 
 def _clearest(fits: list[tuple[LastingError, _Baseline]]) -> list[tuple[LastingError, _Baseline]]:
