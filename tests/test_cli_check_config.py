@@ -118,7 +118,6 @@ HOSTILE = {
     "time set back": (HEADER + b"9" + ROW + ROW, "line 3: time goes back from 91.000 to 1.000 s"),
     "nothing known": (b"time,a,b\n1,2,3\n", "no measurement of any sensor"),
     "everything empty": (HEADER + b"1,,,,,,,\n", "no measurement of any sensor"),
-    "semicolons": (HEADER.replace(b",", b";") + ROW.replace(b",", b";"), "semicolons"),
     "gzip cut off": (gzip.compress(HEADER + ROW * 99)[:-9], "gzip"),
     "parquet cut off": (b"PAR1" + bytes(50), "damaged Parquet"),
     "gyro in deg/s": (

@@ -13,7 +13,7 @@ from test_api import SHIPPED, command
 
 import rovgraph as rg
 from rovgraph.interchange.guessing.names import meaning
-from rovgraph.log.table import read_table
+from rovgraph.tables import read_table
 
 G, DEG = 9.80665, float(np.rad2deg(1.0))
 XYZ = ("x", "y", "z")
@@ -299,7 +299,6 @@ BAD = {
     "no time": (b"acc_x,acc_y,acc_z\n0,0,9.8\n0,0,9.8\n", "no column that can be the time"),
     "dates": (b"time,depth\n2024-01-01T00:00:00,1\n2024-01-01T00:00:01,2\n", "no column that can be the time"),
     "binary": (b"\x00\x01\x02\x03" * 50, "binary data"),
-    "semicolons": (b"time;depth\n0;1\n1;2\n", "separated by semicolons"),
     "twice": (b"time,a,a\n0,1,2\n1,1,2\n", "twice"),
     "native": (b"$GPGGA,120000.00,4142.0,N,00230.0,E,4,10,1.0,0.0,M,0.0,M,,*6A\n" * 9, "convert it without a guess"),
     "configuration": (b"columns: {time: t}\n", "configuration"),

@@ -13,8 +13,8 @@ from rovgraph.interchange.guessing.imu import POINTS_UP
 from rovgraph.interchange.guessing.table import guess_table
 from rovgraph.interchange.own_log import FORMAT as OWN_LOG
 from rovgraph.interchange.unknown import purpose
-from rovgraph.log.table import read_table
 from rovgraph.log.units import groups, quantities
+from rovgraph.tables import read_table
 
 
 @dataclass(frozen=True)

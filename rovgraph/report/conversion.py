@@ -20,8 +20,8 @@ from rovgraph.fast_csv import write_csv, write_sparse_csv
 from rovgraph.geometry import Array
 from rovgraph.interchange.guessing.groups import ColumnGuess
 from rovgraph.log.rows import Part, column_names, frame_of, pieces, whole
-from rovgraph.log.table import SUFFIXES
 from rovgraph.progress import Progress, no_progress
+from rovgraph.tables import SUFFIXES
 
 PIECE = 8192  # rows of a sensor that are written at a time
 DIGITS = 10  # significant, of a cell: latitudes to a centimetre

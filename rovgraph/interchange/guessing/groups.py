@@ -11,8 +11,8 @@ from rovgraph.geometry import Array
 from rovgraph.interchange.guessing.names import Meaning, meaning
 from rovgraph.interchange.guessing.physics import Signal, Sureness, UnitGuess
 from rovgraph.log.streams import is_optional
-from rovgraph.log.table import Table
 from rovgraph.log.units import quantities
+from rovgraph.tables import Table
 
 VECTORS = {
     "acc": ("acc_x", "acc_y", "acc_z"),

@@ -25,8 +25,8 @@ from rovgraph.interchange.guessing.groups import (
 from rovgraph.interchange.guessing.imu import guess_imu
 from rovgraph.interchange.guessing.names import OWN_NAME, Meaning
 from rovgraph.interchange.guessing.physics import UnitGuess
-from rovgraph.log.table import Table
 from rovgraph.log.units import UNITS
+from rovgraph.tables import Table
 
 IN_ORDER = 0.99  # of stamps that are not before the row above
 EVEN = 0.2  # spread of gravity's magnitude over its median
