@@ -165,17 +165,17 @@ def seconds_of_day_and_time(
         days = texts.str.partition(" ")[0] if is_text(day) else texts  # Excel writes 01.05.2026 00:00
         both = (days + " " + clock).where((clock != "") & (days != ""), "")
         return seconds_of_texts(both, rules, where)
-    days, seconds = (pd.to_numeric(each, errors="coerce").to_numpy(float) for each in (day, time))
-    known = np.isfinite(days) & np.isfinite(seconds)
+    count, seconds = (pd.to_numeric(each, errors="coerce").to_numpy(float) for each in (day, time))
+    known = np.isfinite(count) & np.isfinite(seconds)
     if not known.any():
         return None
-    low, high = days[known].min(), days[known].max()
+    low, high = count[known].min(), count[known].max()
     if low >= 1000.0 and high <= 4000.0 and seconds[known].min() >= 0.0 and seconds[known].max() < 604_801.0:
         return np.where(
-            known, unix_of_gps(np.nan_to_num(days), np.nan_to_num(seconds)), np.nan
+            known, unix_of_gps(np.nan_to_num(count), np.nan_to_num(seconds)), np.nan
         ), "GPS weeks and seconds"
     if low > 36525.0 and high < 60000.0 and seconds[known].min() >= 0.0 and seconds[known].max() < 1.0:
-        return unix_of_epoch(days + seconds, "excel"), _PROGRAMS["excel"]
+        return unix_of_epoch(count + seconds, "excel"), _PROGRAMS["excel"]
     return None
 
 
@@ -211,8 +211,10 @@ def _seconds_of_day(parts: pd.DataFrame) -> Array:
 def _time_of_day(of_day: Array, rules: DateRules) -> tuple[Array, str]:
     out = np.full(len(of_day), np.nan)
     known = np.isfinite(of_day)
-    steps = np.diff(of_day[known], prepend=of_day[known][:1])
-    days = np.cumsum(steps < -0.5 * DAY_S) - np.cumsum(steps > 0.5 * DAY_S)  # rows around midnight may be out of order
+    steps: Array = np.diff(of_day[known], prepend=of_day[known][:1])
+    days: Array = np.cumsum(steps < -0.5 * DAY_S) - np.cumsum(
+        steps > 0.5 * DAY_S
+    )  # rows around midnight may be out of order
     out[known] = of_day[known] + DAY_S * days
     if rules.date is None:
         return out, "times of day without a date, as seconds since midnight"
@@ -237,7 +239,8 @@ def _order(
     if (parts["sep"][rows] == ".").all():  # nobody writes the month first with points
         return "dmy"
     first, second = (parts[name][rows].astype(int).to_numpy() for name in "ab")
-    fits: list[Order] = [o for o, months in (("dmy", second), ("mdy", first)) if (months <= 12).all()]
+    orders: tuple[tuple[Order, Any], ...] = (("dmy", second), ("mdy", first))
+    fits = [order for order, months in orders if (months <= 12).all()]
     if len(fits) == 2 and (first != second).any():
         fits = _that_go_on(parts[rows], of_day[rows.to_numpy()], fits)
     if len(fits) == 2 and (first != second).any():
@@ -260,7 +263,7 @@ def _that_go_on(parts: pd.DataFrame, of_day: Array, fits: list[Order]) -> list[O
 
 
 def _iso_days(parts: pd.DataFrame, order: Order | None) -> "pd.Series[Any]":
-    year, month, day = {None: "abc", "dmy": "cba", "mdy": "cab"}[order]
+    year, month, day = {None: ("a", "b", "c"), "dmy": ("c", "b", "a"), "mdy": ("c", "a", "b")}[order]
     years = parts[year].where(parts[year].str.len() != 2, "20" + parts[year])
     return years + "-" + parts[month].str.zfill(2) + "-" + parts[day].str.zfill(2)
 

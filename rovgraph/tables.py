@@ -445,7 +445,7 @@ def _csv(content: bytes, source: str) -> Table:
     return Table(source, frame, kept.astype(np.int64) + layout.first, layout.decimal, tuple(said))
 
 
-def _parsed(body: io.BytesIO, names: Sequence[str], layout: Layout, source: str) -> pd.DataFrame:
+def _parsed(body: io.BytesIO, names: list[str], layout: Layout, source: str) -> pd.DataFrame:
     try:
         return pd.read_csv(
             body,

@@ -220,10 +220,11 @@ def test_a_depth_that_contradicts_the_dvl_is_unsure(tmp_path):
     assert {each.sureness for each in guess.columns if each.field in (*DVL, "depth")} == {"unsure"}
 
 
-def test_a_heading_that_counts_anticlockwise_is_left(frame, tmp_path):
+def test_a_heading_that_counts_anticlockwise_is_unsure(frame, tmp_path):
     names = {n: n for n in ("time", *ACC, *GYR)} | {"dvl_heading": "odometer yaw"}
     guess = rg.guess_columns(written(renamed(frame, names, {"dvl_heading": -1.0}), tmp_path))
-    assert "anticlockwise" in guess.left["odometer yaw"]
+    (yaw,) = [each for each in guess.columns if each.column == "odometer yaw"]
+    assert yaw.sureness == "unsure" and "anticlockwise" in yaw.why
     assert guess.units["gyr"] == "rad/s"
 
 

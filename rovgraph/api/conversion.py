@@ -195,21 +195,20 @@ def settings_of_files(files: Sequence[Path], config: Config) -> list[FileSetting
     """
     for pattern in config.files:
         if not any(fits(path, pattern) for path in files):
-            names = ", ".join(path.name for path in files)
-            raise InputError(f"files: {pattern!r} fits none of the files ({names}); correct or remove it")
+            given = ", ".join(path.name for path in files)
+            raise InputError(f"files: {pattern!r} fits none of the files ({given}); correct or remove it")
     settings = [config.of_file(path) for path in files]
     if len(files) == 1 and not config.files:
         return settings  # its reader names what it lacks
     names = [None if head.startswith(b"PAR1") else set(names_of(head)) for head in map(head_of, files)]
-    for stated, of in [(config.columns, files), *((own.columns, [p for p in files if fits(p, pattern)])
-                       for pattern, own in config.files.items())]:  # fmt: skip
-        for target, source in stated.items():
-            if not any(own is None or source in own for path, own in zip(files, names, strict=True) if path in of):
-                known = [name for own in names for name in own or ()]
-                raise InputError(
-                    f"columns: {target}: none of {', '.join(p.name for p in of)} has a column {source!r}, "
-                    f"nearest is {nearest(source, known)!r}"
-                )
+    stated = [("", config.columns), *((pattern, own.columns) for pattern, own in config.files.items())]
+    for pattern, columns in stated:
+        theirs = {path: own for path, own in zip(files, names, strict=True) if not pattern or fits(path, pattern)}
+        for target, source in columns.items():
+            if not any(own is None or source in own for own in theirs.values()):
+                near = nearest(source, [name for own in theirs.values() for name in own or ()])
+                where = ", ".join(path.name for path in theirs)
+                raise InputError(f"columns: {target}: no column {source!r} in {where}, nearest is {near!r}")
     return [
         one if own is None else one.model_copy(update={"columns": {t: s for t, s in one.columns.items() if s in own}})
         for one, own in zip(settings, names, strict=True)

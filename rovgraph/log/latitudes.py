@@ -44,7 +44,8 @@ def valid_positions(lat: Array, lon: Array, line: NDArray[np.int64], source: str
     unset = known & (lat == 0.0) & (lon == 0.0)
     if unset.any():
         warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0 are invalid and left out")
-    none = (_placeholders(lat) | _placeholders(lon)) & beyond
+    none = np.zeros(len(lat), dtype=bool)
+    none[beyond] = is_placeholder(lat[beyond]) | is_placeholder(lon[beyond])
     none |= known & (lon == 181.0) & (np.abs(lon - np.nanmedian(np.where(none | unset, np.nan, lon))) > APART_DEG)
     if not (known & ~none & ~beyond).any() and len(np.unique(lat[none])) > 1:
         none &= False  # numbers of all fixes that look like it are positions in another unit
@@ -95,7 +96,7 @@ def unit_of(lat: Array, lon: Array) -> str:
     return ""
 
 
-def _placeholders(values: Array) -> NDArray[np.bool_]:
-    """Which are numbers that stand for "unknown", such as 91, 181, 999 or 214.7483647."""
+def is_placeholder(values: Array) -> NDArray[np.bool_]:
+    """Which of some numbers, shape (n,), stand for "unknown", such as 91, 181, 999 or 214.7483647."""
     known = np.unique(values[np.isfinite(values)])
     return np.isin(values, [v for v in known.tolist() if _PLACEHOLDER.fullmatch(f"{v:.10g}")])

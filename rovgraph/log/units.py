@@ -41,7 +41,7 @@ FORMS: dict[str, tuple[str, ...]] = {"latitude": ("ddmm",), "time": tuple(EPOCHS
 # how a heading counts -> sense, and heading of its zero [rad]; "enu" and "nwu" are of axes forward, port, up
 ANGLES = {"ned": (1.0, 0.0), "enu": (-1.0, 0.5 * np.pi), "nwu": (-1.0, 0.0), "east": (1.0, 0.5 * np.pi)}
 # group -> roll, pitch, yaw; how far roll is turned by axes that point up: an IMU's stay as they are, a mounting follows
-_ATTITUDES = {
+_ATTITUDES: dict[str, tuple[tuple[str, str, str], float]] = {
     "ahrs": (("ahrs_roll", "ahrs_pitch", "ahrs_yaw"), np.pi),
     "attitude": (("roll", "pitch", "heading"), 0.0),
     "dvl_heading": (("", "", "dvl_heading"), 0.0),
@@ -119,12 +119,13 @@ class Scale:
         """The same, converted: a number, or ndarray of any shape."""
         if self.form == "ddmm":
             degrees = np.trunc(np.asarray(values) / 100.0)
-            converted = degrees + (np.asarray(values) - 100.0 * degrees) / 60.0
+            minutes = np.asarray(values) - 100.0 * degrees
+            converted = np.where(np.abs(minutes) < 60.0, degrees + minutes / 60.0, np.nan)  # or it is a placeholder
         elif self.form:
             converted = unix_of_epoch(np.asarray(values), self.form)
         else:  # most are in SI: a copy would cost as much as they hold
             return values if self.factor == 1.0 else values * self.factor
-        return float(converted) if isinstance(values, float) else converted  # type: ignore[return-value]
+        return float(converted) if isinstance(values, float) else converted
 
 
 def scales(units: Mapping[str, str], source: str) -> dict[str, Scale]:
@@ -181,7 +182,7 @@ def turn_angles(cells: MutableMapping[str, _Values], angles: Mapping[str, str], 
     ------
     InputError : an unknown column or group, with the nearest known one
     """
-    yaws = {names[2]: group for group, (names, _) in _ATTITUDES.items()}
+    yaws: dict[str, str] = {names[2]: group for group, (names, _) in _ATTITUDES.items()}
     for key, kind in angles.items():
         if key not in _ATTITUDES and key not in yaws:
             near = nearest(key, [*_ATTITUDES, *yaws])
@@ -199,7 +200,7 @@ def turn_angles(cells: MutableMapping[str, _Values], angles: Mapping[str, str], 
 
 def _wrapped(angle: _Values) -> _Values:
     turned = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
-    return float(turned) if isinstance(angle, float) else turned  # type: ignore[return-value]
+    return float(turned) if isinstance(angle, float) else turned
 
 
 def near_miss(name: str, present: Container[str]) -> str | None:

@@ -193,9 +193,11 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
 
 
-def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str]) -> Table:
-    """What each column of a table may be."""
-    table = _table("columns of the file", "column", "field", "unit", "why", "how sure")
+def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str], name: str = "") -> Table:
+    """What each column of a table may be; ``name`` tells its file from others."""
+    table = _table(
+        f"columns of {name}" if name else "columns of the file", "column", "field", "unit", "why", "how sure"
+    )
     for each in columns:
         table.add_row(_printable(each.column), each.field, each.unit, _printable(each.why), each.sureness)
     for column, why in left.items():

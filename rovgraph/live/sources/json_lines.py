@@ -4,6 +4,8 @@ What a configuration says of a log's names and units holds for them too, so that
 log, written as JSON lines, say what the log says.
 """
 
+import math
+
 import numpy as np
 import pandas as pd
 
@@ -17,6 +19,7 @@ from rovgraph.live.message import GEODETIC, Message, readings
 from rovgraph.live.sources.lines import LineDecoder
 from rovgraph.live.sources.source import Notify
 from rovgraph.live.sources.waterlinked import report_message
+from rovgraph.log.latitudes import is_placeholder
 from rovgraph.log.reading import ACC_GAP
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, THRUSTER, is_column, label_number
 from rovgraph.log.units import Scale, near_miss, scales, turn_angles
@@ -100,6 +103,8 @@ class JsonRow:
                 cells[name] = label_number(str(value))  # 7.5 is a name, as it is in a log
             else:
                 cells[name] = self._scale.get(name, _AS_IT_IS)(json_number(key, value))
+                if not math.isfinite(cells[name]):  # a placeholder
+                    del cells[name]
         turn_angles(cells, self._angles, self._url)
         return cells
 
@@ -163,6 +168,10 @@ def _check(cells: dict[str, float]) -> None:
         if cells.get(name, 1.0) <= 0.0:  # as many instruments say that they do not know
             del cells[name]
     lat, lon = (cells.get(name, 0.0) for name in LAT_LON)
+    beyond = abs(lat) > 90.0 or abs(lon) > 360.0
+    if beyond and is_placeholder(np.array([lat, lon])).any():  # of a receiver without a fix
+        cells |= dict.fromkeys(LAT_LON, 0.0)
+        lat = lon = 0.0
     if abs(lat) > 90.0 or abs(lon) > 360.0:
         raise Refused("out of range", f"latitude {lat:g}, longitude {lon:g}, expected degrees; the line is skipped")
     if all(cells.get(name) == 0.0 for name in LAT_LON):  # how a receiver without a fix says so
