@@ -592,7 +592,8 @@ def _place_of_more(text: bytes, names: Sequence[str], odd: _Odd, layout: Layout,
     rows = [line for k, line in enumerate(_lines(text), 1) if layout.first <= k and odd.line - 2 < k < odd.line + 2]
     if odd.line == layout.first:
         empty = b"(?:%s *){%d}" % (re.escape(layout.separator.encode()), more)
-        if not all(re.search(empty + rb"$", line) for line in _lines(text) if line.strip() and line.count(b",")):
+        below = (line for k, line in enumerate(_lines(text), 1) if k >= layout.first and line.strip())
+        if not all(re.search(empty + rb"$", line) for line in below):
             raise wrong
         return len(names), more
     before, after = (_cells(line, layout.separator) for line in rows[:2])
