@@ -19,6 +19,7 @@ from rovgraph.gps_time import unix_of_gps
 Order = Literal["dmy", "mdy"]
 
 DAY_S = 86400.0
+WHOLE_S = 1.0  # step of stamps, from which on digits are missing [s]
 FEW_DIGITS = 20  # measurements, of which a third share a stamp with another
 # epoch of a program's numbers -> day of 1970 in it, and seconds of its unit
 EPOCHS = {"excel": (25569.0, DAY_S), "matlab": (719529.0, DAY_S), "labview": (2_082_844_800.0, 1.0)}
@@ -188,7 +189,8 @@ def few_digits(time: Array) -> str:
         return f"all {len(time)} stamps are {stamps[0]:g}"
     step = float(np.diff(stamps).min())
     power = 10.0 ** round(np.log10(step))
-    if abs(step - power) > 1e-3 * power or abs(stamps / power - np.round(stamps / power)).max() > 1e-3:
+    whole = np.abs(stamps / power - np.round(stamps / power)).max() < 1e-3 and abs(step - power) < 1e-3 * power
+    if power < WHOLE_S or not whole:
         return ""
     return f"{len(time)} measurements have {len(stamps)} stamps, in steps of {power:g} s"
 

@@ -584,7 +584,7 @@ def _place_of_more(text: bytes, names: Sequence[str], odd: _Odd, layout: Layout,
     """
     wrong = InputError(
         f"{source}: line {odd.line} has {odd.cells} cells, expected {len(names)} as in the header; "
-        "repair or delete that line" + ("" if odd.alike == 1 else ", or name every column")
+        + _cause(odd, len(names), layout)
     )
     more = odd.cells - len(names)
     if more < 0 or odd.alike < 2 or odd.alike < WIDE_ROWS * (odd.alike + odd.others) or odd.others > 1:
@@ -605,6 +605,15 @@ def _place_of_more(text: bytes, names: Sequence[str], odd: _Odd, layout: Layout,
     if likeness.count(best) > 1 or best < 0.8 * len(names):
         raise wrong
     return likeness.index(best), more
+
+
+def _cause(odd: _Odd, width: int, layout: Layout) -> str:
+    """What to do about rows that are not as long as the header."""
+    if odd.alike == 1:
+        return "repair or delete that line"
+    if layout.separator == "," and not odd.others and odd.cells >= 2 * width - 1:
+        return "decimal commas between commas? Write the table with semicolons"
+    return "repair these lines, or name every column in the header"
 
 
 def _alike(one: str, other: str) -> float:

@@ -263,7 +263,7 @@ def test_json_lines_turn_angles_and_units_as_tables_do():
     config = rg.Config().changed(angles={"ahrs": "enu"}, units={"fix": "ddmm", "ahrs": "deg"})
     line = b'{"time": 1, "ahrs_roll": 0, "ahrs_pitch": 10, "ahrs_yaw": 30, "fix_lat": 4330, "fix_lon": 1009}\n'
     (message,) = decoded(json_lines("-", Heard(), config), line)
-    values = {r.sensor: r.values for r in message.readings}
+    values = dict(message.readings)
     np.testing.assert_allclose(values["ahrs"], np.deg2rad([60.0, 180.0, -10.0]))
 
 

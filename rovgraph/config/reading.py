@@ -184,7 +184,7 @@ def yaml_text(data: dict[str, Any]) -> str:
 
 def fits(path: Path, pattern: str) -> bool:
     """Whether a pattern of `Config.files` names a file, by its name or by the end of its path."""
-    return path.match(pattern)
+    return path.name == pattern or path.match(pattern)
 
 
 def mount_matrix(rpy_deg: Triple) -> Array:

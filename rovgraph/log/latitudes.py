@@ -19,6 +19,7 @@ FEW = 0.1  # of the fixes, that are out of range one by one
 APART_DEG = 1.0  # from the others, of a longitude that only looks like a placeholder
 COLLAPSED_M = 0.1  # span, to which no unit may shrink fixes that differ
 _PLACEHOLDER = re.compile(r"-?(9\d?\.?9*|9+|91|181|214\.748364[78]|2147483647|2147483648)(\.0*)?")
+WHOLE = 1e-3  # of 1e-7 degrees, as which a number is whole
 _TOLD = 6  # digits
 
 
@@ -90,7 +91,7 @@ def unit_of(lat: Array, lon: Array) -> str:
     factor = UNITS["latitude"]["degE7"]
     span = max(float(np.ptp(lat)), float(np.ptp(lon)))
     shrunk = 0.0 < span * factor * EARTH_M < COLLAPSED_M
-    whole = bool((lat == np.round(lat)).all() and (lon == np.round(lon)).all())
+    whole = all(bool((np.abs(each - np.round(each)) < WHOLE).all()) for each in (lat, lon))
     if size_lat.max() * factor <= 90.0 and size_lon.max() * factor <= 360.0 and whole and not shrunk:
         return "degE7"
     return ""

@@ -116,6 +116,8 @@ def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array
     scale |= scales(stated, table.source)
     day = names.pop(DATE, None)
     times, how = table.times(names["time"], settings.times.rules, day, in_seconds="time" in scale)
+    if how:  # of dates, which have no unit
+        scale.pop("time", None)
     table.warn_how(how, f"units by the header ({', '.join(dict.fromkeys(stated.values()))})" if stated else "")
     cells = {"time": _finite(table, "time", times)}
     cells |= {name: numbers(table, name, source) for name, source in names.items() if name != "time"}
@@ -153,9 +155,8 @@ def map_columns(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
         if source not in table.names:
             near = nearest(source, table.names)
             raise InputError(f"{table.source}: columns: {target}: the log has no {source!r}, nearest is {near!r}")
-    plain = {name: name_and_bracket(name)[0] for name in table.names}
-    names = {plain[name]: name for name in table.names if is_column(plain[name]) or plain[name] == DATE}
-    names |= {name: name for name in table.names if is_column(name)} | dict(columns)
+    names = {plain: name for name in table.names for plain, unit in [name_and_bracket(name)] if _is_known(plain, unit)}
+    names |= {name: name for name in table.names if is_column(name) or name == DATE} | dict(columns)
     if "time" not in names:
         near = nearest("time", table.names)
         raise InputError(
@@ -169,6 +170,11 @@ def map_columns(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
         if meant:
             warn(f"{table.source}: column {name!r} is ignored; if it is {meant}, rename it or map it under columns")
     return names
+
+
+def _is_known(name: str, unit: str) -> bool:
+    """Whether a column that states a unit in brackets is one of a log, in a unit that is known."""
+    return name in quantities() and known_unit(quantities()[name], unit) is not None
 
 
 def numbers(table: Table, name: str, source: str) -> Array:

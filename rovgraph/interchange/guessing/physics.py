@@ -206,7 +206,7 @@ def latitudes_by_range(lat: Array, lon: Array, stated: str) -> UnitGuess:
         return UnitGuess(stated, "stated", "sure") if fits_stated else UnitGuess(stated, "out of range", "unsure")
     if fits == ["deg", "rad"]:
         return UnitGuess("deg", "degrees or radians, both are in range", "unsure")
-    if most_lat > 90.0 or most_lon > 360.0:
+    if not fits:
         unit = unit_of(lat, lon)
         if unit in ("", "exchanged"):
             why = "latitude and longitude are exchanged" if unit else "out of range in any unit"
