@@ -19,6 +19,7 @@ from rovgraph.gps_time import unix_of_gps
 Order = Literal["dmy", "mdy"]
 
 DAY_S = 86400.0
+YEAR_FIRST = "write the year first, such as 2026-05-01 09:30"  # where nobody can state an order
 WHOLE_S = 1.0  # step of stamps, from which on digits are missing [s]
 FEW_DIGITS = 20  # measurements, of which a third share a stamp with another
 # epoch of a program's numbers -> day of 1970 in it, and seconds of its unit
@@ -43,11 +44,13 @@ class DateRules:
     order : of day and month; None = as the dates themselves show
     zone_h : hours ahead of UTC of dates without a zone [h]
     date : day of times of day, YYYY-MM-DD; None = not known
+    remedy : what to do about a date that may mean two days
     """
 
     order: Order | None = None
     zone_h: float = 0.0
     date: str | None = None
+    remedy: str = "state times: {order: dmy} (day first) or times: {order: mdy} (month first)"
 
 
 def is_text(cells: "pd.Series[Any]") -> bool:
@@ -248,10 +251,7 @@ def _order(
     if len(fits) == 2 and (first != second).any():
         k = int(np.flatnonzero(rows.to_numpy())[np.argmax(first != second)])
         days = [pd.to_datetime(_iso_days(parts.iloc[[k]], o).iloc[0]).strftime("%-d %B %Y") for o in fits]
-        raise InputError(
-            f"{where(k)}: {texts.iloc[k]!r} may be {days[0]} or {days[1]}; "
-            "state times: {order: dmy} (day first) or times: {order: mdy} (month first)"
-        )
+        raise InputError(f"{where(k)}: {texts.iloc[k]!r} may be {days[0]} or {days[1]}; {rules.remedy}")
     return fits[0] if fits else "dmy"  # which names the date that is none
 
 

@@ -267,7 +267,7 @@ def layout_of(text: bytes) -> Layout:
     units = _units(lines[1:3], names, separator, decimal)
     if units:
         names = [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, units, strict=True)]
-        said.append(f"line {first + 1} taken for units")
+        said.append(f"with units in line {first + 1}")
     return Layout(tuple(names), separator, decimal, first + (2 if units else 1), tuple(said))
 
 
@@ -421,10 +421,10 @@ def _csv(content: bytes, source: str) -> Table:
     at, more = (0, 0) if wide is None else _place_of_more(text, names, wide, layout, source)
     if wide is not None and more:
         before = f"before {names[at]!r}" if at < len(names) else "behind the others"
-        said.append(f"{_count(more, 'column')} without a name {before} from line {wide.line} on, left out")
+        said.append(f"without {_count(more, 'column')} that no name stands for, {before} from line {wide.line} on")
     nameless = [k for k, name in enumerate(names) if not name]
     if len(nameless) > 1:
-        said.append(f"{len(nameless)} columns without a name left out")
+        said.append(f"without {len(nameless)} columns that have no name")
     if not filled.any():
         return Table(source, pd.DataFrame(columns=names), np.empty(0, dtype=np.int64))
     plain = [name or f"\0{k}" for k, name in enumerate(names)] if len(nameless) > 1 else names

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rovgraph import tables
-from rovgraph.dates import DateRules
+from rovgraph.dates import YEAR_FIRST, DateRules
 from rovgraph.errors import InputError, as_path, warn
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
@@ -254,7 +254,7 @@ def read_table(path: Path | str) -> pd.DataFrame:
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing, a trajectory has time, north, east")
     wanted = [*COLUMNS, *(c + "_sd" for c in COLUMNS[1:]), "cov_north_east"]
-    time, how = table.times("time", DateRules())
+    time, how = table.times("time", DateRules(remedy=YEAR_FIRST))
     table.warn_how(how)
     values = {c: time if c == "time" else table.numbers(c) for c in wanted if c in table.names}
     return pd.DataFrame({c: np.where(np.isfinite(column), column, np.nan) for c, column in values.items()})

@@ -109,16 +109,18 @@ CASES = {
         table(depth=100 * TRUTH["depth"]).replace("depth,", "depth [cm],"), r"units by the header \(cm\)"
     ),
     "units in the second line": Case(
-        with_units(table(depth=100 * TRUTH["depth"])), r"line 2 taken for units; units by the header \(s, cm, deg\)"
+        with_units(table(depth=100 * TRUTH["depth"])), r"with units in line 2; units by the header \(s, cm, deg\)"
     ),
     "units of the configuration": Case(
         table(depth=100 * TRUTH["depth"]).replace("depth,", "depth [mm],"), config="units: {depth: cm}"
     ),
-    "empty columns": Case(table().replace("\n", ",,\n"), "2 columns without a name left out"),
+    "empty columns": Case(table().replace("\n", ",,\n"), "without 2 columns that have no name"),
     "separators at the ends of rows": Case(
         table().replace("\n", ",\n").replace("lon,\n", "lon\n"), "behind the others"
     ),
-    "more columns later on": Case(wider_from(9, table()), "2 columns without a name before 'fix_lat' from line 10 on"),
+    "more columns later on": Case(
+        wider_from(9, table()), "without 2 columns that no name stands for, before 'fix_lat' from line 10 on"
+    ),
     "one row with more cells": Case(table().replace("\n", ",7\n", 3).replace("lon,7", "lon"), "has 5 cells", True),
     # times
     "ISO 8601": Case(table(time=stamps("%Y-%m-%dT%H:%M:%S.%fZ")), "column time as dates"),
@@ -297,6 +299,13 @@ def test_tag_reads_the_times_of_a_table_as_a_log_does(tmp_path):
             pd.DataFrame({"taken": list(times)}), Track("dive", "smoothed", track, (54.3, 10.15)), "taken"
         )
         assert tagged.frame["rov_north"].iloc[10] == pytest.approx(2.5, abs=0.01)
+
+
+def test_a_reference_or_a_tag_that_may_be_of_two_days_is_refused_with_what_to_write(tmp_path):
+    text = "time,north,east\n05/01/2026 09:30:00,0,0\n05/01/2026 09:30:01,1,0\n"
+    (tmp_path / "reference.csv").write_text(text)
+    with pytest.raises(InputError, match="may be 5 January 2026 or 1 May 2026; write the year first, such as 2026-"):
+        rg.read_reference(tmp_path / "reference.csv")
 
 
 # several tables

@@ -88,7 +88,9 @@ def tag(
     photos = out.with_name(f"{out.stem}_photos")
     if exif is not None and photos.exists() and not force:
         raise InputError(f"{photos} exists; choose another --out or give --force")
-    frame = read_cells(table).frame
+    cells = read_cells(table)
+    cells.warn_how()
+    frame = cells.frame
     track = track_of(results, estimate)
     try:
         files = None if exif is None else [table.parent / name for name in column_of(frame, exif)]

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rovgraph.dates import DateRules, is_text, seconds_of_numbers, seconds_of_texts
+from rovgraph.dates import YEAR_FIRST, DateRules, is_text, seconds_of_numbers, seconds_of_texts
 from rovgraph.errors import InputError, in_one_line
 from rovgraph.export.points import point_table
 from rovgraph.export.track import Track
@@ -104,11 +104,11 @@ def _columns(track: Track) -> pd.DataFrame:
 
 
 def _seconds(times: pd.Series, track: Track) -> Array:
-    if not pd.api.types.is_datetime64_any_dtype(times) and not is_text(times):
-        numbers = pd.to_numeric(times.replace(r"^\s*$", None, regex=True), errors="coerce").to_numpy(float)
-        return seconds_of_numbers(numbers)[0]
+    numbers = times if times.dtype.kind in "biufM" else times.astype("string").str.replace(",", ".", regex=False)
+    if numbers.dtype.kind != "M" and not is_text(numbers):  # some with decimal commas
+        return seconds_of_numbers(pd.to_numeric(numbers, errors="coerce").to_numpy(float, na_value=np.nan))[0]
     day = pd.Timestamp(float(track.trajectory.time[0]), unit="s") if track.has_utc else None
-    rules = DateRules(date=None if day is None else day.strftime("%Y-%m-%d"))  # of times of day
+    rules = DateRules(date=None if day is None else day.strftime("%Y-%m-%d"), remedy=YEAR_FIRST)  # of times of day
     texts = times.map(str, na_action="ignore")
     time, _ = seconds_of_texts(texts, rules, lambda row: f"column {times.name}: row {row + 1}")
     if texts.notna().any() and not track.has_utc:

@@ -14,7 +14,7 @@ from rich.table import Table
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from rovgraph.config import Config
+from rovgraph.config import AS_WRITTEN, Config
 from rovgraph.errors import InputError
 from rovgraph.fast_csv import write_csv, write_sparse_csv
 from rovgraph.geometry import Array
@@ -99,7 +99,7 @@ def starter(
     name : of the log's file
     """
     settings: dict[str, Any] = config.model_dump(mode="json", exclude_unset=True)
-    settings = {key: value for key, value in settings.items() if key not in ("columns", "units")}
+    settings = {key: value for key, value in settings.items() if key not in AS_WRITTEN}
     sources = dict(sources)
     if origin is not None and not config.environment.origin:
         section = settings.setdefault("environment", {})
