@@ -199,7 +199,8 @@ def few_digits(time: Array) -> str:
 
 
 def _unix(dates: "pd.Series[Any]") -> Array:
-    return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), dtype=float)
+    since = dates.dt.as_unit("us") - pd.Timestamp(0, tz="UTC").as_unit("us")  # nanoseconds reach 2262 alone
+    return np.asarray(since.dt.total_seconds(), dtype=float)
 
 
 def _seconds_of_day(parts: pd.DataFrame) -> Array:
