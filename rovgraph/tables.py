@@ -123,9 +123,10 @@ class Table:
             return f"{self.source}: line {self.line[row]}, column {name}"
 
         found = None if day is None else seconds_of_day_and_time(self.frame[day], cells, rules, where)
-        if found is None and _no_numbers(cells) == "dates":  # of a data frame or Parquet
+        held = _no_numbers(cells)
+        if found is None and held == "dates":  # of a data frame or Parquet
             found = seconds_of_texts(cells.map(str, na_action="ignore"), rules, where)
-        if found is None and is_text(cells if self.decimal == "." else _with_points(cells)):
+        if found is None and not held and is_text(cells if self.decimal == "." else _with_points(cells)):
             found = seconds_of_texts(cells, rules, where)
         if found is None:
             values = self.numbers(name)

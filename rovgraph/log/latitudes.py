@@ -18,7 +18,7 @@ EARTH_M = 111e3  # of a degree of latitude [m]
 FEW = 0.1  # of the fixes, that are out of range one by one
 APART_DEG = 1.0  # from the others, of a longitude that only looks like a placeholder
 COLLAPSED_M = 0.1  # span, to which no unit may shrink fixes that differ
-_PLACEHOLDER = re.compile(r"-?(9\d?\.?9*|9+|91|181|214\.748364[78]|2147483647|2147483648)(\.0*)?")
+_PLACEHOLDER = re.compile(r"-?(9+(\.9+)?|91|181|214\.748364[78]|2147483647|2147483648)(\.0*)?")
 WHOLE = 1e-3  # of 1e-7 degrees, as which a number is whole
 _TOLD = 6  # digits
 
