@@ -298,7 +298,6 @@ BAD = {
     "no header": (b"0.0,1.0,2.0\n0.1,1.0,2.0\n", "line 1 holds numbers"),
     "no rows": (b"time,acc_x\n", "no rows below"),
     "no time": (b"acc_x,acc_y,acc_z\n0,0,9.8\n0,0,9.8\n", "no column that can be the time"),
-    "dates": (b"time,depth\n2024-01-01T00:00:00,1\n2024-01-01T00:00:01,2\n", "no column that can be the time"),
     "binary": (b"\x00\x01\x02\x03" * 50, "binary data"),
     "twice": (b"time,a,a\n0,1,2\n1,1,2\n", "twice"),
     "native": (b"$GPGGA,120000.00,4142.0,N,00230.0,E,4,10,1.0,0.0,M,0.0,M,,*6A\n" * 9, "convert it without a guess"),
@@ -320,7 +319,6 @@ def test_what_is_no_table_is_refused_in_one_line_with_exit_2(case, tmp_path, mon
 def test_options_that_do_not_go_together_are_refused(frame, tmp_path, monkeypatch, capsys):
     path = written(frame, tmp_path)
     for options, said in (
-        ([path, path, "--guess"], "expected one table"),
         ([path, "--guess", "--out", tmp_path / "log.csv"], "writes no log"),
         ([path], "--out"),
         ([tmp_path / "none.csv", "--guess"], "no such file"),
