@@ -6,7 +6,6 @@ Unix time, and ``lat, lon`` if it is known where on Earth n is. TUM files hold `
 tools such as ``evo_ape``.
 """
 
-import zlib
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rovgraph import tables
+from rovgraph.dates import YEAR_FIRST, DateRules
 from rovgraph.errors import InputError, as_path, warn
 from rovgraph.fast_csv import write_csv
 from rovgraph.geometry import Array, matrix_from_rpy, quaternion_from_matrix, rpy_from_matrix, rpy_jacobian, transpose
@@ -248,31 +249,15 @@ def read_table(path: Path | str) -> pd.DataFrame:
         inside = [found for pattern in likely for found in sorted(path.glob(pattern))]
         such = f", such as {inside[0]}" if inside else ""
         raise InputError(f"{path}: is a directory, expected a CSV file; give one in it{such}")
-    try:
-        table = pd.read_csv(path, index_col=False, skipinitialspace=True, low_memory=False)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, EOFError, zlib.error) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as CSV ({reason})") from None
-    table.columns = table.columns.str.strip()
-    twice = table.columns[table.columns.duplicated()]
-    if len(twice):
-        raise InputError(f"{path}: column {twice[0]} occurs twice")
-    missing = [c for c in ("time", "north", "east") if c not in table]
+    table = tables.read_table(path)
+    missing = [c for c in ("time", "north", "east") if c not in table.names]
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing, a trajectory has time, north, east")
     wanted = [*COLUMNS, *(c + "_sd" for c in COLUMNS[1:]), "cov_north_east"]
-    return pd.DataFrame({c: _numbers(table[c], path) for c in wanted if c in table})
-
-
-def _numbers(column: pd.Series, path: Path | str) -> Array:
-    """A column as floats, empty and infinite values NaN."""
-    values = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
-    wrong = np.flatnonzero(np.isnan(values) & column.notna().to_numpy())
-    if len(wrong):
-        raise InputError(f"{path} line {wrong[0] + 2}: {column.name} is {column.iloc[wrong[0]]!r}, expected a number")
-    return np.where(np.isfinite(values), values, np.nan)
+    time, how = table.times("time", DateRules(remedy=YEAR_FIRST))
+    table.warn_how(how)
+    values = {c: time if c == "time" else table.numbers(c) for c in wanted if c in table.names}
+    return pd.DataFrame({c: np.where(np.isfinite(column), column, np.nan) for c, column in values.items()})
 
 
 def parse_trajectory(table: pd.DataFrame, source: str) -> Trajectory:

@@ -510,15 +510,6 @@ BAD_FRAMES = {
     "text": (pd.DataFrame({"time": T, "depth": ["1", "deep", "2"]}), "line 3, column depth: 'deep' is not a number"),
     "lists": (pd.DataFrame({"time": T, "depth": [[1], [2], [3]]}), r"column depth: '\[1\]' is not a number"),
     "mixed objects": (pd.DataFrame({"time": T, "depth": [1.0, {}, None]}), "column depth: '{}' is not a number"),
-    "dates": (pd.DataFrame({"time": pd.date_range("2024-01-01", periods=3), "depth": T}), "time holds dates"),
-    "time zones": (
-        pd.DataFrame({"time": pd.date_range("2024-01-01", periods=3, tz="Europe/Oslo"), "depth": T}),
-        "column time holds dates, expected numbers; write it in seconds",
-    ),
-    "dates as objects": (
-        pd.DataFrame({"time": pd.Series([*pd.date_range("2024-01-01", periods=3)], dtype=object), "depth": T}),
-        "time holds dates",
-    ),
     "durations": (pd.DataFrame({"time": pd.to_timedelta(T, unit="s"), "depth": T}), "time holds durations"),
     "a mix with complex numbers": (
         pd.DataFrame({"time": T, "depth": pd.Series([1j, 2.0, None], dtype=object)}),
@@ -545,6 +536,17 @@ def test_a_frame_that_is_no_log_is_refused_in_one_line(frame, said):
     with pytest.raises(rg.InputError, match=said) as caught:
         rg.Log.from_frame(frame)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("zone", [None, "Europe/Oslo"])
+@pytest.mark.parametrize("kind", [None, object])
+@pytest.mark.filterwarnings("ignore::rovgraph.errors.DataWarning")
+def test_dates_of_a_frame_are_unix_time(zone, kind):
+    dates = pd.Series(
+        pd.date_range("2024-01-01 01:00" if zone else "2024-01-01", periods=3, freq="s", tz=zone), dtype=kind
+    )
+    log = rg.Log.from_frame(pd.DataFrame({"time": dates, "depth": T}))
+    assert log["depth"].time.tolist() == [1704067200.0, 1704067201.0, 1704067202.0]
 
 
 def test_a_column_of_arrows_lists_is_refused():

@@ -18,6 +18,8 @@ LAYERS = (
     {"errors", "process", "progress"},
     {"geometry", "workers", "fast_csv", "spilling"},
     {"gauss_markov", "units", "gps_time"},
+    {"dates"},
+    {"tables"},
     {"kernels"},
     {"state", "calibration", "thesis"},
     {"vehicle"},
@@ -97,7 +99,7 @@ GRAPH = {name: imports_of(name) for name in MODULES}
 
 
 def member(name: str) -> str:
-    """The part of a name that has a layer: ``log`` of ``rovgraph.log.table``."""
+    """The part of a name that has a layer: ``log`` of ``rovgraph.log.rows``."""
     return name.split(".")[1]
 
 

@@ -60,9 +60,9 @@ def test_warnings_are_counted_and_exit_with_0(run, log, tmp_path):
     (tmp_path / "c.yaml").write_text("imu: {mount_rpy_deg: [180, 0, 0]}\n")
     code, out, _ = run("check", log, "--config", tmp_path / "c.yaml")
     assert code == 0
-    assert "no errors, 2 warnings" in out
+    assert "no errors, 1 warning" in out
     assert "180 deg away from upwards" in out
-    assert "ahrs_yaw turns opposite to the gyro" in out
+    assert "opposite to the gyro" not in out  # which follows
 
 
 def test_errors_exit_with_2_after_the_report(run, log, tmp_path):
@@ -118,7 +118,6 @@ HOSTILE = {
     "time set back": (HEADER + b"9" + ROW + ROW, "line 3: time goes back from 91.000 to 1.000 s"),
     "nothing known": (b"time,a,b\n1,2,3\n", "no measurement of any sensor"),
     "everything empty": (HEADER + b"1,,,,,,,\n", "no measurement of any sensor"),
-    "semicolons": (HEADER.replace(b",", b";") + ROW.replace(b",", b";"), "semicolons"),
     "gzip cut off": (gzip.compress(HEADER + ROW * 99)[:-9], "gzip"),
     "parquet cut off": (b"PAR1" + bytes(50), "damaged Parquet"),
     "gyro in deg/s": (

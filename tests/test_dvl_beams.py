@@ -15,7 +15,7 @@ from rovgraph.errors import InputError
 from rovgraph.interchange.merging import merge
 from rovgraph.interchange.recording import Clock, Recording
 from rovgraph.log.beams import beams_of, usable_beams
-from rovgraph.log.table import table_of_arrays
+from rovgraph.tables import table_of_arrays
 
 START = 1_750_000_000.0  # Unix time of the dive's start [s]
 UNIX, BOOT = Clock("Unix", 0.0, 0.0, "GPS"), Clock("boot")

@@ -373,7 +373,7 @@ def test_dates_are_times_too_where_the_dive_has_unix_time():
     ("table", "column", "words"),
     [
         ({"t": [1.0]}, "time", "column time is not in the table; it has t"),
-        ({"time": ["noon"]}, "time", "row 1 is 'noon', expected seconds or a date"),
+        ({"time": ["noon"]}, "time", "row 1: 'noon' is neither seconds nor a date"),
         ({"time": [1.0, 2.0]}, "time", "are all outside the dive"),
     ],
 )

@@ -303,7 +303,7 @@ def test_magnetometers_stay_raw_in_every_source(heard, tmp_path):
         (b'{"depth": 1' + b"0" * 400 + b"}", "out of range"),
         (b'{"depth": 1' + b"0" * 9999 + b"}", "not JSON"),
         (b'{"dvl_valid": 2}', "out of range"),
-        (b'{"fix_lat": 91, "fix_lon": 0}', "out of range"),
+        (b'{"fix_lat": 95, "fix_lon": 0}', "out of range"),
         (b"[1, 2]", "no object"),
         (b"3", "no object"),
         (b'{"depth": 3', "not JSON"),

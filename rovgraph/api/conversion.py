@@ -8,7 +8,8 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from rovgraph.config import Config, completed, config_or_defaults
+from rovgraph.config import AS_WRITTEN, Config, FileSettings, completed, config_or_defaults
+from rovgraph.config.reading import fits
 from rovgraph.errors import InputError, as_path, as_paths, collected_warnings, warn
 from rovgraph.interchange.account import account, notes
 from rovgraph.interchange.alternatives import SourceMissing
@@ -16,12 +17,13 @@ from rovgraph.interchange.formats import Format, Options, formats, head_of, read
 from rovgraph.interchange.merging import Merged, merge
 from rovgraph.interchange.own_log import FORMAT as OWN_LOG
 from rovgraph.interchange.own_log import is_own_log
-from rovgraph.interchange.recording import Recording
+from rovgraph.interchange.recording import Recording, earlier
 from rovgraph.interchange.unknown import is_text, purpose, refusal
 from rovgraph.log import Log
 from rovgraph.log.beams import BEAMS, usable_beams
-from rovgraph.log.table import table_beside
+from rovgraph.log.units import nearest
 from rovgraph.progress import Progress, no_progress
+from rovgraph.tables import names_of, table_beside
 
 Paths = Path | str | Sequence[Path | str]
 NOTHING: Mapping[str, Any] = {}
@@ -46,7 +48,7 @@ class Conversion:
     @property
     def config(self) -> Config:
         """For the log that `save` writes: completed, without columns and units."""
-        return self.completed.model_copy(update={"columns": {}, "units": {}})
+        return self.completed.model_copy(update=AS_WRITTEN)
 
     @cached_property
     def log(self) -> Log:
@@ -162,6 +164,7 @@ def convert(
     files = as_paths(paths, "paths")
     if not files:
         raise InputError("no file was given; expected native files or logs of one dive")
+    settings_of = settings_of_files(files, config)
     found = [_format(path, config) for path in files]
     names = {name for path in files for name in (str(path), path.name, path.stem)}
     inside = {sensor: source for sensor, source in choose.items() if source not in names}  # of a file's sources
@@ -172,14 +175,44 @@ def convert(
         def read(done: int, total: int, k: int = k, name: str = path.name) -> None:
             progress(f"reading {name}", (k + done / max(total, 1)) / len(files))
 
-        options = Options(inside, read, config.columns, config.units)
-        recordings.append(_read(path, options, format_, len(files) == 1))
+        settings = settings_of[k]
+        recording = _read(path, Options(inside, read, settings), format_, len(files) == 1)
+        recordings.append(earlier(recording, settings.delay_s) if settings.delay_s else recording)
     progress("joining clocks", 1.0)
     merged = merge(recordings, choose, shift)
     for text in merged.warnings:
         warn(text)
     source = " + ".join(merged.names)
     return Conversion(merged, *completed(config, merged.nested_settings(), f"settings in {source}"))
+
+
+def settings_of_files(files: Sequence[Path], config: Config) -> list[FileSettings]:
+    """How each of some files is written; columns that others of them have are left out.
+
+    Raises
+    ------
+    InputError : a pattern of the configuration that fits no file, a file that two fit, a mapped column that no file has
+    """
+    for pattern in config.files:
+        if not any(fits(path, pattern) for path in files):
+            given = ", ".join(path.name for path in files)
+            raise InputError(f"files: {pattern!r} fits none of the files ({given}); correct or remove it")
+    settings = [config.of_file(path) for path in files]
+    if len(files) == 1 and not config.files:
+        return settings  # its reader names what it lacks
+    names = [None if head.startswith(b"PAR1") else set(names_of(head)) for head in map(head_of, files)]
+    stated = [("", config.columns), *((pattern, own.columns) for pattern, own in config.files.items())]
+    for pattern, columns in stated:
+        theirs = {path: own for path, own in zip(files, names, strict=True) if not pattern or fits(path, pattern)}
+        for target, source in columns.items():
+            if not any(own is None or source in own for own in theirs.values()):
+                near = nearest(source, [name for own in theirs.values() for name in own or ()])
+                where = ", ".join(path.name for path in theirs)
+                raise InputError(f"columns: {target}: no column {source!r} in {where}, nearest is {near!r}")
+    return [
+        one if own is None else one.model_copy(update={"columns": {t: s for t, s in one.columns.items() if s in own}})
+        for one, own in zip(settings, names, strict=True)
+    ]
 
 
 def _require_mappings(choose: Mapping[str, str], shift: Mapping[str, float]) -> None:
@@ -220,7 +253,7 @@ def is_plain_log(path: Path, config: Config) -> bool:
     InputError : it is neither: says what it is, and which command reads it
     """
     head = head_of(path)
-    if is_own_log(head, config.columns):
+    if is_own_log(head, config.of_file(path).columns):
         return True
     if recognise(path) is not None:
         return False

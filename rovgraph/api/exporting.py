@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pandas as pd
-
 from rovgraph.errors import InputError, as_path, as_texts, kind_of
 from rovgraph.export import Options, Tagged, Track, read_track, write_track
 from rovgraph.export import tag as tag_table
 from rovgraph.export.tagging import column_of, geotag
+from rovgraph.tables import read_cells
 
 if TYPE_CHECKING:
     from rovgraph.api.smoothing import Result
@@ -89,7 +88,9 @@ def tag(
     photos = out.with_name(f"{out.stem}_photos")
     if exif is not None and photos.exists() and not force:
         raise InputError(f"{photos} exists; choose another --out or give --force")
-    frame = _read_cells(table)
+    cells = read_cells(table)
+    cells.warn_how()
+    frame = cells.frame
     track = track_of(results, estimate)
     try:
         files = None if exif is None else [table.parent / name for name in column_of(frame, exif)]
@@ -101,21 +102,6 @@ def tag(
         if files is not None:
             _copy_photos(tagged, track, files, photos, partial.parent)
     return tagged
-
-
-def _read_cells(table: Path) -> pd.DataFrame:
-    """A table whose cells stay as they are, texts."""
-    try:
-        rows = pd.read_csv(
-            table, header=None, skipinitialspace=True, dtype=str, keep_default_na=False, encoding="utf-8-sig"
-        )
-    except FileNotFoundError:
-        raise InputError(f"{table}: no such file; check the name") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{table}: cannot be read as CSV ({(str(error).splitlines() or [''])[0]})") from None
-    if len(rows) < 2:
-        raise InputError(f"{table}: holds no row below its header")
-    return rows.iloc[1:].set_axis(rows.iloc[0].str.strip(), axis="columns").reset_index(drop=True)
 
 
 def _copy_photos(tagged: Tagged, track: Track, files: Sequence[Path], folder: Path, temporary: Path) -> None:

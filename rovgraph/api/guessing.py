@@ -1,11 +1,11 @@
 """A mapping of the columns of anyone's table: what ``rovgraph convert --guess`` proposes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rovgraph.config import Config, parse_config
+from rovgraph.config import Config, TableSettings, parse_config
 from rovgraph.errors import InputError, as_path
 from rovgraph.interchange.formats import head_of, recognise
 from rovgraph.interchange.guessing.groups import ColumnGuess
@@ -13,8 +13,15 @@ from rovgraph.interchange.guessing.imu import POINTS_UP
 from rovgraph.interchange.guessing.table import guess_table
 from rovgraph.interchange.own_log import FORMAT as OWN_LOG
 from rovgraph.interchange.unknown import purpose
-from rovgraph.log.table import read_table
 from rovgraph.log.units import groups, quantities
+from rovgraph.tables import read_table
+
+REASONS = {
+    "imu": POINTS_UP,
+    "dvl": "its axes point forward, to port and up by their names",
+    "angles": "counts anticlockwise by the gyro, and its name says ENU",
+    "times": "day and month may be exchanged: both orders are possible",
+}
 
 
 @dataclass(frozen=True)
@@ -26,7 +33,7 @@ class Guess:
     source : the file
     columns : what each column may be, in the order of the file; of these, the unsure ones are not proposed
     left : column -> why it feeds nothing
-    settings : of a configuration, that the numbers show: the mounting of an IMU whose z axis points up
+    settings : of a configuration, that names or numbers show: mountings, how headings count, the order of dates
     notes : a sentence each
     """
 
@@ -65,16 +72,7 @@ class Guess:
 
     def to_yaml(self) -> str:
         """``columns`` and ``units`` for a configuration, and settings; unsure columns are comments."""
-        from rovgraph.report.conversion import commented_yaml
-
-        reasons = {f"columns.{each.field}": f"{each.sureness}: {each.why}" for each in self.proposed}
-        reasons |= {f"{section}.{key}": POINTS_UP for section, keys in self.settings.items() for key in keys}
-        sections: dict[str, Any] = {"columns": self.mapping, "units": self.units, **self.settings}
-        stated = {name: section for name, section in sections.items() if section}
-        text = commented_yaml(stated, reasons) if stated else ""
-        unsure = [each for each in self.columns if each.sureness == "unsure"]
-        lines = [f"# unsure: {each.field}: {_one_line(each.column)}  ({each.why})" for each in unsure]
-        return text + "".join(f"{line}\n" for line in lines)
+        return proposal([self])
 
     def save(self, path: Path | str, force: bool = False) -> Path:
         """Write the configuration.
@@ -83,15 +81,53 @@ class Guess:
         ------
         InputError : the file exists and ``force`` is not given, or cannot be written
         """
-        from rovgraph.report.folder import results_files
+        return save_proposal([self], path, force)
 
-        path = as_path(path, "path")
-        if path.resolve() == Path(self.source).resolve():
-            raise InputError(f"{path} is the file that is read; choose another name")
-        head = f"# Proposed for {_one_line(Path(self.source).name)}: confirm each line\n"
-        with results_files([path], force) as (temporary,):
-            temporary.write_text(head + self.to_yaml(), encoding="utf-8")
-        return path
+
+def proposal(guesses: Sequence[Guess]) -> str:
+    """The configuration that one table's guess, or those of several, propose, as YAML; several stand under ``files``.
+
+    Mountings hold for all tables; those of the first one take precedence.
+    """
+    from rovgraph.report.conversion import commented_yaml
+
+    sections: dict[str, Any] = {}
+    reasons: dict[str, str] = {}
+    for guess in guesses:
+        own: dict[str, Any] = {"columns": guess.mapping, "units": guess.units}
+        above = f"files.{Path(guess.source).name}." if len(guesses) > 1 else ""
+        reasons |= {f"{above}columns.{each.field}": f"{each.sureness}: {each.why}" for each in guess.proposed}
+        for section, keys in guess.settings.items():
+            of_table = section in TableSettings.model_fields
+            (own if of_table else sections).setdefault(section, {}).update(keys)
+            reasons |= {f"{above if of_table else ''}{section}.{key}": REASONS[section] for key in keys}
+        stated = {name: section for name, section in own.items() if section}
+        if len(guesses) > 1:
+            sections.setdefault("files", {})[Path(guess.source).name] = stated
+        else:
+            sections = stated | sections
+    text = commented_yaml(sections, reasons) if sections else ""
+    unsure = [each for guess in guesses for each in guess.columns if each.sureness == "unsure"]
+    lines = [f"# unsure: {each.field}: {_one_line(each.column)}  ({each.why})" for each in unsure]
+    return text + "".join(f"{line}\n" for line in lines)
+
+
+def save_proposal(guesses: Sequence[Guess], path: Path | str, force: bool = False) -> Path:
+    """Write the configuration that `proposal` gives.
+
+    Raises
+    ------
+    InputError : the file exists and ``force`` is not given, or cannot be written
+    """
+    from rovgraph.report.folder import results_files
+
+    path = as_path(path, "path")
+    if any(path.resolve() == Path(guess.source).resolve() for guess in guesses):
+        raise InputError(f"{path} is the file that is read; choose another name")
+    names = ", ".join(_one_line(Path(guess.source).name) for guess in guesses)
+    with results_files([path], force) as (temporary,):
+        temporary.write_text(f"# Proposed for {names}: confirm each line\n" + proposal(guesses), encoding="utf-8")
+    return path
 
 
 def guess_columns(path: Path | str) -> Guess:
@@ -108,6 +144,10 @@ def guess_columns(path: Path | str) -> Guess:
     Raises
     ------
     InputError : no table, no names of columns, no time, or a native file, which needs no mapping
+
+    Warns
+    -----
+    DataWarning : how the table was read, where it is not written as a log of this program
     """
     path = as_path(path, "path")
     head = head_of(path)
@@ -116,7 +156,9 @@ def guess_columns(path: Path | str) -> Guess:
         raise InputError(f"{path}: is a {format_.title}, whose columns are known; convert it without a guess")
     if what := purpose(path, head):
         raise InputError(f"{path}: {what}")
-    found = guess_table(read_table(path))
+    table = read_table(path)
+    found = guess_table(table)
+    table.warn_how()
     return Guess(str(path), tuple(found.columns), found.left, found.settings, tuple(found.notes))
 
 

@@ -49,7 +49,7 @@ def read_log(
     files = as_paths(path, "log")
     if config is None:
         warn_of_unused(*files)
-    alone = len(files) == 1 and not choose and not shift
+    alone = len(files) == 1 and not choose and not shift and not config_or_defaults(config).files
     if alone and is_plain_log(files[0], config_or_defaults(config)):
         return library.read_log(files[0], config)
     return convert(files, config, choose, shift, progress).log

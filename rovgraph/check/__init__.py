@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from rovgraph.check.agreement import headings, vertical
+from rovgraph.check.compasses import body_heading
 from rovgraph.check.current import current
 from rovgraph.check.dvl import dvl_and_imu
 from rovgraph.check.findings import Finding, Report, Timing
@@ -71,10 +72,26 @@ def examine(log: Log, config: Config | None = None, examined: Examined | None = 
         standstill: partial(standstill, frozen=frozen),
         **{check: partial(_of_motion, check, unfrozen) for check in MOTION_CHECKS if frozen},
     }
-    findings = [finding for check in CHECKS for finding in known.get(check, check)(log, config)]
+    found = {check: [*known.get(check, check)(log, config)] for check in CHECKS}
+    findings = [finding for own in _without_consequences(found, log, config).values() for finding in own]
     bursts = {f.sensor for f in findings if f.kind == "bursts"}  # whose stamps are late, too
     findings = [f for f in findings if f.kind != "lag" or not bursts & {"imu", f.sensor}]
     return Report(log.source, [timing(stream) for stream in log.streams.values()], findings)
+
+
+def _without_consequences(found: dict[Check, list[Finding]], log: Log, config: Config) -> dict[Check, list[Finding]]:
+    """Findings without those that follow from others: headings from the gyro's axes, tracks from a heading."""
+    out = dict(found)
+    if any(f.kind == "axes" and f.level != "ok" for f in found[gravity]):
+        out[headings] = [f for f in found[headings] if f.kind != "sign" or f.sensor == "mag"]
+    wrong = {f.sensor for f in out[headings] if f.kind in ("sign", "unit") and f.level != "ok"}
+    heading = body_heading(log, config) if wrong else None
+    if heading is not None and heading[0] in wrong:
+        for check in (track, current):
+            if any(f.level != "ok" for f in found[check]):
+                text = f"what it shows beside other sensors is looked at when {heading[0]} is right"
+                out[check] = [Finding(f.sensor, "ok", text) for f in found[check][:1]]
+    return out
 
 
 def _of_motion(check: Check, unfrozen: Log, log: Log, config: Config) -> Iterator[Finding]:

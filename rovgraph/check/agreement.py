@@ -5,11 +5,13 @@ Each comparison takes what two sensors say of the change within windows of some 
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from rovgraph.check.compasses import field_axes, magnetic_heading
 from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
+from rovgraph.check.fixes import turned_by
 from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.check.signals import FOLLOWS, LAG_WARNING, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
@@ -17,6 +19,7 @@ from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, rotate
 from rovgraph.instruments import instruments
 from rovgraph.log import Log, Stream
+from rovgraph.log.units import turn_angles
 
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
@@ -29,7 +32,9 @@ NOISE_MARGIN = 2.0  # of turning over a heading's noise, below which the two nee
 EVIDENCE = 2.0  # in chi-square, that a lag of a heading explains
 WAVE_EVIDENCE = 12.0  # that a lag of a depth explains: waves are alike after a period
 LEAST_LEVEL = 0.1  # cos(pitch)^2 below which a heading turns at any rate
-NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading"}
+NAMES = {"mag": "the field's direction", "ahrs": "ahrs_yaw", "dvl_heading": "dvl_heading", "vehicle_heading": "heading"}
+ZEROS = {"enu": "east", "nwu": "north"}  # of headings that count anticlockwise
+FITS = 0.25 * np.pi  # turn of the DVL's track against the fixes, by which one of them is told
 
 
 def headings(log: Log, config: Config) -> Iterator[Finding]:
@@ -52,7 +57,7 @@ def headings(log: Log, config: Config) -> Iterator[Finding]:
             shifted = Signal(heading.time - coarse_lag(gyro, heading, window), heading.value)
             f = fit(gyro, shifted, window)
         noise = _change_noise(heading, window)
-        yield _turning(log, sensor, f, noise)
+        yield _turning(log, config, sensor, f, noise)
         if sensor != "mag" and abs(f.correlation) > FOLLOWS and max(f.sd_a, f.sd_b) > ENOUGH_TURNING:
             found = _heading_lag(gyro, _heading_by_gyro(log, config, motion), heading)
             delay = config.delay_s.get(sensor, 0.0) + found.seconds
@@ -133,7 +138,7 @@ def _change_noise(heading: Signal, window: float) -> float:
     return float(np.median(second)) / 0.6745 / np.sqrt(3.0) if len(second) else 0.0
 
 
-def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
+def _turning(log: Log, config: Config, sensor: str, f: Fit, noise: float) -> Finding:
     """What a comparison of a heading with the gyro means."""
     name, beyond = NAMES[sensor], sensor != "mag" and _beyond_circle(log[sensor].data[:, 0])
     if f.windows < MIN_WINDOWS or max(f.sd_a, f.sd_b) < ENOUGH_TURNING:
@@ -155,17 +160,28 @@ def _turning(log: Log, sensor: str, f: Fit, noise: float) -> Finding:
         cause, remedy = _factor_of_57(log, sensor, f.slope)
         return Finding(sensor, "error", f"{cause} ({numbers}); {remedy}", "unit")
     if f.slope < 0.0:
-        return Finding(
-            sensor,
-            "warning",
-            f"{name} turns opposite to the gyro ({numbers}): the heading counts anticlockwise, or the IMU's z axis "
-            "points up (imu.mount_rpy_deg)",
-            "sign",
-        )
+        cause = "the IMU's z axis points up (imu.mount_rpy_deg)"
+        if sensor != "mag":
+            cause = f"it counts anticlockwise: {_counting(log, config, sensor)}; or {cause}"
+        return Finding(sensor, "warning", f"{name} turns opposite to the gyro ({numbers}): {cause}", "sign")
     if 0.7 < f.slope < 1.4:
         return Finding(sensor, "ok", f"{name} turns with the gyro ({numbers})")
     text = f"{name} turns with the gyro, but not by the same angle ({numbers}); check the units and scales of both"
     return Finding(sensor, "warning", text, "scale")
+
+
+def _counting(log: Log, config: Config, sensor: str) -> str:
+    """What to state of a heading that counts anticlockwise: from east or north, as the fixes show."""
+    key = {"vehicle_heading": "attitude" if "vehicle_tilt" in log else "heading"}.get(sensor, sensor)
+    stream = log[sensor]
+    for kind in ZEROS:
+        cells = dict(zip(stream.columns, stream.data.T.copy(), strict=True))
+        turn_angles(cells, {key: kind}, log.source)
+        turned = replace(stream, data=np.column_stack([cells[name] for name in stream.columns]))
+        angle = turned_by(replace(log, streams={**log.streams, sensor: turned}), config, sensor)
+        if angle is not None and abs(angle) < FITS:
+            return f"state angles: {{{key}: {kind}}}"
+    return "state " + " or ".join(f"angles: {{{key}: {kind}}} if its zero is {zero}" for kind, zero in ZEROS.items())
 
 
 def _factor_of_57(log: Log, sensor: str, slope: float) -> tuple[str, str]:
@@ -185,7 +201,7 @@ def _factor_of_57(log: Log, sensor: str, slope: float) -> tuple[str, str]:
 
 
 def _if_degrees(sensor: str) -> str:
-    return f"if it is in degrees, state units: {{{sensor}: deg}}"
+    return f"if it is in degrees, state units: {{{sensor.removeprefix('vehicle_')}: deg}}"
 
 
 def _stated(config: Config, found: Lag, late: str, than: str | None = None) -> bool:

@@ -8,7 +8,7 @@ fits better with the conjugate velocity. A cause is named where it explains the 
 
 import math
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,16 @@ from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, rotate
 from rovgraph.instruments import DEFAULT_DIP, heading_sources
-from rovgraph.log import Log
+from rovgraph.log import Log, Stream
+from rovgraph.log.streams import LAT_LON
 
 MIN_FIXES = 15
 STRETCH = 300.0  # over which the DVL's track drifts less than fixes scatter [s]
 LONGEST_GAP = 5.0  # between pings, in which the track is lost [s]
 ENOUGH_DISTANCE = 10.0  # spread of the fixes [m]
 MISALIGNED, BELIEVED_SDS = np.deg2rad(15.0), 3.0
+FARTHER = 5.0  # times the spread of fixes, that a DVL's track spreads over if they are no measurement of it
+RADIANS = 40.0, 80.0  # times too small, that radians are if they are taken for degrees
 LARGEST_LAG = 60.0  # [s]
 LAG_STEP = 0.25  # [s]
 LAG_WARNING = 0.5  # [s]
@@ -60,24 +63,77 @@ class _Line:
     error: float
 
 
-def track(log: Log, config: Config) -> Iterator[Finding]:
-    """Handedness, rotation, scale and clock of the DVL's velocities against the fixes."""
+@dataclass(frozen=True)
+class _Tracks:
+    """The DVL's track beside the fixes.
+
+    Attributes
+    ----------
+    sensor : compass that turns it
+    pings : with bottom lock
+    way, mirrored : ndarray, shape (n,), its track, and that of a DVL whose y axis points the other way [m]
+    """
+
+    sensor: str
+    pings: Stream
+    plane: "_Plane"
+    way: Complexes
+    mirrored: Complexes
+
+
+def _tracks(log: Log, config: Config, compass: str | None = None) -> _Tracks | None:
+    """The DVL's track by the heading that tells most, or by one compass; None where something is missing."""
     if not {"dvl", "fix"} <= log.sensors:
-        return
-    found = body_heading(log, config)
+        return None
+    others = {name: s for name, s in log.streams.items() if compass in (None, name) or name not in OFFSETS}
+    found = body_heading(replace(log, streams=others), config)
     pings = valid_pings(log["dvl"])
     if found is None or len(pings) < MIN_FIXES or len(log["fix"]) < MIN_FIXES:
-        return
+        return None
     sensor, *heading = found
     psi = heading[0], heading[1]
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     turn = np.exp(1j * np.interp(pings.time, *psi))
     arm = complex(*config.fix.lever_arm_m[:2])
     plane = _Plane(log, pings.time, arm * np.exp(1j * np.interp(log["fix"].time, *psi)))
-    if plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
-        yield Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
-        return
     way, mirrored = (plane.way(turn * (v_b[:, 0] + sign * 1j * v_b[:, 1])) for sign in (1.0, -1.0))
+    return _Tracks(sensor, pings, plane, way, mirrored)
+
+
+def turned_by(log: Log, config: Config, compass: str) -> float | None:
+    """How far the DVL's track by a compass has to be turned to fit the fixes [rad]; None where they do not show it."""
+    found = _tracks(log, config, compass)
+    if found is None or found.plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
+        return None
+    line = found.plane.fit(found.way, 0.0)
+    return None if line.agreement < 0.6 else float(np.angle(line.c))
+
+
+def _too_short(found: _Tracks, geodetic: bool) -> Finding:
+    """Fixes that move too little to be compared, although the DVL moves far."""
+    line, moved = found.plane.fit(found.way, 0.0), found.plane.spread_of(found.way)
+    if moved < max(ENOUGH_DISTANCE, FARTHER * found.plane.spread):
+        return Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
+    text = f"the fixes spread over {found.plane.spread:.2g} m while the DVL's track spreads over {moved:.3g} m"
+    if geodetic and line.agreement > 0.6 and RADIANS[0] < 1.0 / max(abs(line.c), 1e-9) < RADIANS[1]:
+        return Finding(
+            "fix", "warning", f"{text}: latitude and longitude are in radians; state units: {{fix: rad}}", "unit"
+        )
+    return Finding("fix", "warning", f"{text}: check the unit of the fixes, and whether they are measured", "scale")
+
+
+def track(log: Log, config: Config) -> Iterator[Finding]:
+    """Handedness, rotation, scale and clock of the DVL's velocities against the fixes."""
+    found = _tracks(log, config)
+    if found is None:
+        return
+    sensor, pings, plane, way, mirrored = found.sensor, found.pings, found.plane, found.way, found.mirrored
+    if plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
+        if len(plane.fixes) >= MIN_FIXES and plane.count >= MIN_FIXES:
+            yield _too_short(found, log.origin is not None)
+        else:
+            yield Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
+        return
     lag, lag_sd, lag_evidence = plane.lag(way)
     offset = beliefs(config)["fix_time_offset"]
     allowed = max(LAG_WARNING, SURE * lag_sd, BELIEVED_SDS * offset.sd if offset.estimate else 0.0)
@@ -92,8 +148,7 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             "fix",
             "warning",
             "north and east are swapped or mirrored; corrected, the fixes fit the DVL's track turned by "
-            f"{angle:+d} deg (agreement {swapped.agreement:.2f} instead of {as_is.agreement:.2f}): "
-            "correct the columns of the fixes",
+            f"{angle:+d} deg (agreement {swapped.agreement:.2f} instead of {as_is.agreement:.2f}): {_exchange(log)}",
             "swapped",
         )
     elif _better(unlike, as_is, MIRRORED) and unlike.agreement > 0.6 and plane.explained(unlike):
@@ -114,6 +169,14 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
             known = config.delay_s.get("fix", 0.0) + lag
             remedy = f"state delay_s: {{fix: {known:.2g}}}, or correct fix.lever_arm_m, if it is {moved:.1f} m off"
             yield Finding("fix", "warning", f"{text}: {remedy}", "lag")
+
+
+def _exchange(log: Log) -> str:
+    """What to do about swapped columns of fixes."""
+    pair = ("fix_north", "fix_east") if log.origin is None else LAT_LON
+    named = {} if log.config is None else log.config.columns
+    one, other = (named.get(name, name) for name in pair)
+    return f"state columns: {{{pair[0]}: {other}, {pair[1]}: {one}}}"
 
 
 def _better(one: _Line, other: _Line, times: float = 1.5) -> bool:
@@ -181,6 +244,10 @@ class _Plane:
     def spread(self) -> float:
         """Of the fixes within their stretches [m]."""
         return 0.0 if self.count < MIN_FIXES else float(2.0 * np.sqrt(np.mean(np.abs(self._free(self.fixes)) ** 2)))
+
+    def spread_of(self, way: Complexes) -> float:
+        """The same of a track at the times of the fixes [m]."""
+        return float(2.0 * np.sqrt(np.mean(np.abs(self._free(self._at(way, 0.0))) ** 2)))
 
     def way(self, velocity: Complexes) -> Complexes:
         """Integral of a velocity at the pings."""

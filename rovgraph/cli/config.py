@@ -33,6 +33,7 @@ _GROUP_TEXT = {
     "vehicle": "vehicle: hydrodynamics, thesis (2.16)-(2.24)",
     "graph": "graph: how it is built and solved",
     "online": "online: estimating as data arrive",
+    "times": "times: what dates as text leave open",
 }
 
 

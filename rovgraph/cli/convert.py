@@ -20,7 +20,7 @@ def convert(
     shift: Shift = None,
     force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
     guess: Annotated[
-        bool, typer.Option("--guess", help="propose columns and units of one table instead; writes no log")
+        bool, typer.Option("--guess", help="propose columns and units of tables instead; writes no log")
     ] = False,
 ) -> None:
     """Convert native files of instruments, autopilots and robots into one log.
@@ -33,7 +33,7 @@ def convert(
 
     if guess:
         if out is not None or config is not None or choose or shift:
-            raise InputError("--guess: writes no log; give one table, and --config-out or nothing")
+            raise InputError("--guess: writes no log; give tables, and --config-out or nothing")
         propose(files, config_out, force)
         return
     if out is None:
@@ -57,22 +57,21 @@ def convert(
 
 
 def propose(files: Sequence[Path], config_out: Path | None, force: bool) -> None:
-    """Print a mapping of the columns of a table."""
+    """Print a mapping of the columns of one or more tables."""
     import rovgraph as rg
+    from rovgraph.api.guessing import proposal, save_proposal
     from rovgraph.cli.console import console, say
-    from rovgraph.errors import InputError
     from rovgraph.report.conversion import guess_table
 
-    if len(files) != 1:
-        raise InputError(f"--guess: expected one table, found {len(files)} files")
-    guess = rg.guess_columns(files[0])
-    saved = None if config_out is None else guess.save(config_out, force)
+    guesses = [rg.guess_columns(path) for path in files]
+    saved = None if config_out is None else save_proposal(guesses, config_out, force)
     shown = console(WIDE)
-    shown.print(guess_table(guess.columns, guess.left))
-    shown.print()
-    typer.echo(guess.to_yaml())
-    for note in guess.notes:
+    for guess in guesses:
+        shown.print(guess_table(guess.columns, guess.left, "" if len(guesses) == 1 else Path(guess.source).name))
+        shown.print()
+    typer.echo(proposal(guesses))
+    for note in dict.fromkeys(note for guess in guesses for note in guess.notes):
         say(shown, f"note: {note}")
     where = "these lines" if saved is None else str(saved)
-    check = f"rovgraph check {files[0]} --config {saved or 'vehicle.yaml'}"
+    check = f"rovgraph check {' '.join(map(str, files))} --config {saved or 'vehicle.yaml'}"
     say(shown, f"this is a proposal: confirm {where}, then run {check}")

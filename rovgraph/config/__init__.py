@@ -21,13 +21,16 @@ from rovgraph.config.reading import (
     with_priors_stated,
     yaml_text,
 )
-from rovgraph.config.sections import ImuNoise, Mag, SensorSettings
+from rovgraph.config.sections import AS_WRITTEN, FileSettings, ImuNoise, Mag, SensorSettings, TableSettings
 
 __all__ = [
+    "AS_WRITTEN",
     "Config",
+    "FileSettings",
     "ImuNoise",
     "Mag",
     "SensorSettings",
+    "TableSettings",
     "beliefs",
     "completed",
     "config_or_defaults",

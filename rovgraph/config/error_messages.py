@@ -1,5 +1,6 @@
 """What is wrong with a configuration, in words that need no knowledge of the program."""
 
+import datetime as dt
 import difflib
 import types
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -7,7 +8,13 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 
 COUNTS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+KINDS = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "text",
+    dt.date: "a date such as 2026-05-01",
+}
 WRONG_KIND = ("_type", "_parsing", "int_from_float", "missing", "too_long")  # ends of pydantic's error types
 BOUNDS = {
     "greater_than": ("gt", "more than {:g}"),

@@ -18,10 +18,15 @@ from rovgraph.config.presets import with_presets, without_presets
 from rovgraph.config.priors import Calibration, calibration_entry
 from rovgraph.config.registered import add_key, remove_key
 from rovgraph.config.sections import (
+    ANGLES_TEXT,
+    COLUMNS_TEXT,
+    UNITS_TEXT,
+    Angles,
     Delays,
     Depth,
     Dvl,
     Environment,
+    FileSettings,
     Fix,
     Graph,
     Heading,
@@ -34,7 +39,9 @@ from rovgraph.config.sections import (
     Sensors,
     SensorSettings,
     Start,
+    TableSettings,
     Tilt,
+    Times,
     Triple,
     Vehicle,
 )
@@ -64,8 +71,14 @@ class Config(Section):
     vehicle: Vehicle = Vehicle()
     graph: Graph = Graph()
     online: Online = Online()
-    columns: dict[str, str] = Field(default_factory=dict, description="rovgraph's column: the log's own name for it")
-    units: dict[str, str] = Field(default_factory=dict, description="column or sensor: unit it is in, e.g. gyr: deg/s")
+    columns: dict[str, str] = Field(default_factory=dict, description=COLUMNS_TEXT)
+    units: dict[str, str] = Field(default_factory=dict, description=UNITS_TEXT)
+    angles: Angles = Field(default_factory=dict, description=ANGLES_TEXT)
+    times: Times = Times()
+    files: dict[str, FileSettings] = Field(
+        default_factory=dict,
+        description="name or pattern of a file: its own columns, units, angles, times, delay_s",
+    )
     delay_s: Delays = Field(
         {},
         description="sensor: how much older its measurements are than their stamps, in a log and online; e.g. fix: 2",
@@ -91,6 +104,24 @@ class Config(Section):
         if twice := sorted(map(str, former.keys() & own.keys())):
             raise PydanticCustomError("stated_twice", f"delay_s and online.delay_s both name {twice[0]}; state it once")
         return data | {"online": rest, "delay_s": {**former, **own}}
+
+    @property
+    def table(self) -> TableSettings:
+        """How tables are written that `files` does not name."""
+        return TableSettings(columns=self.columns, units=self.units, angles=self.angles, times=self.times)
+
+    def of_file(self, path: Path) -> FileSettings:
+        """How a file is written: by the pattern of `files` that it fits, then by what holds for all.
+
+        Raises
+        ------
+        InputError : two patterns fit it
+        """
+        fitting = [pattern for pattern in self.files if fits(path, pattern)]
+        if len(fitting) > 1:
+            raise InputError(f"{path}: files: both {fitting[0]!r} and {fitting[1]!r} fit it; state one of them")
+        own = self.files[fitting[0]].model_dump(exclude_unset=True) if fitting else {}
+        return FileSettings.model_validate(merged(self.table.model_dump(), own))
 
     def to_yaml(self) -> str:
         """The effective configuration, every key written out."""
@@ -149,6 +180,11 @@ def yaml_text(data: dict[str, Any]) -> str:
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     yaml.dump(data, stream)
     return stream.getvalue()
+
+
+def fits(path: Path, pattern: str) -> bool:
+    """Whether a pattern of `Config.files` names a file, by its name or by the end of its path."""
+    return path.name == pattern or path.match(pattern)
 
 
 def mount_matrix(rpy_deg: Triple) -> Array:

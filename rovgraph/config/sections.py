@@ -1,5 +1,6 @@
 """The sections of the configuration, and what may stand in them."""
 
+import datetime as dt
 from functools import partial
 from typing import Annotated, Literal, Self
 
@@ -9,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 from pydantic_core import PydanticCustomError
 
 from rovgraph.config.presets import known_preset
+from rovgraph.dates import DateRules
 
 Positive = Annotated[float, Field(gt=0)]
 Readmission = Annotated[
@@ -320,6 +322,47 @@ def _stamped(sensor: str) -> str:
 
 
 Delays = dict[Annotated[str, AfterValidator(_stamped)], float]  # sensor -> how late its stamps are known to be [s]
+
+
+class Times(Section):
+    """What dates as text leave open."""
+
+    order: Literal["dmy", "mdy"] | None = Field(
+        None, description="order of day and month in dates such as 05/01/2026; null = as the dates themselves show"
+    )
+    zone_h: float = Field(0.0, ge=-14, le=14, description="hours ahead of UTC of dates that state no zone [h]")
+    date: dt.date | None = Field(None, description="day of times of day without a date, e.g. 2026-05-01")
+
+    @property
+    def rules(self) -> DateRules:
+        """The same, for those who read dates."""
+        return DateRules(self.order, self.zone_h, None if self.date is None else self.date.isoformat())
+
+
+COLUMNS_TEXT = "rovgraph's column: the log's own name for it"
+UNITS_TEXT = "column or sensor: unit it is in, e.g. gyr: deg/s"
+ANGLES_TEXT = (
+    "ahrs, attitude, dvl_heading, or a column: how its heading counts; ned, enu or nwu (axes forward, port, up), east"
+)
+Angles = dict[str, Literal["ned", "enu", "nwu", "east"]]
+
+
+class TableSettings(Section):
+    """How a table is written: names, units, senses of angles and times."""
+
+    columns: dict[str, str] = Field(default_factory=dict, description=COLUMNS_TEXT)
+    units: dict[str, str] = Field(default_factory=dict, description=UNITS_TEXT)
+    angles: Angles = Field(default_factory=dict, description=ANGLES_TEXT)
+    times: Times = Times()
+
+
+AS_WRITTEN: dict[str, object] = {"columns": {}, "units": {}, "angles": {}, "times": Times(), "files": {}}  # by rovgraph
+
+
+class FileSettings(TableSettings):
+    """How one of several files is written, where it differs from the others."""
+
+    delay_s: float = Field(0.0, description="how much older its measurements are than their stamps")
 
 
 class Online(Section):

@@ -23,6 +23,7 @@ def document(track: Track, options: Options) -> "simplekml.Kml":
     kml = simplekml.Kml(name=f"{track.name}, {track.estimate}")
     shown = track.at_rate(options.rate_or(SHOWN_HZ))
     lat, lon = shown.lat_lon
+    lon = track.continuous(lon)
     height = np.nan_to_num(-shown.trajectory.p_n[:, 2])
     coordinates = np.column_stack([lon.round(9), lat.round(9), height.round(4)]).tolist()
     if track.has_utc:
@@ -44,7 +45,7 @@ def _add_ellipses(kml: "simplekml.Kml", track: Track) -> None:
         if not np.isfinite(P := t.cov_p[k, :2, :2]).all():
             continue
         lat, lon = track.place(*(t.p_n[k, :2] + ellipse(P)).T)
-        ring = np.column_stack([lon, lat]).round(9).tolist()
+        ring = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
         polygon = folder.newpolygon(name=f"{t.time[k] - t.time[0]:.0f} s", outerboundaryis=ring)
         polygon.style.polystyle.color, polygon.style.linestyle.width = SHADE, 0
 

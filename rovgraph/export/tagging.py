@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rovgraph.dates import YEAR_FIRST, DateRules, is_text, seconds_of_numbers, seconds_of_texts
 from rovgraph.errors import InputError, in_one_line
 from rovgraph.export.points import point_table
 from rovgraph.export.track import Track
@@ -103,24 +104,18 @@ def _columns(track: Track) -> pd.DataFrame:
 
 
 def _seconds(times: pd.Series, track: Track) -> Array:
-    texts = times.astype(str).str.strip()
-    stated = times.notna() & (texts != "")  # a row without a time is outside the dive
-    if not pd.api.types.is_datetime64_any_dtype(times):
-        numbers = pd.to_numeric(times, errors="coerce")
-        if numbers[stated].notna().all():
-            return numbers.to_numpy(float)
-    dates = pd.to_datetime(texts.where(stated), utc=True, errors="coerce", format="ISO8601")
-    wrong = np.flatnonzero(dates.isna() & stated)
-    if len(wrong):
-        raise InputError(
-            f"column {times.name}: row {wrong[0] + 1} is {str(times.iloc[wrong[0]])[:30]!r}, expected seconds or a date"
-            " such as 2026-05-01T09:30:00Z"
-        )
-    if not track.has_utc:
+    numbers = times if times.dtype.kind in "biufM" else times.astype("string").str.replace(",", ".", regex=False)
+    if numbers.dtype.kind != "M" and not is_text(numbers):  # some with decimal commas
+        return seconds_of_numbers(pd.to_numeric(numbers, errors="coerce").to_numpy(float, na_value=np.nan))[0]
+    day = pd.Timestamp(float(track.trajectory.time[0]), unit="s") if track.has_utc else None
+    rules = DateRules(date=None if day is None else day.strftime("%Y-%m-%d"), remedy=YEAR_FIRST)  # of times of day
+    texts = times.map(str, na_action="ignore")
+    time, _ = seconds_of_texts(texts, rules, lambda row: f"column {times.name}: row {row + 1}")
+    if texts.notna().any() and not track.has_utc:
         raise InputError(
             f"column {times.name}: holds dates, and the dive's time is not Unix time; give seconds of the dive's clock"
         )
-    return np.asarray((dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds(), dtype=float)
+    return time
 
 
 def geotag(tagged: Tagged, track: Track, files: Sequence[Path], folder: Path) -> int:

@@ -63,6 +63,11 @@ class Track:
         """
         return self.trajectory.geodetic(require_place(self.name, self.origin))
 
+    def continuous(self, lon: Array) -> Array:
+        """Longitudes [deg] that go on beyond 180 where a dive crosses the date line: lines and rings stay whole."""
+        start = self.lat_lon[1][0]
+        return np.asarray(start + (lon - start + 180.0) % 360.0 - 180.0)
+
     def place(self, north: Array, east: Array) -> tuple[Array, Array]:
         """Latitude and longitude [deg] of other points, shape as given.
 

@@ -16,6 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol
 
+from rovgraph.config import TableSettings
 from rovgraph.errors import InputError, in_one_line, warn
 from rovgraph.interchange.recording import Recording
 
@@ -53,13 +54,12 @@ class Options:
     ----------
     choose : sensor -> instance, message or topic that feeds it, where a file has several
     progress : called with the bytes read so far and those of the file
-    columns, units : of a configuration, for rovgraph's own log (docs/log-format.md)
+    table : names, units, angles and times of rovgraph's own log, by a configuration (docs/log-format.md)
     """
 
     choose: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[int, int], None] = lambda done, total: None
-    columns: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
+    table: TableSettings = field(default_factory=TableSettings)
 
 
 class Format(Protocol):

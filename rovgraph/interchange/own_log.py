@@ -3,7 +3,7 @@
 A log that is read alone does not come here: `rovgraph.log.read_log` reads it.
 """
 
-import csv
+import warnings as python_warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,10 +15,10 @@ from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
 from rovgraph.interchange.stamps import UNIX_S
 from rovgraph.log.beams import BEAMS, beams_beside, beams_frame
-from rovgraph.log.reading import map_columns, numbers
+from rovgraph.log.reading import numbers, read_columns
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
-from rovgraph.log.table import read_table
-from rovgraph.log.units import factors
+from rovgraph.log.units import name_and_bracket
+from rovgraph.tables import names_of, read_table
 
 SURE = 0.95
 IN_RECEIVED = "host that received"
@@ -37,11 +37,10 @@ class OwnLog:
 
     def read(self, path: Path, options: Options) -> Recording:
         """Every sensor of the log, its stamps one clock."""
-        with collected_warnings() as texts:
+        with collected_warnings() as texts, python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore")  # said by whoever joins recordings, with the name of the file
             table = read_table(path)
-            names = map_columns(table, options.columns)
-            scale = factors(options.units, table.source)
-            cells = {name: numbers(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
+            cells, names = read_columns(table, options.table)
             beams = beams_beside(path)
         if RECEIVED in table.names:
             cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
@@ -70,12 +69,8 @@ def is_own_log(head: bytes, columns: Mapping[str, str] | None = None) -> bool:
     """
     if head.startswith(b"PAR1"):
         return True
-    own = dict(columns or {})
-    try:
-        top = head.partition(b"\n")[0].decode("utf-8").removeprefix("\ufeff").strip()
-        header = {name.strip() for name in next(csv.reader([top], skipinitialspace=True), [])}
-    except (UnicodeDecodeError, csv.Error):
-        return False
+    own, header = dict(columns or {}), set(names_of(head))
+    header |= {name_and_bracket(name)[0] for name in header}
     found = {name for name in header if is_column(name)} | {
         own_name for own_name, name in own.items() if name in header
     }

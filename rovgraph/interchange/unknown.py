@@ -1,10 +1,10 @@
 """What a file is that is given as a log and is none, and which command reads it."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 from rovgraph.config import Config
+from rovgraph.tables import encoding_of, names_of
 
 TRACK = {"time", "north", "east"}
 SUMMARY = "summary.json"
@@ -37,7 +37,7 @@ def purpose(path: Path, head: bytes) -> str:
         return "is an export of Foxglove as JSON; give the bag or MCAP file that it comes from"
     text = head.decode("utf-8", errors="replace")
     lines = text.splitlines()
-    header = {name.strip() for name in next(csv.reader(lines[:1]), [])}
+    header = set(names_of(head))
     if header >= TRACK:
         return f"is a track, not a log; rovgraph evaluate {path} REFERENCE compares it"
     keys = {line.partition(":")[0] for line in lines if ":" in line and not line.startswith((" ", "#"))}
@@ -48,12 +48,7 @@ def purpose(path: Path, head: bytes) -> str:
 
 def is_text(head: bytes) -> bool:
     """Whether a file that begins like this may be a table of text."""
-    try:
-        head.decode("utf-8")
-    except UnicodeDecodeError as error:
-        if len(head) - error.start > 3:  # or a letter was cut
-            return False
-    return b"\0" not in head
+    return encoding_of(head) is not None
 
 
 def refusal(path: Path, titles: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pymap3d
 
-from rovgraph.config import Config
+from rovgraph.config import AS_WRITTEN, Config
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
@@ -81,7 +81,7 @@ class Files:
         self.received = self._received() if self.resume else None  # before the track is touched: it may not be readable
         self.track = TrackFile(self.folder / TRACK, until)
         self.keeper = Keeper(checkpoint, self.warnings)
-        recorded = self.config.model_copy(update=_as_recorded(self.config))
+        recorded = self.config.model_copy(update={**AS_WRITTEN, "delay_s": {}})  # which has been applied
         try:
             (self.folder / CONFIG).write_text(recorded.to_yaml(), encoding="utf-8")
             (self.folder / SETTINGS).write_text(self.config.to_yaml(), encoding="utf-8")
@@ -217,8 +217,3 @@ def _last_rows(path: Path, origin: tuple[float, float] | None) -> pd.DataFrame:
         lat, lon = frame.pop("fix_lat").to_numpy(float), frame.pop("fix_lon").to_numpy(float)
         frame["fix_north"], frame["fix_east"], _ = pymap3d.geodetic2ned(lat, lon, 0.0, *origin, 0.0)
     return frame
-
-
-def _as_recorded(config: Config) -> dict[str, Any]:
-    """What of a configuration has been applied to a recording already."""
-    return {"columns": {}, "units": {}, "delay_s": {}}

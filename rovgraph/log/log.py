@@ -15,7 +15,7 @@ from rovgraph.log.beams import beams_beside
 from rovgraph.log.reading import read_streams
 from rovgraph.log.rows import Rows, tables_of
 from rovgraph.log.streams import STREAMS, Measurement, Stream, arrivals, in_precedence
-from rovgraph.log.table import Table, read_table, table_of_arrays, table_of_frame
+from rovgraph.tables import Table, read_table, table_of_arrays, table_of_frame
 
 
 @dataclass(frozen=True, repr=False)
@@ -161,7 +161,7 @@ class Log:
         """
         if self.config is None:
             return
-        for key in ("columns", "units", "delay_s", "imu.mag", "environment.origin"):
+        for key in ("columns", "units", "angles", "times", "files", "delay_s", "imu.mag", "environment.origin"):
             if _entry(self.config, key) != _entry(config, key):
                 raise InputError(
                     f"{self.source}: was read with another value of {key} than the configuration has; "

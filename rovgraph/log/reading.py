@@ -10,10 +10,13 @@ import numpy as np
 import pymap3d
 from numpy.typing import NDArray
 
-from rovgraph.config import Config
+from rovgraph.config import Config, TableSettings
+from rovgraph.dates import few_digits
 from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
+from rovgraph.log.latitudes import valid_positions
 from rovgraph.log.streams import (
+    DATE,
     LABEL,
     LAT_LON,
     RECEIVED,
@@ -23,10 +26,11 @@ from rovgraph.log.streams import (
     all_columns,
     is_column,
     is_optional,
+    label_number,
 )
-from rovgraph.log.table import Table
-from rovgraph.log.units import factors, near_miss, nearest
+from rovgraph.log.units import known_unit, name_and_bracket, near_miss, nearest, quantities, scales, turn_angles
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
+from rovgraph.tables import Table
 
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
@@ -80,9 +84,7 @@ def read_streams(tables: Iterable[Table], config: Config, source: str) -> tuple[
 
 def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, Stream], Origin]:
     """The streams of one table as they stand in it, and the origin, which is its first fix where it was not known."""
-    scale = factors(config.units, table.source)
-    names = map_columns(table, config.columns)
-    cells = {name: _scaled(numbers(table, name, source), scale.get(name, 1.0)) for name, source in names.items()}
+    cells, _ = read_columns(table, config.table)
     cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
     cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
     origin = _add_local_fixes(cells, line, table.source, origin)
@@ -92,8 +94,45 @@ def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, St
     return {s.sensor: _distinct_times(s, table.source) for s in streams if s is not None and len(s)}, origin
 
 
-def _scaled(values: Array, factor: float) -> Array:
-    return values if factor == 1.0 else values * factor  # most are: a copy would cost as much as they hold
+def read_columns(table: Table, settings: TableSettings) -> tuple[dict[str, Array], dict[str, str]]:
+    """The columns of a table that a log has, in SI and radians, and their names in the table.
+
+    Returns
+    -------
+    cells : rovgraph's name -> ndarray, shape (n,)
+    names : rovgraph's name -> the table's
+
+    Raises
+    ------
+    InputError : a column or unit that is unknown, a cell that is no number, no time
+
+    Warns
+    -----
+    DataWarning : infinities; how the table was read, where it is not written as a log of this program
+    """
+    names = map_columns(table, settings.columns)
+    scale = scales(settings.units, table.source)
+    stated = _units_of_header({name: written for name, written in names.items() if name not in scale})
+    scale |= scales(stated, table.source)
+    day = names.pop(DATE, None)
+    times, how = table.times(names["time"], settings.times.rules, day, in_seconds="time" in scale)
+    if how:  # of dates, which have no unit
+        scale.pop("time", None)
+    table.warn_how(how, f"units by the header ({', '.join(dict.fromkeys(stated.values()))})" if stated else "")
+    cells = {"time": _finite(table, "time", times)}
+    cells |= {name: numbers(table, name, source) for name, source in names.items() if name != "time"}
+    for name in scale.keys() & cells.keys():
+        cells[name] = scale[name](cells[name])
+    turn_angles(cells, settings.angles, table.source)
+    return {name: cells[name] for name in names}, names
+
+
+def _units_of_header(names: Mapping[str, str]) -> dict[str, str]:
+    """Column of a log -> unit that its name in the file states."""
+    kinds = quantities()
+    brackets = {name: name_and_bracket(written)[1] for name, written in names.items() if name in kinds}
+    units = {name: known_unit(kinds[name], bracket) for name, bracket in brackets.items() if bracket}
+    return {name: unit for name, unit in units.items() if unit is not None}
 
 
 def _found(names: Sequence[str]) -> str:
@@ -109,19 +148,21 @@ def map_columns(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
     InputError : unknown target, missing source, no time
     """
     for target, source in columns.items():
-        if not is_column(target):
+        if not is_column(target) and target != DATE:
             raise InputError(
                 f"{table.source}: columns: {target} is unknown, nearest is {nearest(target, all_columns())}"
             )
         if source not in table.names:
             near = nearest(source, table.names)
             raise InputError(f"{table.source}: columns: {target}: the log has no {source!r}, nearest is {near!r}")
-    names = {name: name for name in table.names if is_column(name)} | dict(columns)
+    names = {plain: name for name in table.names for plain, unit in [name_and_bracket(name)] if _is_known(plain, unit)}
+    names |= {name: name for name in table.names if is_column(name) or name == DATE} | dict(columns)
     if "time" not in names:
         near = nearest("time", table.names)
         raise InputError(
             f"{table.source}: line 1: no column time; {_found(table.names)}; "
-            f"rename one or map it, as in columns: {{time: {near!r}}}"
+            f"rename one or map it, as in columns: {{time: {near!r}}}; "
+            f"rovgraph convert {table.source} --guess proposes a mapping"
         )
     taken = {*names, *names.values()}
     for name in table.names:
@@ -131,9 +172,26 @@ def map_columns(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
     return names
 
 
+def _is_known(name: str, unit: str) -> bool:
+    """Whether a column that states a unit in brackets is one of a log, in a unit that is known."""
+    return name in quantities() and known_unit(quantities()[name], unit) is not None
+
+
 def numbers(table: Table, name: str, source: str) -> Array:
     """A column with infinities taken as missing, shape (n,)."""
-    values = table.labels(source) if name == LABEL else table.numbers(source)
+    return _finite(table, name, _labels(table, source) if name == LABEL else table.numbers(source))
+
+
+def _labels(table: Table, name: str) -> Array:
+    """A column of names as the numbers that stand for them, shape (n,); NaN = empty cell."""
+    cells = table.frame[name]
+    filled = cells.notna() & (cells.astype(str).str.strip() != "")
+    out = np.full(len(cells), np.nan)
+    out[filled] = [label_number(str(cell)) for cell in cells[filled]]
+    return out
+
+
+def _finite(table: Table, name: str, values: Array) -> Array:
     infinite = np.flatnonzero(np.isinf(values))
     if infinite.size:
         warn(
@@ -202,17 +260,7 @@ def _add_local_fixes(
     if "fix_north" in cells and "fix_east" in cells:
         warn(f"{source}: fix_lat and fix_lon are ignored beside fix_north and fix_east")
         return origin
-    lat, lon = (cells.pop(name).copy() for name in LAT_LON)
-    wild = np.flatnonzero((np.abs(lat) > 90.0) | (np.abs(lon) > 360.0))
-    if wild.size:
-        raise InputError(
-            f"{source}: line {line[wild[0]]}: latitude {lat[wild[0]]:g}, longitude {lon[wild[0]]:g}, expected degrees; "
-            "if they are in units of 1e-7 degrees, say units: {fix: degE7}"
-        )
-    unset = (lat == 0.0) & (lon == 0.0)
-    if unset.any():
-        warn(f"{source}: {unset.sum()} fixes at latitude and longitude 0 are invalid and left out")
-        lat[unset] = np.nan
+    lat, lon = valid_positions(cells.pop("fix_lat"), cells.pop("fix_lon"), line, source)
     valid = np.flatnonzero(~np.isnan(lat) & ~np.isnan(lon))
     cells["fix_north"], cells["fix_east"] = lat * np.nan, lon * np.nan
     if not valid.size:
@@ -370,6 +418,11 @@ def _distinct_times(stream: Stream, source: str) -> Stream:
         return stream
     first = np.flatnonzero(~again)[np.cumsum(~again) - 1]
     same = again & ((stream.data == stream.data[first]) | (np.isnan(stream.data) & np.isnan(stream.data[first]))).all(1)
+    if why := few_digits(stream.time[~same]):
+        raise InputError(
+            f"{source}: {stream.sensor}: {why}: they were written with too few digits, or the clock stood still; "
+            "write time with at least milliseconds, such as 1740564858.016"
+        )
     for which, what in ((same, "repeated exactly, left out"), (again & ~same, "at the time of another, first kept")):
         if which.any():
             line = stream.row[np.argmax(which)]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, all_columns
-from rovgraph.log.table import Table
 from rovgraph.spilling import release
+from rovgraph.tables import Table
 
 STAMP_DIGITS = 6  # of a second, as a log is written
 

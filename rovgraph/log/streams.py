@@ -33,6 +33,7 @@ STREAMS: Mapping[str, tuple[str, ...]] = _Streams()  # sensor -> its columns
 LABEL = "place_id"  # a column of names, not of quantities
 LAT_LON = ("fix_lat", "fix_lon")
 RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
+DATE = "date"  # day, or GPS week, of the times beside it
 THRUSTER = re.compile(r"thruster_[1-9]\d*")
 
 

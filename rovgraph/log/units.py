@@ -1,16 +1,21 @@
 """Units that a file may use, and names that may be misspelled.
 
 A unit is declared for a column (``gyr_x: deg/s``) or for a group of columns
-(``gyr: deg/s``); everything becomes SI and radians. A minus before the unit turns the sign (``depth: -m``).
+(``gyr: deg/s``); everything becomes SI and radians. A minus before the unit turns the sign (``depth: -m``). How an
+attitude counts is declared in the same way (``ahrs: enu``).
 """
 
 import difflib
 import re
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, MutableMapping
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
+from rovgraph.dates import EPOCHS, unix_of_epoch
 from rovgraph.errors import InputError
+from rovgraph.geometry import Array
 from rovgraph.log.streams import LAT_LON, all_columns
 from rovgraph.sensors import SENSORS
 
@@ -30,6 +35,19 @@ UNITS: dict[str, dict[str, float]] = {
     "length": _LENGTH,
     "latitude": {"deg": 1.0, "degE7": 1e-7, "rad": 1.0 / _DEG},
 }
+# kind of quantity -> units that no factor converts
+FORMS: dict[str, tuple[str, ...]] = {"latitude": ("ddmm",), "time": tuple(EPOCHS)}
+
+# how a heading counts -> sense, and heading of its zero [rad]; "enu" and "nwu" are of axes forward, port, up
+ANGLES = {"ned": (1.0, 0.0), "enu": (-1.0, 0.5 * np.pi), "nwu": (-1.0, 0.0), "east": (1.0, 0.5 * np.pi)}
+# group -> roll, pitch, yaw; how far roll is turned by axes that point up: an IMU's stay as they are, a mounting follows
+_ATTITUDES: dict[str, tuple[tuple[str, str, str], float]] = {
+    "ahrs": (("ahrs_roll", "ahrs_pitch", "ahrs_yaw"), np.pi),
+    "attitude": (("roll", "pitch", "heading"), 0.0),
+    "dvl_heading": (("", "", "dvl_heading"), 0.0),
+}
+
+_Values = TypeVar("_Values", float, Array)
 
 _SPELLINGS = {  # as other programs write units, in small letters
     "m/s²": "m/s2", "m/s/s": "m/s2", "m/sec^2": "m/s2", "m/sec2": "m/s2", "m/sec/sec": "m/s2", "mps2": "m/s2",
@@ -90,8 +108,28 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return plain[near[0]] if near else ""
 
 
-def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
-    """Factor to SI and radians of each column that a unit was declared for.
+@dataclass(frozen=True)
+class Scale:
+    """What makes SI and radians of the numbers of a column: a factor, or a form of `FORMS`."""
+
+    factor: float = 1.0
+    form: str = ""
+
+    def __call__(self, values: _Values) -> _Values:
+        """The same, converted: a number, or ndarray of any shape."""
+        if self.form == "ddmm":
+            degrees = np.trunc(np.asarray(values) / 100.0)
+            minutes = np.asarray(values) - 100.0 * degrees
+            converted = np.where(np.abs(minutes) < 60.0, degrees + minutes / 60.0, np.nan)  # or it is a placeholder
+        elif self.form:
+            converted = unix_of_epoch(np.asarray(values), self.form)
+        else:  # most are in SI: a copy would cost as much as they hold
+            return values if self.factor == 1.0 else values * self.factor
+        return float(converted) if isinstance(values, float) else converted
+
+
+def scales(units: Mapping[str, str], source: str) -> dict[str, Scale]:
+    """What makes SI and radians of each column that a unit was declared for.
 
     Parameters
     ----------
@@ -102,7 +140,7 @@ def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
     ------
     InputError : unknown column, group or unit, with the nearest known one
     """
-    out: dict[str, float] = {}
+    out: dict[str, Scale] = {}
     by_group, kinds = groups(), quantities()
     for key, signed in sorted(units.items(), key=lambda item: item[0] in kinds and item[0] not in by_group):
         unit = signed.removeprefix("-")
@@ -110,7 +148,7 @@ def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
         if not columns:
             near = nearest(key, [*by_group, *kinds])
             raise InputError(f"{source}: units: {key} is not a column or group with a unit, nearest is {near}")
-        known = [unit for c in columns for unit in UNITS[kinds[c]]]
+        known = [unit for c in columns for unit in (*UNITS[kinds[c]], *FORMS.get(kinds[c], ()))]
         if unit != signed and key == "time":
             raise InputError(f"{source}: units: time: {signed!r} has a sign, and time does not run backwards")
         if unit not in known:
@@ -119,9 +157,50 @@ def factors(units: Mapping[str, str], source: str) -> dict[str, float]:
                 f"known are {', '.join(dict.fromkeys(known))}"
             )
         sign = 1.0 if unit == signed else -1.0
-        for column in (c for c in columns if unit in UNITS[kinds[c]]):
-            out[column] = UNITS[kinds[column]][unit] * (1.0 if column.endswith("_sd") else sign)  # an sd has no sign
+        for column in columns:
+            if unit in FORMS.get(kinds[column], ()):
+                out[column] = Scale(form=unit)
+            elif unit in UNITS[kinds[column]]:
+                factor = UNITS[kinds[column]][unit]
+                out[column] = Scale(factor * (1.0 if column.endswith("_sd") else sign))  # an sd has no sign
     return out
+
+
+def turn_angles(cells: MutableMapping[str, _Values], angles: Mapping[str, str], source: str) -> None:
+    """Make headings clockwise from north, with roll and pitch of axes forward, starboard, down, of others.
+
+    An attitude R of axes forward, port, up in east, north, up is Rz(90 deg - yaw) Ry(-pitch) Rx(roll + 180 deg) of the
+    same axes in north, east, down.
+
+    Parameters
+    ----------
+    cells : column -> radians, a number or ndarray, shape (n,); changed in place
+    angles : group or column of headings -> key of `ANGLES`; a column alone leaves roll and pitch as they are
+    source : name of the log, for messages
+
+    Raises
+    ------
+    InputError : an unknown column or group, with the nearest known one
+    """
+    yaws: dict[str, str] = {names[2]: group for group, (names, _) in _ATTITUDES.items()}
+    for key, kind in angles.items():
+        if key not in _ATTITUDES and key not in yaws:
+            near = nearest(key, [*_ATTITUDES, *yaws])
+            raise InputError(f"{source}: angles: {key} is not a heading or a group with one, nearest is {near}")
+        (roll, pitch, yaw), upside_down = _ATTITUDES[key if key in _ATTITUDES else yaws[key]]
+        sense, zero = ANGLES[kind]
+        if yaw in cells:
+            cells[yaw] = _wrapped(zero + sense * cells[yaw])
+        if key in _ATTITUDES and sense < 0.0:
+            if pitch in cells:
+                cells[pitch] = -cells[pitch]
+            if roll in cells and upside_down:
+                cells[roll] = _wrapped(cells[roll] + upside_down)
+
+
+def _wrapped(angle: _Values) -> _Values:
+    turned = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+    return float(turned) if isinstance(angle, float) else turned
 
 
 def near_miss(name: str, present: Container[str]) -> str | None:

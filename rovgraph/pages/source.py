@@ -16,9 +16,9 @@ from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Stream
 from rovgraph.log.beams import beams_of
-from rovgraph.log.table import read_table
 from rovgraph.report.folder import STAMP, SUMMARY
 from rovgraph.report.results import BEAMS_FILE, CHI2_99
+from rovgraph.tables import read_table
 
 LACKS_S = 1.0  # that a track may end before its dive
 KINDS = ("smoothed", "filtered", "dead_reckoning")

@@ -14,14 +14,14 @@ from rich.table import Table
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from rovgraph.config import Config
+from rovgraph.config import AS_WRITTEN, Config
 from rovgraph.errors import InputError
 from rovgraph.fast_csv import write_csv, write_sparse_csv
 from rovgraph.geometry import Array
 from rovgraph.interchange.guessing.groups import ColumnGuess
 from rovgraph.log.rows import Part, column_names, frame_of, pieces, whole
-from rovgraph.log.table import SUFFIXES
 from rovgraph.progress import Progress, no_progress
+from rovgraph.tables import SUFFIXES
 
 PIECE = 8192  # rows of a sensor that are written at a time
 DIGITS = 10  # significant, of a cell: latitudes to a centimetre
@@ -99,7 +99,7 @@ def starter(
     name : of the log's file
     """
     settings: dict[str, Any] = config.model_dump(mode="json", exclude_unset=True)
-    settings = {key: value for key, value in settings.items() if key not in ("columns", "units")}
+    settings = {key: value for key, value in settings.items() if key not in AS_WRITTEN}
     sources = dict(sources)
     if origin is not None and not config.environment.origin:
         section = settings.setdefault("environment", {})
@@ -193,9 +193,11 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
 
 
-def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str]) -> Table:
-    """What each column of a table may be."""
-    table = _table("columns of the file", "column", "field", "unit", "why", "how sure")
+def guess_table(columns: Iterable[ColumnGuess], left: Mapping[str, str], name: str = "") -> Table:
+    """What each column of a table may be; ``name`` tells its file from others."""
+    table = _table(
+        f"columns of {name}" if name else "columns of the file", "column", "field", "unit", "why", "how sure"
+    )
     for each in columns:
         table.add_row(_printable(each.column), each.field, each.unit, _printable(each.why), each.sureness)
     for column, why in left.items():

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from rovgraph.config import Config, beliefs
+from rovgraph.config import AS_WRITTEN, Config, beliefs
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.log import Log
@@ -200,7 +200,7 @@ def path_of(manoeuvre: Manoeuvre, duration: float) -> Path:
 def predicted(manoeuvre: Manoeuvre, config: Config, duration: float, sensors: Sensors) -> Observability:
     """What a manoeuvre would show by itself."""
     ahrs = 10.0 if "ahrs" in (config.heading.sources or ()) else None
-    own = config.model_copy(update={"columns": {}, "units": {}, "delay_s": {}})
+    own = config.model_copy(update={**AS_WRITTEN, "delay_s": {}})
     truth = Truth(
         own, noise=False, imu_rate=sensors.imu_rate, dvl_rate=sensors.dvl_rate,
         fix_interval=sensors.fix_interval, ahrs_rate=ahrs,

@@ -7,7 +7,8 @@ import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.interchange.guessing import physics
-from rovgraph.interchange.guessing.groups import VECTORS, Group, Guesses, propose
+from rovgraph.interchange.guessing.groups import VECTORS, Candidate, ColumnGuess, Group, Guesses, propose
+from rovgraph.interchange.guessing.imu import UP
 from rovgraph.interchange.guessing.physics import Signal, UnitGuess
 
 NOTHING = Signal(np.empty(0), np.empty((0, 3)))
@@ -28,9 +29,22 @@ def guess_doppler(groups: Mapping[str, Group], time: Array, out: Guesses) -> Non
         propose(out, depth, _depth(depth.stated, sunk, lengths, agree))
     if moving is not None:
         propose(out, moving, _speed(moving.stated, speeds, agree))
+        _axes(moving, out)
     if (water := groups.get("dvl_water")) is not None:
         values = water.signal(time, VECTORS["dvl_water"]).values
         propose(out, water, _speed(water.stated, physics.speeds_by_size(values, water.stated), None))
+
+
+def _axes(moving: Group, out: Guesses) -> None:
+    """Axes to port and upwards by their names: a mounting where both are, else a sign."""
+    back = {name for name, each in moving.columns.items() if each.meaning.backwards}
+    if back >= {"dvl_vy", "dvl_vz"}:
+        out.state("dvl", "mount_rpy_deg", list(UP))
+        out.notes.append("the DVL's axes point forward, to port and up by their names")
+        return
+    for k, each in enumerate(out.columns):
+        if each.field in back and each.unit:
+            out.columns[k] = replace(each, unit=f"-{each.unit}", why=f"{each.why}, in the other direction by its name")
 
 
 def _descending(
@@ -80,7 +94,7 @@ def guess_others(groups: Mapping[str, Group], time: Array, out: Guesses) -> None
         for group in _present(groups, name):
             values = next(iter(group.columns.values())).values
             if name == "dvl_altitude" and np.nanmedian(values) < 0.0:
-                out.left |= {c.column: "negative, as no altitude above the bottom is" for c in group.columns.values()}
+                _height(next(iter(group.columns.values())), "depth" in groups, out)
                 continue
             unit = UnitGuess(group.stated, "stated", "sure")
             if not group.stated:
@@ -92,6 +106,16 @@ def guess_others(groups: Mapping[str, Group], time: Array, out: Guesses) -> None
         if len(fixes.time):
             unit = physics.latitudes_by_range(fixes.values[:, 0], fixes.values[:, 1], group.stated)
         propose(out, group, unit)
+
+
+def _height(each: Candidate, known: bool, out: Guesses) -> None:
+    """A negative altitude: a depth below the surface where there is no other."""
+    if known:
+        out.left[each.column] = "negative, as no altitude above the bottom is"
+        return
+    unit = each.meaning.unit or "m"
+    why = "negative, as a height above the surface is under water"
+    out.columns.append(ColumnGuess(each.column, "depth", f"-{unit}", why, "likely"))
 
 
 def _present(groups: Mapping[str, Group], name: str) -> Iterator[Group]:

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from rovgraph.dates import DateRules, Order
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.interchange.guessing.names import Meaning, meaning
 from rovgraph.interchange.guessing.physics import Signal, Sureness, UnitGuess
 from rovgraph.log.streams import is_optional
-from rovgraph.log.table import Table
 from rovgraph.log.units import quantities
+from rovgraph.tables import Table
 
 VECTORS = {
     "acc": ("acc_x", "acc_y", "acc_z"),
@@ -32,7 +33,7 @@ VECTORS = {
 PARTIAL = "attitude"  # whose columns may be of two sources
 OTHER = "attitude of another source"
 LARGEST = 1e100  # squares of more are infinite
-_ORDER: tuple[Sureness, ...] = ("sure", "likely", "unsure")
+ORDER: tuple[Sureness, ...] = ("sure", "likely", "unsure")
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,32 @@ class Guesses:
     left : column -> why it feeds nothing
     settings : of a configuration, that the numbers show, such as the mounting of an IMU
     notes : a sentence each
+    seconds : column of dates as text -> their times, ndarray, shape (n,) [s]
     """
 
     columns: list[ColumnGuess] = field(default_factory=list)
     left: dict[str, str] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    seconds: dict[str, Array] = field(default_factory=dict)
+
+    def state(self, section: str, key: str, value: object) -> None:
+        """Add a setting."""
+        self.settings.setdefault(section, {})[key] = value
+
+    def times(self, table: Table, name: str) -> bool:
+        """Whether a column of texts holds times, which are kept; where day and month may be exchanged, it is noted."""
+        orders: tuple[Order | None, ...] = (None, "dmy", "mdy")
+        for order in orders:
+            try:
+                self.seconds[name] = table.times(name, DateRules(order))[0]
+            except InputError:
+                continue
+            if order is not None:
+                self.state("times", "order", order)
+                self.notes.append(f"dates of {name} may have day or month first: see times.order")
+            return True
+        return False
 
 
 @dataclass(frozen=True)
@@ -112,8 +133,10 @@ def candidates_of(table: Table, out: Guesses) -> tuple[dict[str, Candidate], dic
         try:
             values = table.numbers(name)
         except InputError:
-            out.left[name] = "holds texts, not numbers alone"
-            continue
+            if not out.times(table, name):
+                out.left[name] = "holds texts, not numbers alone"
+                continue
+            values = out.seconds[name]
         values = np.where(np.abs(values) < LARGEST, values, np.nan)
         what = meaning(name)
         if not np.isfinite(values).any():
@@ -197,5 +220,5 @@ def propose(out: Guesses, group: Group, unit: UnitGuess) -> None:
         doubts = [text for text in (group.likely, each.meaning.assumed, shared) if text]
         choice: Sureness = "likely" if doubts else "sure"
         why = "; ".join([each.meaning.why, unit.why, *doubts])
-        sureness = max(unit.sureness, choice, key=_ORDER.index)
+        sureness = max(unit.sureness, choice, key=ORDER.index)
         out.columns.append(ColumnGuess(each.column, name, unit.unit, why, sureness))

@@ -12,7 +12,7 @@ from rovgraph.interchange.guessing.physics import Signal, UnitGuess
 from rovgraph.log.units import UNITS
 
 HEADINGS = {"ahrs": "ahrs_yaw", PARTIAL: "heading", OTHER: "heading", "dvl_heading": "dvl_heading"}
-ANTICLOCKWISE = "counts anticlockwise by the gyro, as ENU does: convert it, heading = 90 deg - yaw"
+ANTICLOCKWISE = "counts anticlockwise by the gyro: state angles, enu where its zero is east, nwu where it is north"
 UP = (180.0, 0.0, 0.0)  # mounting of an IMU whose z axis points up [deg]
 POINTS_UP = "the IMU's z axis points up by gravity: x forward and y to port are assumed"
 LEVEL = 0.7  # of gravity, that lies along an axis that is called vertical
@@ -46,7 +46,7 @@ def _mounting(force: Signal, out: Guesses) -> None:
         axis = "xyz"[int(np.abs(f).argmax())]
         out.notes.append(f"gravity lies along the IMU's {axis} axis: state imu.mount_rpy_deg (docs/mounting.md)")
     elif f[2] > 0.0:
-        out.settings["imu"] = {"mount_rpy_deg": list(UP)}
+        out.state("imu", "mount_rpy_deg", list(UP))
         out.notes.append(POINTS_UP)
 
 
@@ -139,16 +139,23 @@ def _angles(group: Group, yaw: str, time: Array, gyro: _Gyro, out: Guesses) -> _
         propose(out, group, replace(unit, why=told, sureness="unsure"))
         return replace(gyro, heading=False)
     left = tuple(dict.fromkeys(rate for _, rate in pairs))
-    if correlation < 0.0:
-        out.left |= {each.column: ANTICLOCKWISE for each in group.columns.values()}
-        return replace(gyro, units=left, heading=True)
     if len(pairs) > 1 and unit.sureness != "unsure":  # degrees with the gyro's, or radians with the gyro's
         pairs = [pair for pair in pairs if pair[0] == unit.unit] or pairs
     if len({angle for angle, _ in pairs}) == 1:
         unit = UnitGuess(pairs[0][0], "turns as the gyro does", "sure")
         left = tuple(dict.fromkeys(rate for _, rate in pairs))
+    if correlation < 0.0:
+        said = group.columns[yaw].meaning.enu
+        unit = replace(unit, why=f"{unit.why}; {ANTICLOCKWISE}", sureness=unit.sureness if said else "unsure")
+        if said:
+            out.state("angles", _named(group, yaw), "enu")
     propose(out, group, unit)
     return replace(gyro, units=left, heading=True)
+
+
+def _named(group: Group, yaw: str) -> str:
+    """What a configuration's ``angles`` calls it: with its roll and pitch, or the heading alone."""
+    return next((key for key in ("ahrs", "attitude") if len(group.columns) > 1 and yaw in VECTORS[key]), yaw)
 
 
 def _angle_by_range(values: Sequence[Array], units: Sequence[str], stated: str) -> UnitGuess:

@@ -8,34 +8,38 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
-from rovgraph.log.streams import is_column
+from rovgraph.log.streams import DATE, is_column
 from rovgraph.log.units import known_unit, name_and_bracket, quantities
 
 OWN_NAME = "rovgraph's own name"
-_PIECES = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_PIECES = re.compile(r"[A-ZÄÖÜ]+(?![a-zäöüß])|[A-ZÄÖÜ]?[a-zäöüß]+|\d+")
 _AXES = {
-    **{"x": "x", "forward": "x", "fwd": "x", "surge": "x"},
-    **{"y": "y", "starboard": "y", "stbd": "y", "sway": "y"},
-    **{"z": "z", "down": "z", "heave": "z"},
+    **dict.fromkeys(("x", "forward", "fwd", "surge", "vorne", "voraus"), "x"),
+    **dict.fromkeys(("y", "starboard", "stbd", "sway", "right", "rechts", "port", "left", "links"), "y"),
+    **dict.fromkeys(("z", "down", "heave", "unten", "up", "oben"), "z"),
 }
+_BACKWARDS = {"port", "left", "links", "up", "oben"}  # of axes to starboard and down
 _ACC = {"acc", "accel", "accelerometer", "acceleration", "a"}
 _GYR = {"gyr", "gyro", "gyroscope", "omega", "w"}
 _MAG = {"mag", "magn", "magnetic", "magnetometer", "magfield"}
 _VELOCITY = {"vel", "velocity", "v", "speed", "twist"}
 _GLUED = _ACC | _GYR | _MAG | _VELOCITY | {"g", "m"}  # words that an axis may be glued to: "accx", "gx"
 _SINGLE = {"g": "gyro", "m": "mag"}
-_ANGLES = {"roll": "roll", "pitch": "pitch"} | dict.fromkeys(("yaw", "heading", "hdg", "hdt", "hdm", "azimuth"), "yaw")
+_ANGLES = {"roll": "roll", "pitch": "pitch"} | dict.fromkeys(
+    ("yaw", "heading", "hdg", "hdt", "hdm", "azimuth", "kurs"), "yaw"
+)
 _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 _RATES = {"rate", "speed"}
 _SCALARS = {
-    "depth": {"depth"},
-    "dvl_altitude": {"altitude", "altimeter", "alt", "range"},
-    "fix_lat": {"lat", "latitude"},
-    "fix_lon": {"lon", "lng", "longitude"},
+    "depth": {"depth", "tiefe"},
+    "dvl_altitude": {"altitude", "altimeter", "alt", "range", "height", "hoehe", "höhe"},
+    "fix_lat": {"lat", "latitude", "breite", "breitengrad"},
+    "fix_lon": {"lon", "lng", "longitude", "länge", "laenge", "längengrad"},
     "fix_north": {"north", "northing"},
     "fix_east": {"east", "easting"},
 }
-_TIME = {"time", "timestamp", "stamp", "t", "utc", "clock", "epoch"}
+_TIME = {"time", "timestamp", "stamp", "t", "utc", "clock", "epoch", "zeit", "uhrzeit", "tow", "itow", "sow"}
+_DAY = {"date", "datum", "week"}  # of times beside it
 _IMU = {"imu", "ahrs", "ins", "xsens", "vn", "vectornav", "microstrain", "mti"}
 _DVL = {"dvl", "bt", "btm", "bottom"}
 _WATER = {"water", "wt"}
@@ -49,7 +53,7 @@ _DERIVED = {
     **dict.fromkeys(("setpoint", "desired", "target", "cmd", "command", "reference", "ref"), "a command"),
     **dict.fromkeys(("truth", "groundtruth", "ekf", "kf", "filter", "filtered", "estimate", "estimated", "odom",
                      "odometry"), "an estimate"),
-    **dict.fromkeys(("delta", "increment", "week", "error", "err"), "not a measurement that a log has"),
+    **dict.fromkeys(("delta", "increment", "error", "err"), "not a measurement that a log has"),
     **dict.fromkeys(("orientation", "quaternion", "quat", "q"), "a quaternion; write roll, pitch and yaw"),
     **dict.fromkeys(("pressure", "press"), "a pressure; write the depth in metres"),
 }  # fmt: skip
@@ -66,6 +70,8 @@ class Meaning:
     unit : that the name states, a key of `UNITS`; "" = none
     why : what the field follows from, or why there is none
     assumed : what the name leaves open, "" = nothing
+    backwards : it is of an axis to port or upwards
+    enu : it says that its axes are east, north, up
     """
 
     field: str
@@ -73,6 +79,8 @@ class Meaning:
     unit: str
     why: str
     assumed: str = ""
+    backwards: bool = False
+    enu: bool = False
 
 
 def meaning(written: str) -> Meaning:
@@ -95,7 +103,13 @@ def meaning(written: str) -> Meaning:
     field, words, unit = whole
     if not field:
         return Meaning("", "", "", _refusal(words))
-    return replace(_with_unit(field, _source(words), unit, "by name"), assumed=_assumption(field, set(words)))
+    said = set(words)
+    return replace(
+        _with_unit(field, _source(words), unit, "by name"),
+        assumed=_assumption(field, said),
+        backwards=bool(said & _BACKWARDS),
+        enu="enu" in said,
+    )
 
 
 def _with_unit(field: str, source: str, unit: str, why: str) -> Meaning:
@@ -155,6 +169,8 @@ def _field(words: Collection[str]) -> str:
         return "dvl_valid" if has(_DVL | _VELOCITY) else ""
     if has(_TIME):
         return "time"
+    if has(_DAY):
+        return DATE
     angle = next((_ANGLES[word] for word in words if word in _ANGLES), "")
     axis = next((_AXES[word] for word in reversed(list(words)) if word in _AXES), "")
     if angle and has(_RATES):
@@ -178,7 +194,7 @@ def _vector(axis: str, words: set[str]) -> str:
     for group, known in (("mag", _MAG), ("gyr", _GYR), ("acc", _ACC)):
         if words & known:
             return f"{group}_{axis}"
-    if words & _VELOCITY and not words & _NOT_DVL:
+    if words & (_VELOCITY | _DVL) and not words & _NOT_DVL:
         return f"dvl_water_v{axis}" if words & _WATER else f"dvl_v{axis}"
     return ""
 
@@ -191,7 +207,21 @@ def _scalar(words: set[str]) -> str:
 
 def _source(words: Collection[str]) -> str:
     """What a name says beside quantity and axis."""
-    spoken = {*_AXES, *_ACC, *_GYR, *_MAG, *_VELOCITY, *_ANGLES, *_RATES, *_SD, *_VALID, "angular", "linear", "field"}
+    spoken = {
+        "enu",
+        *_AXES,
+        *_ACC,
+        *_GYR,
+        *_MAG,
+        *_VELOCITY,
+        *_ANGLES,
+        *_RATES,
+        *_SD,
+        *_VALID,
+        "angular",
+        "linear",
+        "field",
+    }
     spoken = spoken.union({"g", "m"}, *_SCALARS.values())
     return " ".join(word for word in words if word not in spoken)
 

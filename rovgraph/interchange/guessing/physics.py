@@ -17,6 +17,7 @@ import numpy as np
 from rovgraph.geometry import Array, cross
 from rovgraph.interchange.inertial import GRAVITY, MOST
 from rovgraph.interchange.stamps import UNIX_S
+from rovgraph.log.latitudes import is_placeholder, unit_of
 from rovgraph.log.units import UNITS
 
 Sureness = Literal["sure", "likely", "unsure"]
@@ -192,6 +193,8 @@ def agreeing(slope: float, a: tuple[str, Sequence[str]], b: tuple[str, Sequence[
 
 def latitudes_by_range(lat: Array, lon: Array, stated: str) -> UnitGuess:
     """Unit of positions on the ellipsoid, shape (n,) each."""
+    known = ~(is_placeholder(lat) | is_placeholder(lon)) | (np.abs(lat) <= 90.0) & (np.abs(lon) <= 360.0)
+    lat, lon = (lat[known], lon[known]) if known.any() else (lat, lon)
     most_lat, most_lon = float(np.abs(lat).max()), float(np.abs(lon).max())
     fits = [
         unit
@@ -199,12 +202,18 @@ def latitudes_by_range(lat: Array, lon: Array, stated: str) -> UnitGuess:
         if most_lat * factor <= 90.0 and most_lon * factor <= 180.0 and (unit != "degE7" or most_lat * factor > 0.01)
     ]
     if stated:
-        fits_stated = stated in fits
+        fits_stated = stated in fits or stated == "ddmm"
         return UnitGuess(stated, "stated", "sure") if fits_stated else UnitGuess(stated, "out of range", "unsure")
     if fits == ["deg", "rad"]:
         return UnitGuess("deg", "degrees or radians, both are in range", "unsure")
     if not fits:
-        return UnitGuess("deg", "out of range in any unit", "unsure")
+        unit = unit_of(lat, lon)
+        if unit in ("", "exchanged"):
+            why = "latitude and longitude are exchanged" if unit else "out of range in any unit"
+            return UnitGuess("deg", why, "unsure")
+        return UnitGuess(
+            unit, "degrees and minutes" if unit == "ddmm" else f"up to {most_lat:.7g}, {most_lon:.7g}", "sure"
+        )
     unit = fits[0]
     return UnitGuess(unit, f"up to {most_lat:.7g}, {most_lon:.7g}", "sure")
 

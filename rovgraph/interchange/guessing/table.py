@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rovgraph.dates import EPOCHS, DateRules, seconds_of_numbers
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.interchange.guessing import physics
@@ -23,10 +24,11 @@ from rovgraph.interchange.guessing.groups import (
     propose,
 )
 from rovgraph.interchange.guessing.imu import guess_imu
-from rovgraph.interchange.guessing.names import OWN_NAME, Meaning
+from rovgraph.interchange.guessing.names import OWN_NAME, Meaning, meaning
 from rovgraph.interchange.guessing.physics import UnitGuess
-from rovgraph.log.table import Table
+from rovgraph.log.streams import DATE
 from rovgraph.log.units import UNITS
+from rovgraph.tables import Table
 
 IN_ORDER = 0.99  # of stamps that are not before the row above
 EVEN = 0.2  # spread of gravity's magnitude over its median
@@ -47,12 +49,11 @@ def guess_table(table: Table) -> Guesses:
     out = Guesses()
     candidates, unnamed = candidates_of(table, out)
     stamps = _time(table, candidates, unnamed, out)
-    groups = groups_of([c for c in candidates.values() if c.meaning.field != "time"], out)
-    unit = _unit_of_time(stamps, groups.get("acc"))
+    groups = groups_of([c for c in candidates.values() if c.meaning.field not in ("time", DATE)], out)
+    time, unit = _seconds(table, stamps, candidates, groups.get("acc"), out)
     propose(out, Group({"time": stamps}), unit)
     if "acc" not in groups:
         _force_without_a_name(unnamed, out)
-    time = stamps.values * UNITS["time"][unit.unit]
     guess_imu(groups, time, out)
     guess_doppler(groups, time, out)
     guess_others(groups, time, out)
@@ -60,6 +61,30 @@ def guess_table(table: Table) -> Guesses:
     out.columns.sort(key=lambda each: order[each.column])
     out.left = {name: out.left[name] for name in sorted(out.left, key=order.__getitem__)}
     return out
+
+
+def _seconds(
+    table: Table, stamps: Candidate, candidates: Mapping[str, Candidate], imu: Group | None, out: Guesses
+) -> tuple[Array, UnitGuess]:
+    """Times, shape (n,) [s], and the unit of their column; with days of another column where there are some."""
+    days = [name for name in table.names if meaning(name).field == DATE]
+    for day in days:
+        try:
+            time, how = table.times(stamps.column, DateRules(), day)
+        except InputError:
+            continue
+        if how and (stamps.column not in out.seconds or "without a date" not in how):
+            out.columns.append(ColumnGuess(day, DATE, "", how, "sure"))
+            out.left.pop(day, None)
+            return time, UnitGuess("", f"beside {day}", "sure")
+    out.left |= {day: "a date, of times that have none" for day in days}
+    if stamps.column in out.seconds:
+        return stamps.values, UnitGuess("", "dates or times of day as text", "sure")
+    time, how = seconds_of_numbers(stamps.values)
+    if program := next((each for each in EPOCHS if each in how.lower()), ""):
+        return time, UnitGuess(program, how, "likely")
+    unit = _unit_of_time(stamps, imu)
+    return stamps.values * UNITS["time"][unit.unit], unit
 
 
 def _is_number(text: str) -> bool:

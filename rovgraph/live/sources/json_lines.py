@@ -4,9 +4,14 @@ What a configuration says of a log's names and units holds for them too, so that
 log, written as JSON lines, say what the log says.
 """
 
+import math
+
 import numpy as np
+import pandas as pd
 
 from rovgraph.config import Config
+from rovgraph.dates import seconds_of_texts
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.interchange.lines import Refused, json_number, json_object, shown
 from rovgraph.interchange.waterlinked_reports import is_report
@@ -14,14 +19,16 @@ from rovgraph.live.message import GEODETIC, Message, readings
 from rovgraph.live.sources.lines import LineDecoder
 from rovgraph.live.sources.source import Notify
 from rovgraph.live.sources.waterlinked import report_message
+from rovgraph.log.latitudes import is_placeholder
 from rovgraph.log.reading import ACC_GAP
 from rovgraph.log.streams import LABEL, LAT_LON, STREAMS, THRUSTER, is_column, label_number
-from rovgraph.log.units import factors, near_miss
+from rovgraph.log.units import Scale, near_miss, scales, turn_angles
 from rovgraph.sensors import SENSORS
 
 ACC, GYR = STREAMS["imu"][:3], STREAMS["imu"][3:]
 UNKNOWN = 20  # unknown keys that are told apart
 
+_AS_IT_IS = Scale()
 _OTHERS = dict.fromkeys(LAT_LON, GEODETIC) | {"dvl_valid": "dvl", "dvl_sd": "dvl", "place_sd": "place"}
 
 
@@ -53,7 +60,9 @@ class JsonRow:
         self._url = url
         self._notify = notify
         self._names = {theirs: ours for ours, theirs in config.columns.items()}
-        self._scale = factors(config.units, url)
+        self._scale = scales(config.units, url)
+        self._angles, self._rules = config.angles, config.times.rules
+        turn_angles({}, config.angles, url)  # an unknown one is told before the first line
         self._unknown: set[str] = set()
         self._sensors = {c: sensor.name for sensor in SENSORS.values() for c in sensor.required} | _OTHERS
         self._acc: tuple[Array, float | None, float] | None = None  # the last one, its stamp and arrival
@@ -88,11 +97,30 @@ class JsonRow:
                 self._report(key)
             elif value is None:
                 continue
+            elif name == "time" and isinstance(value, str):
+                cells[name] = self._seconds(value)
             elif name == LABEL and (isinstance(value, str) or json_number(key, value) % 1.0):
                 cells[name] = label_number(str(value))  # 7.5 is a name, as it is in a log
             else:
-                cells[name] = json_number(key, value, self._scale.get(name, 1.0))
+                cells[name] = self._scale.get(name, _AS_IT_IS)(json_number(key, value))
+                if not math.isfinite(cells[name]):  # a placeholder
+                    del cells[name]
+        turn_angles(cells, self._angles, self._url)
         return cells
+
+    def _seconds(self, text: str) -> float:
+        """Unix time of a date.
+
+        Raises
+        ------
+        Refused : it is none, or may be of two days
+        """
+        try:
+            time, how = seconds_of_texts(pd.Series([text]), self._rules, lambda _: "time")
+        except InputError as error:
+            raise Refused("no time", f"{error}; the line is skipped") from None
+        self._notify("dates", f"time is read as {how}", once=True)
+        return float(time[0])
 
     def _report(self, key: str) -> None:
         if key in self._unknown or len(self._unknown) < UNKNOWN:
@@ -140,6 +168,10 @@ def _check(cells: dict[str, float]) -> None:
         if cells.get(name, 1.0) <= 0.0:  # as many instruments say that they do not know
             del cells[name]
     lat, lon = (cells.get(name, 0.0) for name in LAT_LON)
+    beyond = abs(lat) > 90.0 or abs(lon) > 360.0
+    if beyond and is_placeholder(np.array([lat, lon])).any():  # of a receiver without a fix
+        cells |= dict.fromkeys(LAT_LON, 0.0)
+        lat = lon = 0.0
     if abs(lat) > 90.0 or abs(lon) > 360.0:
         raise Refused("out of range", f"latitude {lat:g}, longitude {lon:g}, expected degrees; the line is skipped")
     if all(cells.get(name) == 0.0 for name in LAT_LON):  # how a receiver without a fix says so
