@@ -1,4 +1,4 @@
-"""GeoJSON (RFC 7946): the track as a line, points with their sds, 95 % ellipses and fixes; depth is negative."""
+"""GeoJSON (RFC 7946): the track as a line, points with their sds, 95 % ellipses and fixes; heights above sea level."""
 
 import json
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def _fixes(track: Track) -> Iterator[Feature]:
     if track.fixes is None:
         return
     lat, lon = track.place(*track.fixes.position.T)
-    places = zip(track.fixes.time, track.fixes.used, _continuous(track, lon), lat, strict=True)
+    places = zip(track.fixes.time, track.fixes.used, track.continuous(lon), lat, strict=True)
     for time, used, *where in places:
         place = [round(float(x), 9) for x in where]
         yield _feature("Point", place, kind="fix", time=round(float(time), 4), used=bool(used))
@@ -55,21 +55,15 @@ def _fixes(track: Track) -> Iterator[Feature]:
 
 def _ring(track: Track, corners: Array) -> list[list[float]]:
     lat, lon = track.place(*corners[:-1].T)
-    ring = np.column_stack([_continuous(track, lon), lat]).round(9).tolist()
+    ring = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
     return [*ring, ring[0]]
 
 
 def _coordinates(track: Track) -> list[list[float]]:
     lat, lon = track.lat_lon
-    where = np.column_stack([_continuous(track, lon).round(9), lat.round(9), -track.trajectory.p_n[:, 2].round(4)])
+    where = np.column_stack([track.continuous(lon).round(9), lat.round(9), track.height.round(4)])
     coordinates: list[list[float]] = where[:, : 2 if np.isnan(where[:, 2]).any() else 3].tolist()
     return coordinates
-
-
-def _continuous(track: Track, lon: Array) -> Array:
-    """Longitudes [deg] that go on beyond 180 where a dive crosses the date line: lines and rings stay whole."""
-    start = track.lat_lon[1][0]
-    return np.asarray(start + (lon - start + 180.0) % 360.0 - 180.0)
 
 
 def _feature(kind_of_geometry: str, coordinates: Any, **properties: Any) -> Feature:

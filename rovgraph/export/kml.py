@@ -23,8 +23,8 @@ def document(track: Track, options: Options) -> "simplekml.Kml":
     kml = simplekml.Kml(name=f"{track.name}, {track.estimate}")
     shown = track.at_rate(options.rate_or(SHOWN_HZ))
     lat, lon = shown.lat_lon
-    height = np.nan_to_num(-shown.trajectory.p_n[:, 2])
-    coordinates = np.column_stack([lon.round(9), lat.round(9), height.round(4)]).tolist()
+    height = np.nan_to_num(shown.height)
+    coordinates = np.column_stack([track.continuous(lon).round(9), lat.round(9), height.round(4)]).tolist()
     if track.has_utc:
         line = kml.newgxtrack(name=track.name, altitudemode="absolute")
         line.newwhen([stamp.strftime("%Y-%m-%dT%H:%M:%S.%fZ") for stamp in shown.utc])
@@ -44,7 +44,7 @@ def _add_ellipses(kml: "simplekml.Kml", track: Track) -> None:
         if not np.isfinite(P := t.cov_p[k, :2, :2]).all():
             continue
         lat, lon = track.place(*(t.p_n[k, :2] + ellipse(P)).T)
-        ring = np.column_stack([lon, lat]).round(9).tolist()
+        ring = np.column_stack([track.continuous(lon), lat]).round(9).tolist()
         polygon = folder.newpolygon(name=f"{t.time[k] - t.time[0]:.0f} s", outerboundaryis=ring)
         polygon.style.polystyle.color, polygon.style.linestyle.width = SHADE, 0
 
@@ -54,6 +54,7 @@ def _add_fixes(kml: "simplekml.Kml", track: Track) -> None:
         return
     folder, start = kml.newfolder(name="fixes"), track.trajectory.time[0]
     lat, lon = track.place(*track.fixes.position.T)
+    lon = track.continuous(lon)
     for k, (time, used) in enumerate(zip(track.fixes.time, track.fixes.used, strict=True)):
         point = folder.newpoint(coords=[(round(float(lon[k]), 9), round(float(lat[k]), 9))])
         point.description = f"{time - start:.1f} s, {'used' if used else 'rejected'}"
