@@ -65,7 +65,7 @@ def track(log: Log, config: Config) -> Iterator[Finding]:
     psi = heading[0], heading[1]
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     turn = np.exp(1j * np.interp(pings.time, *psi))
-    arm = complex(*config.fix.lever_arm_m[:2])
+    arm = complex(*config.fix.lever_arm_m[:2]) - complex(*config.dvl.lever_arm_m[:2])  # from the DVL
     plane = _Plane(log, pings.time, arm * np.exp(1j * np.interp(log["fix"].time, *psi)))
     if plane.spread < max(ENOUGH_DISTANCE, SURE * config.fix.sd_m):
         yield Finding("fix", "ok", "too few fixes, or too little movement, to compare the DVL with them")
@@ -136,7 +136,7 @@ def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Lin
 
 
 class _Plane:
-    """Fixes as complex numbers, less their lever arm, and the stretches in which the DVL's track is known."""
+    """Fixes as complex numbers, less their arm from the DVL, and the stretches in which the DVL's track is known."""
 
     def __init__(self, log: Log, pings: Array, arms: Complexes):
         fix = log["fix"]
