@@ -53,12 +53,14 @@ class Options:
     choose : sensor -> instance, message or topic that feeds it, where a file has several
     progress : called with the bytes read so far and those of the file
     columns, units : of a configuration, for rovgraph's own log (docs/log-format.md)
+    arrival : stamps are to be those of arrival, at least some: rows whose own stamps are wrong are kept
     """
 
     choose: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[int, int], None] = lambda done, total: None
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    arrival: bool = False
 
 
 class Format(Protocol):

@@ -13,12 +13,12 @@ from rovgraph.errors import InputError, collected_warnings
 from rovgraph.geometry import Array
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
-from rovgraph.interchange.stamps import UNIX_S
 from rovgraph.log.beams import BEAMS, beams_beside, beams_frame
-from rovgraph.log.reading import map_columns, numbers
+from rovgraph.log.reading import in_order, map_columns, numbers
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
 from rovgraph.log.table import read_table
 from rovgraph.log.units import factors
+from rovgraph.stamps import UNIX_S
 
 SURE = 0.95
 IN_RECEIVED = "host that received"
@@ -43,8 +43,13 @@ class OwnLog:
             scale = factors(options.units, table.source)
             cells = {name: numbers(table, name, source) * scale.get(name, 1.0) for name, source in names.items()}
             beams = beams_beside(path)
-        if RECEIVED in table.names:
-            cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
+            if RECEIVED in table.names:
+                cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
+            try:
+                cells = cells if options.arrival else in_order(cells, table.line, table.source, RECEIVED in cells)[0]
+            except InputError:
+                if RECEIVED not in cells:  # by which each sensor's stamps are put right
+                    raise
         channels = tuple(_channels(cells))
         if not channels:
             raise InputError(f"{path}: no measurement of any sensor in it; columns: {', '.join(table.names)[:200]}")
