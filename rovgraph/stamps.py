@@ -17,7 +17,7 @@ from rovgraph.spilling import holds, steps
 STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 JUMP = 86400.0  # ahead, after which a stamp is of another epoch [s]
 LOST = 0.1  # of the rows, that stamps of another epoch may have
-NOT_SET = 0.5  # of the rows, that may be from before a clock was set
+NOT_SET = 0.33  # of the rows, that may be from before a clock was set
 UNIX_S = 9.5e8, 4.2e9  # what lies within, 2000 to 2103, is taken for Unix time [s]
 HOUR_S, DAY_S, WEEK_S = 3600.0, 86400.0, 604_800.0
 LEAP_S = 18.0  # that GPS time is ahead of UTC since 2017
@@ -67,7 +67,11 @@ def counter_range(before: float, after: float) -> float:
 
 
 def mend(
-    time: Array, where: str, line: NDArray[np.int64] | None = None, step_back: float = STEP_BACK
+    time: Array,
+    where: str,
+    line: NDArray[np.int64] | None = None,
+    step_back: float = STEP_BACK,
+    not_set: float = NOT_SET,
 ) -> tuple[Array, list[str]]:
     """Stamps of one clock in the order in which they were recorded, put right as far as they tell how.
 
@@ -77,6 +81,7 @@ def mend(
     where : file and sensor, for messages
     line : of the file, ndarray of int, shape (n,); None = rows are counted from 1
     step_back : by which rows may be earlier than those above them [s]
+    not_set : share of rows that may be left out as they are from before a clock was set
 
     Returns
     -------
@@ -96,7 +101,7 @@ def mend(
     kept = np.ones(len(rows), bool)
     unset = _unset(stamps)
     if unset.any():
-        if unset.mean() > NOT_SET:
+        if unset.mean() > not_set:
             until = f"{what} {number[rows[np.flatnonzero(~unset)[0]]]}"
             raise InputError(
                 f"{where}: {_count(unset)} of {len(rows)} rows have stamps of a clock that was not set "
@@ -220,7 +225,7 @@ def _unset(time: Array) -> NDArray[np.bool_]:
     unix = (time > UNIX_S[0]) & (time < UNIX_S[1])
     if unix.mean() > LOST:
         return np.asarray(~unix)
-    return np.asarray(np.isin(time, FULL) | ((time == 0.0) & (np.median(time) > DAY_S)))
+    return np.isin(time, FULL)
 
 
 def _counter(time: Array) -> float:

@@ -116,7 +116,7 @@ def merge(
     if not any(recording.channels for recording in recordings):
         raise InputError(f"{', '.join(file_names(recordings))}: no measurement of any sensor in it")
     recordings, shift, told = join_pieces(recordings, shift)
-    said += told
+    said = [*(text for recording in recordings for text in recording.warnings), *said, *told]
     selected, unused = select(recordings, choose)
     said += require_used(recordings, selected, unused, choose)
     clocks, beside, unix, notes = join_clocks(recordings, selected, shift, _motion)
@@ -203,7 +203,6 @@ def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[st
     out: list[Recording] = []
     said: list[str] = []
     for recording, name in zip(recordings, file_names(recordings), strict=True):
-        said += recording.warnings
         channels = []
         for channel in recording.channels:
             ordered, text = put_in_order(channel, name)

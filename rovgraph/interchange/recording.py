@@ -36,6 +36,22 @@ class Clock:
 
 
 @dataclass(frozen=True)
+class Zero:
+    """The surface that depths count from, where it was taken from the pressures of the same file.
+
+    Attributes
+    ----------
+    depth : of water that weighs as much as the pressure that was taken off [m]
+    said : the sentence of `Recording.warnings` that tells it
+    measured : False = the standard atmosphere, as nothing was measured near the surface
+    """
+
+    depth: float
+    said: str
+    measured: bool
+
+
+@dataclass(frozen=True)
 class Channel:
     """Measurements of one sensor, as columns of a log (docs/log-format.md).
 
@@ -49,6 +65,7 @@ class Channel:
     clock : name of the `Clock` that stamps it
     received : when each row arrived, on the clock ``receiver``, ndarray, shape (n,); None = not recorded
     receiver : name of the `Clock` of ``received``
+    zero : of depths, where the file does not state it: pieces of one recording share the least
     """
 
     sensor: str
@@ -58,6 +75,7 @@ class Channel:
     clock: str = ""
     received: Array | None = None
     receiver: str = ""
+    zero: Zero | None = None
 
 
 def in_files(channel: Channel) -> Channel:
@@ -119,6 +137,7 @@ class Recording:
         the clock of the DVL's channels, or of the first channel where there is none. ``dvl_beams`` has what each beam
         of the DVL measured, its columns as `rovgraph.log.beams` names them
     pieces : the files that it was joined of, in the order of time; () = it is one file
+    assumed : section of ``settings`` that is not known but assumed -> the sentence of ``warnings`` that tells it
     """
 
     path: str
@@ -131,6 +150,7 @@ class Recording:
     warnings: tuple[str, ...] = ()
     tables: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
     pieces: tuple[Piece, ...] = ()
+    assumed: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:

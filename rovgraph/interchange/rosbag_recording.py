@@ -13,9 +13,9 @@ from rovgraph.geometry import Array, matrix_from_quaternion, rpy_from_matrix
 from rovgraph.interchange.alternatives import preferred_first
 from rovgraph.interchange.fixes import ONE_POINT, new_fixes, one_point
 from rovgraph.interchange.formats import Options
-from rovgraph.interchange.pressure import depth, surface_pressure
+from rovgraph.interchange.pressure import depth, surface_pressure, zero_of
 from rovgraph.interchange.rates import too_slow
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording, in_files
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording, Zero, in_files
 from rovgraph.interchange.rosbag_frames import FRD_OF_FLU, Frames, Mounting
 from rovgraph.interchange.rosbag_messages import COLUMNS, DOWN, GENERAL
 from rovgraph.interchange.rosbag_nucleus import CLOCK as NUCLEUS
@@ -78,7 +78,9 @@ def recording(
     used = {c.clock for c in channels} | {c.receiver for c in channels}
     clocks = {name: clock for name, clock in made.clocks.items() if name in used}
     notes, warnings = tuple(dict.fromkeys(made.notes)), tuple(dict.fromkeys(made.warnings))
-    return Recording(str(path), format_, channels, clocks, tuple(made.left), made.settings, notes, warnings)
+    return Recording(
+        str(path), format_, channels, clocks, tuple(made.left), made.settings, notes, warnings, assumed=made.assumed
+    )
 
 
 class _Made:
@@ -92,6 +94,8 @@ class _Made:
         self.clocks = {name: Clock(name, 0.0, 0.0, "its stamps are Unix time") for name in (HEADERS, RECORDER)}
         self._path, self._frames, self._choose = path, frames, options.choose
         self._mountings: dict[str, Mounting | None] = {}  # of the preferred topic of a sensor
+        self.assumed: dict[str, str] = {}
+        self._zeros: dict[str, Zero] = {}  # by topic
 
     def of(self, sensor: str, topics: Mapping[str, Topic]) -> Iterator[Channel]:
         """All topics that tell of a sensor, the preferred one first."""
@@ -126,7 +130,8 @@ class _Made:
         if first:
             self._mountings[sensor] = self._frames.mounting(topic.frame)
         source = f"{topic.name} ({topic.type})"
-        return in_files(Channel(sensor, columns, source, frame, clock, received, RECORDER))
+        zero = self._zeros.get(topic.name) if sensor == "depth" else None
+        return in_files(Channel(sensor, columns, source, frame, clock, received, RECORDER, zero))
 
     def _columns(self, sensor: str, topic: Topic, values: Array) -> dict[str, Array]:
         if sensor == "depth":
@@ -183,6 +188,7 @@ class _Made:
         surface, said, _ = surface_pressure(None, pressure)
         at = f"{surface / 100.0:.0f} hPa at the surface ({said})"
         self.warnings.append(f"{topic.name}: depth against {at}, in water of {SEA:.0f} kg/m3")
+        self._zeros[topic.name] = zero_of(surface, SEA, self.warnings[-1])
         return depth(pressure, surface, SEA)
 
     def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
@@ -239,7 +245,7 @@ class _Made:
             upwards = bool(acc[2] > 0.0)
             mounting = Mounting(FRD_OF_FLU if upwards else np.eye(3))
             axes = "x forward, y left, z up" if upwards else "x forward, y right, z down"
-            self._unmounted(topic, f"{axes}, as gravity has it")
+            self._unmounted("imu", topic, f"{axes}, as gravity has it")
         elif (mounting.R_bs @ acc)[2] > 0.0:
             self.warnings.append(f"{topic.name}: gravity is upside down with the mounting of /tf_static; check both")
         return mounting.settings()
@@ -248,12 +254,13 @@ class _Made:
         if mounting is None:
             down = topic.type.startswith(DOWN)
             mounting = Mounting(np.eye(3) if down else FRD_OF_FLU)
-            self._unmounted(topic, "x forward, y right, z down" if down else "x forward, y left, z up")
+            self._unmounted("dvl", topic, "x forward, y right, z down" if down else "x forward, y left, z up")
         return mounting.settings()
 
-    def _unmounted(self, topic: Topic, axes: str) -> None:
+    def _unmounted(self, section: str, topic: Topic, axes: str) -> None:
         way = f"/tf_static does not lead from {topic.frame!r} to base_link"
         self.warnings.append(f"{topic.name}: {way}; its axes are taken as {axes}: check the mounting")
+        self.assumed[section] = self.warnings[-1]
 
 
 def _rank(topic: Topic) -> int:

@@ -344,18 +344,31 @@ def _joined(members: Sequence[_File]) -> Recording:
             late = time > (parts[-1]["time"][-1] if parts else -np.inf)
             if late.any():
                 parts.append({n: np.asarray(v)[late] for n, v in table.items()} | {"time": time[late]})
-    settings: dict[str, Any] = {}
+    parts_of = [member.recording for member in members]
     left = Counter[tuple[str, str]]()
-    for member in members:
-        settings = _completed(settings, member.recording.settings)
-        left.update({(each.name, each.reason): each.count for each in member.recording.left})
+    for each in parts_of:
+        left.update({(one.name, one.reason): one.count for one in each.left})
+    known: dict[str, Any] = {}
+    for each in parts_of:
+        known = _completed(known, {key: value for key, value in each.settings.items() if key not in each.assumed})
+    settings = known
+    for each in parts_of:
+        settings = {**each.settings, **settings}
+    assumed = {key: text for each in reversed(parts_of) for key, text in each.assumed.items() if key not in known}
+    untold = {text for each in parts_of for text in each.assumed.values()} - set(assumed.values())
+    channels = [_one(parts) for parts in found.values()]
+    untold |= {part.zero.said for parts in found.values() for part in parts if part.zero is not None}
+    untold -= {channel.zero.said for channel in channels if channel.zero is not None}
+    warnings = dict.fromkeys(text for each in parts_of for text in each.warnings if text not in untold)
     return replace(
         first.recording,
-        channels=tuple(in_files(_one(parts)) for parts in found.values()),
+        channels=tuple(in_files(channel) for channel in channels),
         clocks=clocks,
         left=tuple(Left(name, count, reason) for (name, reason), count in left.items()),
         settings=settings,
-        notes=tuple(dict.fromkeys(note for member in members for note in member.recording.notes)),
+        notes=tuple(dict.fromkeys(note for each in parts_of for note in each.notes)),
+        warnings=tuple(warnings),
+        assumed=assumed,
         tables={name: _stacked(parts) for name, parts in tables.items()},
         pieces=tuple(counts),
     )
@@ -369,7 +382,15 @@ def _of_tables(member: _File, first: _File) -> float:
 
 def _one(parts: Sequence[Channel]) -> Channel:
     received = None if any(p.received is None for p in parts) else np.concatenate([p.received for p in parts])
-    return replace(parts[0], columns=_stacked([part.columns for part in parts]), received=received)
+    columns = [part.columns for part in parts]
+    zeros = [part.zero for part in parts if part.zero is not None]
+    zero = min(zeros, key=lambda each: (not each.measured, each.depth), default=None)
+    if zero is not None:  # only one piece may have been at the surface
+        columns = [
+            c if p.zero is None else {**c, "depth": c["depth"] + (p.zero.depth - zero.depth)}
+            for c, p in zip(columns, parts, strict=True)
+        ]
+    return replace(parts[0], columns=_stacked(columns), received=received, zero=zero)
 
 
 def _stacked(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:

@@ -11,7 +11,7 @@ from rovgraph.geometry import Array
 from rovgraph.interchange.receiver import receiver_clock
 from rovgraph.interchange.recording import Channel
 from rovgraph.spilling import every, holds, steps, taken
-from rovgraph.stamps import COUNTERS, ENOUGH, JUMP, STEP_BACK, mend, require_moving
+from rovgraph.stamps import COUNTERS, ENOUGH, JUMP, LOST, NOT_SET, STEP_BACK, mend, require_moving
 
 SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
 APART_S = 1.0  # between stamp and arrival; more is another clock
@@ -71,7 +71,7 @@ def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     if timeless := int(np.count_nonzero(~np.isfinite(time))):
         said.append(f"{where}: {timeless} rows without time left out")
     try:
-        mended, told = mend(time, where)
+        mended, told = mend(time, where, not_set=NOT_SET if channel.received is None else LOST)
     except InputError:
         if channel.received is None:
             raise
