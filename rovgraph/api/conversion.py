@@ -60,7 +60,7 @@ class Conversion:
         -----
         DataWarning : values that are left out or look wrong
         """
-        merged, source = self.merged, " + ".join(self.merged.names)
+        merged, source = self.merged, self.merged.source
         with collected_warnings() as texts:
             beams = usable_beams(merged.tables[BEAMS], f"beams of {source}") if BEAMS in merged.tables else None
         log = Log.from_rows(merged.rows, self.config, source).with_beams(beams)
@@ -185,8 +185,7 @@ def convert(
     merged = merge(recordings, choose, shift, times)
     for text in (*said, *merged.warnings):
         warn(text)
-    source = " + ".join(merged.names)
-    return Conversion(merged, *completed(config, merged.nested_settings(), f"settings in {source}"))
+    return Conversion(merged, *completed(config, merged.nested_settings(), f"settings in {merged.source}"))
 
 
 def _require_mappings(choose: Mapping[str, str], shift: Mapping[str, float]) -> None:

@@ -3,6 +3,7 @@
 import warnings as python_warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -79,6 +80,14 @@ class Merged:
     def names(self) -> list[str]:
         """Of the files."""
         return file_names(self.recordings)
+
+    @property
+    def source(self) -> str:
+        """What the log is called in messages."""
+        return " + ".join(
+            f"{name} to {Path(recording.pieces[-1].path).name}" if recording.pieces else name
+            for recording, name in zip(self.recordings, self.names, strict=True)
+        )
 
     def nested_settings(self) -> dict[str, Any]:
         """What the files know, nested as in YAML."""
