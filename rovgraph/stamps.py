@@ -33,7 +33,7 @@ COUNTERS = {  # range [s] -> what counts so far
     4294967.296: "32 bits of milliseconds",
 }
 FULL = (4294967295.0, 4294967.295, 4294.967295)  # 0xFFFFFFFF in s, ms, us: no time is known [s]
-GAP_S, GAP = 60.0, 0.002  # that a recording may have where a counter wraps [s], and of its range
+GAP_S, GAP, LEAST_GAP_S = 60.0, 0.002, 0.5  # where a counter wraps: at most [s], of its range, at least [s]
 NEAR_S = 2.0  # between stamps around a setting [s]
 SURELY = 0.5  # share of the shorter of two spans that a known difference of clocks makes common
 MOVES = 5  # rows that tell of a setting, on each side of it
@@ -243,7 +243,7 @@ def _counter(time: Array) -> float:
 
 def _near(wrap: float) -> float:
     """How far from its ends a counter may be before and after a wrap [s]: a dive that ends there is a coincidence."""
-    return min(GAP_S, GAP * wrap)
+    return min(GAP_S, max(LEAST_GAP_S, GAP * wrap), 0.1 * wrap)
 
 
 def _alone(time: Array, step_back: float) -> NDArray[np.bool_]:

@@ -142,8 +142,8 @@ def test_one_sensor_of_a_source_may_stand_still_beside_others():
     clocks = begun()
     for k in range(50):
         clocks.time(imu(1005.0 + 0.2 * k))
-        clocks.time(dvl(1005.0 + 0.2 * k, 1004.0))
         assert clocks.time(depth(1005.0 + 0.2 * k, 1004.9 + 0.2 * k)) == pytest.approx(1004.9 + 0.2 * k)
+        clocks.time(dvl(1005.0 + 0.2 * k, 1004.0))
     assert [text for _, text in clocks.news] == ["the stamps of dvl stand still at 1004 s; times of arrival are used"]
 
 
