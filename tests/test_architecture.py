@@ -17,7 +17,7 @@ PACKAGE = ROOT / "rovgraph"
 LAYERS = (
     {"errors", "process", "progress"},
     {"geometry", "workers", "fast_csv", "spilling"},
-    {"gauss_markov", "units", "gps_time"},
+    {"gauss_markov", "units", "gps_time", "stamps"},
     {"dates"},
     {"tables"},
     {"kernels"},

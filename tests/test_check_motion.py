@@ -311,6 +311,19 @@ def test_fixes_that_are_late_are_measured(with_fixes):
     assert found == pytest.approx(4.0, abs=1.0)  # at 0.35 m/s; 1 s is less than a fix's sd
 
 
+@pytest.mark.parametrize("arm", [(1.5, 0.0, 0.3), (-1.5, 0.0, 0.3), (0.0, 1.5, 0.3)])
+def test_the_lag_of_fixes_allows_for_the_arm_of_the_dvl(arm):
+    """Along a circle a DVL 1.5 m ahead of the antenna looks as if the fixes came seconds late."""
+    right = {"ahrs_offset": {"estimate": False}, "ahrs_deviation": {"estimate": False}}
+    placed = {"lever_arm_m": list(arm)}
+    config = falcon(heading={"sources": ["ahrs"]}, fix={"sd_m": 0.2}, dvl=placed, calibration=right)
+    case = simulated(config, 240.0, 5, "figure8", fix_interval=1.0, ahrs_rate=10.0)
+    assert "fixes come" not in said(case.log, config, "fix")
+    text = said(later(case.log, "fix", 2.0), config, "fix")
+    found = float(text.split("fixes come ")[1].split(" s late")[0])
+    assert found == pytest.approx(2.0, abs=0.4)
+
+
 def test_swapped_fixes_are_named(with_fixes):
     log, config = with_fixes
     data = log["fix"].data.copy()

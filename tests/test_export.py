@@ -262,6 +262,40 @@ def test_a_line_across_the_date_line_stays_whole(tmp_path):
         assert np.abs(lon - 180.0).max() < 0.01
 
 
+@pytest.mark.parametrize("start", [BEGAN, 0.0], ids=["dated", "undated"])
+@pytest.mark.parametrize("side", [180.0, -180.0])
+def test_kml_across_the_date_line_stays_whole(tmp_path, side, start):
+    across = replace(track(start=start), origin=(-16.8, side))
+    text = written("kml", tmp_path, of=across).read_text(encoding="utf-8")
+    found = re.findall(r"(-?\d+\.\d+)[, ]-16\.\d+", text)
+    assert len(found) > 100 and np.abs(np.array(found, float) - side).max() < 0.01
+
+
+@pytest.mark.parametrize("name", ["kml", "geojson", "gpx", "nmea"])
+def test_heights_over_a_lake_are_above_the_sea(tmp_path, name):
+    lake = track().placed(None, 395.0)
+    text = written(name, tmp_path, of=lake).read_text(encoding="utf-8")
+    heights = {
+        "kml": r"<gx:coord>\S+ \S+ (\S+)</gx:coord>",
+        "geojson": r'"Point", "coordinates": \[[-\d.]+, [-\d.]+, ([-\d.]+)\]',
+        "gpx": r"<ele>([^<]+)</ele>",
+        "nmea": r"GGA,[^\n]*?,([-\d.]+),M,",
+    }
+    found = np.array(re.findall(heights[name], text), float)
+    np.testing.assert_allclose(found, np.interp(np.arange(len(found)), [0, 60], [392.0, 390.0]), atol=0.06)
+
+
+def test_an_origin_that_is_given_places_results_that_have_none(tmp_path):
+    assert off(*track(None).placed(ORIGIN, 0.0).lat_lon, track().trajectory.time) < WITHIN_M
+    with pytest.raises(rg.InputError, match=r"export its results with --origin LAT LON, or"):
+        written("kml", tmp_path, of=track(None))
+    for wrong in ((91.0, 0.0), (0.0, 200.0)):
+        with pytest.raises(rg.InputError, match=r"origin .*: expected latitude and longitude in degrees"):
+            track(None).placed(wrong, 0.0)
+    with pytest.raises(rg.InputError, match="surface: nan is no height"):
+        track().placed(None, float("nan"))
+
+
 @pytest.mark.parametrize("raw", ["line\nbreak", "bell\x07", "\udce9t\udce9"], ids=repr)
 @pytest.mark.parametrize("name", ["geojson", "kml", "gpx", "netcdf", "srt"])
 def test_a_dive_may_be_called_anything_that_a_file_may(tmp_path, name, raw):
@@ -398,6 +432,7 @@ def test_commands_write_what_the_library_does(results, monkeypatch, capsys):
     for arguments in (
         smooth,
         ["export", "out", "--to", "tum", "--to", "geojson", "--out", "maps"],
+        ["export", "out", "--to", "kml", "--out", "lake", "--origin", "47.7", "9.3", "--surface", "395"],
         ["tag", "out/trajectory_filtered.csv", "out", "--out", "placed.csv"],
     ):
         monkeypatch.setattr("sys.argv", ["rovgraph", *arguments])
@@ -405,6 +440,10 @@ def test_commands_write_what_the_library_does(results, monkeypatch, capsys):
             main()
         assert end.value.code == 0
     rg.export("out", ["tum", "geojson"], out="library")
+    rg.export("out", "kml", out="library", origin=(47.7, 9.3), surface=395.0)
+    lake, library = ((results / name / "track_smoothed.kml").read_text() for name in ("lake", "library"))
+    heights = [re.findall(r"47\.[67]\d*[ ,](3\d\d)", text) for text in (lake, library)]
+    assert heights[0] == heights[1] and len(heights[0]) > 50
     for name in ("track_smoothed.ned.tum", "track_smoothed.geojson"):
         assert (results / "maps" / name).read_bytes() == (results / "library" / name).read_bytes()
     assert (results / "out" / "track_smoothed.geojson").stat().st_size > 0

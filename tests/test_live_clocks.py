@@ -108,3 +108,69 @@ def test_recordings_of_different_epochs_are_put_together_by_their_arrivals_or_re
     assert clocks.time(Message("mavlink:a.tlog", 1.7e9 + 1.0, 1.7e9 + 1.0, DVL, "unix")) == pytest.approx(101.0)
     with pytest.raises(InputError, match=r"b\.csv: its clock reads 1900000000\.0 s where that of mavlink:a\.tlog boot"):
         clocks.time(Message("file:b.csv", 1.9e9, 1.9e9, DVL))
+
+
+def depth(arrival: float, stamp: float) -> Message:
+    return Message("tcp://dvl", arrival, stamp, (Reading("depth", np.zeros(1)),))
+
+
+STUCK = {  # stamps of the DVL by its arrivals
+    "one stamp": lambda arrival: 1004.0,
+    "no clock": lambda arrival: 1.0,
+    "the second stands still": lambda arrival: 1004.0 + arrival % 1.0,
+}
+
+
+@pytest.mark.parametrize("trust", [False, True], ids=["live", "replayed"])
+@pytest.mark.parametrize("case", STUCK)
+def test_stamps_that_stand_still_are_told_within_three_seconds_and_arrivals_take_over(case, trust):
+    clocks, told, times = begun(), np.inf, {}
+    clocks.trust = trust
+    for arrival in np.arange(1005.0, 1015.0, 0.01).round(2).tolist():
+        clocks.time(imu(arrival, 0.01))
+        if round(100 * arrival) % 20 == 0:
+            times[arrival] = clocks.time(dvl(arrival, STUCK[case](arrival)))
+        if any("the stamps of dvl stand still" in text for _, text in clocks.news):
+            told = min(told, arrival)
+    assert told - 1005.0 < 3.0
+    late = np.array([arrival - time for arrival, time in times.items() if arrival > told])
+    np.testing.assert_allclose(late, 0.01, atol=0.005)
+    assert sum("stand still" in text for _, text in clocks.news) == 1
+
+
+def test_one_sensor_of_a_source_may_stand_still_beside_others():
+    clocks = begun()
+    for k in range(50):
+        clocks.time(imu(1005.0 + 0.2 * k))
+        assert clocks.time(depth(1005.0 + 0.2 * k, 1004.9 + 0.2 * k)) == pytest.approx(1004.9 + 0.2 * k)
+        clocks.time(dvl(1005.0 + 0.2 * k, 1004.0))
+    assert [text for _, text in clocks.news] == ["the stamps of dvl stand still at 1004 s; times of arrival are used"]
+
+
+def test_stamps_that_move_on_are_used_again():
+    clocks = begun()
+    for k in range(50):
+        clocks.time(dvl(1005.0 + 0.2 * k, 1004.9))
+    times = [clocks.time(dvl(1015.0 + 0.2 * k, 1014.9 + 0.2 * k)) for k in range(50)]
+    assert any("move on, and are used again" in text for _, text in clocks.news)
+    assert times[-1] == pytest.approx(1014.9 + 0.2 * 49)
+
+
+@pytest.mark.parametrize("sensor", ["imu", "dvl"])
+@pytest.mark.parametrize("wrap", [65.536, 4294.967296, 86400.0, 604800.0])
+def test_a_counter_that_wraps_goes_on_at_once_and_a_late_message_stays_before_it(sensor, wrap):
+    clocks, make = Clocks(), imu if sensor == "imu" else dvl
+    epoch = 1010.0 - wrap  # the counter is full at 1010 s
+    times = []
+    for k in range(200):
+        arrival, true = 1005.0 + 0.1 * k, 1004.99 + 0.1 * k - (0.3 if k == 51 else 0.0)
+        stamp = (true - epoch) % wrap
+        if sensor == "dvl":
+            clocks.time(imu(arrival))
+            times.append(clocks.time(dvl(arrival, stamp)))
+        else:
+            times.append(clocks.time(make(arrival)._replace(stamp=stamp)))
+    steps = np.diff(np.delete(np.array(times, dtype=float), 51))
+    np.testing.assert_allclose(np.delete(steps, 50), 0.1, atol=0.02)
+    assert times[51] == pytest.approx(times[50] - 0.2, abs=0.02)
+    assert sum("wrap; time goes on" in text for _, text in clocks.news) == 1

@@ -163,3 +163,13 @@ def test_fixes_given_by_hand_are_not_missed():
     faults.accept(fix(110.0))
     faults.tick(112.0)
     assert kinds(faults) == ["silent"]
+
+
+@pytest.mark.parametrize(("measurement", "longest"), [(moving, 10.0), (fix, 30.0)])
+def test_a_sensor_that_spoke_once_is_silent_after_ten_seconds_and_a_position_after_thirty(measurement, longest):
+    faults = Faults()
+    faults.look(measurement(0.0))
+    faults.tick(longest - 0.1)
+    assert kinds(faults) == []
+    faults.tick(longest + 0.1)
+    assert kinds(faults) == ["silent"]

@@ -14,7 +14,7 @@ from rovgraph.errors import InputError, as_path, as_paths, collected_warnings, w
 from rovgraph.interchange.account import account, notes
 from rovgraph.interchange.alternatives import SourceMissing
 from rovgraph.interchange.formats import Format, Options, formats, head_of, read_recording, recognise
-from rovgraph.interchange.merging import Merged, merge
+from rovgraph.interchange.merging import ARRIVAL, EVERY, Merged, merge
 from rovgraph.interchange.own_log import FORMAT as OWN_LOG
 from rovgraph.interchange.own_log import is_own_log
 from rovgraph.interchange.recording import Recording, earlier
@@ -62,7 +62,7 @@ class Conversion:
         -----
         DataWarning : values that are left out or look wrong
         """
-        merged, source = self.merged, " + ".join(self.merged.names)
+        merged, source = self.merged, self.merged.source
         with collected_warnings() as texts:
             beams = usable_beams(merged.tables[BEAMS], f"beams of {source}") if BEAMS in merged.tables else None
         log = Log.from_rows(merged.rows, self.config, source).with_beams(beams)
@@ -114,7 +114,11 @@ class Conversion:
 
         path = as_path(path, "path")
         stem = check_suffix(path)
-        inputs = {Path(recording.path).resolve() for recording in self.merged.recordings}
+        inputs = {
+            Path(path).resolve()
+            for recording in self.merged.recordings
+            for path in (recording.path, *(piece.path for piece in recording.pieces))
+        }
         tables = {table_beside(path, name): table for name, table in self.merged.tables.items()}
         report = path.with_name(stem + REPORT)
         config_path = None if config_out is None else as_path(config_out, "config_out")
@@ -140,6 +144,7 @@ def convert(
     choose: Mapping[str, str] = NOTHING,
     shift: Mapping[str, float] = NOTHING,
     progress: Progress = no_progress,
+    times: str | Mapping[str, str] = NOTHING,
 ) -> Conversion:
     """Convert native files of one dive into one log (docs/formats.md).
 
@@ -150,6 +155,7 @@ def convert(
     choose : sensor -> file, instance, message or topic that feeds it, where there are several
     shift : sensor or file -> seconds to add to its stamps, if known
     progress : called at times with the current task and its progress from 0 to 1
+    times : "arrival" for the recorder's times in place of all stamps, or sensor or file -> "arrival" for those of one
 
     Raises
     ------
@@ -161,7 +167,8 @@ def convert(
     """
     config = config_or_defaults(config)
     _require_mappings(choose, shift)
-    files = as_paths(paths, "paths")
+    times = _times(times)
+    files, said = once(as_paths(paths, "paths"))
     if not files:
         raise InputError("no file was given; expected native files or logs of one dive")
     settings_of = settings_of_files(files, config)
@@ -176,14 +183,14 @@ def convert(
             progress(f"reading {name}", (k + done / max(total, 1)) / len(files))
 
         settings = settings_of[k]
-        recording = _read(path, Options(inside, read, settings), format_, len(files) == 1)
+        options = Options(inside, read, settings, bool(times))
+        recording = _read(path, options, format_, len(files) == 1)
         recordings.append(earlier(recording, settings.delay_s) if settings.delay_s else recording)
     progress("joining clocks", 1.0)
-    merged = merge(recordings, choose, shift)
-    for text in merged.warnings:
+    merged = merge(recordings, choose, shift, times)
+    for text in (*said, *merged.warnings):
         warn(text)
-    source = " + ".join(merged.names)
-    return Conversion(merged, *completed(config, merged.nested_settings(), f"settings in {source}"))
+    return Conversion(merged, *completed(config, merged.nested_settings(), f"settings in {merged.source}"))
 
 
 def settings_of_files(files: Sequence[Path], config: Config) -> list[FileSettings]:
@@ -228,6 +235,29 @@ def _require_mappings(choose: Mapping[str, str], shift: Mapping[str, float]) -> 
     for name, seconds in shift.items():
         if not isinstance(seconds, Real):
             raise InputError(f"shift {name}: expected seconds, a number, found {seconds!r}")
+
+
+def once(files: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Files without those that are given again, and what to say of it."""
+    given: dict[Path, Path] = {}
+    said = []
+    for path in files:
+        if (same := given.setdefault(path.resolve(), path)) is not path:
+            said.append(f"{path}: is given twice{'' if path == same else f', as {same} too'}, and taken once")
+    return list(given.values()), said
+
+
+def _times(given: str | Mapping[str, str]) -> Mapping[str, str]:
+    """Sensor or file, or `EVERY` -> whose times are taken.
+
+    Raises
+    ------
+    InputError : others than those of arrival
+    """
+    times = {EVERY: given} if isinstance(given, str) else given
+    if not isinstance(times, Mapping) or any(whose != ARRIVAL for whose in times.values()):
+        raise InputError(f"times: expected 'arrival', or a mapping of sensors or files to it, found {given!r}")
+    return times
 
 
 def _read(path: Path, options: Options, format_: Format | None, alone: bool) -> Recording:

@@ -23,6 +23,8 @@ def export(
     crs: str | None = None,
     unix_offset: float = 0.0,
     force: bool = False,
+    origin: tuple[float, float] | None = None,
+    surface: float = 0.0,
 ) -> list[Path]:
     """Write the track of a dive in formats that others open (docs/export.md).
 
@@ -36,6 +38,8 @@ def export(
     crs : coordinates of GeoPackage and shapefile, such as "EPSG:25832" or "utm"
     unix_offset : Unix time of the log's time 0 [s]
     force : replace older files
+    origin : latitude and longitude of north = east = 0 [deg]; None = that of the results
+    surface : height of the water's surface above sea level [m], for heights in a lake
 
     Returns
     -------
@@ -46,7 +50,7 @@ def export(
     InputError : an unknown format, a missing library, a missing origin or Unix time that a format needs, a file that
         exists
     """
-    track = track_of(results, estimate).shifted(unix_offset)
+    track = track_of(results, estimate).shifted(unix_offset).placed(origin, surface)
     if out is None:
         if not isinstance(results, str | Path):
             raise InputError("out: expected a folder to write into, because these results have none")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from rovgraph import log as library
-from rovgraph.api.conversion import NOTHING, Paths, convert, is_plain_log
+from rovgraph.api.conversion import NOTHING, Paths, convert, is_plain_log, once
 from rovgraph.check import Finding, Report, bridge_jumps, examine
 from rovgraph.check import warn as warn_of_findings
 from rovgraph.config import Config, completed, config_or_defaults
@@ -23,6 +23,7 @@ def read_log(
     choose: Mapping[str, str] = NOTHING,
     shift: Mapping[str, float] = NOTHING,
     progress: Progress = no_progress,
+    times: str | Mapping[str, str] = NOTHING,
 ) -> Log:
     """Read a log (docs/log-format.md) with the columns, units and delays of a configuration, or native files as one.
 
@@ -30,7 +31,7 @@ def read_log(
     ----------
     path : CSV, gzipped CSV or Parquet; or native files of one dive, one or several (docs/formats.md)
     config : None = rovgraph's own columns, in SI
-    choose, shift, progress : of `rovgraph.convert`, for native files
+    choose, shift, progress, times : of `rovgraph.convert`, for native files
 
     Returns
     -------
@@ -46,13 +47,16 @@ def read_log(
     """
     if isinstance(path, pd.DataFrame):
         raise InputError("log: is a DataFrame, expected a file's name; use Log.from_frame")
-    files = as_paths(path, "log")
+    files, said = once(as_paths(path, "log"))
+    for text in said:
+        warn(text)
     if config is None:
         warn_of_unused(*files)
-    alone = len(files) == 1 and not choose and not shift and not config_or_defaults(config).files
+    stated = choose or shift or times or config_or_defaults(config).files
+    alone = len(files) == 1 and not stated
     if alone and is_plain_log(files[0], config_or_defaults(config)):
         return library.read_log(files[0], config)
-    return convert(files, config, choose, shift, progress).log
+    return convert(files, config, choose, shift, progress, times).log
 
 
 def warn_of_unused(*logs: Path | str) -> None:

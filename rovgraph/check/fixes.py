@@ -94,7 +94,7 @@ def _tracks(log: Log, config: Config, compass: str | None = None) -> _Tracks | N
     psi = heading[0], heading[1]
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
     turn = np.exp(1j * np.interp(pings.time, *psi))
-    arm = complex(*config.fix.lever_arm_m[:2])
+    arm = complex(*config.fix.lever_arm_m[:2]) - complex(*config.dvl.lever_arm_m[:2])  # from the DVL
     plane = _Plane(log, pings.time, arm * np.exp(1j * np.interp(log["fix"].time, *psi)))
     way, mirrored = (plane.way(turn * (v_b[:, 0] + sign * 1j * v_b[:, 1])) for sign in (1.0, -1.0))
     return _Tracks(sensor, pings, plane, way, mirrored)
@@ -219,7 +219,7 @@ def _turned(config: Config, sources: Collection[str], as_is: _Line, unlike: _Lin
 
 
 class _Plane:
-    """Fixes as complex numbers, less their lever arm, and the stretches in which the DVL's track is known."""
+    """Fixes as complex numbers, less their arm from the DVL, and the stretches in which the DVL's track is known."""
 
     def __init__(self, log: Log, pings: Array, arms: Complexes):
         fix = log["fix"]

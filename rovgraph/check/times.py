@@ -12,6 +12,7 @@ from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, FrozenStretch, equal_runs, without
 from rovgraph.sensors import SENSORS
+from rovgraph.stamps import few_digits
 
 GAP_PERIODS = 5.0  # longer than this many periods is a gap
 BURST = 0.3  # of the mean period, below which most periods lie within bursts
@@ -112,7 +113,12 @@ def regularity(log: Log, config: Config, frozen: Sequence[FrozenStretch] = ()) -
             text = (
                 f"{stream.same_time} of {t.count + stream.same_time} measurements have the stamp of another, so that "
             )
-            text += "only the first of each batch is used: they may be times of arrival; log times of measurement"
+            text += "only the first of each batch is used: "
+            text += (
+                "stamps were written with too few digits; write them with six decimals (%.6f)"
+                if few_digits(stream.time)
+                else "they may be times of arrival; log times of measurement"
+            )
             yield Finding(sensor, "warning", text, "bursts")
         yield from _gaps(log, config, t, period or 1.0 / t.rate)
         if sensor == "imu" and period is None and t.jitter * t.rate > 0.5:

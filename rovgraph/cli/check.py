@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rovgraph.cli.files import Choose, Files, Shift, read_files
+from rovgraph.cli.files import Choose, Files, Shift, Times, read_files
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,6 +20,7 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON")] = False,
     choose: Choose = None,
     shift: Shift = None,
+    times: Times = None,
     page: Annotated[Path | None, typer.Option("--page", help="also write the report as an HTML page")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an older page")] = False,
 ) -> None:
@@ -31,7 +32,7 @@ def check(
     from rovgraph.cli.console import console, say
 
     settings = None if config is None else rg.load_config(config)
-    log = read_files(files, settings, choose, shift)
+    log = read_files(files, settings, choose, shift, times)
     report = rg.check(log, settings)
     if page is not None:
         rg.report_check(report, page, force)

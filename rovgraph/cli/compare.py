@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rovgraph.cli.files import Choose, Shift, read_files
+from rovgraph.cli.files import Choose, Shift, Times, read_files
 
 WIDE = 120  # columns of a file or a pipe, which has no width of its own
 
@@ -33,6 +33,7 @@ def compare(
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     choose: Choose = None,
     shift: Shift = None,
+    times: Times = None,
 ) -> None:
     """Compare estimators: errors, consistency and cost of each, in a table and figures.
 
@@ -53,7 +54,7 @@ def compare(
     require_one(files[0] if files else None, reference, scenario, chosen, duration)
     check_writable(out, force, [*(files or []), config, reference])
     settings = None if config is None else rg.load_config(config)
-    dive_log = read_files(files, settings, choose, shift) if files else None
+    dive_log = read_files(files, settings, choose, shift, times) if files else None
     with progress_bar() as progress:
         result = rg.compare(dive_log, settings, reference, scenario, chosen, duration, estimators, jobs, progress)
     result.save(out, force)

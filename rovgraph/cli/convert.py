@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rovgraph.cli.files import Choose, Files, Shift, pairs, seconds
+from rovgraph.cli.files import Choose, Files, Shift, Times, pairs, seconds, whose
 
 WIDE = 150  # columns of a file or a pipe, which has no width of its own
 
@@ -18,6 +18,7 @@ def convert(
     config_out: Annotated[Path | None, typer.Option(help="also write a configuration to begin with (YAML)")] = None,
     choose: Choose = None,
     shift: Shift = None,
+    times: Times = None,
     force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
     guess: Annotated[
         bool, typer.Option("--guess", help="propose columns and units of tables instead; writes no log")
@@ -32,7 +33,7 @@ def convert(
     from rovgraph.errors import InputError
 
     if guess:
-        if out is not None or config is not None or choose or shift:
+        if out is not None or config is not None or choose or shift or times:
             raise InputError("--guess: writes no log; give tables, and --config-out or nothing")
         propose(files, config_out, force)
         return
@@ -45,7 +46,7 @@ def convert(
     check_suffix(out)
     settings = None if config is None else rg.load_config(config)
     with progress_bar() as progress:
-        result = rg.convert(files, settings, pairs("choose", choose), seconds("shift", shift), progress)
+        result = rg.convert(files, settings, pairs("choose", choose), seconds("shift", shift), progress, whose(times))
         written = result.save(out, config_out, force, progress)
     shown = console(WIDE)
     for table in conversion_tables(result.report):

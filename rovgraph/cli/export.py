@@ -22,6 +22,13 @@ def export(
     unix_offset: Annotated[
         float, typer.Option(help="Unix time of the log's time 0 in seconds, for formats that need it")
     ] = 0.0,
+    origin: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="latitude and longitude of north = east = 0, where results have none", metavar="LAT LON"),
+    ] = None,
+    surface: Annotated[
+        float, typer.Option(help="height of the water's surface above sea level in metres, of a lake")
+    ] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="replace older files")] = False,
 ) -> None:
     """Write a track as KML, GeoJSON, GPX, GeoPackage, NMEA, ROS 2 bag, NetCDF, SBET, subtitles and more.
@@ -41,5 +48,5 @@ def export(
             table.add_row(each.name, each.title, f"rovgraph\\[{each.extra}]" if each.extra else "")
         shown.print(table)
         return
-    for path in rg.export(results, to, out, estimate, rate, crs, unix_offset, force):
+    for path in rg.export(results, to, out, estimate, rate, crs, unix_offset, force, origin, surface):
         say(shown, f"written: {path}")

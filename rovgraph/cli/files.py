@@ -21,17 +21,28 @@ Shift = Annotated[
     list[str] | None,
     typer.Option(help="seconds to add to the stamps of a sensor or file; may be repeated", metavar="NAME=SECONDS"),
 ]
+Times = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="take the recorder's times: arrival for all, or of one sensor or file; may be repeated",
+        metavar="[NAME=]arrival",
+    ),
+]
 
 
 def read_files(
-    files: Sequence[Path], config: "Config | None", choose: Sequence[str] | None, shift: Sequence[str] | None
+    files: Sequence[Path],
+    config: "Config | None",
+    choose: Sequence[str] | None,
+    shift: Sequence[str] | None,
+    times: Sequence[str] | None,
 ) -> "Log":
     """The log of some files, with a progress bar."""
     import rovgraph as rg
     from rovgraph.cli.progress import progress_bar
 
     with progress_bar() as progress:
-        return rg.read_log(files, config, pairs("choose", choose), seconds("shift", shift), progress)
+        return rg.read_log(files, config, pairs("choose", choose), seconds("shift", shift), progress, whose(times))
 
 
 def pairs(option: str, texts: Sequence[str] | None) -> dict[str, str]:
@@ -62,6 +73,12 @@ def seconds(option: str, texts: Sequence[str] | None) -> dict[str, float]:
         if not math.isfinite(out[name]):
             raise InputError(f"--{option} {name}={value}: expected seconds, a number")
     return out
+
+
+def whose(texts: Sequence[str] | None) -> "str | dict[str, str]":
+    """Whose times are taken: of a repeated ``--times [NAME=]arrival``."""
+    alone = [text for text in texts or [] if "=" not in text]
+    return alone[0] if alone else pairs("times", texts)
 
 
 def name_of(files: Sequence[Path]) -> str:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rovgraph.cli.files import Choose, Files, Shift, name_of, read_files
+from rovgraph.cli.files import Choose, Files, Shift, Times, name_of, read_files
 
 WIDE = 150  # columns of a file or a pipe, which has no width of its own
 
@@ -20,6 +20,7 @@ def observe(
     force: Annotated[bool, typer.Option("--force", help="replace an older results folder")] = False,
     choose: Choose = None,
     shift: Shift = None,
+    times: Times = None,
 ) -> None:
     """Show how well a dive determines each calibration variable, when it did, and what is missing.
 
@@ -34,7 +35,7 @@ def observe(
     out = Path("observed-" + name_of(files)) if out is None else out
     settings = None if config is None else rg.load_config(config)
     check_writable(out, force, [*files, config])
-    dive_log = read_files(files, settings, choose, shift)
+    dive_log = read_files(files, settings, choose, shift, times)
     with progress_bar() as progress:
         result = rg.observe(dive_log, settings, estimate or (), progress)
     result.save(out, force)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rovgraph.cli.files import Choose, Files, Shift, name_of, read_files
+from rovgraph.cli.files import Choose, Files, Shift, Times, name_of, read_files
 
 if TYPE_CHECKING:
     from rovgraph import Result
@@ -49,6 +49,7 @@ def smooth(
     strict: Annotated[bool, typer.Option("--strict", help="exit with 3 unless the verdict is trusted")] = False,
     choose: Choose = None,
     shift: Shift = None,
+    times: Times = None,
 ) -> None:
     """Estimate the track of a dive, and the calibration of its instruments.
 
@@ -66,7 +67,7 @@ def smooth(
     known_formats(export or [])
     check_writable(out, force, [*files, config])
     began = time.perf_counter()
-    dive_log = read_files(files, settings, choose, shift)
+    dive_log = read_files(files, settings, choose, shift, times)
     check_exportable(export or [], dive_log.source, dive_log.origin, dive_log.start)
     read = time.perf_counter()
     with progress_bar() as progress:

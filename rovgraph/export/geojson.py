@@ -1,4 +1,4 @@
-"""GeoJSON (RFC 7946): the track as a line, points with their sds, 95 % ellipses and fixes; depth is negative."""
+"""GeoJSON (RFC 7946): the track as a line, points with their sds, 95 % ellipses and fixes; heights above sea level."""
 
 import json
 from collections.abc import Iterator
@@ -61,7 +61,7 @@ def _ring(track: Track, corners: Array) -> list[list[float]]:
 
 def _coordinates(track: Track) -> list[list[float]]:
     lat, lon = track.lat_lon
-    where = np.column_stack([track.continuous(lon).round(9), lat.round(9), -track.trajectory.p_n[:, 2].round(4)])
+    where = np.column_stack([track.continuous(lon).round(9), lat.round(9), track.height.round(4)])
     coordinates: list[list[float]] = where[:, : 2 if np.isnan(where[:, 2]).any() else 3].tolist()
     return coordinates
 

@@ -17,7 +17,7 @@ LONGEST = 10  # characters of a shapefile's field name
 
 
 def write_layer(track: Track, path: Path, options: Options, driver: str) -> None:
-    """A layer of points with depth as z (negative down).
+    """A layer of points with the height above sea level as z.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def write_layer(track: Track, path: Path, options: Options, driver: str) -> None
     shown = track.at_rate(options.rate_or(SHOWN_HZ))
     table = point_table(shown)
     x, y, crs = projected(table["lon"].to_numpy(), table["lat"].to_numpy(), options.crs)
-    points = shapely.to_wkb(shapely.points(np.column_stack([x, y, -table["depth"].fillna(0.0)])))
+    points = shapely.to_wkb(shapely.points(np.column_stack([x, y, np.nan_to_num(shown.height)])))
     fields = [name[:LONGEST] if driver == "ESRI Shapefile" else name for name in table.columns]
     try:
         pyogrio.raw.write(

@@ -1,4 +1,4 @@
-"""GPX 1.1 for chart plotters and phones: a track; elevation is the negative depth."""
+"""GPX 1.1 for chart plotters and phones: a track; elevation is above sea level."""
 
 from pathlib import Path
 
@@ -17,8 +17,8 @@ def write(track: Track, path: Path, options: Options) -> None:
     line = gpxpy.gpx.GPXTrack(name=f"{track.name}, {track.estimate}")
     segment = gpxpy.gpx.GPXTrackSegment()
     times = shown.utc.to_pydatetime() if shown.has_utc else [None] * len(shown.trajectory)
-    for lat, lon, down, time in zip(*shown.lat_lon, shown.trajectory.p_n[:, 2], times, strict=True):
-        height = None if down != down else round(-float(down), 4)
+    for lat, lon, high, time in zip(*shown.lat_lon, shown.height, times, strict=True):
+        height = None if high != high else round(float(high), 4)
         segment.points.append(gpxpy.gpx.GPXTrackPoint(round(float(lat), 9), round(float(lon), 9), height, time))
     line.segments.append(segment)
     gpx.tracks.append(line)

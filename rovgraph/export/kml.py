@@ -24,7 +24,7 @@ def document(track: Track, options: Options) -> "simplekml.Kml":
     shown = track.at_rate(options.rate_or(SHOWN_HZ))
     lat, lon = shown.lat_lon
     lon = track.continuous(lon)
-    height = np.nan_to_num(-shown.trajectory.p_n[:, 2])
+    height = np.nan_to_num(shown.height)
     coordinates = np.column_stack([lon.round(9), lat.round(9), height.round(4)]).tolist()
     if track.has_utc:
         line = kml.newgxtrack(name=track.name, altitudemode="absolute")
@@ -55,6 +55,7 @@ def _add_fixes(kml: "simplekml.Kml", track: Track) -> None:
         return
     folder, start = kml.newfolder(name="fixes"), track.trajectory.time[0]
     lat, lon = track.place(*track.fixes.position.T)
+    lon = track.continuous(lon)
     for k, (time, used) in enumerate(zip(track.fixes.time, track.fixes.used, strict=True)):
         point = folder.newpoint(coords=[(round(float(lon[k]), 9), round(float(lat[k]), 9))])
         point.description = f"{time - start:.1f} s, {'used' if used else 'rejected'}"

@@ -15,7 +15,7 @@ def write(track: Track, path: Path, options: Options) -> None:
     shown = track.at_rate(options.rate_or(SHOWN_HZ))
     t = shown.trajectory
     sd = np.hypot(t.p_sd[:, 0], t.p_sd[:, 1])
-    rows = np.column_stack([t.time, *shown.lat_lon, t.p_n[:, 2], sd, t.rpy[:, 2], t.v_n[:, :2]]).tolist()
+    rows = np.column_stack([t.time, *shown.lat_lon, -shown.height, sd, t.rpy[:, 2], t.v_n[:, :2]]).tolist()
     with path.open("w", encoding="ascii", newline="") as file:
         for time, lat, lon, down, spread, yaw, north, east in rows:
             file.write(position_sentence(time, lat, lon, down, spread))

@@ -67,6 +67,7 @@ class Messages:
         self.time = t.time
         self.lat_lon = None if track.origin is None else np.column_stack(track.lat_lon)
         self.p = t.p_n @ NED_TO_ENU.T
+        self.height = track.height
         R = NED_TO_ENU @ t.R_nb @ FRD_TO_FLU
         self.q = quaternion_from_matrix(R)
         self.v = np.einsum("nji,nj->ni", R, t.v_n @ NED_TO_ENU.T)  # in the body
@@ -116,7 +117,7 @@ class Messages:
             status=self._make("sensor_msgs/msg/NavSatStatus", status=NO_FIX_TYPE, service=0),
             latitude=float(self.lat_lon[k, 0]),
             longitude=float(self.lat_lon[k, 1]),
-            altitude=float(self.p[k, 2]),
+            altitude=float(self.height[k]),
             position_covariance=np.nan_to_num(self.cov_p[k]).ravel(),
             position_covariance_type=COVARIANCE_KNOWN if known else 0,
         )

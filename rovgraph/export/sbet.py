@@ -40,7 +40,7 @@ def write(track: Track, path: Path, options: Options) -> None:
     lat, lon = shown.lat_lon
     record = np.zeros((len(t), len(NAMES)), dtype="<f8")
     record[:, 0] = week_seconds(t.time)
-    record[:, 1:4] = np.column_stack([np.deg2rad(lat), np.deg2rad(lon), -t.p_n[:, 2]])
+    record[:, 1:4] = np.column_stack([np.deg2rad(lat), np.deg2rad(lon), shown.height])
     record[:, 4:7], record[:, 7:10] = t.v_n, t.rpy
     path.mkdir()
     (path / "sbet.out").write_bytes(record.tobytes())

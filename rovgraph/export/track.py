@@ -45,6 +45,7 @@ class Track:
     trajectory : of the body's origin
     origin : latitude and longitude [deg] of north = east = 0; None = not known
     fixes : None where the dive has none
+    surface : height of the water's surface above sea level [m]
     """
 
     name: str
@@ -52,6 +53,7 @@ class Track:
     trajectory: Trajectory
     origin: tuple[float, float] | None = None
     fixes: Fixes | None = None
+    surface: float = 0.0
 
     @cached_property
     def lat_lon(self) -> tuple[Array, Array]:
@@ -62,11 +64,6 @@ class Track:
         InputError : it is not known where on Earth the dive was
         """
         return self.trajectory.geodetic(require_place(self.name, self.origin))
-
-    def continuous(self, lon: Array) -> Array:
-        """Longitudes [deg] that go on beyond 180 where a dive crosses the date line: lines and rings stay whole."""
-        start = self.lat_lon[1][0]
-        return np.asarray(start + (lon - start + 180.0) % 360.0 - 180.0)
 
     def place(self, north: Array, east: Array) -> tuple[Array, Array]:
         """Latitude and longitude [deg] of other points, shape as given.
@@ -79,6 +76,37 @@ class Track:
 
         lat, lon, _ = ned2geodetic(north, east, 0.0, *require_place(self.name, self.origin), 0.0)
         return np.asarray(lat), np.asarray(lon)
+
+    @property
+    def height(self) -> Array:
+        """Height above sea level [m], shape (n,), NaN where the depth is not known."""
+        return np.asarray(self.surface - self.trajectory.p_n[:, 2])
+
+    def continuous(self, lon: Array) -> Array:
+        """Longitudes [deg] that go on beyond 180 where a dive crosses the date line: lines and rings stay whole."""
+        start = self.lat_lon[1][0]
+        return np.asarray(start + (lon - start + 180.0) % 360.0 - 180.0)
+
+    def placed(self, origin: tuple[float, float] | None, surface: float) -> "Track":
+        """The same elsewhere on Earth.
+
+        Parameters
+        ----------
+        origin : latitude and longitude of north = east = 0 [deg]; None = as it is known
+        surface : height of the water's surface above sea level [m]
+
+        Raises
+        ------
+        InputError : they are no degrees, or no height
+        """
+        if not np.isfinite(surface):
+            raise InputError(f"surface: {surface:g} is no height in metres")
+        if origin is None:
+            return replace(self, surface=surface)
+        if not (len(origin) == 2 and abs(origin[0]) <= 90.0 and abs(origin[1]) <= 180.0):
+            given = ", ".join(f"{angle:g}" for angle in origin)
+            raise InputError(f"origin {given}: expected latitude and longitude in degrees, such as 43.1 3.2")
+        return replace(self, origin=(float(origin[0]), float(origin[1])), surface=surface)
 
     @property
     def has_utc(self) -> bool:
@@ -139,8 +167,8 @@ def require_place(name: str, origin: tuple[float, float] | None) -> tuple[float,
     """
     if origin is None:
         raise InputError(
-            f"{name}: the dive's place on Earth is unknown; state environment.origin_lat_deg and "
-            "origin_lon_deg, or log fixes as fix_lat and fix_lon, and smooth again"
+            f"{name}: the dive's place on Earth is unknown; export its results with --origin LAT LON, or state "
+            "environment.origin_lat_deg and origin_lon_deg, or log fixes as fix_lat and fix_lon, and smooth again"
         )
     return origin
 

@@ -32,6 +32,11 @@ def account(merged: Merged) -> dict[str, Any]:
         ]
         left = [{"name": each.name, "count": each.count, "reason": each.reason} for each in recording.left]
         file = {"file": name, "path": recording.path, "format": recording.format, "channels": channels, "left": left}
+        if recording.pieces:
+            file["pieces"] = [
+                {"file": p.path, "first_s": p.first, "last_s": p.last, "rows": p.rows, "rows_again": p.again}
+                for p in recording.pieces
+            ]
         files.append({**file, "notes": list(recording.notes), "warnings": list(recording.warnings)})
     clocks = [
         {

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.interchange.pressure import FRESH, depth, surface_pressure
+from rovgraph.interchange.pressure import FRESH, depth, surface_pressure, zero_of
+from rovgraph.interchange.recording import Zero
 
 CLOCK = "autopilot's boot time"
 BODY = "vehicle: forward, starboard, down"
@@ -28,7 +29,9 @@ def declination(parameters: Mapping[str, float]) -> float:
     return parameters.get("COMPASS_DEC", 0.0)
 
 
-def depth_of(instance: int, pressure: Array, parameters: Mapping[str, float], label: str) -> tuple[Array, str, bool]:
+def depth_of(
+    instance: int, pressure: Array, parameters: Mapping[str, float], label: str
+) -> tuple[Array, str, bool, Zero | None]:
     """Depth of a pressure sensor.
 
     Parameters
@@ -40,13 +43,15 @@ def depth_of(instance: int, pressure: Array, parameters: Mapping[str, float], la
 
     Returns
     -------
-    depth, ndarray, shape (n,) [m]; what it rests on, for people; whether that is the autopilot's own word
+    depth, ndarray, shape (n,) [m]; what it rests on, for people; whether that is the autopilot's own word; the surface
+    where it is guessed
     """
     surface, found, good = surface_of(instance, pressure, parameters)
     density = density_of(parameters)
     water = f"water of {density:.0f} kg/m3" + ("" if "BARO_SPEC_GRAV" in parameters else " for want of BARO_SPEC_GRAV")
     said = f"{label}: surface pressure {surface / 100.0:.1f} hPa ({found}), {water}"
-    return depth(pressure, surface, density), said, good and "BARO_SPEC_GRAV" in parameters
+    zero = None if good else zero_of(surface, density, said)
+    return depth(pressure, surface, density), said, good and "BARO_SPEC_GRAV" in parameters, zero
 
 
 def surface_of(instance: int, pressure: Array, parameters: Mapping[str, float]) -> tuple[float, str, bool]:

@@ -19,6 +19,7 @@ from rovgraph.interchange.recording import Channel, Recording
 from rovgraph.interchange.selection import Selected, file_names
 from rovgraph.interchange.synchronise import Offset, find_offset
 from rovgraph.spilling import every
+from rovgraph.stamps import known_offset
 
 UNKNOWN_ZONE_S = 1800.0  # sd of a clock that may show local time
 AGREE_S = 0.5  # stamps that motion contradicts by less stay: a sensor may be late by as much
@@ -86,12 +87,14 @@ class _Axis:
     unix : their common time is Unix time
     lines : clock -> from its stamps to the common time
     sources : clock -> how that is known, with its sd [s]
+    cycle : of `Clock`, where it is not Unix time [s]
     """
 
     file: int
     unix: bool
     lines: Mapping[str, Line]
     sources: Mapping[str, tuple[str, float]]
+    cycle: float = 0.0
 
     @property
     def least_sd(self) -> float:
@@ -167,7 +170,7 @@ def join_clocks(
                 pool.append(_known([_moved(channel, line) for channel in channels], motion_of))
             waiting.remove(axis)
         if len(waiting) == before:
-            raise InputError(_not_joined(waiting[0], base, recordings, names))
+            raise InputError(_not_joined(waiting[0], base, pool, recordings, names))
     out = []
     for axis, line, sd, drift_sd, how in joined:
         for name, own in axis.lines.items():
@@ -205,7 +208,7 @@ def _axes(file: int, recording: Recording) -> tuple[list[_Axis], list[str]]:
             alone.remove(name)
     if known:
         axes.append(_Axis(file, True, known, sources))
-    axes += [_Axis(file, False, {name: Line()}, {name: ("", 0.0)}) for name in alone]
+    axes += [_Axis(file, False, {name: Line()}, {name: ("", 0.0)}, recording.clocks[name].cycle) for name in alone]
     return axes, said
 
 
@@ -279,6 +282,12 @@ def _joined(
     found = [o for joined in pool if (o := find_offset(joined.motion, own)) is not None]
     offset = min(found, key=lambda each: each.sd, default=None)
     line = None if offset is None else _line(offset)
+    if (known := _usual(axis, base, _span(channels), pool)) is not None:
+        by, usual, surely = known
+        moved = offset is not None and abs(offset.seconds + by) < max(AGREE_S, SURE * offset.sd)
+        if unix_sd < UNKNOWN_ZONE_S and (moved or (offset is None and surely)):
+            how = f"{usual}{', as motion has it' if moved else ''}"
+            return Line(by), unix_sd, 0.0, how, f"{usual}: moved by {by:+.0f} s; --shift states another"
     agrees = offset is None or abs(offset.seconds) < max(AGREE_S, SURE * offset.sd)
     if axis.unix and base.unix and agrees and _overlap(_span(channels), pool):
         if offset is None and unix_sd < UNKNOWN_ZONE_S:
@@ -298,12 +307,27 @@ def _joined(
     return line, float(np.hypot(offset.sd, SYSTEMATIC_S)), offset.drift_sd, how, text
 
 
+def _usual(
+    axis: _Axis, base: _Axis, span: tuple[float, float], pool: Sequence[_Joined]
+) -> tuple[float, str, bool] | None:
+    """What clocks are usually off by that makes an axis meet the base, as `rovgraph.stamps.known_offset` has it."""
+    if not (axis.unix or axis.cycle) or not (base.unix or base.cycle):
+        return None
+    if axis.cycle:
+        return known_offset(span, pool[0].span, axis.cycle)
+    if base.cycle and (found := known_offset(pool[0].span, span, base.cycle)) is not None:
+        return -found[0], found[1].replace("its stamps have", "the other files' stamps have"), found[2]
+    return None if base.cycle or _overlap(span, pool) else known_offset(span, pool[0].span)
+
+
 def _line(offset: Offset) -> Line:
     """From clock B to clock A."""
     return Line(-offset.seconds, 1.0 / (1.0 + offset.drift) - 1.0, offset.at + offset.seconds)
 
 
-def _not_joined(axis: _Axis, base: _Axis, recordings: Sequence[Recording], names: Sequence[str]) -> str:
+def _not_joined(
+    axis: _Axis, base: _Axis, pool: Sequence[_Joined], recordings: Sequence[Recording], names: Sequence[str]
+) -> str:
     """Why an axis cannot be joined, and what to do."""
     one, other = (_span(a.channels(recordings[a.file])) for a in (axis, base))
     if axis.unix and base.unix:
@@ -313,10 +337,10 @@ def _not_joined(axis: _Axis, base: _Axis, recordings: Sequence[Recording], names
         spans = [f"{begin:.1f} to {end:.1f} s" for begin, end in (one, other)]
         told = f"clock {next(iter(axis.lines))} reads {spans[0]}, {names[base.file]} {spans[1]}"
     sensors = sorted({channel.sensor for channel in axis.channels(recordings[axis.file])})
-    return (
-        f"{names[axis.file]}: {told}, and no common motion shows the offset of their clocks; are they of one dive? "
-        f"If you know the offset, state what to add to its stamps: --shift {sensors[0]}=SECONDS"
-    )
+    told = f"{names[axis.file]}: {told}, and no common motion shows the offset of their clocks; are they of one dive? "
+    if (known := _usual(axis, base, one, pool)) is not None:
+        return f"{told}Perhaps {known[1]}: --shift {names[axis.file]}={known[0]:.0f} if that is so"
+    return f"{told}If you know the offset, state what to add to its stamps: --shift {sensors[0]}=SECONDS"
 
 
 def _typical_stamp(recording: Recording, clock: str) -> float:

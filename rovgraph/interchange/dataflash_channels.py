@@ -220,9 +220,9 @@ def attitude(source: Source) -> Channel | None:
 def barometer(source: Source) -> Channel | None:
     """BARO: depth from pressure."""
     pressure = np.asarray(source.si("Press"), dtype=float)
-    found, said, good = depth_of(source.instance, pressure, source.parameters, source.label)
+    found, said, good, zero = depth_of(source.instance, pressure, source.parameters, source.label)
     (source.findings.notes if good else source.findings.warnings).append(said)
-    return source.channel("depth", {"time": source.time("SMS", 1e-3), "depth": found}, "Press")
+    return replace(source.channel("depth", {"time": source.time("SMS", 1e-3), "depth": found}, "Press"), zero=zero)
 
 
 def rangefinder(source: Source) -> Channel | None:

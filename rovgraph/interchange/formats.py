@@ -55,11 +55,13 @@ class Options:
     choose : sensor -> instance, message or topic that feeds it, where a file has several
     progress : called with the bytes read so far and those of the file
     table : names, units, angles and times of rovgraph's own log, by a configuration (docs/log-format.md)
+    arrival : stamps are to be those of arrival, at least some: rows whose own stamps are wrong are kept
     """
 
     choose: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[int, int], None] = lambda done, total: None
     table: TableSettings = field(default_factory=TableSettings)
+    arrival: bool = False
 
 
 class Format(Protocol):

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -227,9 +228,9 @@ class _Vehicle:
 
     def _depth(self, sensor: str, rows: Rows) -> Iterator[Channel]:
         instance = PRESSURES.index(rows.name)
-        found, said, good = depth_of(instance, rows.columns["pressure"], self.parameters, rows.name)
+        found, said, good, zero = depth_of(instance, rows.columns["pressure"], self.parameters, rows.name)
         (self.notes if good else self.warnings).append(said)
-        yield self._channel(sensor, rows, {"depth": found}, "")
+        yield replace(self._channel(sensor, rows, {"depth": found}, ""), zero=zero)
 
     def _velocity(self, sensor: str, rows: Rows) -> Iterator[Channel]:
         if rows.name == "VISION_SPEED_ESTIMATE":

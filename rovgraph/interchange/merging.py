@@ -3,6 +3,8 @@
 import warnings as python_warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,13 +17,14 @@ from rovgraph.interchange.clocks import BASES, JoinedClock, join_clocks
 from rovgraph.interchange.motion import Motion
 from rovgraph.interchange.motion import motion_of as motion_of_log
 from rovgraph.interchange.recording import Channel, Recording
-from rovgraph.interchange.selection import Selected, Unused, file_names, select
-from rovgraph.interchange.stamps import put_in_order
+from rovgraph.interchange.selection import Selected, Unused, file_names, join_pieces, require_used, select
+from rovgraph.interchange.stamps import by_arrival, put_in_order
 from rovgraph.log import Log
 from rovgraph.log.rows import STAMP_DIGITS, Part, Rows, frame_of, in_order, whole
 
 OF_INSTRUMENT = ("imu", "dvl", "depth", "fix")  # sections of settings that belong to the channel of this sensor
 UNSURE_S = 0.002  # sd of a joined clock from which the sensors' time offset is estimated [s]
+ARRIVAL, EVERY = "arrival", ""  # whose times are taken, and of what: a sensor, a file, or every one
 OFFSETS = ("dvl", "ahrs", "mag", "depth", "fix")  # sensors with a calibration variable for it
 
 
@@ -78,6 +81,14 @@ class Merged:
         """Of the files."""
         return file_names(self.recordings)
 
+    @property
+    def source(self) -> str:
+        """What the log is called in messages."""
+        return " + ".join(
+            f"{name} to {Path(recording.pieces[-1].path).name}" if recording.pieces else name
+            for recording, name in zip(self.recordings, self.names, strict=True)
+        )
+
     def nested_settings(self) -> dict[str, Any]:
         """What the files know, nested as in YAML."""
         out: dict[str, Any] = {}
@@ -90,22 +101,33 @@ class Merged:
         return out
 
 
-def merge(recordings: Sequence[Recording], choose: Mapping[str, str], shift: Mapping[str, float]) -> Merged:
+def merge(
+    recordings: Sequence[Recording],
+    choose: Mapping[str, str],
+    shift: Mapping[str, float],
+    times: Mapping[str, str] = MappingProxyType({}),
+) -> Merged:
     """One log of some recordings of a dive.
 
     Parameters
     ----------
     choose : sensor -> file, instance, message or topic that feeds it
     shift : sensor or file -> what is added to its stamps [s]
+    times : sensor or file, or `EVERY` -> `ARRIVAL`, where its stamps are to be those of the recorder
 
     Raises
     ------
-    InputError : clocks that cannot be joined; a sensor, file or source that is not there; no measurement
+    InputError : clocks that cannot be joined; a sensor, file or source that is not there; no measurement; a file of
+        which nothing is used although nothing else covers its time
     """
+    recordings = _stamped(recordings, times)
     recordings, said = _in_order(recordings)
     if not any(recording.channels for recording in recordings):
         raise InputError(f"{', '.join(file_names(recordings))}: no measurement of any sensor in it")
+    recordings, shift, told = join_pieces(recordings, shift)
+    said = [*(text for recording in recordings for text in recording.warnings), *said, *told]
     selected, unused = select(recordings, choose)
+    said += require_used(recordings, selected, unused, choose)
     clocks, beside, unix, notes = join_clocks(recordings, selected, shift, _motion)
     by_name = {(clock.file, clock.name): clock for clock in clocks}
     parts = []
@@ -151,12 +173,45 @@ def _tables(
     return out
 
 
+def _stamped(recordings: Sequence[Recording], times: Mapping[str, str]) -> list[Recording]:
+    """Recordings of which some channels are stamped by whoever received them."""
+    out, known, taken = [], {EVERY}, False
+    for recording, name in zip(recordings, file_names(recordings), strict=True):
+        of_file = times.keys() & {EVERY, name, *recording.names}
+        known |= {name, *recording.names, *(channel.sensor for channel in recording.channels)}
+        channels = []
+        for channel in recording.channels:
+            wanted = of_file or channel.sensor in times
+            recorded = channel.received is not None
+            if wanted and not recorded and times.keys() != {EVERY}:
+                raise InputError(f"times: {name}: {channel.source}: no arrivals are recorded; leave it out of --times")
+            channels.append(by_arrival(channel) if wanted and recorded else channel)
+            taken = taken or channels[-1] is not channel
+        tables = recording.tables
+        if moved := [(a, b) for a, b in zip(recording.channels, channels, strict=True) if a is not b]:
+            before, after = next((pair for pair in moved if pair[0].sensor.startswith("dvl")), moved[0])
+            tables = {n: {**t, "time": _moved_as(np.asarray(t["time"]), before, after)} for n, t in tables.items()}
+        out.append(replace(recording, channels=tuple(channels), tables=tables))
+    if times and (unknown := times.keys() - known):
+        raise InputError(f"times {min(unknown)}: is neither a sensor nor a file; known are {', '.join(sorted(known))}")
+    if times and not taken:
+        raise InputError(f"times: no arrivals are recorded in {', '.join(file_names(recordings))}; leave out --times")
+    return out
+
+
+def _moved_as(time: Array, before: Channel, after: Channel) -> Array:
+    """Times of a table, shape (n,) [s], moved as the stamps of a channel were."""
+    own, new = np.asarray(before.columns["time"], dtype=float), np.asarray(after.columns["time"], dtype=float)
+    place = {stamp: k for k, stamp in enumerate(own.tolist())}
+    rows = [place.get(stamp, -1) for stamp in time.tolist()]
+    return np.array([new[k] if k >= 0 else np.nan for k in rows])
+
+
 def _in_order(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str]]:
     """Recordings whose stamps are in order, and all that is to be warned of."""
     out: list[Recording] = []
     said: list[str] = []
     for recording, name in zip(recordings, file_names(recordings), strict=True):
-        said += recording.warnings
         channels = []
         for channel in recording.channels:
             ordered, text = put_in_order(channel, name)

@@ -30,8 +30,9 @@ from rovgraph.interchange.inertial import (
     xyz,
 )
 from rovgraph.interchange.recording import Clock, Recording
-from rovgraph.interchange.stamps import UNIX_S, unix_of_text, unwrapped
+from rovgraph.interchange.stamps import unix_of_text
 from rovgraph.interchange.text_table import Layout, Table, cells_of, read_table
+from rovgraph.stamps import UNIX_S, unwrapped
 
 START = b"DATA_START"
 DESCRIPTOR = re.compile(r"^(.*?)\s*\[x([0-9A-F]{4})\]$", re.IGNORECASE)

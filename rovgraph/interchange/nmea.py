@@ -35,10 +35,11 @@ from rovgraph.interchange.nmea_sentences import (
     sentence_of,
 )
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
+from rovgraph.stamps import DAY_S
 
 UTC, DAY = "UTC of the sentences", "time of day of the sentences"
 SHIP = ("PSIMLBP", "PUSBA", "PSONLLD")  # of acoustic systems: relative to the ship, or not decoded
-NOON_S, DAY_S = 43_200.0, 86_400.0
+NOON_S = 43_200.0
 LONGEST = 1 << 12
 FEW = 3  # whole sentences that make a file one of these
 BINARY = 0.02  # of a file's bytes, that no text has: sentences within them are another format's
@@ -186,7 +187,7 @@ class _Sentences:
         if not self._clock:
             raise InputError(f"{path}: no sentence has a time; record ZDA, RMC or GGA beside the headings")
         place, time = np.frombuffer(self._clock).reshape(-1, 2).T.copy()
-        clock = Clock(UTC, 0.0, 0.0, "its stamps are Unix time") if self._times.dated else Clock(DAY)
+        clock = Clock(UTC, 0.0, 0.0, "its stamps are Unix time") if self._times.dated else Clock(DAY, cycle=DAY_S)
         if self._times.dated and 0 < self._undated < len(time):  # whole days until the first date
             step = time[self._undated] - time[self._undated - 1]
             time[: self._undated] += DAY_S * round(step / DAY_S)

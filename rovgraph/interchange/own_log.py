@@ -13,11 +13,11 @@ from rovgraph.errors import InputError, collected_warnings
 from rovgraph.geometry import Array
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Channel, Clock, Left, Recording
-from rovgraph.interchange.stamps import UNIX_S
 from rovgraph.log.beams import BEAMS, beams_beside, beams_frame
-from rovgraph.log.reading import numbers, read_columns
+from rovgraph.log.reading import in_order, numbers, read_columns
 from rovgraph.log.streams import LAT_LON, RECEIVED, STREAMS, THRUSTER, is_column
 from rovgraph.log.units import name_and_bracket
+from rovgraph.stamps import UNIX_S
 from rovgraph.tables import names_of, read_table
 
 SURE = 0.95
@@ -42,8 +42,13 @@ class OwnLog:
             table = read_table(path)
             cells, names = read_columns(table, options.table)
             beams = beams_beside(path)
-        if RECEIVED in table.names:
-            cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
+            if RECEIVED in table.names:
+                cells[RECEIVED] = numbers(table, RECEIVED, RECEIVED)
+            try:
+                cells = cells if options.arrival else in_order(cells, table.line, table.source, RECEIVED in cells)[0]
+            except InputError:
+                if RECEIVED not in cells:  # by which each sensor's stamps are put right
+                    raise
         channels = tuple(_channels(cells))
         if not channels:
             raise InputError(f"{path}: no measurement of any sensor in it; columns: {', '.join(table.names)[:200]}")

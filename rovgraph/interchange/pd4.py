@@ -17,11 +17,11 @@ from rovgraph.interchange.formats import Options
 from rovgraph.interchange.recording import Clock, Left, Recording
 from rovgraph.interchange.trdi_axes import BEAM, EARTH, INSTRUMENT, SHIP, Attitude, forward_starboard_down
 from rovgraph.interchange.trdi_recording import CLOCK, Pings, recording
+from rovgraph.stamps import DAY_S, unwrapped
 
 MARK = 0x7D
 SIZES = {0: 47, 1: 88}  # bytes of a frame, by its kind: PD4, PD5
 BAD = -32768
-DAY = 86400.0
 HEADS = [struct.pack("<BBH", MARK, kind, size - 2) for kind, size in SIZES.items()]
 FIELDS = [
     ("mark", "u1"), ("kind", "u1"), ("bytes", "<u2"), ("system", "u1"), ("velocity", "4<i2"), ("range", "4<u2"),
@@ -56,7 +56,7 @@ class PD4:
         warnings = [f"{count} velocities are left out: {reason}" for reason, count in refused.items()]
         if skipped:
             warnings.append(f"{skipped} bytes belong to no whole frame, or to one with a wrong checksum")
-        return recording(path, self.name, pings, Clock(CLOCK), left, tuple(warnings))
+        return recording(path, self.name, pings, Clock(CLOCK, cycle=DAY_S), left, tuple(warnings))
 
 
 FORMAT = PD4()
@@ -162,7 +162,4 @@ def _time(clock: NDArray[np.uint8]) -> Array:
     hour, minute, second, hundredths = clock.astype(float).T
     time = 3600.0 * hour + 60.0 * minute + second + 0.01 * hundredths
     time[(hour > 23) | (minute > 59) | (second > 59) | (hundredths > 99)] = np.nan
-    known = np.flatnonzero(np.isfinite(time))
-    days = np.cumsum(np.diff(time[known], prepend=time[known][:1]) < -0.5 * DAY)
-    time[known] += DAY * days
-    return np.asarray(time)
+    return unwrapped(time, DAY_S)

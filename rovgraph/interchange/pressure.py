@@ -3,6 +3,7 @@
 import numpy as np
 
 from rovgraph.geometry import Array
+from rovgraph.interchange.recording import Zero
 
 STANDARD = 101325.0  # of the atmosphere at sea level [Pa]
 GRAVITY = 9.80665  # [m/s2]
@@ -31,6 +32,11 @@ def surface_pressure(stated: float | None, pressure: Array) -> tuple[float, str,
     if least <= high:
         return least, f"{said}; the least that was measured", False
     return STANDARD, f"{said}, and never measured; the standard atmosphere", False
+
+
+def zero_of(surface: float, density: float, said: str) -> Zero:
+    """The surface as a depth, where it is guessed by the measured pressures."""
+    return Zero(surface / (density * GRAVITY), said, surface != STANDARD)
 
 
 def depth(pressure: Array, surface: float, density: float) -> Array:

@@ -7,6 +7,7 @@ clocks, units become SI and radians, vectors stay in the instrument's axes: what
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from rovgraph.geometry import Array
@@ -23,12 +24,31 @@ class Clock:
     unix_offset : what its stamps lack of Unix time [s]; 0 = they are Unix time; None = not known
     offset_sd : how well that is known [s]
     source : how it was found, such as "GPS week and milliseconds"; "" where it is not known
+    cycle : where ``unix_offset`` is None, its stamps are Unix time but for whole multiples of this, such as times of
+        day [s]; 0 = nothing is known of them
     """
 
     name: str
     unix_offset: float | None = None
     offset_sd: float = 0.0
     source: str = ""
+    cycle: float = 0.0
+
+
+@dataclass(frozen=True)
+class Zero:
+    """The surface that depths count from, where it was taken from the pressures of the same file.
+
+    Attributes
+    ----------
+    depth : of water that weighs as much as the pressure that was taken off [m]
+    said : the sentence of `Recording.warnings` that tells it
+    measured : False = the standard atmosphere, as nothing was measured near the surface
+    """
+
+    depth: float
+    said: str
+    measured: bool
 
 
 @dataclass(frozen=True)
@@ -45,6 +65,7 @@ class Channel:
     clock : name of the `Clock` that stamps it
     received : when each row arrived, on the clock ``receiver``, ndarray, shape (n,); None = not recorded
     receiver : name of the `Clock` of ``received``
+    zero : of depths, where the file does not state it: pieces of one recording share the least
     """
 
     sensor: str
@@ -54,6 +75,7 @@ class Channel:
     clock: str = ""
     received: Array | None = None
     receiver: str = ""
+    zero: Zero | None = None
 
 
 def in_files(channel: Channel) -> Channel:
@@ -89,12 +111,31 @@ class Left:
 
 
 @dataclass(frozen=True)
+class Piece:
+    """One of several consecutive files that are read as one recording.
+
+    Attributes
+    ----------
+    path : the file, as given
+    first, last : of its stamps, by the clocks of the recording [s]
+    rows : of all its channels
+    again : of these, that the piece before has as well
+    """
+
+    path: str
+    first: float
+    last: float
+    rows: int
+    again: int
+
+
+@dataclass(frozen=True)
 class Recording:
     """A native file as channels of a log.
 
     Attributes
     ----------
-    path : the file, as given
+    path : the file, as given; of several pieces, the first
     format : name of the format that it is in
     channels : what goes into the log; several of one sensor are alternatives, the preferred one first
     clocks : name -> Clock, of every channel's clock
@@ -105,6 +146,8 @@ class Recording:
     tables : other tables that are worth keeping (name -> column -> ndarray, shape (n,)), with a column ``time`` [s] by
         the clock of the DVL's channels, or of the first channel where there is none. ``dvl_beams`` has what each beam
         of the DVL measured, its columns as `rovgraph.log.beams` names them
+    pieces : the files that it was joined of, in the order of time; () = it is one file
+    assumed : section of ``settings`` that is not known but assumed -> the sentence of ``warnings`` that tells it
     """
 
     path: str
@@ -116,3 +159,15 @@ class Recording:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     tables: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+    pieces: tuple[Piece, ...] = ()
+    assumed: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def names(self) -> set[str]:
+        """What its files may be called in options: path, name, and name without suffix."""
+        paths = [Path(path) for path in (self.path, *(piece.path for piece in self.pieces))]
+        return {text for path in paths for text in (str(path), path.name, path.stem)}
+
+    def unix_offset(self, clock: str) -> float | None:
+        """What the stamps of one of its clocks lack of Unix time [s]; None = not known."""
+        return self.clocks[clock].unix_offset if clock in self.clocks else None

@@ -13,19 +13,16 @@ from rovgraph.geometry import Array, matrix_from_quaternion, rpy_from_matrix
 from rovgraph.interchange.alternatives import preferred_first
 from rovgraph.interchange.fixes import ONE_POINT, new_fixes, one_point
 from rovgraph.interchange.formats import Options
-from rovgraph.interchange.pressure import depth, surface_pressure
+from rovgraph.interchange.pressure import depth, surface_pressure, zero_of
 from rovgraph.interchange.rates import too_slow
-from rovgraph.interchange.receiver import receiver_clock
-from rovgraph.interchange.recording import Channel, Clock, Left, Recording, in_files
+from rovgraph.interchange.recording import Channel, Clock, Left, Recording, Zero, in_files
 from rovgraph.interchange.rosbag_frames import FRD_OF_FLU, Frames, Mounting
 from rovgraph.interchange.rosbag_messages import COLUMNS, DOWN, GENERAL
 from rovgraph.interchange.rosbag_nucleus import CLOCK as NUCLEUS
+from rovgraph.interchange.stamps import APART_S, by_arrivals
 from rovgraph.spilling import FlatTable, computed, every, taken
 
 HEADERS, RECORDER = "headers of messages", "recorder"
-SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
-APART_S = 1.0  # between stamp and arrival; more is another clock
-BACK_S = 1.0  # by which stamps go back where their clock was set
 LATENCY_SD_S = 0.05
 SOME = 10_000  # messages that something is told by
 SEA = 1025.0  # density of water [kg/m3]
@@ -81,7 +78,9 @@ def recording(
     used = {c.clock for c in channels} | {c.receiver for c in channels}
     clocks = {name: clock for name, clock in made.clocks.items() if name in used}
     notes, warnings = tuple(dict.fromkeys(made.notes)), tuple(dict.fromkeys(made.warnings))
-    return Recording(str(path), format_, channels, clocks, tuple(made.left), made.settings, notes, warnings)
+    return Recording(
+        str(path), format_, channels, clocks, tuple(made.left), made.settings, notes, warnings, assumed=made.assumed
+    )
 
 
 class _Made:
@@ -95,6 +94,8 @@ class _Made:
         self.clocks = {name: Clock(name, 0.0, 0.0, "its stamps are Unix time") for name in (HEADERS, RECORDER)}
         self._path, self._frames, self._choose = path, frames, options.choose
         self._mountings: dict[str, Mounting | None] = {}  # of the preferred topic of a sensor
+        self.assumed: dict[str, str] = {}
+        self._zeros: dict[str, Zero] = {}  # by topic
 
     def of(self, sensor: str, topics: Mapping[str, Topic]) -> Iterator[Channel]:
         """All topics that tell of a sensor, the preferred one first."""
@@ -129,7 +130,8 @@ class _Made:
         if first:
             self._mountings[sensor] = self._frames.mounting(topic.frame)
         source = f"{topic.name} ({topic.type})"
-        return in_files(Channel(sensor, columns, source, frame, clock, received, RECORDER))
+        zero = self._zeros.get(topic.name) if sensor == "depth" else None
+        return in_files(Channel(sensor, columns, source, frame, clock, received, RECORDER, zero))
 
     def _columns(self, sensor: str, topic: Topic, values: Array) -> dict[str, Array]:
         if sensor == "depth":
@@ -141,18 +143,17 @@ class _Made:
 
     def _times(self, topic: Topic, table: Array) -> tuple[NDArray[np.bool_], Array, str]:
         """Which rows can be used, their stamps [s], and the clock of these."""
-        stamp, received = table[:, 0].copy(), table[:, 1]
-        keep = np.ones(len(table), bool)
+        received = table[:, 1]
         if topic.latencies:
             self.notes.append(f"{topic.name}: stamped by arrival, less the time that each report says it took")
-        empty = stamp == 0.0
-        if empty.mean() > 0.5:
-            self.warnings.append(f"{topic.name}: no stamps in the headers; those of arrival are taken, which are late")
-            return keep, received, RECORDER
-        if empty.any():
-            self.left.append(Left(f"{topic.name} ({topic.type})", int(empty.sum()), "no stamp in the header"))
-            keep &= ~empty
-        self._unjump(topic, stamp, received, keep)
+        stamp, said = by_arrivals(table[:, 0], received)
+        self.warnings += [f"{topic.name}: {text}" for text in said]
+        if stamp is None:
+            return np.ones(len(table), bool), received, RECORDER
+        keep = np.isfinite(stamp)
+        if not keep.all():
+            why = "no stamp in the header, or one of another clock"
+            self.left.append(Left(f"{topic.name} ({topic.type})", int((~keep).sum()), why))
         apart = float(np.median((received - stamp)[keep]))
         if abs(apart) <= APART_S:
             return keep, stamp[keep], HEADERS
@@ -163,24 +164,6 @@ class _Made:
         self.clocks[name] = Clock(name, offset, LATENCY_SD_S, "least of (received - stamp) by the recorder")
         self.warnings.append(f"{topic.name}: headers are {apart:+.1f} s apart from the recorder's clock, so of another")
         return keep, stamp[keep], name
-
-    def _unjump(self, topic: Topic, stamp: Array, received: Array, keep: NDArray[np.bool_]) -> None:
-        """Put stamps of a clock that went back on its last setting, as the recorder's clock tells."""
-        rows = np.flatnonzero(keep)
-        unset = stamp[rows] < SET
-        if not ((np.diff(stamp[rows]) < -BACK_S).any() or (unset.any() and not unset.all())):
-            return
-        clock = receiver_clock(np.arange(len(rows)), stamp[rows], received[rows])
-        stamp[rows] = clock.corrected(np.arange(len(rows)), stamp[rows])
-        steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "an amount that too few messages show"
-        self.warnings.append(
-            f"{topic.name}: the clock of its headers was set by {steps}; earlier stamps are moved to it"
-        )
-        apart = received[rows] - stamp[rows]
-        other = np.abs(apart - np.median(apart)) > APART_S  # too few to tell how their clock was set
-        if other.any():
-            self.left.append(Left(f"{topic.name} ({topic.type})", int(other.sum()), "stamps of another clock"))
-            keep[rows[other]] = False
 
     def _new_fixes(self, topic: Topic, time: Array, values: Array) -> NDArray[np.bool_]:
         lat, lon = values[:, 0], values[:, 1]
@@ -205,6 +188,7 @@ class _Made:
         surface, said, _ = surface_pressure(None, pressure)
         at = f"{surface / 100.0:.0f} hPa at the surface ({said})"
         self.warnings.append(f"{topic.name}: depth against {at}, in water of {SEA:.0f} kg/m3")
+        self._zeros[topic.name] = zero_of(surface, SEA, self.warnings[-1])
         return depth(pressure, surface, SEA)
 
     def _attitude(self, topic: Topic, xyzw: Array) -> dict[str, Array]:
@@ -261,7 +245,7 @@ class _Made:
             upwards = bool(acc[2] > 0.0)
             mounting = Mounting(FRD_OF_FLU if upwards else np.eye(3))
             axes = "x forward, y left, z up" if upwards else "x forward, y right, z down"
-            self._unmounted(topic, f"{axes}, as gravity has it")
+            self._unmounted("imu", topic, f"{axes}, as gravity has it")
         elif (mounting.R_bs @ acc)[2] > 0.0:
             self.warnings.append(f"{topic.name}: gravity is upside down with the mounting of /tf_static; check both")
         return mounting.settings()
@@ -270,12 +254,13 @@ class _Made:
         if mounting is None:
             down = topic.type.startswith(DOWN)
             mounting = Mounting(np.eye(3) if down else FRD_OF_FLU)
-            self._unmounted(topic, "x forward, y right, z down" if down else "x forward, y left, z up")
+            self._unmounted("dvl", topic, "x forward, y right, z down" if down else "x forward, y left, z up")
         return mounting.settings()
 
-    def _unmounted(self, topic: Topic, axes: str) -> None:
+    def _unmounted(self, section: str, topic: Topic, axes: str) -> None:
         way = f"/tf_static does not lead from {topic.frame!r} to base_link"
         self.warnings.append(f"{topic.name}: {way}; its axes are taken as {axes}: check the mounting")
+        self.assumed[section] = self.warnings[-1]
 
 
 def _rank(topic: Topic) -> int:

@@ -1,4 +1,4 @@
-"""Stamps of a channel that are put in order: a clock that was set within a file is told, never believed."""
+"""Stamps of a channel that are put in order, by `rovgraph.stamps` and by the arrivals that a recorder kept."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
+from rovgraph.interchange.receiver import receiver_clock
 from rovgraph.interchange.recording import Channel
-from rovgraph.spilling import steps, taken
+from rovgraph.spilling import every, holds, steps, taken
+from rovgraph.stamps import COUNTERS, ENOUGH, JUMP, LOST, NOT_SET, STEP_BACK, mend, require_moving
 
-STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
-JUMP = 86400.0  # ahead, after which a stamp is of another epoch [s]
-UNIX_S = 9.5e8, 4.2e9  # what lies within, 2000 to 2103, is taken for Unix time [s]
-LOST = 0.1  # of the rows, that stamps of another epoch may have
+SET = 1e9  # [s] since 1970: stamps before are of no clock that was set
+APART_S = 1.0  # between stamp and arrival; more is another clock
+SOME = 10_000  # rows that something is told by
+WENT_BY_S = 2.0  # that shows whether stamps go on
+STANDS = 0.1  # of the time that went by, over which stamps that stand still reach
 
 
 def unix_of_calendar(
@@ -46,95 +49,98 @@ def unix_of_text(text: str) -> float:
     return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
-def unwrapped(count: Array, wrap: float) -> Array:
-    """A counter, shape (n,), without its wraps, which are where it goes back by more than half its range; NaN stays."""
-    out = np.full(len(count), np.nan)
-    known = np.isfinite(count)
-    out[known] = count[known] + wrap * np.cumsum(np.diff(count[known], prepend=count[known][:1]) < -0.5 * wrap)
-    return out
-
-
 def put_in_order(channel: Channel, file: str) -> tuple[Channel, list[str]]:
     """A channel with its rows in the order of time, and what was done, a sentence each.
 
-    Rows whose stamps jump back, or ahead by a day, are left out where they are few, such as those from before a clock
-    was set.
+    Where its stamps are empty or stand still, those of the recorder are taken, if they are known.
 
     Raises
     ------
-    InputError : no row with a time, or many whose stamps are of another epoch
+    InputError : no row with a time, stamps that stand still, or many that are of another epoch
     """
-    where, time = f"{file}: {channel.source}", np.asarray(channel.columns["time"], dtype=float)
+    where, said = f"{file}: {channel.source}", list[str]()
+    if channel.received is not None and (why := _tells_nothing(channel.columns["time"], channel.received)):
+        said.append(f"{where}: its stamps {why}; those of arrival are taken, which are late")
+        channel = by_arrival(channel)
+    time = np.asarray(channel.columns["time"], dtype=float)
     if _increase(time):
-        return channel, []
-    said: list[str] = []
-    kept = None if _of_one_clock(time) else _usable(time, where, said)
-    stamps = time if kept is None else time[kept]
+        require_moving(time, where)
+        return channel, said
+    if not np.isfinite(time).any():
+        raise InputError(f"{where}: no row has a time")
+    if timeless := int(np.count_nonzero(~np.isfinite(time))):
+        said.append(f"{where}: {timeless} rows without time left out")
+    try:
+        mended, told = mend(time, where, not_set=NOT_SET if channel.received is None else LOST)
+    except InputError:
+        if channel.received is None:
+            raise
+        by_recorder, told = by_arrivals(time, channel.received)
+        mended = time if by_recorder is None else by_recorder
+        told = [f"{where}: {text}" for text in told]
+    said += told
+    kept = None if holds(np.isfinite, mended) else np.flatnonzero(np.isfinite(mended))
+    stamps = mended if kept is None else mended[kept]
     late = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps)))
     if late:
         said.append(f"{where}: {late} rows are earlier than a row above them, sorted")
     order = np.argsort(stamps, kind="stable")
     order = order if kept is None else kept[order]
-    if len(order) == len(time) and not late:
-        return channel, said
     received = None if channel.received is None else taken(channel.received, order)
     columns = {name: taken(np.asarray(values), order) for name, values in channel.columns.items()}
+    columns["time"] = taken(mended, order)
     return replace(channel, columns=columns, received=received), said
+
+
+def by_arrival(channel: Channel) -> Channel:
+    """A channel, whose arrivals are known, that is stamped by whoever received it."""
+    assert channel.received is not None
+    columns = {**channel.columns, "time": channel.received}
+    return replace(channel, columns=columns, clock=channel.receiver)
+
+
+def by_arrivals(stamp: Array, received: Array) -> tuple[Array | None, list[str]]:
+    """Stamps of a message's sender as whoever received them shows them to be.
+
+    Parameters
+    ----------
+    stamp, received : ndarray, shape (n,) [s]
+
+    Returns
+    -------
+    stamp : ndarray, shape (n,) [s], on the clock's last setting, NaN where it cannot be used; None = take arrivals
+    said : what was done, without a subject
+    """
+    if why := _tells_nothing(stamp, received):
+        return None, [f"stamps {why}; those of arrival are taken, which are late"]
+    out = np.where(stamp == 0.0, np.nan, stamp)
+    rows = np.flatnonzero(np.isfinite(out))
+    unset = out[rows] < SET
+    if not ((np.diff(out[rows]) < -STEP_BACK).any() or (unset.any() and not unset.all())):
+        return out, []
+    clock = receiver_clock(np.arange(len(rows)), out[rows], received[rows])
+    out[rows] = clock.corrected(np.arange(len(rows)), out[rows])
+    steps = ", ".join(f"{step:+.1f} s" for step in clock.steps) or "an amount that too few messages show"
+    apart = received[rows] - out[rows]
+    out[rows[np.abs(apart - np.median(apart)) > APART_S]] = np.nan  # too few to tell how their clock was set
+    return out, [f"its clock was set by {steps}; earlier stamps are moved to it"]
+
+
+def _tells_nothing(stamp: Array, received: Array) -> str:
+    """What is wrong with stamps that tell nothing, as arrivals show; "" where they tell something."""
+    stamp, received = (every(np.asarray(values), max(len(stamp) // SOME, 1)) for values in (stamp, received))
+    known = np.isfinite(stamp) & (stamp != 0.0)
+    if known.mean() <= 0.5:
+        return "are empty"
+    went_by = float(np.ptp(received[known]))
+    if np.count_nonzero(known) < ENOUGH or not went_by > WENT_BY_S:
+        return ""
+    low, high = np.percentile(stamp[known], [5.0, 95.0])
+    wraps = any(low >= 0.0 and high <= wrap and high > 0.5 * wrap for wrap in COUNTERS)
+    return f"stand still at {low:.10g} s" if high - low < STANDS * went_by and not wraps else ""
 
 
 def _increase(time: NDArray[np.float64]) -> bool:
     """Whether all stamps are known and in order, as most are: a large channel is not copied to find out."""
     known = len(time) > 0 and bool(np.isfinite(time[[0, -1]]).all())
     return known and not len(steps(time, lambda step: ~((step >= 0.0) & (step <= JUMP))))
-
-
-def _of_one_clock(time: NDArray[np.float64]) -> bool:
-    """Whether all stamps are known and nearly in order: then all rows are of one epoch, found without a copy."""
-    return len(time) > 1 and not len(steps(time, lambda step: ~((step > -0.5 * STEP_BACK) & (step <= JUMP))))
-
-
-def _usable(time: NDArray[np.float64], where: str, said: list[str]) -> NDArray[np.int64]:
-    """Indices of the rows whose stamps can be used; what is left out is said."""
-    stamped = np.isfinite(time)
-    if not stamped.any():
-        raise InputError(f"{where}: no row has a time")
-    if not stamped.all():
-        said.append(f"{where}: {np.count_nonzero(~stamped)} rows without time left out")
-    rows = np.flatnonzero(stamped)
-    kept = rows[_of_one_epoch(time[rows])]
-    if lost := len(rows) - len(kept):
-        odd = np.setdiff1d(rows, kept)[0]
-        apart = f"{time[odd]:.1f} s, others from {time[kept[0]]:.1f} s"
-        told = f"{lost} of {len(rows)} rows have stamps of another time ({apart})"
-        if lost > LOST * len(rows):
-            raise InputError(f"{where}: {told}; was the clock set, or are two dives in one file? Split it")
-        said.append(f"{where}: {told}; left out")
-    return kept
-
-
-def _of_one_epoch(time: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of the longest piece without a jump, and of the pieces around it that go on in its order."""
-    kept = np.flatnonzero(~_alone(time))
-    return np.asarray(kept[_longest(time[kept])])
-
-
-def _alone(time: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Rows whose stamp is wrong by itself: those before and after it are in order, it is not between them."""
-    before, after = time[:-2], time[2:]
-    outside = (time[1:-1] > after + STEP_BACK) | (time[1:-1] < before - STEP_BACK)
-    return np.pad(outside & (before <= after), 1)[: len(time)]
-
-
-def _longest(time: NDArray[np.float64]) -> NDArray[np.int64]:
-    steps = np.diff(time)
-    breaks = np.flatnonzero((steps < -STEP_BACK) | (steps > JUMP)) + 1
-    pieces = np.split(np.arange(len(time)), breaks)
-    longest = max(range(len(pieces)), key=lambda k: len(pieces[k]))
-    kept = [pieces[longest]]
-    for piece in pieces[longest + 1 :]:
-        if -STEP_BACK <= time[piece[0]] - time[kept[-1]].max() <= JUMP:
-            kept.append(piece)
-    for piece in reversed(pieces[:longest]):
-        if -STEP_BACK <= time[kept[0][0]] - time[piece].max() <= JUMP:
-            kept.insert(0, piece)
-    return np.concatenate(kept)

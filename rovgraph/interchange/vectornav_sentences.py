@@ -24,9 +24,10 @@ from rovgraph.gps_time import WEEK_S, is_week, unix_of_gps
 from rovgraph.interchange.formats import Options
 from rovgraph.interchange.inertial import SINCE_START, Account, Measured, recording_of_inertial
 from rovgraph.interchange.recording import Clock, Recording
-from rovgraph.interchange.stamps import UNIX_S, unix_of_text, unwrapped
+from rovgraph.interchange.stamps import unix_of_text
 from rovgraph.interchange.vectornav import NORTH, attitude_of, gnss
 from rovgraph.log.units import UNITS
+from rovgraph.stamps import DAY_S, UNIX_S, unwrapped
 
 SENTENCE = re.compile(rb"^([^$]*)\$(VN([A-Z]{3}),([^*$]*))\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})\W*$")
 RATE = re.compile(rb"\$VN[RW]RG,0?7,0*([0-9]+)")
@@ -44,7 +45,7 @@ GPS_CELLS = (4, 5, 2, 10, 11)  # latitude, longitude, kind of fix, sd north and 
 PLACE, LOGGED, COUNT, FIRST = range(4)  # columns before the cells
 BROKEN, SHORT = "a wrong checksum, or no sentence", "cells that are missing or no numbers"
 COMMANDS = ("RRG", "WRG", "ERR", "WNV", "RST", "RFS", "TAR", "ASY")
-DAY_S, US, COUNT_WRAP = 86_400.0, 1e-6, 2.0**32
+US, COUNT_WRAP = 1e-6, 2.0**32
 LEAST_US = 500.0  # between two messages; a counter that goes on by less counts events
 GPS_SD_S, LOGGER_SD_S = 0.02, 1.0
 
@@ -213,7 +214,9 @@ def _times(
         account.warnings.append("stamps are those that a logger wrote before the sentences, after the transport")
         if UNIX_S[0] < float(np.nanmedian(logged)) < UNIX_S[1]:
             return logged, Clock("the logger's time", 0.0, LOGGER_SD_S, "its stamps look like Unix time")
-        return unwrapped(logged, DAY_S) if np.nanmax(logged) <= DAY_S else logged, Clock("the logger's time")
+        if np.nanmax(logged) <= DAY_S:
+            return unwrapped(logged, DAY_S), Clock("the logger's time", cycle=DAY_S)
+        return logged, Clock("the logger's time")
     if np.isfinite(count).mean() > 0.5:
         since = US * unwrapped(count, COUNT_WRAP)
         steps = np.diff(since[np.isfinite(since)])

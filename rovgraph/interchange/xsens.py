@@ -15,8 +15,8 @@ from rovgraph.geometry import Array
 from rovgraph.interchange.formats import HEAD, Options
 from rovgraph.interchange.inertial import Account, Measured, recording_of_inertial
 from rovgraph.interchange.recording import Clock, Recording
-from rovgraph.interchange.stamps import unwrapped
 from rovgraph.interchange.text_table import Layout, cells_of, read_table
+from rovgraph.stamps import unwrapped
 
 FINE_S, FINE_WRAP = 1e-4, 2**32
 COUNTER_WRAP = 2**16

@@ -13,7 +13,8 @@ The stamps of recordings are believed. Those of another epoch than the IMU's are
 refused where these do not tell.
 
 A stamp that is suddenly seconds off is left out. When the stamps go on like that, the clock
-was set: it is shifted, so that time goes on.
+was set: it is shifted, so that time goes on. A counter that wraps goes on at once. Stamps that stand
+still for `STILL_S` while messages come are not used any more: arrivals are, until the stamps move on.
 """
 
 from collections import deque
@@ -23,12 +24,14 @@ from typing import Any
 
 from rovgraph.errors import InputError
 from rovgraph.live.message import Message
+from rovgraph.stamps import COUNTERS, counter_range
 
 AGREE_S = 0.5
 AGREE_SENT_S = 0.1
 EPOCH_S = 86400.0  # recorded stamps that are further apart are of different epochs
 JUMP_S = 5.0  # a delay that differs by more from the one before is no delay
 CONFIRM_S, CONFIRM = 2.0, 5  # so long, and so many stamps, until a clock counts as set
+STILL_S, STILL_RANGE_S, STILL = 2.5, 1.0, 5  # so long, within so much, in so many messages, until stamps stand still
 WINDOW_S = 60.0  # over which the least delay is taken
 PIECES = 6  # that the window is kept in
 
@@ -67,6 +70,23 @@ class _Clock:
 
 
 @dataclass
+class _Moves:
+    """Whether the stamps of one sensor move on.
+
+    Attributes
+    ----------
+    arrival, stamp : when they last did by `STILL_RANGE_S` [s]
+    count : of messages since then
+    still : they stand still
+    """
+
+    arrival: float
+    stamp: float
+    count: int = 0
+    still: bool = False
+
+
+@dataclass
 class Clocks:
     """Times of messages by the estimator's clock.
 
@@ -81,6 +101,7 @@ class Clocks:
     news: list[tuple[str, str]] = field(default_factory=list)
     odd: int = 0
     _clocks: dict[tuple[str, str], _Clock] = field(default_factory=dict)
+    _moves: dict[tuple[str, str, str], _Moves] = field(default_factory=dict)  # by source, clock and sensor
     _base: _Clock | None = None
 
     def time(self, message: Message) -> float | None:
@@ -97,15 +118,18 @@ class Clocks:
         clock = self._clocks.get((message.source, message.clock)) or self._met(message)
         if self._base is None and any(r.sensor == "imu" for r in message.readings):
             self._base, clock.apart = clock, 0.0
-        clock.newest, processing = message.stamp, message.latency or 0.0
-        stamp = message.stamp + clock.shift
+        if self._stands_still(message, clock):
+            base = clock if self._base is None else self._base
+            return message.arrival - base.delay.value
+        own, processing = self._unwrapped(message.stamp, clock), message.latency or 0.0
+        stamp = own + clock.shift
         if self.trust:
             clock.delay.add(message.arrival, message.arrival - stamp - processing)
             return self._recorded(stamp, clock)
         if self._is_odd(clock, message.arrival, message.arrival - stamp - processing):
             self.odd += 1
             return None
-        stamp = message.stamp + clock.shift  # it may have been set
+        stamp = own + clock.shift  # it may have been set
         clock.delay.add(message.arrival, message.arrival - stamp - processing)
         return stamp + self._correction(clock, AGREE_S if message.latency is None else AGREE_SENT_S)
 
@@ -132,6 +156,35 @@ class Clocks:
             self._clocks[known["source"][0], known["source"][1]] = clock
             if clock.name == state["base"]:
                 self._base = clock
+
+    def _unwrapped(self, stamp: float, clock: _Clock) -> float:
+        """A stamp, of a counter that goes on where it wraps; of a late message from before that, less its range [s]."""
+        newest = stamp if clock.newest is None else clock.newest
+        if late := counter_range(stamp, newest):
+            return stamp - late
+        if wrap := counter_range(newest, stamp):
+            clock.shift += wrap
+            self.news.append((clock.name, f"its stamps count {COUNTERS[wrap]} and wrap; time goes on"))
+        clock.newest = stamp
+        return stamp
+
+    def _stands_still(self, message: Message, clock: _Clock) -> bool:
+        """Whether the stamps of a sensor stand still while its messages come."""
+        assert message.stamp is not None
+        sensor = message.readings[0].sensor if message.readings else ""
+        moves = self._moves.setdefault((message.source, message.clock, sensor), _Moves(message.arrival, message.stamp))
+        if abs(message.stamp - moves.stamp) > STILL_RANGE_S:
+            moves.arrival, moves.stamp, moves.count = message.arrival, message.stamp, 0
+            if moves.still:
+                moves.still = False
+                self.news.append((sensor, f"the stamps of {sensor} move on, and are used again"))
+        moves.count += 1
+        known = clock.delay.pieces and (self._base is None or self._base.delay.pieces)
+        if known and not moves.still and moves.count >= STILL and message.arrival - moves.arrival >= STILL_S:
+            moves.still = True
+            text = f"the stamps of {sensor} stand still at {message.stamp:.10g} s; times of arrival are used"
+            self.news.append((sensor, text))
+        return moves.still
 
     def _met(self, message: Message) -> _Clock:
         """A clock that has not been read before."""

@@ -31,8 +31,9 @@ from rovgraph.log.frozen import (
 )
 
 SILENT_S, SILENT_PERIODS = 3.0, 10.0  # without a measurement, the longer of the two
-SILENT_AT_FIRST_S = 30.0  # after a first measurement, as long as the period is not known
-TELL_S = 2.0  # a ping without bottom lock is not worth an event, nor is a zero;
+SILENT_AT_FIRST_S = 10.0  # after a first measurement, as long as the period is not known
+SELDOM_AT_FIRST_S = {"fix": 30.0}  # of sensors that speak less often
+TELL_S = 2.0  # a ping without bottom lock is not worth an event, nor is a zero
 OFTEN, OFTEN_S = 10, 60.0  # so many times zeros in such a time are
 FROZEN = {"imu": 20, "dvl": 3}  # equal measurements running that no working sensor gives
 NOISY = {"mag", "depth", "dvl_water"}  # sensors whose noise may show, so that values hardly ever repeat
@@ -218,7 +219,8 @@ class Faults:
             if sensor in OCCASIONAL or watch.by_hand:
                 continue
             quiet = time - watch.heard  # what comes late all the time is not silent
-            longest = max(SILENT_S, SILENT_PERIODS * watch.period) if watch.period else SILENT_AT_FIRST_S
+            at_first = SELDOM_AT_FIRST_S.get(sensor, SILENT_AT_FIRST_S)
+            longest = max(SILENT_S, SILENT_PERIODS * watch.period) if watch.period else at_first
             if watch.state != "silent" and quiet > longest:
                 watch.state = watch.reported = "silent"
                 self.events.append(Event(time, sensor, "silent", f"{sensor}: nothing for {quiet:.1f} s"))

@@ -30,9 +30,9 @@ from rovgraph.log.streams import (
 )
 from rovgraph.log.units import known_unit, name_and_bracket, near_miss, nearest, quantities, scales, turn_angles
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
+from rovgraph.stamps import STEP_BACK, mend, require_moving
 from rovgraph.tables import Table
 
-STEP_BACK = 1.0  # streams that are written in turn overlap by less [s]
 LATE = 600.0  # what comes later than this was not late, the clock was set [s]
 FARTHEST = 100e3  # of fixes from a stated origin: n is flat, and one that far is a mistake [m]
 ACC_GAP = 0.5  # accelerations further apart are not interpolated [s]
@@ -86,7 +86,7 @@ def _streams(table: Table, config: Config, origin: Origin) -> tuple[dict[str, St
     """The streams of one table as they stand in it, and the origin, which is its first fix where it was not known."""
     cells, _ = read_columns(table, config.table)
     cells = {name: values for name, values in cells.items() if not (_may_lack(name) and np.isnan(values).all())}
-    cells, line = _in_order(cells, table.line, table.source, RECEIVED in table.names)
+    cells, line = in_order(cells, table.line, table.source, RECEIVED in table.names)
     origin = _add_local_fixes(cells, line, table.source, origin)
     streams = [_imu(cells, line, table.source)]
     streams += [_stream(sensor, cells, line, table.source) for sensor in STREAMS if sensor != "imu"]
@@ -207,7 +207,7 @@ def _may_lack(name: str) -> bool:
     return name in (*LAT_LON, "fix_north", "fix_east") or THRUSTER.fullmatch(name) is not None
 
 
-def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool) -> tuple[dict[str, Array], Lines]:
+def in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: bool) -> tuple[dict[str, Array], Lines]:
     """Rows in the order of time, those without a time left out.
 
     Parameters
@@ -216,7 +216,7 @@ def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: boo
 
     Raises
     ------
-    InputError : time goes back further than `STEP_BACK` (`LATE` by arrival), or no row has a time
+    InputError : stamps of another time than the others, or that stand still; no row has a time
     """
     timeless = np.isnan(cells["time"])
     if timeless.any():
@@ -224,18 +224,15 @@ def _in_order(cells: dict[str, Array], line: Lines, source: str, by_arrival: boo
             raise InputError(f"{source}: column time is empty, expected seconds in every row")
         warn(f"{source}: {timeless.sum()} rows without time left out, first in line {line[np.argmax(timeless)]}")
         cells, line = {name: values[~timeless] for name, values in cells.items()}, line[~timeless]
-    time = cells["time"]
-    latest = np.maximum.accumulate(time)
-    late = np.flatnonzero(time < latest)
+    time, said = mend(cells["time"], source, line, LATE if by_arrival else STEP_BACK)
+    for text in said:
+        warn(text)
+    if not (usable := np.isfinite(time)).all():
+        cells, line, time = {name: values[usable] for name, values in cells.items()}, line[usable], time[usable]
+    cells = {**cells, "time": time}
+    late = np.flatnonzero(time < np.maximum.accumulate(time))
     if not late.size:
         return cells, line
-    limit = LATE if by_arrival else STEP_BACK
-    worst = late[np.argmax(latest[late] - time[late] > limit)]
-    if latest[worst] - time[worst] > limit:
-        raise InputError(
-            f"{source}: line {line[worst]}: time goes back from {latest[worst]:.3f} to {time[worst]:.3f} s, "
-            f"expected steps back of at most {limit:g} s; was the clock set, or are two dives in one file? Split it"
-        )
     if not by_arrival:
         warn(f"{source}: {late.size} rows are earlier than a row above them, sorted; first in line {line[late[0]]}")
     order = np.argsort(time, kind="stable")
@@ -413,6 +410,7 @@ def _interpolated(at: Array, time: Array, values: Array) -> tuple[Array, Bools]:
 
 def _distinct_times(stream: Stream, source: str) -> Stream:
     """A stream with one measurement at a time, the first."""
+    require_moving(stream.time, f"{source}: {stream.sensor}")
     again = np.concatenate([[False], np.diff(stream.time) == 0.0])
     if not again.any():
         return stream

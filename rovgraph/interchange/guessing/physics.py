@@ -16,9 +16,9 @@ import numpy as np
 
 from rovgraph.geometry import Array, cross
 from rovgraph.interchange.inertial import GRAVITY, MOST
-from rovgraph.interchange.stamps import UNIX_S
 from rovgraph.log.latitudes import is_placeholder, unit_of
 from rovgraph.log.units import UNITS
+from rovgraph.stamps import UNIX_S
 
 Sureness = Literal["sure", "likely", "unsure"]
 STEP_S = 0.0005, 0.5  # of an IMU's samples [s]: each lasts less than the factor between two units of time

@@ -18,18 +18,16 @@ from rovgraph.live.message import Message, readings
 from rovgraph.live.sources.lines import LineDecoder
 from rovgraph.live.sources.source import Chunk, Notify
 
-DAY_S = 86400.0
 PENDING = 1 << 14  # bytes that may be the beginning of a record; no Nucleus sends longer ones
 PASSWORD = b"enter password"
 
 
 class Pd4Decoder:
-    """Frames of PD4 and PD5; their clock has no date, and goes on over midnight here."""
+    """Frames of PD4 and PD5; their clock has no date."""
 
     def __init__(self, url: str, notify: Notify) -> None:
         self._url, self._notify = url, notify
         self._frames = Frames()
-        self._last: float | None = None  # stamp [s since the first midnight]
 
     def feed(self, chunk: Chunk) -> Iterator[Message]:
         if chunk.fresh:
@@ -40,16 +38,9 @@ class Pd4Decoder:
             pings, refused = decoded(row)
             for reason in refused:
                 self._notify("coordinates", reason)
-            for message in _messages(channels_of(pings, constants=True), self._url, chunk.arrival):
-                yield message._replace(stamp=self._unwrapped(message.stamp))
+            yield from _messages(channels_of(pings, constants=True), self._url, chunk.arrival)
         if self._frames.skipped > skipped:
             self._notify("malformed", "bytes that are no whole frame with a right checksum are skipped")
-
-    def _unwrapped(self, stamp: float | None) -> float | None:
-        if stamp is not None and self._last is not None:
-            stamp += DAY_S * round((self._last - stamp) / DAY_S)
-        self._last = stamp
-        return stamp
 
 
 def pd6(url: str, notify: Notify) -> LineDecoder:
