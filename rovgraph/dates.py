@@ -20,8 +20,6 @@ Order = Literal["dmy", "mdy"]
 
 DAY_S = 86400.0
 YEAR_FIRST = "write the year first, such as 2026-05-01 09:30"  # where nobody can state an order
-WHOLE_S = 1.0  # step of stamps, from which on digits are missing [s]
-FEW_DIGITS = 20  # measurements, of which a third share a stamp with another
 # epoch of a program's numbers -> day of 1970 in it, and seconds of its unit
 EPOCHS = {"excel": (25569.0, DAY_S), "matlab": (719529.0, DAY_S), "labview": (2_082_844_800.0, 1.0)}
 UNIX_UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -181,21 +179,6 @@ def seconds_of_day_and_time(
     if low > 36525.0 and high < 60000.0 and seconds[known].min() >= 0.0 and seconds[known].max() < 1.0:
         return unix_of_epoch(count + seconds, "excel"), _PROGRAMS["excel"]
     return None
-
-
-def few_digits(time: Array) -> str:
-    """Why many stamps of one sensor, shape (n,) in order [s], are alike; "" where their digits are enough."""
-    stamps = np.unique(time)
-    if len(time) < FEW_DIGITS or 3 * len(stamps) > len(time):
-        return ""
-    if len(stamps) == 1:
-        return f"all {len(time)} stamps are {stamps[0]:g}"
-    step = float(np.diff(stamps).min())
-    power = 10.0 ** round(np.log10(step))
-    whole = np.abs(stamps / power - np.round(stamps / power)).max() < 1e-3 and abs(step - power) < 1e-3 * power
-    if power < WHOLE_S or not whole:
-        return ""
-    return f"{len(time)} measurements have {len(stamps)} stamps, in steps of {power:g} s"
 
 
 def _unix(dates: "pd.Series[Any]") -> Array:

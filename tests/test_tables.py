@@ -170,9 +170,9 @@ CASES = {
     "stated Excel": Case(table(time=DAYS + 25569.0), config="units: {time: excel}"),
     "seconds of the size of days": Case(table(time=45000.0 + TRUTH["time"] - T0), shift=45000.0 - T0),
     "too few digits": Case(
-        table(time=[f"{t:.6g}" for t in TRUTH["time"]]), "all stamps are 1777630000 s: written with too few digits", True
+        table(time=[f"{t:.6g}" for t in TRUTH["time"]]), "all stamps are 1777630000 s: .*too few digits", True
     ),
-    "whole ten seconds": Case(table(time=np.floor(TRUTH["time"] / 10) * 10), "40 stamps have 2 values, such as .*: written with too few digits", True),
+    "whole ten seconds": Case(table(time=np.floor(TRUTH["time"] / 10) * 10), "40 stamps have 2 .*too few digits", True),
     "no time": Case(table(time=["noon"] * N), "'noon' is neither seconds nor a date", True),
     "no such day": Case(table(time=["31.02.2026 09:30"] * N), "is not a date; write it as", True),
     # latitudes

@@ -11,7 +11,6 @@ import pymap3d
 from numpy.typing import NDArray
 
 from rovgraph.config import Config, TableSettings
-from rovgraph.dates import few_digits
 from rovgraph.errors import InputError, warn
 from rovgraph.geometry import Array
 from rovgraph.log.latitudes import valid_positions
@@ -416,11 +415,6 @@ def _distinct_times(stream: Stream, source: str) -> Stream:
         return stream
     first = np.flatnonzero(~again)[np.cumsum(~again) - 1]
     same = again & ((stream.data == stream.data[first]) | (np.isnan(stream.data) & np.isnan(stream.data[first]))).all(1)
-    if why := few_digits(stream.time[~same]):
-        raise InputError(
-            f"{source}: {stream.sensor}: {why}: they were written with too few digits, or the clock stood still; "
-            "write time with at least milliseconds, such as 1740564858.016"
-        )
     for which, what in ((same, "repeated exactly, left out"), (again & ~same, "at the time of another, first kept")):
         if which.any():
             line = stream.row[np.argmax(which)]
