@@ -59,8 +59,11 @@ def unwrapped(count: Array, wrap: float) -> Array:
 
 
 def counter_range(before: float, after: float) -> float:
-    """What a counter has wrapped by between two stamps, as `COUNTERS` has it; 0 where it did not [s]."""
-    for wrap in COUNTERS:
+    """What a counter has wrapped by between two stamps, as `COUNTERS` has it; 0 where it did not [s].
+
+    One step back tells nothing of a short counter: a message that comes late makes it, too.
+    """
+    for wrap in (own for own in COUNTERS if own > GAP_S):
         if wrap - _near(wrap) < before <= wrap and 0.0 <= after < _near(wrap):
             return wrap
     return 0.0

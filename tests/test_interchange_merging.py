@@ -496,7 +496,6 @@ HOSTILE = {
     "zip": (b"PK\x03\x04rest", "is a ZIP archive; unpack it first"),
     "ulog": (b"ULog\x01\x12\x35\x01" + bytes(30), "is a PX4 ULog; convert it with ulog2csv"),
     "rowe": (b"\x80" * 16 + bytes(40), "is a recording of a Rowe DVL or ADCP, which is not read"),
-    "rostopic": (b"%time,field.header.seq\n1700000000,1\n", "is a topic of a ROS bag as text"),
     "foxglove": (b'[{"topic": "/imu", "receiveTime": {}, "message": {}}]', "is an export of Foxglove as JSON"),
     "track": (b"time,north,east\n0,1,2\n", "is a track, not a log; rovgraph evaluate"),
     "empty": (b"", "is empty"),

@@ -19,6 +19,7 @@ from dives import (
     interrupted,
     kept,
     renewed,
+    rms,
     same,
     true_at,
     without,
@@ -260,7 +261,10 @@ def test_a_wrong_heading_is_loud_where_a_few_fixes_show_the_way(dive, wrong):
     fixes[:, :2] = true_at(case, time).p_n[:, :2] + np.random.default_rng(7).standard_normal((len(time), 2))
     fixes[:, STREAMS["fix"].index("fix_sd")] = 1.0
     fixed = replace(log, streams={**log.streams, "fix": Stream("fix", STREAMS["fix"], time, fixes, row)})
-    assert "rejected" in [alarm.kind for alarm in smooth(fixed, config, "smoothed").alarms if alarm.sensor == "fix"]
+    dive = smooth(fixed, config, "smoothed")
+    assert dive.verdict == "doubtful" and "if the fixes are right" in dive.warnings[0]
+    track = dive.estimates[0].trajectory
+    assert rms(np.linalg.norm((track.p_n - true_at(case, track.time).p_n)[:, :2], axis=1)) < 2.0  # by its fixes
     assert smooth(log, config, "smoothed").verdict == "trusted"  # nothing else can show it
 
 

@@ -12,7 +12,6 @@ BEGINNINGS = {  # formats that are known by name and not read
     b"PK\x03\x04": "is a ZIP archive; unpack it first",
     b"ULog\x01\x12\x35": "is a PX4 ULog; convert it with ulog2csv (pip install pyulog), and give its tables",
     b"\x80" * 16: "is a recording of a Rowe DVL or ADCP, which is not read; export it as PD0 with Rowe's software",
-    b"%time,": "is a topic of a ROS bag as text (rostopic echo -p); give the bag itself",
 }
 FOXGLOVE = (b'"topic"', b'"message"', b'"receiveTime"')  # of a message exported as JSON
 
