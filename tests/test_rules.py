@@ -252,6 +252,14 @@ def test_left_out_is_the_share_of_the_log(count, severity):
     assert (one.figure, one.severity, span_of(one)) == (pytest.approx(count / 1000), severity, (0.0, SECONDS))
 
 
+def test_fixes_that_a_ship_recorded_for_longer_than_the_dive_are_no_fault_and_pings_are():
+    row = (np.arange(100.0), np.zeros((100, 5)))
+    log = level_log(100.0, np.zeros(3), np.zeros(3), fix=(row[0], row[1][:, :3]), dvl=row)
+    reason = "after the last IMU sample"
+    (one,) = residuals.left_out(evidence(left_out={("fix", reason): 80, ("dvl", reason): 80}, log=log))
+    assert (one.sensor, one.severity) == ("dvl", "wrong")
+
+
 @levels
 def test_lasting_of_one_window_is_said_of_that_window(limit, times, severity):
     ratio = figure_of("lasting", limit, times)

@@ -25,6 +25,7 @@ GIVEN_UP = 0.25  # share of a sensor's in the dive, where it has too few in a mi
 USUAL_SHARE = 0.01  # of outliers, that every DVL and USBL has
 IN_A_MINUTE = 1.5  # times as much
 SETTLED_S = 20.0  # from which on the filter is asked
+OUTSIDE = "IMU sample"  # before the first or after the last: a ship records her fixes for longer than a dive
 REPORTED = ("no bottom lock", "no heading", "no tilt", "frozen")  # reasons that are no fault, or have a rule
 LASTING_S = (5.0, 20.0)  # over which errors last that are no noise
 OF_ONE = 8.0  # a single mean may be that much more
@@ -213,7 +214,7 @@ def filter_alone(evidence: Evidence) -> Iterator[Statistic]:
 def left_out(evidence: Evidence) -> Iterator[Statistic]:
     """Share of a sensor's measurements that were refused one by one before the estimate."""
     for (sensor, why), count in evidence.left_out.items():
-        if sensor not in evidence.log or why.startswith(REPORTED):
+        if sensor not in evidence.log or why.startswith(REPORTED) or (sensor == "fix" and why.endswith(OUTSIDE)):
             continue
         share = count / max(len(evidence.log[sensor]), 1)
         yield Statistic(
