@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pint
 import pytest
 
 from rovgraph.calibration import TABLE
 from rovgraph.config import Config, parse_config
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, rotate, transpose, wrap_angle
 from rovgraph.instruments import instruments
+from rovgraph.log.units import UNITS
 from rovgraph.sensors import field_direction, innovation
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, State
 
@@ -258,3 +260,22 @@ def test_a_rotated_world_rotates_the_dvl_not():
     by_turn = rotate(H[POSE][..., :3], up) + rotate(H["velocity"], np.cross([0, 0, 1.0], state.v_n))
     np.testing.assert_allclose(by_turn, 0.0, atol=1e-12)
     assert BIAS in H
+
+
+def test_every_unit_has_the_factor_that_pint_has():
+    """Milligauss was free to be wrong."""
+    registry = pint.UnitRegistry()
+    inside = {
+        "time": "second", "acceleration": "meter / second ** 2", "rate": "radian / second", "field": "microtesla",
+        "angle": "radian", "speed": "meter / second", "length": "meter", "latitude": "degree",
+    }  # fmt: skip
+    named = {
+        "g": "standard_gravity", "mg": "millistandard_gravity", "m/s2": "meter / second ** 2",
+        "m/s^2": "meter / second ** 2", "mrad/s": "milliradian / second", "deg/s": "degree / second",
+        "uT": "microtesla", "nT": "nanotesla", "mG": "milligauss", "gauss": "gauss", "us": "microsecond",
+        "degE7": "1e-7 degree",
+    }  # fmt: skip
+    for kind, factors in UNITS.items():
+        for unit, factor in factors.items():
+            quantity = registry.parse_expression(named.get(unit, unit))
+            assert factor == pytest.approx(quantity.to(inside[kind], "Gaussian").magnitude, rel=1e-12), (kind, unit)

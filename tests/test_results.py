@@ -1,0 +1,61 @@
+"""What an estimate publishes: the body's position, velocity and sds, from states at an IMU with an arm."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from dives import falcon
+
+from rovgraph.estimators.results import body_trajectory
+from rovgraph.geometry import exp_rotation, skew
+from rovgraph.state import State
+
+ARM_B = np.array([2.0, -2.0, 1.0])  # 3 m
+N, DRAWS = 4, 40_000
+
+
+@pytest.fixture(scope="module")
+def published():
+    """States of a few keyframes, their covariances in GTSAM's tangent space, and the trajectory of the body."""
+    rng = np.random.default_rng(5)
+    R_nb = exp_rotation(rng.normal(0.0, 1.0, (N, 3)))
+    p_n, v_n = rng.normal(0.0, 9.0, (2, N, 3))
+    bias = rng.normal(0.0, 0.1, (N, 6))
+    rate_b, rate_sd = rng.normal(0.0, 0.5, (N, 3)), 0.02
+    roots = rng.normal(0.0, 0.02, (N, 6, 6))
+    cov_pose, cov_v = roots @ roots.transpose(0, 2, 1), np.tile(np.diag([1e-4, 4e-4, 9e-4]), (N, 1, 1))
+    intervals = [SimpleNamespace(time=float(k), rate_b=rate_b[k], rate_sd=rate_sd) for k in range(N)]
+    config = falcon(imu={"lever_arm_m": ARM_B.tolist()})
+    initial = SimpleNamespace(config=config, beliefs={}, streams=())
+    states = State(R_nb, p_n, v_n, bias, {})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rovgraph.estimators.results.rests_on_doubtful_compass", lambda initial: False)
+        track = body_trajectory(intervals, states, initial, cov_pose, cov_v)
+    return states, rate_b, rate_sd, cov_pose, cov_v, track
+
+
+def test_the_body_lies_an_arm_away_and_moves_as_it_turns(published):
+    states, rate_b, _, _, _, track = published
+    for k in range(N):
+        R, omega_b = states.R_nb[k], rate_b[k] - states.bias[k, 3:]
+        np.testing.assert_allclose(track.p_n[k], states.p_n[k] - R @ ARM_B)
+        np.testing.assert_allclose(track.v_n[k], states.v_n[k] - R @ np.cross(omega_b, ARM_B))
+
+
+def test_published_covariances_are_those_of_sampled_states(published):
+    """Drawn in the tangent space: R exp(theta), p + R rho, and the gyro's noise in the velocity of the arm."""
+    states, _, rate_sd, cov_pose, cov_v, track = published
+    rng = np.random.default_rng(6)
+    for k in range(N):
+        R = states.R_nb[k]
+        xi = rng.multivariate_normal(np.zeros(6), cov_pose[k], DRAWS)
+        turned = R @ exp_rotation(xi[:, :3])
+        p = states.p_n[k] + xi[:, 3:] @ R.T - turned @ ARM_B
+        for found, given in (
+            (np.cov(p.T), track.cov_p[k]),
+            (np.cov((xi[:, :3] @ R.T).T), track.cov_theta[k]),
+        ):
+            scale = np.sqrt(np.outer(np.diag(given), np.diag(given)))
+            np.testing.assert_allclose(found / scale, given / scale, atol=0.03)
+        arm = R @ skew(ARM_B)
+        np.testing.assert_allclose(track.cov_v[k], cov_v[k] + rate_sd**2 * arm @ arm.T)
