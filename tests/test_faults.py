@@ -538,7 +538,7 @@ def test_a_dvls_arm_that_is_off_is_named_and_used_not_taken_for_an_error_that_la
     ("case", "remedy"),
     [
         ("dvl y flipped", "units: {dvl_vy: -m/s}"),  # its wrong estimate has a turn of 90 degrees in its place
-        ("dvl y and z flipped", "dvl.mount_rpy_deg: [0.0, 0.0, -45.0]"),
+        pytest.param("dvl y and z flipped", "dvl.mount_rpy_deg: [0.0, 0.0, -45.0]", marks=pytest.mark.slow),
         pytest.param("dvl 3.2 s late", "mean: 3.188", marks=pytest.mark.slow),
     ],
 )
@@ -555,6 +555,7 @@ def test_online_a_dvl_whose_clock_is_late_is_not_said_to_be_elsewhere():
     assert not any("elsewhere" in text for text in told)
 
 
+@pytest.mark.slow
 def test_online_ignores_a_depth_that_is_stuck_while_the_vehicle_dives():
     result = run_case(CASES["depth stuck"], 0, online=True)
     assert max(result.nees["online"].values()) < 2.0  # of the depth 765 where it was used

@@ -388,6 +388,7 @@ def test_a_log_is_written_as_its_name_says(files, tmp_path, name):
     np.testing.assert_allclose(again["dvl"].data, converted.log["dvl"].data, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_large_log_is_converted_in_few_bytes_a_sample_and_shows_how_far_it_is(tmp_path):
     """NumPy tells tracemalloc of its arrays."""
     second = DataFlashWriter()
