@@ -1,9 +1,11 @@
 """Files of NMEA sentences and GPX tracks: fixes and headings at their times."""
 
 from datetime import UTC, datetime
+from pathlib import Path
 
 import gpxpy.gpx
 import numpy as np
+import pynmea2
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +14,7 @@ from recordings import check_refused_or_whole, close, first, read
 from wire import sentence
 
 from rovgraph.errors import InputError
-from rovgraph.interchange.formats import recognise
+from rovgraph.interchange.formats import read_recording, recognise
 from rovgraph.interchange.recording import Recording
 
 MIDNIGHT = datetime(2024, 3, 2, tzinfo=UTC).timestamp()
@@ -306,3 +308,31 @@ def test_points_of_a_gpx_track_are_fixes(tmp_path):
 def test_a_gpx_file_that_is_cut_off_or_without_times_is_refused(data, said, tmp_path):
     with pytest.raises(InputError, match=said):
         read(data, tmp_path)
+
+
+CASES = Path(__file__).parents[2] / "shared" / "cases"
+REAL = CASES / "real-text" / "gpsd_rst39.log"
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason=f"no {REAL}")
+def test_a_real_recording_has_the_values_of_pynmea2():
+    """Fixes of GGA, and headings, pitch and roll of PASHR, at their own times."""
+    sentences = [line for line in REAL.read_text(encoding="ascii").splitlines() if line.startswith("$")]
+    recording = read_recording(REAL)
+    parsed = [pynmea2.parse(line) for line in sentences if line.startswith("$GPGGA")]
+    fixes = next(c for c in recording.channels if c.source == "GPGGA").columns
+    close(fixes["fix_lat"], [each.latitude for each in parsed], atol=1e-12)
+    close(fixes["fix_lon"], [each.longitude for each in parsed], atol=1e-12)
+    of_day = [
+        3600.0 * t.hour + 60.0 * t.minute + t.second + 1e-6 * t.microsecond for t in (p.timestamp for p in parsed)
+    ]
+    close(fixes["time"] % 86400.0, of_day, atol=1e-5)
+    cells = [line.split(",") for line in sentences if line.startswith("$PASHR")]
+    attitude = first(recording, "ahrs").columns
+    assert len(attitude["time"]) == len(cells) == 100
+    for name, place in (("ahrs_yaw", 2), ("ahrs_roll", 4), ("ahrs_pitch", 5)):
+        close(np.rad2deg(attitude[name]), [wrap(float(row[place])) for row in cells], atol=1e-9)
+
+
+def wrap(degrees: float) -> float:
+    return (degrees + 180.0) % 360.0 - 180.0
