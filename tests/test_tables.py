@@ -111,6 +111,9 @@ CASES = {
     "units in the second line": Case(
         with_units(table(depth=100 * TRUTH["depth"])), r"with units in line 2; units by the header \(s, cm, deg\)"
     ),
+    "a unit that is not known": Case(
+        table().replace("depth,", "depth [ft],"), "unknown unit 'ft', expected one of m", True
+    ),
     "units of the configuration": Case(
         table(depth=100 * TRUTH["depth"]).replace("depth,", "depth [mm],"), config="units: {depth: cm}"
     ),

@@ -115,9 +115,10 @@ def require_used(
         if alone > SHARED * (span[1] - span[0]) and not any(s.file == each.file for s in selected):
             files = _File(recordings[used.file], 0.0), _File(recordings[each.file], 0.0)
             before, after = sorted(files, key=_begin)
+            why = why_apart(before, before, after)
             raise InputError(
                 f"{name}: nothing of it is used, although nothing else has {sensor} for {alone:.1f} s of its time; "
-                f"it is no piece of the same recording as {names[used.file]}: {why_apart(before, before, after)}; "
+                f"it is no piece of the same recording as {names[used.file]}{': ' if why else ''}{why}; "
                 "cut off what they share, or leave out one of them"
             )
         if span[0] < other[1] and other[0] < span[1]:

@@ -27,7 +27,16 @@ from rovgraph.log.streams import (
     is_optional,
     label_number,
 )
-from rovgraph.log.units import known_unit, name_and_bracket, near_miss, nearest, quantities, scales, turn_angles
+from rovgraph.log.units import (
+    UNITS,
+    known_unit,
+    name_and_bracket,
+    near_miss,
+    nearest,
+    quantities,
+    scales,
+    turn_angles,
+)
 from rovgraph.sensors import MOSTLY, SENSORS, Column, placeholders
 from rovgraph.stamps import STEP_BACK, mend, require_moving
 from rovgraph.tables import Table
@@ -165,6 +174,13 @@ def map_columns(table: Table, columns: Mapping[str, str]) -> dict[str, str]:
         )
     taken = {*names, *names.values()}
     for name in table.names:
+        plain, unit = name_and_bracket(name)
+        if unit and name not in taken and plain in quantities() and plain not in names:
+            known = ", ".join(UNITS[quantities()[plain]])
+            raise InputError(
+                f"{table.source}: line 1: column {name!r} is in the unknown unit {unit!r}, expected one of {known}; "
+                f"convert it, or rename it to {plain} if the unit is wrong"
+            )
         meant = None if name in taken else near_miss(name, names)
         if meant:
             warn(f"{table.source}: column {name!r} is ignored; if it is {meant}, rename it or map it under columns")
