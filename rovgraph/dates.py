@@ -21,6 +21,7 @@ Order = Literal["dmy", "mdy"]
 DAY_S = 86400.0
 YEAR_FIRST = "write the year first, such as 2026-05-01 09:30"  # where nobody can state an order
 # epoch of a program's numbers -> day of 1970 in it, and seconds of its unit
+LONGEST_STEP_S = 3600.0  # between rows of a table, that is likely
 EPOCHS = {"excel": (25569.0, DAY_S), "matlab": (719529.0, DAY_S), "labview": (2_082_844_800.0, 1.0)}
 UNIX_UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 YEARS = 946_684_800.0, 2_840_140_800.0  # 2000 to 2060, within which a number is taken for a date of some program [s]
@@ -131,6 +132,8 @@ def seconds_of_numbers(values: Array) -> tuple[Array, str]:
         if YEARS[0] < (middle - zero) * unit_s < YEARS[1]:
             steps = np.diff(np.unique(known))
             if unit_s == DAY_S and not (len(steps) and np.median(steps) < LONGEST_STEP):
+                continue
+            if len(steps) and np.median(steps) * unit_s > LONGEST_STEP_S:  # a counter of microseconds
                 continue
             return (values - zero) * unit_s, _PROGRAMS[program]
     return values, ""
