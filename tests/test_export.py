@@ -580,3 +580,9 @@ def test_what_a_writers_library_cannot_write_is_refused_in_one_line(tmp_path, mo
     with pytest.raises(rg.InputError, match=r"cannot be written \(.*disk is full\); choose another --out"):
         written(name, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_format_that_fails_leaves_nothing_of_the_others(tmp_path):
+    with pytest.raises(rg.InputError, match="crs 'EPSG:bogus'"):
+        write_track(track(), ["kml", "gpkg"], tmp_path / "out", Options(None, "EPSG:bogus"))
+    assert not [*tmp_path.glob("out/*")]

@@ -111,7 +111,7 @@ def check_exportable(names: Sequence[str], name: str, origin: tuple[float, float
 
 
 def write_track(track: Track, names: Sequence[str], folder: Path, options: Options, force: bool = False) -> list[Path]:
-    """Write a track as ``track_ESTIMATE`` with each format's suffix, each file whole or not at all.
+    """Write a track as ``track_ESTIMATE`` with each format's suffix, all files or none.
 
     Parameters
     ----------
@@ -137,9 +137,9 @@ def write_track(track: Track, names: Sequence[str], folder: Path, options: Optio
             raise InputError(f"{target} exists; choose another --out or give --force")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for format_, target in zip(formats, targets, strict=True):
-            with _whole(target) as partial:
-                _write(format_, track, partial, options)
+        with contextlib.ExitStack() as written:
+            for format_, target in zip(formats, targets, strict=True):
+                _write(format_, track, written.enter_context(_whole(target)), options)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from None
     return targets
