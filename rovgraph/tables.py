@@ -76,7 +76,9 @@ class Table:
             raise InputError(f"{self.source}: column {name} holds {held}, expected numbers; {remedy}")
         if pd.api.types.is_string_dtype(cells):  # the parser leaves blanks around numbers that stand among texts
             cells = cells.where(cells.isna(), cells.astype(str).str.strip()).replace("", None)
-            cells = cells if self.decimal == "." else cells.str.replace(self.decimal, ".", regex=False)
+            if self.decimal != ".":
+                self._refuse_points(name, cells)
+                cells = cells.str.replace(self.decimal, ".", regex=False)
         if cells.dtype == object:  # what is neither a number nor a text becomes the text that the message shows
             cells = cells.map(lambda cell: cell if isinstance(cell, NUMBERS) else str(cell), na_action="ignore")
         try:
@@ -93,6 +95,16 @@ class Table:
                 f"leave a cell empty where there is no value ({_count(bad.size, 'such cell')})"
             )
         return values.to_numpy(dtype=float, na_value=np.nan)
+
+    def _refuse_points(self, name: str, cells: "pd.Series[Any]") -> None:
+        """Where commas are decimal, a point may be one as well, or part of thousands."""
+        both = np.flatnonzero(cells.str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+").fillna(False))
+        if both.size:
+            cell = str(cells.iloc[both[0]])
+            raise InputError(
+                f"{self.source}: line {self.line[both[0]]}, column {name}: {cell!r} may be {cell.replace('.', '')} or "
+                f"{cell}, as the file has decimal commas; write its numbers in one way"
+            )
 
     def warn_how(self, *more: str) -> None:
         """Issue a `DataWarning` of how the file was read, and of ``more``; none of a log of this program."""

@@ -111,6 +111,9 @@ CASES = {
     "units in the second line": Case(
         with_units(table(depth=100 * TRUTH["depth"])), r"with units in line 2; units by the header \(s, cm, deg\)"
     ),
+    "thousands or decimals": Case(
+        german(table(";")).replace(";4,", ";4.", 3), "'4.[0-9]*' may be 4[0-9]* or 4.[0-9]*, as the file has", True
+    ),
     "a unit that is not known": Case(
         table().replace("depth,", "depth [ft],"), "unknown unit 'ft', expected one of m", True
     ),
