@@ -118,7 +118,10 @@ def test_single_zeros_between_pings_at_speed_are_none(case, share, prepare):
     assert {f.reason for f in found} == {"exactly zero"}
 
 
-@pytest.mark.parametrize("share", [0.2, 0.3])
+@pytest.mark.parametrize(
+    "share",
+    [pytest.param(0.02, marks=pytest.mark.xfail(strict=True, reason="so few are taken for manoeuvres")), 0.2, 0.3],
+)
 def test_pings_at_half_the_speed_of_those_around_them_are_none(case, share):
     log, bad = spoilt(case.log, share, 0.5)
     (found,) = frozen_stretches(log, case.config)

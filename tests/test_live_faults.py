@@ -43,6 +43,52 @@ def test_zeros_of_a_vehicle_that_stands_still_are_used():
     assert faults.events == []
 
 
+def test_single_zeros_among_pings_at_speed_are_left_out_and_told_once():
+    faults = Faults()
+    for k in range(300):
+        verdict = faults.look(ping(0.2 * k, 0.0, 0.0, 0.0) if k % 7 == 6 else moving(0.2 * k))
+        assert verdict.use == (k % 7 != 6)
+        assert verdict.reason == ("" if verdict.use else "exactly zero")
+    assert kinds(faults) == ["no lock"]
+    assert "again and again" in faults.events[0].text
+
+
+@pytest.mark.parametrize(("apart", "used"), [(0.37, False), (1.2, False), (1.4, True)])
+def test_a_zero_is_used_where_the_vehicle_can_have_stopped(apart, used):
+    """A DVL whose pings show noise measures exact zeros at rest seldom, so 0.3 m/s^2 counts, as in a log."""
+    faults = Faults()
+    for k in range(40):
+        faults.look(moving(0.2 * k))  # 0.4 m/s
+    assert faults.look(ping(7.8 + apart, 0.0, 0.0, 0.0)).use == used
+
+
+def test_a_vehicle_that_slows_down_may_come_to_rest_at_zero():
+    faults = Faults()
+    speeds = [*[0.4] * 30, *np.linspace(0.4, 0.0, 9).tolist(), *[0.0] * 50]
+    for k, speed in enumerate(speeds):
+        v = [speed, 0.002 * (-1) ** k, 0.0] if speed else [0.0, 0.0, 0.0]
+        assert faults.look(ping(0.2 * k, *v)).use
+    assert faults.events == []
+
+
+def test_zeros_of_a_dvl_whose_resolution_hides_its_noise_are_left_to_the_filter():
+    faults = Faults()
+    for k in range(40):
+        assert faults.look(ping(0.2 * k, 0.4, 0.01 * (k % 2), 0.0)).use
+    assert faults.look(ping(8.0, 0.0, 0.0, 0.0)).use
+
+
+@pytest.mark.parametrize("sensor", ["depth", "ahrs", "fix"])
+def test_exact_zeros_far_from_what_was_measured_are_left_out(sensor):
+    faults, values = Faults(), {"depth": 1, "ahrs": 3, "fix": 3}[sensor]
+    for k in range(60):
+        away = (2.0 if sensor != "fix" else 40.0) + 0.01 * RNG.standard_normal()
+        zero = k in (30, 40) or 50 <= k < 58
+        m = Measurement(0.5 * k, sensor, np.full(values, 0.0 if zero else away), 0)
+        assert faults.look(m).use != zero
+    assert kinds(faults) == ["frozen", "back"]  # of those that last
+
+
 def test_a_lost_bottom_lock_is_said_once():
     faults = Faults()
     faults.look(moving(0.0))
