@@ -42,6 +42,7 @@ SHIP = ("PSIMLBP", "PUSBA", "PSONLLD")  # of acoustic systems: relative to the s
 NOON_S = 43_200.0
 LONGEST = 1 << 12
 FEW = 3  # whole sentences that make a file one of these
+CONTROL = bytes(byte for byte in range(32) if not 9 <= byte <= 13)
 BINARY = 0.02  # of a file's bytes, that no text has: sentences within them are another format's
 _NORTH = "relative to magnetic north"
 NO_CHECKSUM = "no sentence has a checksum: all are taken as they stand, damaged ones too"
@@ -56,7 +57,7 @@ class Nmea:
     extra = "online"
 
     def recognise(self, path: Path, head: bytes) -> float:
-        if sum(byte < 9 or 13 < byte < 32 for byte in head) > BINARY * len(head):
+        if len(head) - len(head.translate(None, CONTROL)) > BINARY * len(head):
             return 0.0
         lines = [line for line in head.split(b"\n")[:50] if line.strip() and not line.startswith(b"#")]
         whole = sum(b"$" in line and b"," in line and _is_sentence(line) for line in lines)
