@@ -12,6 +12,7 @@ import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,6 +117,27 @@ class PD0:
 FORMAT = PD0()
 
 
+class _Told(NamedTuple):
+    """Fixes as ensembles hold them, some of them more than once, m in all.
+
+    Attributes
+    ----------
+    source : in words
+    time : shape (m,), Unix time of the receiver, on the day nearest to the instrument's clock [s]
+    before : shape (m,), how long before the ping it came [s]
+    ensemble : shape (m,), number of the ping
+    lat, lon, sd : shape (m,) [deg], [m]; an sd may be NaN
+    """
+
+    source: str
+    time: Array
+    before: Array
+    ensemble: NDArray[np.int64]
+    lat: Array
+    lon: Array
+    sd: Array
+
+
 @dataclass(frozen=True)
 class _Receiver:
     """Fixes that were written beside the pings, and headings.
@@ -158,11 +180,8 @@ def _receiver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _R
     return _Receiver(source, time, lat, lon, sd, offset, offset_sd, *_headings(content, found, stamps + offset))
 
 
-Told = tuple[str, Array, Array, NDArray[np.int64], Array, Array, Array]
-
-
-def _by_winriver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> Told | None:
-    """Source, time, how long before the ping, number of the ensemble, latitude, longitude and sd."""
+def _by_winriver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _Told | None:
+    """Of sentences that WinRiver has decoded."""
     rows, ensemble = found.records_of(content, SENTENCES, BY_WINRIVER)
     own = (rows["kind"] >= 100) & np.char.endswith(rows["name"], b"GGA")
     rows, ensemble = rows[own], ensemble[own]
@@ -173,10 +192,10 @@ def _by_winriver(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) ->
     lon = np.where(rows["east"] == b"W", -rows["lon"], rows["lon"])
     sd = np.array([RANGE_SD_M.get(int(quality), np.nan) for quality in rows["quality"]]) * rows["hdop"]
     lat[~np.isin(rows["quality"], [*RANGE_SD_M])] = np.nan
-    return "record 0x2022 (GGA)", time, rows["before"], ensemble, lat, lon, np.where(sd > 0.0, sd, np.nan)
+    return _Told("record 0x2022 (GGA)", time, rows["before"], ensemble, lat, lon, np.where(sd > 0.0, sd, np.nan))
 
 
-def _by_text(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> Told | None:
+def _by_text(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _Told | None:
     """The same of sentences as they came, which tell no delay."""
     rows, ensemble = found.records_of(content, GGA, TEXT)
     cells = [[*text.decode("ascii", "replace").split(","), *[""] * 9] for text in rows["text"]]
@@ -190,10 +209,10 @@ def _by_text(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> Tol
     range_sd = [RANGE_SD_M.get(int(row[6]) if row[6].isdigit() else 0, np.nan) for row in cells]
     sd = np.array([own * (number(row[8]) or np.nan) for own, row in zip(range_sd, cells, strict=True)])
     lat[np.isnan(range_sd)] = np.nan
-    return "record 0x2101 (GGA)", time, np.zeros(len(time)), ensemble, lat, lon, sd
+    return _Told("record 0x2101 (GGA)", time, np.zeros(len(time)), ensemble, lat, lon, sd)
 
 
-def _by_vmdas(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> Told | None:
+def _by_vmdas(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> _Told | None:
     at, length = found.at[NAVIGATION], found.length[NAVIGATION]
     rows, there = gathered(content, BY_VMDAS, at, length, OF_VMDAS)
     ensemble = np.flatnonzero(there)
@@ -204,7 +223,8 @@ def _by_vmdas(content: bytes | mmap.mmap, found: Ensembles, stamps: Array) -> To
     day = unix_of_calendar(*date, *np.zeros((3, len(rows)), np.int64))
     time = day + 1e-4 * rows["last"] + DAY_S * (rows["last"] < rows["first"])
     lat, lon = SEMICIRCLE * rows["lat"], SEMICIRCLE * rows["lon"]
-    return "record 0x2000 of VmDas", time, np.zeros(len(rows)), ensemble, lat, lon, np.full(len(rows), np.nan)
+    nothing = np.full(len(rows), np.nan)
+    return _Told("record 0x2000 of VmDas", time, np.zeros(len(rows)), ensemble, lat, lon, nothing)
 
 
 def _headings(content: bytes | mmap.mmap, found: Ensembles, pinged: Array) -> tuple[Array, Array]:
