@@ -171,9 +171,9 @@ class _Known:
 def _sources_where_largest(track: Trajectory, best: ChainOptimum) -> dict[str, object]:
     """What brings the horizontal variance, at the keyframe where it is largest; see `variance_sources`."""
     variance = track.cov_p[:, 0, 0] + track.cov_p[:, 1, 1]
-    keyframe = int(np.searchsorted(best.chain.rows.time, track.time[np.argmax(variance)]))
-    keyframe = min(keyframe, len(best.intervals) - 1)
-    return {"time_s": float(best.chain.rows.time[keyframe]), "m2": variance_sources(best, keyframe)}
+    keyframe = int(np.searchsorted(best.problem.time, track.time[np.argmax(variance)]))
+    keyframe = min(keyframe, len(best.problem) - 1)
+    return {"time_s": float(best.problem.time[keyframe]), "m2": variance_sources(best, keyframe)}
 
 
 def _with_main(dive: Dive, **more: object) -> Dive:
@@ -186,7 +186,7 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
     """The dive as it is believed to be, and the optimum of its smoothed estimate where a batch solver found it."""
     initial, log = known.initial, known.log
     batch = assemble(log, initial)
-    if known.states is not None and len(known.states) != len(batch.intervals):  # stamps stand elsewhere than they did
+    if known.states is not None and len(known.states) != len(batch.problem):  # stamps stand elsewhere than they did
         known = replace(known, states=None)
     if initial.config.graph.solver == "isam2":
         solver = _isam2(batch, progress)
@@ -200,7 +200,7 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
         batch.forget_motion_covariances()
         if passed is not None:
             estimates.append(passed.solve())
-            if states is None and not batch.measurements:
+            if states is None and not batch.time_offsets.lags:
                 states = passed.states()  # where the filter went is close by
             passed = None  # of a long dive it is large
         give_back()
@@ -210,11 +210,10 @@ def _solve(known: _Known, estimate: str, progress: Progress) -> tuple[Dive, Opti
             del states
             estimates.insert(0, smoothed(best, initial))
             give_back()
-    intervals = batch.intervals if best is None else best.intervals
     left_out = _left_out(batch, known.frozen, known.gaps)
     revealed = [(one.sensor, one.cause) for one in reversed(known.found)]  # what moves the track most: errors that last
     seen = known.frozen, log, known.gaps, left_out, known.findings, revealed, known.before, known.rivals
-    numbers = statistics(Evidence(initial, estimates, intervals, best, *seen))
+    numbers = statistics(Evidence(initial, estimates, (best or batch).problem, best, *seen))
     if any(one.kind == "rivals" and one.severity for one in numbers) and best is not None:
         estimates = [_covering(estimate, known.rivals, best) for estimate in estimates]
     return Dive([*estimates, batch.dead_reckoning()], initial, left_out, known.frozen, numbers), best
@@ -239,15 +238,14 @@ def _saying(dive: Dive, found: Sequence[UnstatedNoise]) -> Dive:
 
 def assemble(log: Log, initial: InitialConditions, searches: Searches | None = None) -> BatchSmoother:
     """All keyframes of a log and what lies between them; ``searches`` as of `BatchSmoother`."""
-    batch = BatchSmoother(initial, searches=searches or Searches())
-    batch.take(log)
+    batch = BatchSmoother(initial, log, searches=searches or Searches())
     give_back()
     return batch
 
 
 def _left_out(batch: BatchSmoother, frozen: list[FrozenStretch], gaps: list[AttitudeGap]) -> dict[tuple[str, str], int]:
     """What never reached the graph, and why."""
-    counts = dict(batch.assembler.left_out)
+    counts = dict(batch.left_out)
     for stretch in frozen:
         why = (stretch.sensor, stretch.reason)
         counts[why] = counts.get(why, 0) + len(stretch.time)
@@ -271,14 +269,10 @@ def _taken_as_exact(initial: InitialConditions) -> list[str]:
 
 def _filter(batch: BatchSmoother, progress: Progress) -> ErrorStateFilter:
     filtering = partial(progress, "filtering")
-    measurements = batch.measurements
-    if not measurements:
-        return replay(batch.intervals, batch.initial, REINITIALISE_AT_S, filtering, batch.rows)
-    estimator = ErrorStateFilter(batch.initial, REINITIALISE_AT_S)  # learns how late they are while they come
-    for k, measurement in enumerate(measurements):
-        if estimator.add(measurement) and len(estimator.intervals) % PROGRESS_EVERY == 0:
-            filtering(k / len(measurements))
-    estimator.finish()
+    if not batch.time_offsets.lags:
+        return replay(batch.problem, batch.initial, REINITIALISE_AT_S, filtering)
+    estimator = ErrorStateFilter(batch.initial, REINITIALISE_AT_S)
+    estimator.take(batch.log, filtering)  # learns how late stamps are while it goes on
     return estimator
 
 
@@ -288,8 +282,8 @@ def _isam2(batch: BatchSmoother, progress: Progress) -> "IncrementalEstimator":
 
     progress("incremental smoothing", 0.0)
     report = partial(progress, "incremental smoothing")
-    solver = run_isam2(batch.intervals, batch.initial, report)
+    solver = run_isam2(batch.problem, batch.initial, report)
     again = batch.placed_again(solver.latest().calibration)
     if again is not None:
-        solver = run_isam2(again.intervals, again.initial, report)
+        solver = run_isam2(again.problem, again.initial, report)
     return solver

@@ -88,17 +88,15 @@ class _Compared:
 
     @staticmethod
     def of(best: Optimum, block: Block) -> "_Compared | None":
-        intervals, state = best.intervals, best.state
+        problem, state = best.problem, best.state
         model = block.instrument.model
-        if not isinstance(model, DvlVelocity) or len(block) < ENOUGH or len(intervals) < 3:
+        if not isinstance(model, DvlVelocity) or len(block) < ENOUGH or len(problem) < 3:
             return None
-        motions = [i.motion for i in intervals[1:]]
-        dv = np.array([np.zeros(3) if m is None else m.dv for m in motions])
-        seconds = np.array([0.0 if m is None else m.duration for m in motions])
+        dv, seconds = problem.motions[:, motion_row.VELOCITY], problem.motions[:, motion_row.DURATION]
         gravity = np.array([0.0, 0.0, block.gravity])
         force_n = rotate(state.R_nb[:-1], dv - state.bias[:-1, :3] * seconds[:, None])
         velocity_n = np.vstack([np.zeros(3), np.cumsum(force_n + gravity * seconds[:, None], axis=0)])
-        broken = np.append(0, np.cumsum([i.bridged for i in intervals[1:]]))
+        broken = np.cumsum(problem.bridged)
         k = block.keyframe.astype(np.int64)
         now = np.arange(len(block))
         before = np.searchsorted(block.time, block.time - OVER_S)

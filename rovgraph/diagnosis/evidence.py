@@ -9,8 +9,8 @@ import pandas as pd
 
 from rovgraph.check import Finding
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.lasting import Rival
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.optimum import Optimum
 from rovgraph.estimators.attitude_gaps import AttitudeGap
 from rovgraph.estimators.estimate import Estimate
@@ -52,7 +52,7 @@ class Evidence:
     ----------
     initial : configuration, instruments and prior
     estimates : smoothed, filtered or both
-    intervals : of the estimates' keyframes
+    problem : of the estimates' keyframes
     optimum : of the smoothed estimate, where a batch solver found it
     frozen : what was left out since it is none
     log : of the dive
@@ -66,7 +66,7 @@ class Evidence:
 
     initial: InitialConditions
     estimates: Sequence[Estimate]
-    intervals: Sequence[KeyframeInterval]
+    problem: Problem
     optimum: Optimum | None
     frozen: Sequence[FrozenStretch]
     log: Log

@@ -10,7 +10,6 @@ from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence, windows
 from rovgraph.diagnosis.rules import CHANCE, RULES
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.trajectory import Trajectory
 
@@ -29,11 +28,11 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
 
     What is left between two keyframes is next to nothing, since the keyframes follow the IMU. What lasts is not.
     """
-    if evidence.optimum is None or len(evidence.intervals) < 3:
+    if evidence.optimum is None or len(evidence.problem) < 3:
         return
     r = _motion_residuals(evidence)
-    kept = ~np.array([i.bridged for i in evidence.intervals[1:]])
-    time = np.array([i.time for i in evidence.intervals[1:]])[kept]
+    kept = ~evidence.problem.bridged[1:]
+    time = evidence.problem.time[1:][kept]
     window = windows(time, evidence.start, IMU_S)
     count = np.bincount(window) if len(window) else np.zeros(1)
     full = count >= max(3.0, 0.3 * np.median(count))
@@ -68,9 +67,9 @@ def imu(evidence: Evidence) -> Iterator[Statistic]:
 
 def bias_drift(evidence: Evidence) -> Iterator[Statistic]:
     """How far the IMU's biases went from start to end, in sds of their walks: a gyro that warms up goes too far."""
-    if evidence.optimum is None or len(evidence.intervals) < 3:
+    if evidence.optimum is None or len(evidence.problem) < 3:
         return
-    r, time = _motion_residuals(evidence), np.array([i.time for i in evidence.intervals])
+    r, time = _motion_residuals(evidence), evidence.problem.time
     share = np.sqrt(np.diff(time) / (time[-1] - time[0]))  # whitened steps become parts of the way
     for name, columns, key, unit, factor in BIASES:
         gone = np.abs(share @ r[:, columns])
@@ -95,15 +94,13 @@ def _moved_motions(evidence: Evidence, here: Array) -> Iterator[Array]:
     best = evidence.optimum
     if isinstance(best, ChainOptimum):
         for state in best.moved_by_considered():
-            yield best.wide.rows.motion_residuals(state) - here
+            yield best.wide.problem.motion_residuals(state) - here
 
 
 def _motion_residuals(evidence: Evidence) -> Array:
     """Whitened residuals of the n - 1 motions between the smoothed keyframes, shape (n - 1, 15)."""
     assert evidence.optimum is not None
-    best = evidence.optimum
-    rows = best.chain.rows if isinstance(best, ChainOptimum) else DiveRows.of(best.intervals, [*best.blocks])
-    return rows.motion_residuals(best.state)
+    return evidence.optimum.problem.motion_residuals(evidence.optimum.state)
 
 
 def _squares(a: Trajectory, b: Trajectory, P: Array, heading_variance: Array) -> dict[str, Array]:

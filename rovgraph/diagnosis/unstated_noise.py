@@ -27,7 +27,6 @@ from rovgraph.diagnosis.residuals import SD_KEY
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.initial_conditions import Beliefs
 from rovgraph.engine.lasting import LASTING, LastingError, Rival, find_lasting, rejects_much
-from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.widened_chain import lasting_belief
 from rovgraph.geometry import Array
@@ -141,7 +140,7 @@ def _placed(best: ChainOptimum, place: DvlPlace) -> UnstatedNoise:
 
 def unstated(best: ChainOptimum, config: Config, alarms: Sequence[Alarm]) -> Iterator[Statistic]:
     """The same as alarms, of an estimate that goes on without it; parameters are those of `find_noise`."""
-    begin, end = best.intervals[0].time, best.intervals[-1].time
+    begin, end = float(best.problem.time[0]), float(best.problem.time[-1])
     for one in find_noise(best, config, alarms, UNLIKELY)[0] or find_errors(best, config, alarms)[0]:
         if not _is_allowed_for(one, best):
             yield Statistic("unstated", one.sensor, begin, end, 1.0, one.cause, one.remedy)
@@ -194,7 +193,7 @@ def _is_stated(best: ChainOptimum, sensor: str) -> bool:
     """Whether a sensor's noise is the configuration's, and not what the log says of most measurements."""
     believed = best.chain.initial.instruments[sensor].sd
     dim = best.blocks[sensor].instrument.model.dim
-    sd = MeasurementTable.of_dive(best.intervals).of_sensor(sensor).sd(dim)
+    sd = best.problem.sd(best.problem.of_sensor(sensor), dim)
     return bool(np.median(np.abs(sd / believed - 1.0)) < OWN_SD)
 
 
@@ -209,7 +208,7 @@ def _lasting(best: ChainOptimum, error: LastingError) -> UnstatedNoise:
     bottom = f"{'if the fixes are right, ' if 'fix' in best.blocks else ''}the bottom that it sees"
     values = {"estimate": True, "sd_deg" if variable.angular else "sd": sd}
     if error.steps:
-        begin = best.intervals[0].time
+        begin = float(best.problem.time[0])
         sizes = ((time - begin, ", ".join(f"{factor * by:+.2g}" for by in step.tolist())) for time, step in error.steps)
         when = " and ".join(f"at {since:.0f} s by {size}{behind(unit)}" for since, size in sizes)
         what = f"{bottom} changes its velocity" if moves else "its error changes at once"

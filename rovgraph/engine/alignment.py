@@ -7,13 +7,13 @@ That is no measurement: the covariance stays, and they enter afterwards as they 
 iterated Kalman filter does (Bell and Cathey 1993), for the attitude alone, and begun where it can converge.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from rovgraph.engine.filter_step import Gaussian
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.problem import Index, Problem
 from rovgraph.geometry import (
     Array,
     exp_rotation,
@@ -25,6 +25,7 @@ from rovgraph.geometry import (
     transpose,
 )
 from rovgraph.instruments import HEADING_STREAMS
+from rovgraph.kernels import motion_row
 from rovgraph.kernels.filtering import attitude_variances_of
 from rovgraph.state import PLACE_DIM
 
@@ -32,7 +33,7 @@ POORLY_KNOWN = np.deg2rad([4.0, 10.0]) ** 2  # variances of tilt and heading fro
 STEP, REACH_SD = np.deg2rad(3.0), 3.0  # of the headings that are tried
 AT_REST = 0.2  # share of gravity by which a mean specific force may differ from it and still show where down is
 
-Linearize = Callable[[Gaussian, Sequence[KeyframeMeasurement]], tuple[Array, Array]]
+Linearize = Callable[[Gaussian, Problem, Index], tuple[Array, Array]]
 
 
 def poorly_known(known: Gaussian) -> bool:
@@ -41,22 +42,25 @@ def poorly_known(known: Gaussian) -> bool:
     return bool(tilt > POORLY_KNOWN[0] or heading > POORLY_KNOWN[1])
 
 
-def aligned(known: Gaussian, interval: KeyframeInterval, linearize: Linearize, gravity: float) -> Gaussian:
-    """The keyframe before an interval, levelled and turned to its compasses where it is `poorly_known`.
+def aligned(
+    known: Gaussian, problem: Problem, k: int, between: slice, linearize: Linearize, gravity: float
+) -> Gaussian:
+    """The keyframe before keyframe k, levelled and turned to its compasses where it is `poorly_known`.
 
     Parameters
     ----------
     known : its estimate
-    interval : with motion
+    problem, between : the dive, and its measurements between the two
     linearize : from an estimate and measurements to whitened innovations and Jacobians
     gravity : [m/s^2]
     """
     tilt, heading = attitude_variances_of(known.x, known.P)
     if tilt > POORLY_KNOWN[0]:
-        known = with_attitude(known, _levelled(known, interval, gravity))
-    compasses = [m for m in interval.between if m.sensor in HEADING_STREAMS]
-    if compasses and heading > POORLY_KNOWN[1]:
-        known = with_attitude(known, _towards(known, compasses, linearize))
+        known = with_attitude(known, _levelled(known, problem, k, gravity))
+    which = [n for n, sensor in enumerate(problem.sensors) if sensor in HEADING_STREAMS]
+    compasses = between.start + np.flatnonzero(np.isin(problem.which[between], which))
+    if len(compasses) and heading > POORLY_KNOWN[1]:
+        known = with_attitude(known, _towards(known, problem, compasses, linearize))
     return known
 
 
@@ -77,19 +81,20 @@ def with_attitude(known: Gaussian, R_nb: Array) -> Gaussian:
     return replace(known, x=x, P=basis @ known.P @ basis.T, B=B)
 
 
-def _levelled(known: Gaussian, interval: KeyframeInterval, gravity: float) -> Array:
+def _levelled(known: Gaussian, problem: Problem, k: int, gravity: float) -> Array:
     """The attitude whose down is that of the interval's mean specific force, where that can be gravity's."""
     R_nb: Array = known.state.R_nb[0]
-    if interval.motion is None or interval.bridged:
+    if problem.bridged[k]:
         return R_nb
-    excess = known.state.bias[0, :3] - interval.motion.bias[:3]
-    force_b = interval.motion.dv / interval.motion.duration - excess
+    motion = problem.motions[k - 1]
+    excess = known.state.bias[0, :3] - motion[motion_row.BIAS : motion_row.BIAS + 3]
+    force_b = motion[motion_row.VELOCITY] / motion[motion_row.DURATION] - excess
     if abs(float(np.linalg.norm(force_b)) / gravity - 1.0) > AT_REST:
         return R_nb
     return matrix_from_rpy([*level_from_force(force_b), rpy_from_matrix(R_nb)[2]])
 
 
-def _towards(known: Gaussian, compasses: Sequence[KeyframeMeasurement], linearize: Linearize) -> Array:
+def _towards(known: Gaussian, problem: Problem, compasses: Index, linearize: Linearize) -> Array:
     """The attitude with the heading that compasses make likeliest.
 
     Headings all around the believed one are tried, calibration and tilt being as sure as they are.
@@ -102,7 +107,7 @@ def _towards(known: Gaussian, compasses: Sequence[KeyframeMeasurement], lineariz
     reach = min(REACH_SD * np.sqrt(variance), np.pi)
     angles = np.linspace(-reach, reach, 2 * int(np.ceil(reach / STEP)) + 1)
     turned = exp_rotation(np.column_stack([0.0 * angles, 0.0 * angles, angles])) @ R_nb
-    rows = [linearize(replace(known, x=np.concatenate([R.ravel(), known.x[9:]])), compasses) for R in turned]
+    rows = [linearize(replace(known, x=np.concatenate([R.ravel(), known.x[9:]])), problem, compasses) for R in turned]
     misfit, by = np.array([r for r, _ in rows]), np.array([H[:, :size] for _, H in rows])
     S = by @ (P - np.outer(by_heading, by_heading) / variance) @ transpose(by) + identity(misfit.shape[1])
     nis = (misfit * np.linalg.solve(S, misfit[..., None])[..., 0]).sum(axis=1)

@@ -1,353 +1,733 @@
-"""Measurements in the order of time become keyframes and what lies between them.
+"""What has come of a dive, and the keyframes that are made of it, as arrays that grow.
 
-A keyframe stands at every DVL ping, and wherever `graph.max_gap_s` passes without one. A ping that comes up to
-`Graph.ping_due_s` later makes the keyframe itself: where the period of pings is about ``max_gap_s``, rounding would
-otherwise decide whether a ping has a keyframe.
-
-Any other measurement belongs to the keyframe before it and carries the IMU's motion
-from there to its own time, so nothing is rounded to a keyframe. Batch and incremental
-estimators consume the same `KeyframeInterval` objects.
-
-Headings and depths are taken once per interval, the first one: their errors last
-longer than that, and counting each sample would make the estimate too sure of itself.
+`Assembly.extend` is the only rule of assembly, compiled in `rovgraph.kernels.assembly`: called once for a log, and for
+each ping online. Every keyframe knows how much had come when it was made, so that a measurement that comes late is
+inserted and the keyframes since are made once more. Time offsets that are estimated are assumed anew for what is read
+from then on. What noise has been learnt, and how often places have been seen, stands with the keyframes.
 """
 
 import math
-from bisect import bisect_right
-from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import InitVar, dataclass, field
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.engine.admission import admitted
-from rovgraph.engine.aiding import Aiding
-from rovgraph.engine.constant_velocity import LONGEST_CRUISED_S, Ticks, has_constant_velocity, tick
-from rovgraph.engine.keyframes import (
-    KeyframeInterval,
-    KeyframeMeasurement,
-    measurement_rows,
-    sd_of,
-)
-from rovgraph.engine.landmarks import STILL_IN_VIEW, Landmarks
-from rovgraph.engine.late_stamp_window import beyond_samples, window_around
-from rovgraph.engine.motion import Motion
-from rovgraph.engine.samples import HALF_WINDOW_S, Samples, covering
-from rovgraph.engine.scale import scale_to_bias, wanted
-from rovgraph.engine.time_offsets import StampedMeasurement, TimeOffsets, pack_stamped, unpack_stamped
+from rovgraph.engine.aiding import thruster_pieces
+from rovgraph.engine.constant_velocity import has_constant_velocity, ticks
+from rovgraph.engine.initial_conditions import InitialConditions
+from rovgraph.engine.preintegration import preintegration_params
+from rovgraph.engine.problem import Problem, in_body
+from rovgraph.engine.scale import wanted
+from rovgraph.engine.time_offsets import TimeOffsets
 from rovgraph.engine.unknowns import unknowns
-from rovgraph.engine.whole_log import SHORTEST_S
+from rovgraph.errors import InputError
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
-from rovgraph.kernels import measurement_row as at
-from rovgraph.log import Measurement
+from rovgraph.kernels import assembly as at
+from rovgraph.kernels import motion_row
+from rovgraph.kernels.imu_samples import HALF_WINDOW_S
+from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.measurement_row import MOST, Z
+from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.packing import pack, unpack
+from rovgraph.log.streams import arrivals, in_precedence, precedence
 from rovgraph.sensors import SENSORS, ModelAiding
-from rovgraph.sensors.sensor import none_refused
+from rovgraph.sensors.sensor import none_refused, of_instrument
 from rovgraph.state import PLACE
 
-_AT_KEYFRAME = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])[None]  # a snapshot without motion
+GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
+KEPT = 256  # keyframes that are never forgotten, for the noise that they have shown
+BUFFER = 64  # rows of an array to begin with
+_FATES = {
+    at.EARLY: "before the first IMU sample",
+    at.LATE: "after the last IMU sample",
+    at.UNFINISHED: "after the last keyframe",
+    at.IN_VIEW: "still in view",
+}
+
+
+def assembly_of(
+    initial: InitialConditions, time_offsets: TimeOffsets | None = None, learn_noise: bool = False
+) -> "Assembly":
+    """An empty one for a dive that begins so; attributes as of `Assembly`."""
+    bias = initial.prior.state.bias[0]
+    return Assembly(initial.config, initial.instruments, bias, initial.beliefs, time_offsets, learn_noise)
+
+
+class InsertResult(StrEnum):
+    """What became of a measurement."""
+
+    IN = "taken"
+    LATE = "later than the lag"
+    AGAIN = "repeated"
 
 
 @dataclass
-class Assembler:
-    """Takes measurements one by one, gives back an `KeyframeInterval` whenever one is complete.
+class Assembly:
+    """A dive that grows.
 
     Attributes
     ----------
     config : effective configuration
     instruments : the sensors in use, by stream
-    bias : ndarray, shape (6,), for preintegration; may be renewed between intervals
-    left_out : (sensor, reason) -> count of measurements that never reach the graph
-    learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
+    bias : ndarray, shape (6,), for preintegration
     believed : priors of the calibration; None = the configuration's
-    assumed : how late stamps are; None = as these have it
-    stamps : the same
+    time_offsets : how late stamps are assumed to be; None = as these have it
+    learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
     """
 
     config: Config
-    instruments: dict[str, Instrument]
+    instruments: Mapping[str, Instrument]
     bias: Array
-    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
+    believed: Mapping[str, Belief] | None = None
+    time_offsets: TimeOffsets = None  # type: ignore[assignment]  # after `__post_init__` it is one
     learn_noise: bool = False
-    believed: InitVar[Mapping[str, Belief] | None] = None
-    assumed: InitVar[TimeOffsets | None] = None
 
-    def __post_init__(self, believed: Mapping[str, Belief] | None, assumed: TimeOffsets | None) -> None:
-        believed = beliefs(self.config) if believed is None else believed
-        self._R_bs = mount_matrix(self.config.imu.mount_rpy_deg)
-        self._ticking = has_constant_velocity(self.config)
-        self._samples = Ticks(self.config) if self._ticking else Samples(self.config, self.learn_noise)
-        self._closing = {*self.instruments} if self._ticking else {"dvl"}  # sensors that make keyframes
-        self._arrived: list[StampedMeasurement] = []  # since `_take_until` looked last
-        self._waiting: deque[StampedMeasurement] = deque()  # in order, admitted
-        self._refusing = {sensor for sensor in self.instruments if SENSORS[sensor].refused is not none_refused}
-        self._due = math.inf  # time of the first that waits or has arrived, and closes an interval [s]
-        self._aiding: Aiding | None = None
-        if "thruster" in self.instruments:
-            self._aiding = Aiding(cast(ModelAiding, self.instruments["thruster"].model), self.left_out)
-        self._index, self._start = -1, 0.0
-        self._heard = np.inf  # when anything was measured last, without an IMU
-        self._segment, self._segment_start = -1, -np.inf
-        self._between: list[StampedMeasurement] = []
-        self._landmarks = Landmarks(self.config.place.every_s)
-        self.time_offsets = assumed or TimeOffsets.of(believed, self.instruments)
-        self._scaled = wanted(believed)
-        lasting = unknowns(believed, self.instruments).time_constants  # which begin a segment at every keyframe
-        self._segment_s = 0.0 if lasting else self.config.graph.segment_s
-        graph = self.config.graph
-        self._longest_gap = graph.max_gap_s + graph.ping_due_s  # a ping that is late may still come
-        self._around = HALF_WINDOW_S + self.time_offsets.span
-        self._dim = max(i.model.dim for i in self.instruments.values()) if self.instruments else 0
-        # the rate reaches these: by a lever arm, or by the motion of a turning body
-        self._turned = {sensor for sensor, i in self.instruments.items() if i.rate_gain.any()} | {"thruster"}
+    def __post_init__(self) -> None:
+        believed = beliefs(self.config) if self.believed is None else self.believed
+        if self.time_offsets is None:
+            self.time_offsets = TimeOffsets.of(believed, self.instruments)
+        self.names = tuple(self.instruments)
+        self._which = {sensor: k for k, sensor in enumerate(self.names)}
+        self._no_imu = has_constant_velocity(self.config)
+        self._rule = self._make_rule(believed)
+        self._integration = self._make_integration()
+        self._sensors = np.array([self._about(s) for s in self.names], np.int64).reshape(-1, at.ABOUT)
+        dims = [i.model.dim for i in self.instruments.values()]
+        self._most = max([MOST, *dims])
+        self._R_sb = mount_matrix(self.config.imu.mount_rpy_deg).T
+        self._imu, self._samples = np.empty((BUFFER, 7)), 0
+        self._fresh: list[tuple[float, Array]] = []  # samples that have no row yet
+        self._events, self._come = np.empty((BUFFER, at.VALUES + 2 * self._most)), 0
+        self._signals: list[Measurement] = []  # of thrusters
+        self._reasons: list[str] = []  # why measurements are refused
+        self._steps = np.full(at.PERIODS + 1, math.inf)
+        self._periods: list[float] = []
+        self._gaps: list[float] = []  # times of samples after gaps, since the newest keyframe
+        self._left_out: Counter[tuple[str, str]] = Counter()  # what has been forgotten
+        self._no_pieces: list[tuple[int, str]] = []  # keyframe, and why a piece before it tells nothing
+        self._order = np.empty(BUFFER, np.int64)
+        self._dive = self._room(BUFFER, BUFFER, BUFFER)
+        self._ahead = self._room(2, 0, 0)
+        self._due = -math.inf  # a keyframe may be past from here on [s]
+        self.forgotten = 0  # keyframes
+        self.newest = -math.inf  # time of the newest sample [s]
 
-    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
-        """Take a measurement; times must not decrease.
+    # what comes
 
-        Returns
-        -------
-        list of KeyframeInterval : those that this measurement completes, usually none or one
+    def take(self, log: Log) -> None:
+        """Take a whole log, before anything else.
 
         Raises
         ------
         InputError : an IMU gap longer than ``imu.max_gap_s``
         """
-        if measurement.sensor != "imu":
-            if measurement.sensor == "thruster":
-                if self._aiding is not None:
-                    self._aiding.add(measurement)
-            elif measurement.sensor in self.instruments:
-                self._put(measurement)
-            if not self._ticking:
-                return []
-            measurement = tick(measurement)
-        elif self._ticking:
-            return []
-        if self._samples.add(measurement):  # after a gap: a keyframe here, so that nothing is carried through it
-            self._put(measurement)
-        until = measurement.time - self._around
-        if self._index < 0:
-            return [self._begin(measurement.time), *self._take_until(until)]
-        if until < self._due and until - self._start <= self._longest_gap:
-            return []
-        return self._take_until(until)
+        streams = {s: x for s, x in log.streams.items() if s in self.instruments and s != "thruster"}
+        imu = log.streams.get("imu")
+        if self._no_imu:
+            time = ticks(log).time
+            self._imu = np.column_stack([time, np.zeros((len(time), 6))])
+        elif imu is not None and len(imu):
+            self._imu = np.column_stack([imu.time, in_body(imu.data[:, :6], self._R_sb)])
+            self._check_gaps(np.diff(imu.time), imu)
+        self._samples = len(self._imu) if imu is not None or self._no_imu else 0
+        if not self._samples:
+            return
+        time = self._imu[:, 0]
+        self.newest = float(time[-1])
+        for period in np.diff(time[: at.PERIODS + 1]).tolist():
+            self._take_period(period)
+        if "thruster" in self.instruments and "thruster" in log.streams:
+            signals = log.streams["thruster"]
+            rows = zip(signals.time.tolist(), signals.data, signals.row.tolist(), strict=True)
+            self._signals = [Measurement(t, "thruster", values, row) for t, values, row in rows]
+        admissible = []
+        for sensor, stream in streams.items():
+            mask = admitted(sensor, stream.data, self.config, self._left_out)
+            admissible.append(stream if mask.all() else stream.take(mask))
+        if admissible:
+            admissible.sort(key=lambda stream: self._which[stream.sensor])
+            self._events = self._wanted(in_precedence(admissible))
+            self._come = len(self._events)
+            self._order = np.empty(self._come, np.int64)
 
-    def copy(self) -> "Assembler":
-        """One that goes on by itself from here."""
-        twin = copy(self)
-        twin._samples, twin.left_out = self._samples.copy(), self.left_out.copy()
-        twin._arrived, twin._waiting, twin._between = self._arrived[:], self._waiting.copy(), self._between[:]
-        twin._landmarks = self._landmarks.copy()
-        twin.time_offsets = self.time_offsets.copy()
-        if self._aiding is not None:
-            twin._aiding = self._aiding.copy(twin.left_out)
-        return twin
-
-    def state(self) -> dict[str, Any]:
-        """Where it stands, as plain values and arrays."""
-        self._admit()
-        return {
-            **self._samples.state(),
-            "waiting": pack_stamped(self._waiting),
-            "between": pack_stamped(self._between),
-            "assumed": self.time_offsets.assumed,
-            "signals": pack(self._aiding.signals if self._aiding is not None else []),
-            "at": [self._index, self._start, self._segment, self._segment_start],
-            "sighted": np.array([*self._landmarks.seen.items()]).reshape(-1, 2),
-            "landmarks": self._landmarks.count,
-            "bias": self.bias,
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from where another stood."""
-        self._samples.restore(state)
-        self._waiting, self._between = deque(unpack_stamped(state["waiting"])), unpack_stamped(state["between"])
-        self._arrived, self._due = [], self._first_closing()
-        self.time_offsets.assumed.update(state["assumed"])
-        if self._aiding is not None:
-            self._aiding.signals = unpack(state["signals"])
-        self._index, self._start, self._segment, self._segment_start = state["at"]
-        self.bias = state["bias"]
-        self._landmarks.seen, self._landmarks.count = dict(state["sighted"].tolist()), state["landmarks"]
-
-    def ahead(self, samples: Sequence[Measurement], time: float, x: Array) -> KeyframeInterval:
-        """From the newest keyframe to a later time, as far as the IMU goes; beyond that, as if it stood still.
+    def insert(self, m: Measurement, settled: float = -math.inf) -> InsertResult:
+        """Take a measurement, whenever it comes; keyframes that it comes before are unmade.
 
         Parameters
         ----------
-        samples : of the IMU, those that have not been taken yet
+        settled : nothing before that time is taken any more [s]
+
+        Raises
+        ------
+        InputError : an IMU gap longer than ``imu.max_gap_s``
+        """
+        if m.time < settled:
+            return InsertResult.LATE
+        if m.sensor == "imu":
+            return InsertResult.IN if self._no_imu else self._insert_sample(m.time, m.values[:6], m.row)
+        known = m.sensor in self._which
+        if m.sensor == "thruster" and known:
+            k = bisect_left(self._signals, m.time, key=_time)
+            if k < len(self._signals) and self._signals[k].time == m.time:
+                return InsertResult.AGAIN
+            self._undo(m.time)
+            self._signals.insert(k, m)
+        elif known:
+            place, k = (m.time, precedence(m.sensor), self._which[m.sensor], _name(m)), self._come
+            while k > 0 and self._place_of(k - 1) > place:
+                k -= 1
+            if k > 0 and self._place_of(k - 1) == place:
+                return InsertResult.AGAIN
+            self._undo(m.time)
+            self._insert_event(m, k)
+        if self._no_imu:  # time goes on to it
+            self._insert_sample(m.time, np.zeros(6), m.row)
+        return InsertResult.IN
+
+    def remove(self, sensor: str, since: float, settled: float) -> None:
+        """Take back a sensor's measurements from a time on, but for what is before ``settled`` [s]."""
+        events = self._events[: self._come]
+        wrong = (events[:, at.SENSOR] == self._which.get(sensor, -1)) & (events[:, at.STAMP] >= max(since, settled))
+        if wrong.any():
+            self._undo(float(events[wrong.argmax(), at.STAMP]))
+            kept = events[~wrong]
+            self._come = len(kept)
+            self._events[: self._come] = kept
+            self._due = self._next_due()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Times of the first and of the newest sample [s]."""
+        return float(self._table[0, 0]) if len(self._table) else math.nan, self.newest
+
+    # the keyframes
+
+    def extend(self, until: float = math.inf, one: bool = False, finish: bool = False) -> int:
+        """Make the keyframes that are past by the samples up to a time; how many.
+
+        Parameters
+        ----------
+        until : the newest sample that may be looked at [s]
+        one : those of the first sample by which any is past
+        finish : nothing else comes: place what is left, and a last keyframe at the last sample
+        """
+        if not finish and min(until, self.newest) - self._rule.around < self._due:
+            return 0
+        table = self._table
+        count = len(table) if until >= self.newest else int(table[:, 0].searchsorted(until, side="right"))
+        if not len(table):
+            return 0
+        begin, dive = len(self), self._dive
+        start = float(dive.keyframes[begin - 1, at.TIME] if begin else table[0, 0])
+        most = begin + len(self._closing()) + len(self._gaps) + int((table[-1, 0] - start) / self._rule.max_gap) + 3
+        self._dive = dive._replace(keyframes=_grown(dive.keyframes, begin, most))
+        late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
+        at.place_keyframes(self._streams, late, self._rule, self._dive, count, one, finish)
+        made = len(self) - begin
+        if made:
+            self._assemble(begin)
+        self._due = self._next_due()
+        return made
+
+    def _assemble(self, begin: int) -> None:
+        """Fill what lies between the keyframes from ``begin`` on."""
+        dive, streams, n = self._dive, self._streams, len(self)
+        pieces = self._pieces(max(begin, 1)) if "thruster" in self.instruments else self._events[:0]
+        first = int(dive.keyframes[begin - 1, at.UPTO]) if begin else 0
+        own = streams.events[streams.order[first : int(dive.keyframes[n - 1, at.UPTO])], at.SENSOR].astype(np.int64)
+        late = np.count_nonzero(self._sensors[own, at.LAG] >= 0) if len(self._sensors) else 0
+        rows, windows = int(dive.counts[at.ROWS]), int(dive.counts[at.WINDOWS])
+        more, scaled = rows + len(own) + len(pieces), int(self._rule.scaled)
+        self._dive = dive._replace(
+            motions=_grown(dive.motions, begin, n),
+            weights=_grown(dive.weights, begin, n),
+            scales=_grown(dive.scales, begin * scaled, n * scaled),
+            rows=_grown(dive.rows, rows, more),
+            row_scales=_grown(dive.row_scales, rows * scaled, more * scaled),
+            of=_grown(dive.of, rows, more, axis=1),
+            windows=_grown(dive.windows, windows, windows + late + 1),
+            names=_grown(dive.names, rows, more),
+        )
+        at.assemble(streams, pieces, self._rule, self._integration, self._dive, begin)
+
+    def truncate(self, n: int) -> None:
+        """Unmake the keyframes from ``n`` on; what they were made of is looked at again."""
+        dive = self._dive
+        counts, last = dive.counts, dive.keyframes[n - 1] if n else np.zeros(at.KEYFRAME)
+        upto, streams = int(last[at.UPTO]), self._streams
+        again = streams.events[:, at.FATE] < at.REFUSED
+        again[self._order[:upto]] = False
+        streams.events[again, at.FATE] = at.IN
+        counts[at.SAMPLES] = int(last[at.COUNT]) - counts[at.FORGOTTEN] if n else 0
+        read = streams.events[:, at.STAMP].searchsorted(self._table[counts[at.SAMPLES] - 1, 0]) if n else 0
+        order = self._order[: counts[at.ORDERED]]
+        order = order[order < read]
+        self._order[: len(order)] = order
+        counts[at.READ], counts[at.ORDERED], counts[at.KEYFRAMES] = read, len(order), n
+        counts[at.ROWS] = int(last[at.TAKEN])
+        counts[at.WINDOWS] = dive.of[at.WINDOW_OF, : counts[at.ROWS]].max(initial=-1) + 1
+        self._no_pieces = [(k, why) for k, why in self._no_pieces if k < n]
+        self._due = self._next_due()
+
+    def forget(self, n: int) -> None:
+        """Forget the keyframes before ``n``, now and then and but for some, and what they were made of."""
+        if min(n, len(self) - KEPT) >= KEPT:
+            self._drop(min(n, len(self) - KEPT))
+
+    def _drop(self, n: int) -> None:
+        """Forget the keyframes before ``n``."""
+        if n == 0:
+            return
+        dive, counts = self._dive, self._dive.counts
+        time = float(dive.keyframes[n, at.TIME]) - self._rule.around - self._rule.every_s
+        samples, rows = int(self._table[:, 0].searchsorted(time)), int(dive.keyframes[n - 1, at.TAKEN])
+        upto, windows = int(dive.keyframes[n - 1, at.UPTO]), int(dive.of[at.WINDOW_OF, :rows].max(initial=-1)) + 1
+        gone = np.zeros(self._come, bool)
+        gone[self._order[:upto]] = True
+        gone |= (self._events[: self._come, at.FATE] >= at.REFUSED) & (self._events[: self._come, at.STAMP] < time)
+        self._left_out += self._counted(gone)
+        moved = np.cumsum(~gone) - 1
+        order = moved[self._order[upto : counts[at.ORDERED]]]
+        counts[at.READ] -= np.count_nonzero(gone[: counts[at.READ]])
+        self._events, self._come = self._events[: self._come][~gone], int((~gone).sum())
+        self._order = np.append(order, np.empty(self._come - len(order), np.int64))
+        self._imu, self._samples = self._table[samples:].copy(), self._samples - samples
+        self._left_out += Counter(("thruster", why) for k, why in self._no_pieces if k < n)
+        self._no_pieces = [(k - n, why) for k, why in self._no_pieces if k >= n]
+        memory = bisect_right(self._signals, time - 10.0, key=_time)
+        del self._signals[: max(memory - 1, 0)]
+        counts -= [samples, 0, upto, n, rows, windows, -samples]
+        scaled = int(self._rule.scaled)
+        self._dive = at.Dive(
+            dive.keyframes[n:].copy(),
+            dive.motions[n:].copy(),
+            dive.weights[n:].copy(),
+            dive.scales[n * scaled :].copy(),
+            dive.rows[rows:].copy(),
+            dive.row_scales[rows * scaled :].copy(),
+            dive.of[:, rows:].copy(),
+            dive.windows[windows:].copy(),
+            dive.names[rows:].copy(),
+            counts,
+        )
+        self._dive.keyframes[:, at.UPTO] -= upto
+        self._dive.keyframes[:, at.TAKEN] -= rows
+        self._dive.of[[at.KEYFRAME_OF, at.INTERVAL_OF]] -= n
+        own = self._dive.of[at.WINDOW_OF]
+        own[own >= 0] -= windows
+        self.forgotten += n
+
+    def __len__(self) -> int:
+        """Count of keyframes."""
+        return int(self._dive.counts[at.KEYFRAMES])
+
+    def closed_at(self, k: int) -> float:
+        """Time of the sample by which keyframe k was past [s]."""
+        return float(self._table[int(self._dive.keyframes[k, at.COUNT] - self._dive.counts[at.FORGOTTEN]) - 1, 0])
+
+    @property
+    def problem(self) -> Problem:
+        """The keyframes so far; nothing of it is written again but by `truncate`."""
+        d, n, m, w = self._dive, len(self), int(self._dive.counts[at.ROWS]), int(self._dive.counts[at.WINDOWS])
+        scaled = int(self._rule.scaled)
+        return Problem(
+            self.names,
+            tuple(i.model.dim for i in self.instruments.values()),
+            d.keyframes[:n],
+            d.motions[1:n],
+            d.weights[1:n],
+            d.scales[scaled : n * scaled],
+            d.rows[:m],
+            d.row_scales[: m * scaled],
+            d.of[:, :m],
+            d.windows[:w],
+            d.names[:m],
+            {s: lag for s in self.names if (lag := self.time_offsets.lag(s)) is not None},
+            self._integration.row[motion_row.BIAS : motion_row.BIAS + 6],
+            self._samples_between,
+        )
+
+    def _samples_between(self, first: int, last: int) -> Array:
+        """Some of the IMU's, in body axes, shape (m, 7)."""
+        gone = int(self._dive.counts[at.FORGOTTEN])
+        return self._table[first - gone : last - gone]
+
+    def ahead(self, time: float, x: Array) -> Problem:
+        """The newest keyframe and one at a later time, as far as the IMU goes; beyond that, as if it stood still.
+
+        Parameters
+        ----------
         time : [s]
         x : ndarray, shape (21,), state vector of the newest keyframe, as of `rovgraph.engine.filter_step.Gaussian`
         """
-        at_rest = x[15:].copy()
-        at_rest[:3] -= self.config.environment.gravity_mps2 * x[6:9]
-        table = self._samples.ahead(samples, time, at_rest)
-        motion, _ = self._samples.integrated(table, self.bias, self._start, np.empty(0), time, learn=False)
-        rate_b, rate_sd = self._samples.rate(table, time)
-        return KeyframeInterval(self._index + 1, time, self._segment, rate_b, rate_sd, motion, [])
+        table, dive, newest = self._table, self._ahead, self._dive.keyframes[len(self) - 1]
+        first = max(int(table[:, 0].searchsorted(newest[at.TIME] - self._rule.around, side="right")) - 1, 0)
+        table = table[first : int(table[:, 0].searchsorted(time, side="right"))]
+        known = first + int(self._dive.counts[at.FORGOTTEN])
+        if time - table[-1, 0] > self._steps[min(known + len(table), len(self._steps)) - 1]:
+            at_rest = x[15:].copy()
+            at_rest[:3] -= self.config.environment.gravity_mps2 * x[6:9]
+            table = np.vstack([table, np.append(time, at_rest)])
+        dive.keyframes[:] = newest
+        dive.keyframes[1, [at.TIME, at.COUNT, at.HERE]] = time, known + len(table), 0
+        dive.counts[:] = 0
+        dive.counts[[at.KEYFRAMES, at.FORGOTTEN]] = 2, known
+        streams, rule = self._streams._replace(imu=table), self._rule._replace(learns=0.0)
+        at.assemble(streams, self._events[:0], rule, self._integration, dive, 1)
+        return replace(self.problem, keyframes=dive.keyframes, motions=dive.motions[1:], scales=dive.scales[1:])
 
-    def _take_until(self, time: float) -> list[KeyframeInterval]:
-        """Place what has waited for the IMU up to a time."""
-        self._admit()
-        done: list[KeyframeInterval] = []
-        while self._waiting and self._waiting[0].time <= time:
-            m = self._waiting.popleft()
-            done += self._silence(m.time, self._longest_gap)
-            if m.sensor == "imu" and m.time - self._start > SHORTEST_S:
-                done.append(self._close(m.time))
-            elif self._ticking and m.time - self._heard > LONGEST_CRUISED_S:
-                done.append(self._close(m.time))  # a keyframe that what is measured at it can align
-                self._between.append(m)
-            elif m.sensor in self._closing and m.time - self._start >= self.config.graph.min_gap_s:
-                done.append(self._close(m.time, m, *self._together_with(m)))
-            elif m.sensor != "imu":
-                self._between.append(m)
-            self._heard = m.time
-        done += self._silence(time, self._longest_gap)
-        self._due = self._first_closing()
-        return done
+    # files and twins
 
-    def finish(self) -> list[KeyframeInterval]:
-        """Place the rest, and a last keyframe at the last IMU sample."""
-        end = self._samples.newest
-        if end == -math.inf:
-            return []
-        done = self._take_until(end)
-        done += self._silence(end, self.config.graph.max_gap_s)
-        self.left_out.update((m.sensor, "after the last IMU sample") for m in self._waiting)
-        if end - self._start < SHORTEST_S:
-            self.left_out.update((m.sensor, "after the last keyframe") for m in self._between)
-            return done
-        return [*done, self._close(end)]
+    def state(self, n: int, whole: bool = False) -> dict[str, Any]:
+        """Where it stood when its first ``n`` keyframes were made, with all that has come since, as plain values.
 
-    def _put(self, m: Measurement) -> None:
-        """Keep a measurement until `_take_until` looks; one of the IMU marks a gap before it."""
-        placed = self.time_offsets.placed(m)
-        self._arrived.append(placed)
-        if m.sensor in self._closing or m.sensor == "imu":
-            self._due = min(self._due, placed.time)
-
-    def _admit(self) -> None:
-        """Put those that have arrived, and may enter the graph, in order; count those that may not."""
-        if not self._arrived:
-            return
-        arrived, self._arrived = self._arrived, []
-        values: dict[str, list[Array]] = {}
-        for m in arrived:
-            if m.sensor in self._refusing:
-                values.setdefault(m.sensor, []).append(m.values)
-        may = {s: iter(admitted(s, np.array(own), self.config, self.left_out).tolist()) for s, own in values.items()}
-        admissible = [m for m in arrived if m.sensor not in may or next(may[m.sensor])]
-        self._waiting = deque(sorted([*self._waiting, *admissible], key=_time))
-
-    def _first_closing(self) -> float:
-        """Time of the first that waits and closes an interval [s]."""
-        return min((m.time for m in self._waiting if m.sensor in self._closing or m.sensor == "imu"), default=math.inf)
-
-    def _begin(self, time: float) -> KeyframeInterval:
-        """The first keyframe, at the first IMU sample, before which nothing can be placed."""
-        self._admit()
-        early = [m for m in self._waiting if m.time < time]
-        self.left_out.update((m.sensor, "before the first IMU sample") for m in early)
-        self._waiting = deque(m for m in self._waiting if m.time >= time)
-        return self._close(time)
-
-    def _silence(self, time: float, longest: float) -> list[KeyframeInterval]:
-        """Keyframes for a time without pings, wherever it is longer than ``longest`` [s]."""
-        done = []
-        while time - self._start > longest:
-            done.append(self._close(self._start + self.config.graph.max_gap_s))
-        return done
-
-    def _together_with(self, m: StampedMeasurement) -> Iterator[StampedMeasurement]:
-        """Without an IMU, all else that was measured at the same time: it belongs to the same keyframe."""
-        while self._ticking and self._waiting and self._waiting[0].time == m.time:
-            yield self._waiting.popleft()
-
-    def _close(self, time: float, *here: StampedMeasurement) -> KeyframeInterval:
-        """Make a keyframe at ``time``, with what is measured ``here``, and the interval that leads to it."""
-        every = self._samples.table
-        samples = covering(every, self._start)
-        samples = samples[: int(samples[:, 0].searchsorted(time + self._around)) + 1]
-        later = bisect_right(self._between, time, key=_time)
-        motion: Motion | None = None
-        attached: list[KeyframeMeasurement] = []
-        if self._index >= 0:
-            motion, attached = self._integrate(samples, every, self._between[:later], time)
-        before = self._start
-        self._index, self._start, self._between = self._index + 1, time, self._between[later:]
-        if time - self._segment_start >= self._segment_s:
-            self._segment, self._segment_start = self._segment + 1, time
-        rate_b, rate_sd = self._samples.rate(samples, time)
-        for m in here:
-            row = measurement_rows(time, _AT_KEYFRAME, self.bias, self._dim)[0]
-            attached += self._attach(m, row, (rate_b, rate_sd), every)
-        scaled = self._scale_to_bias(samples, before, time) if motion is not None else None
-        self._samples.forget(time, self._around)
-        return KeyframeInterval(self._index, time, self._segment, rate_b, rate_sd, motion, attached, scaled)
-
-    def _integrate(
-        self, samples: Array, every: Array, between: list[StampedMeasurement], time: float
-    ) -> tuple[Motion, list[KeyframeMeasurement]]:
-        taken, seen = [], set()
-        for m in between:
-            if m.sensor not in seen:
-                taken.append(m)
-            if SENSORS[m.sensor].once_per_interval:
-                seen.add(m.sensor)
-        if self._aiding is not None and not self._samples.gap(samples):
-            aiding = self._aiding.between(self._start, time, samples, lambda t: self._samples.rate(samples, t)[0])
-            taken = sorted(taken + [StampedMeasurement(*m, m.time) for m in aiding], key=_time)
-        stops = np.array([m.time for m in taken])
-        motion, snapshots = self._samples.integrated(samples, self.bias, self._start, stops, time, learn=True)
-        attached: list[KeyframeMeasurement] = []
-        for m, row in zip(taken, measurement_rows(stops, snapshots, self.bias, self._dim), strict=True):
-            rate = self._samples.rate(samples, m.time) if m.sensor in self._turned else None
-            attached += self._attach(m, row, rate, every)
-        return motion, attached
-
-    def _attach(
-        self, m: StampedMeasurement, row: Array, rate: tuple[Array, float] | None, every: Array
-    ) -> list[KeyframeMeasurement]:
-        """The measurement, or nothing where its stamp may be too late for the IMU's samples ``every``.
-
-        Its motion stands in ``row``; ``rate`` is what is measured there, and its noise, where it matters.
+        What lies between the keyframes is in it only where it is asked for as a ``whole``.
         """
-        instrument = self.instruments[m.sensor]
-        dim = instrument.model.dim
-        lag = self.time_offsets.lag(m.sensor)
-        window, known, landmark = None, self._samples, None
-        if lag is not None:
-            window = window_around(m.stamp, lag, every, self._start, (known.params, self.bias), known.longest_step)
-            if window is None:
-                self.left_out[m.sensor, beyond_samples(instrument)] += 1
-                return []
-        if m.sensor == PLACE:
-            landmark = self._landmarks.observe(float(m.values[0]), m.time)
-            if landmark is None:
-                self.left_out[m.sensor, STILL_IN_VIEW] += 1
-                return []
+        twin = self._twin()
+        twin.truncate(n)
+        if not whole:
+            twin._drop(max(n - KEPT, 0))
+        counts, dive = twin._dive.counts, twin._dive
+        more = {name: getattr(dive, name) for name in ("motions", "weights", "scales", "rows", "row_scales", "windows")}
+        return {
+            **(more if whole else {}),
+            "imu": twin._table,
+            "events": twin._events[: twin._come],
+            "order": twin._order[: counts[at.ORDERED]],
+            "keyframes": twin._dive.keyframes[: len(twin)],
+            "times": twin._dive.rows[: counts[at.ROWS], 0],
+            "of": twin._dive.of[:, : counts[at.ROWS]],
+            "names": twin._dive.names[: counts[at.ROWS]],
+            "counts": counts,
+            "forgotten": twin.forgotten,
+            "sensors": list(self.names),
+            "reasons": list(self._reasons),
+            "periods": list(self._periods),
+            "gaps": list(self._gaps),
+            "signals": pack(twin._signals),
+            "assumed": self.time_offsets.assumed,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from where another stood, which may have had fewer sensors."""
+        counts, events = np.array(state["counts"], np.int64), np.array(state["events"], float)
+        number = np.array([self._which[sensor] for sensor in state["sensors"]], np.int64)
+        self._imu, self._samples, self._fresh = np.array(state["imu"], float), len(state["imu"]), []
+        self.newest = float(self._imu[-1, 0])
+        self._come, most = len(events), (events.shape[1] - at.VALUES) // 2
+        self._events = np.zeros((self._come, at.VALUES + 2 * self._most))
+        self._events[:, : at.VALUES + most] = events[:, : at.VALUES + most]
+        self._events[:, at.VALUES + self._most : at.VALUES + self._most + most] = events[:, at.VALUES + most :]
+        self._events[:, at.SENSOR] = number[events[:, at.SENSOR].astype(np.int64)]
+        self._order = np.append(np.array(state["order"], np.int64), np.empty(self._come, np.int64))
+        n, m = int(counts[at.KEYFRAMES]), int(counts[at.ROWS])
+        self._dive = self._room(n, m, int(counts[at.WINDOWS]))._replace(counts=counts)
+        self._dive.keyframes[:], self._dive.names[:] = state["keyframes"], state["names"]
+        self._dive.rows[:, 0] = state["times"]
+        for name in ("motions", "weights", "scales", "rows", "row_scales", "windows") if "motions" in state else ():
+            here, there = getattr(self._dive, name), state[name]
+            part = tuple(slice(min(sizes)) for sizes in zip(here.shape, there.shape, strict=True))
+            here[part] = there[part]
+        self._dive.of[:] = state["of"]
+        self._dive.of[at.WHICH] = number[self._dive.of[at.WHICH]]
+        self.forgotten, self._reasons = int(state["forgotten"]), list(state["reasons"])
+        self._gaps, self._signals = list(state["gaps"]), unpack(state["signals"])
+        self._periods, self._steps[:] = [], math.inf
+        for period in state["periods"]:
+            self._take_period(period)
+        self.time_offsets.assumed.update(state["assumed"])
+        self._due = self._next_due()
+
+    def _twin(self) -> "Assembly":
+        """One that goes on by itself from here."""
+        table, twin = self._table, copy(self)
+        twin._imu, twin._events, twin._order = table.copy(), self._events.copy(), self._order.copy()
+        twin._fresh, twin._signals, twin._no_pieces = [], self._signals[:], self._no_pieces[:]
+        twin._left_out, twin._dive = self._left_out.copy(), at.Dive(*(array.copy() for array in self._dive))
+        return twin
+
+    @property
+    def left_out(self) -> Counter[tuple[str, str]]:
+        """(sensor, reason) -> count of measurements that never reach the graph."""
+        pieces = Counter(("thruster", why) for _, why in self._no_pieces)
+        return self._left_out + self._counted(np.ones(self._come, bool)) + pieces
+
+    def _counted(self, some: NDArray[np.bool_]) -> Counter[tuple[str, str]]:
+        """Of some of the events, those that are left out."""
+        events = self._events[: self._come][some]
+        events = events[events[:, at.FATE] != at.IN][:, [at.SENSOR, at.FATE]].astype(np.int64)
+        found, counts = np.unique(events, axis=0, return_counts=True) if len(events) else (events, events[:, 0])
+        return Counter(
+            {(self.names[k], self._why(k, fate)): n for (k, fate), n in zip(found.tolist(), counts.tolist(), strict=True)}
+        )
+
+    def _why(self, sensor: int, fate: int) -> str:
+        """Why a measurement of a sensor is left out."""
+        if fate == at.BEYOND:
+            offset = self.instruments[self.names[sensor]].time_offset
+            return f"calibration.{offset} reaches beyond the IMU's samples"
+        return _FATES.get(fate) or self._reasons[fate - at.REFUSED]
+
+    # arrays
+
+    @property
+    def _table(self) -> Array:
+        """The samples, shape (m, 7)."""
+        if self._fresh:
+            rows = np.empty((len(self._fresh), 7))
+            rows[:, 0] = [time for time, _ in self._fresh]
+            rows[:, 1:] = in_body(np.array([values for _, values in self._fresh]), self._R_sb)
+            self._imu = _grown(self._imu, self._samples, self._samples + len(rows))
+            self._imu[self._samples : self._samples + len(rows)] = rows
+            self._samples, self._fresh = self._samples + len(rows), []
+        return self._imu[: self._samples]
+
+    @property
+    def _streams(self) -> at.Streams:
+        """What has come, as kernels take it."""
+        self._order = _grown(self._order, int(self._dive.counts[at.ORDERED]), self._come)
+        return at.Streams(self._table, self._events[: self._come], self._order, self._sensors, self._steps)
+
+    def _room(self, keyframes: int, rows: int, windows: int) -> at.Dive:
+        """Room for so many of each, nothing of which is there."""
+        scaled, knots = int(self._rule.scaled), self._integration.lags.shape[1]
+        return at.Dive(
+            np.zeros((keyframes, at.KEYFRAME)),
+            np.zeros((keyframes, motion_row.ROW)),
+            np.zeros((keyframes, MOTION, MOTION)),
+            np.zeros((keyframes * scaled, 6, 6)),
+            np.zeros((rows, Z + 2 * self._most)),
+            np.zeros((rows * scaled, 6, 6)),
+            np.zeros((at.OF, rows), np.int64),
+            np.zeros((windows, knots, at.KNOT)),
+            np.zeros(rows),
+            np.zeros(7, np.int64),
+        )
+
+    def _make_rule(self, believed: Mapping[str, Belief]) -> at.Rule:
+        graph, config = self.config.graph, self.config
+        lasting = unknowns(believed, self.instruments).time_constants  # which begin a segment at every keyframe
+        return at.Rule(
+            around=HALF_WINDOW_S + self.time_offsets.span,
+            max_gap=graph.max_gap_s,
+            longest=graph.max_gap_s + graph.ping_due_s,
+            min_gap=graph.min_gap_s,
+            segment_s=0.0 if lasting else graph.segment_s,
+            every_s=config.place.every_s,
+            without_imu=float(self._no_imu),
+            learns=float(self.learn_noise and not self._no_imu),
+            scaled=float(wanted(believed)),
+            rate_sd=math.radians(config.motion.rate_sd_dps),
+        )
+
+    def _make_integration(self) -> at.Integration:
+        lags = [lag for s in self.names if (lag := self.time_offsets.lag(s)) is not None]
+        padded = np.full((len(lags), max(map(len, lags), default=0)), np.nan)
+        for row, lag in zip(padded, lags, strict=True):
+            row[: len(lag)] = lag
+        params = preintegration_params(self.config)
+        return at.Integration(params.row(self.bias, 0.0), mount_matrix(self.config.imu.mount_rpy_deg), padded)
+
+    def _about(self, sensor: str) -> list[int]:
+        """What kernels need to know of a sensor."""
+        late = [s for s in self.names if self.time_offsets.lag(s) is not None]
+        closes = self._no_imu or sensor == "dvl"
+        # the rate reaches these: by a lever arm, or by the motion of a turning body
+        turned = self.instruments[sensor].rate_gain.any() or sensor == "thruster"
+        numbers = self.instruments[sensor].model.dim, sensor == PLACE, late.index(sensor) if sensor in late else -1
+        return [int(closes), int(SENSORS[sensor].once_per_interval), int(turned), *map(int, numbers)]
+
+    # measurements and samples
+
+    def _insert_event(self, m: Measurement, k: int) -> None:
+        """Put a measurement at a place among those that have come."""
+        self._events = events = _grown(self._events, self._come, self._come + 1)
+        events[k + 1 : self._come + 1] = events[k : self._come]
+        sensor, row = self._which[m.sensor], events[k]
+        row[:] = self._rows_of(m.sensor, np.array([m.time]), m.values[None], np.array([m.row]))[0]
+        self._come += 1
+        if SENSORS[m.sensor].refused is not none_refused:
+            refused: Counter[tuple[str, str]] = Counter()
+            if not admitted(m.sensor, m.values[None], self.config, refused)[0]:
+                ((_, why),) = refused
+                if why not in self._reasons:
+                    self._reasons.append(why)
+                row[at.FATE] = at.REFUSED + self._reasons.index(why)
+                return
+        if self._sensors[sensor, at.CLOSES]:
+            self._due = min(self._due, m.time - self.time_offsets.of_sensor(m.sensor))
+
+    def _rows_of(self, sensor: str, time: Array, values: Array, line: NDArray[np.int64]) -> Array:
+        """Events of n measurements of a sensor, shape (n, VALUES + 2 D)."""
+        instrument, own, D = self.instruments[sensor], SENSORS[sensor], self._most
+        out, dim = np.zeros((len(time), at.VALUES + 2 * D)), instrument.model.dim
+        out[:, at.STAMP], out[:, at.SENSOR], out[:, at.LINE] = time, self._which[sensor], line
+        if sensor == PLACE:
+            out[:, at.NAME] = values[:, 0]
         else:
-            row[at.Z : at.Z + dim] = m.values[:dim]
-        sd = sd_of(dim)
-        row[sd : sd + dim] = SENSORS[m.sensor].standard_deviation(m.values, instrument, self.config)
-        if rate is not None:
-            row[at.RATE : at.RATE_SD], row[at.RATE_SD] = rate
-        scaled = self._scale_to_bias(every, self._start, m.time)
-        place = (m.sensor, self._index, self._segment, m.row)
-        return [KeyframeMeasurement(*place, dim, row, window, scaled, landmark)]
+            out[:, at.VALUES : at.VALUES + dim] = values[:, :dim]
+        sd = instrument.sd
+        if own.standard_deviation is not of_instrument and len(values):
+            sd = np.array([own.standard_deviation(one, instrument, self.config) for one in values])
+        out[:, at.VALUES + D : at.VALUES + D + dim] = sd
+        return out
 
-    def _scale_to_bias(self, samples: Array, begin: float, end: float) -> Array | None:
-        """The IMU's mean signal as scale errors make a bias of it, where there may be any."""
-        if not self._scaled:
-            return None
-        return scale_to_bias(self._samples.mean(samples, begin, end) - self.bias, self._R_bs)
+    def _place_of(self, k: int) -> tuple[float, int, int, float]:
+        """Order of what has come: by time, and the DVL's before others."""
+        stamp, sensor, name = self._events[k, [at.STAMP, at.SENSOR, at.NAME]].tolist()
+        return stamp, precedence(self.names[int(sensor)]), int(sensor), name
+
+    def _insert_sample(self, time: float, values: Array, line: int) -> InsertResult:
+        if time > self.newest:
+            period = time - self.newest
+            if self.newest > -math.inf and not self._no_imu:
+                if period > self._steps[len(self._periods)]:  # nothing is carried through a gap
+                    self._gaps.append(time)
+                    self._due = min(self._due, time)
+                if period > self.config.imu.max_gap_s:
+                    raise too_long(self.config, period, time, line)
+                self._take_period(period)
+            self._fresh.append((time, values))
+            self.newest = time
+            return InsertResult.IN
+        k = int(self._table[:, 0].searchsorted(time))
+        if self._imu[k, 0] == time:
+            return InsertResult.AGAIN
+        self._undo(time)
+        row = np.append(time, in_body(values, self._R_sb))
+        self._imu = np.insert(self._table, k, row, axis=0)
+        self._samples += 1
+        return InsertResult.IN
+
+    def _undo(self, time: float) -> None:
+        """Unmake what has been made of what comes after a time [s]."""
+        counts = self._dive.counts
+        if counts[at.SAMPLES] and time < self._table[counts[at.SAMPLES] - 1, 0]:
+            n = len(self)
+            while n > 0 and self.closed_at(n - 1) > time:
+                n -= 1
+            self.truncate(n)
+
+    def _take_period(self, period: float) -> None:
+        """Learn from the first samples what a gap is."""
+        if len(self._periods) < at.PERIODS and not self._no_imu:
+            self._periods.append(period)
+            self._steps[len(self._periods) :] = GAP_PERIODS * float(np.median(self._periods))
+
+    def _closing(self) -> Array:
+        """Times of what waits and may make a keyframe [s]."""
+        counts, events, n = self._dive.counts, self._events[: self._come], len(self)
+        upto = int(self._dive.keyframes[n - 1, at.UPTO]) if n else 0
+        late = np.array([self.time_offsets.of_sensor(sensor) for sensor in self.names] or [0.0])
+        waits = np.concatenate([self._order[upto : counts[at.ORDERED]], np.arange(counts[at.READ], self._come)])
+        some = events[waits]
+        sensor = some[:, at.SENSOR].astype(np.int64)
+        closes = (some[:, at.FATE] < at.REFUSED) & (self._sensors[sensor, at.CLOSES] != 0)
+        return np.asarray((some[:, at.STAMP] - late[sensor])[closes])
+
+    def _next_due(self) -> float:
+        """From when on a keyframe may be past, by what has come [s]."""
+        if not len(self):
+            return -math.inf
+        start = float(self._dive.keyframes[len(self) - 1, at.TIME])
+        closing = self._closing()
+        self._gaps = [time for time in self._gaps if time > start + at.SHORTEST_S]
+        soon = closing[closing - start >= self._rule.min_gap].min(initial=start + self._rule.longest)
+        return min(float(soon), *self._gaps, math.inf) - 1e-9
+
+    def _wanted(self, streams: Sequence[Stream]) -> Array:
+        """Events of streams in the order of their stamps, without those of which one an interval is taken, where
+        surely another one is: between near pings."""
+        which, index, stamp = arrivals(streams)
+        late = np.array([self.time_offsets.of_sensor(stream.sensor) for stream in streams])
+        placed, wanted = stamp - late[which], np.ones(len(stamp), bool)
+        graph, time = self.config.graph, self._imu[:, 0]
+        if not self._no_imu:
+            known = np.minimum(np.arange(1, len(time)), at.PERIODS + 1) - 1
+            ends = time[1:][np.diff(time) > self._steps[known]]
+            pings = np.isin(which, [k for k, stream in enumerate(streams) if stream.sensor == "dvl"])
+            self._gaps = ends.tolist()
+            ends = np.sort(np.concatenate([ends, placed[pings]]))
+            edges = np.concatenate([[-np.inf], ends, [np.inf]])
+            # the keyframe before may stand up to `min_gap_s` before a ping that makes none
+            whole = np.diff(edges) > graph.max_gap_s - graph.min_gap_s - at.SHORTEST_S
+            whole |= (edges[:-1] < time[0]) | (edges[1:] > time[-1] - at.SHORTEST_S)  # what is left out is counted
+            for k, stream in enumerate(streams):
+                if SENSORS[stream.sensor].once_per_interval:
+                    own = np.flatnonzero(which == k)
+                    before, after = ends.searchsorted(placed[own]), ends.searchsorted(placed[own], side="right")
+                    first = (np.diff(before, prepend=-1) > 0) | (np.diff(after, prepend=-1) > 0)
+                    wanted[own] = whole[after] | whole[before] | first
+        which, index = which[wanted], index[wanted]
+        events = np.empty((len(which), at.VALUES + 2 * self._most))
+        for k, stream in enumerate(streams):
+            own = which == k
+            some = index[own]
+            events[own] = self._rows_of(stream.sensor, stream.time[some], stream.data[some], stream.row[some])
+        return events
+
+    def _pieces(self, begin: int) -> Array:
+        """What thrusters tell of the intervals that end with keyframes from ``begin`` on, as events."""
+        model = cast(ModelAiding, self.instruments["thruster"].model)
+        table, gone, out = self._table, int(self._dive.counts[at.FORGOTTEN]), [self._events[:0]]
+        for k in range(begin, len(self)):
+            (start, _), (end, count) = self._dive.keyframes[k - 1 : k + 1, [at.TIME, at.COUNT]].tolist()
+            first = max(int(table[:, 0].searchsorted(start - HALF_WINDOW_S, side="right")) - 1, 0)
+            last = min(int(table[:, 0].searchsorted(end + self._rule.around)) + 1, int(count) - gone)
+            samples = table[first:last]
+            if np.diff(samples[:, 0]).max(initial=0.0) > self._steps[min(int(count), len(self._steps)) - 1]:
+                continue
+            since = bisect_right(self._signals, start - model.memory, key=_time)
+            signals = self._signals[max(since - 1, 0) : bisect_right(self._signals, end, key=_time)]
+            for piece in thruster_pieces(model, signals, start, end, samples):
+                if isinstance(piece, str):
+                    self._no_pieces.append((k, piece))
+                else:
+                    own = self._rows_of("thruster", np.array([piece.time]), piece.values[None], np.array([piece.row]))
+                    own[0, [at.PLACED, at.NAME]] = piece.time, k
+                    out.append(own)
+        return np.vstack(out)
+
+    def _check_gaps(self, periods: Array, imu: Stream) -> None:
+        long = np.flatnonzero(periods > self.config.imu.max_gap_s)
+        if long.size:
+            k = int(long[0])
+            raise too_long(self.config, float(periods[k]), float(imu.time[k + 1]), int(imu.row[k + 1]))
 
 
-def _time(m: StampedMeasurement) -> float:
+def too_long(config: Config, period: float, time: float, row: int) -> InputError:
+    """A gap before a sample that cannot be bridged."""
+    return InputError(
+        f"row {row}: the IMU is silent for {period:.1f} s before {time:.3f} s, longer than "
+        f"imu.max_gap_s = {config.imu.max_gap_s:g}; split the log there or raise that key"
+    )
+
+
+def _grown(array: NDArray[Any], used: int, need: int, axis: int = 0) -> Any:
+    """An array with room for so many, of which ``used`` are kept."""
+    if array.shape[axis] >= need:
+        return array
+    shape = [*array.shape]
+    shape[axis] = max(need, 2 * shape[axis])
+    out, kept = np.zeros(shape, array.dtype), (slice(None),) * axis + (slice(used),)
+    out[kept] = array[kept]
+    return out
+
+
+def _time(m: Measurement) -> float:
     return m.time
+
+
+def _name(m: Measurement) -> float:
+    """Of a place that is seen, else 0."""
+    return float(m.values[0]) if m.sensor == PLACE else 0.0

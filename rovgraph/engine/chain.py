@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 from rovgraph.calibration import LAYOUT, TABLE, Belief, calibration_size
 from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, UndeterminedError, square_root
 from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING, ChainLayout
-from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates, Measured
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import (
     Block,
     Seen,
@@ -32,6 +30,7 @@ from rovgraph.engine.measurements import (
     measurement_cost,
 )
 from rovgraph.engine.pieces import pieces
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.sensor_rows import compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
@@ -79,15 +78,13 @@ class Chain:
 
     Attributes
     ----------
-    intervals, initial, beliefs, unknowns : the dive
-    rows : the same as arrays
+    problem, initial, beliefs, unknowns : the dive
     """
 
-    intervals: Sequence[KeyframeInterval]
+    problem: Problem
     initial: InitialConditions
     beliefs: Mapping[str, Belief]
     unknowns: Unknowns
-    rows: DiveRows
 
     @cached_property
     def layout(self) -> ChainLayout:
@@ -97,13 +94,13 @@ class Chain:
     @cached_property
     def walk(self) -> tuple[Array, Array]:
         """Square-root information of the walks, and what they keep of a deviation; shape (n - 1, d - 15) each."""
-        seconds = np.diff(self.rows.time)
+        seconds = np.diff(self.problem.time)
         kept, sd = np.empty((2, len(seconds), self.layout.d - MOTION))
         for name in self.layout.walking:
             own = self.unknowns.walked(name, seconds[:, None])
             kept[:, self._walking(name)], sd[:, self._walking(name)] = own
-            ends = self.rows.time.searchsorted(self.beliefs[name].changes)  # of the intervals that hold changes
-            sd[ends[(ends > 0) & (ends < len(self.rows.time))] - 1, self._walking(name)] = self.beliefs[name].sd
+            ends = self.problem.time.searchsorted(self.beliefs[name].changes)  # of the intervals that hold changes
+            sd[ends[(ends > 0) & (ends < len(self.problem.time))] - 1, self._walking(name)] = self.beliefs[name].sd
         return 1.0 / sd, kept
 
     def _walking(self, name: str) -> slice:
@@ -130,7 +127,7 @@ class Chain:
 
     def _blocks(self, sensors: set[str]) -> dict[str, Block]:
         gravity = self.initial.gravity
-        return blocks_of(self.intervals, sensors, self.initial.instruments, gravity, self.unknowns)
+        return blocks_of(self.problem, sensors, self.initial.instruments, gravity, self.unknowns)
 
     @cached_property
     def _unknown_to_kernels(self) -> set[str]:
@@ -146,7 +143,7 @@ class Chain:
     def _places(self) -> dict[str, NDArray[np.int64]]:
         """Sensor that kernels know -> places of its measurements among all."""
         names = [s for s in self.initial.instruments if s not in self._unknown_to_kernels]
-        places = {name: self.rows.of_sensor(name) for name in names}
+        places = {name: self.problem.of_sensor(name) for name in names}
         return {name: found for name, found in places.items() if len(found)}
 
     # what `rovgraph.engine.gauss_newton` asks
@@ -157,7 +154,7 @@ class Chain:
 
     def measured(self) -> dict[str, Measured]:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
-        times = {sensor: self.rows.rows[places, TIME] for sensor, places in self._places.items()}
+        times = {sensor: self.problem.rows[places, TIME] for sensor, places in self._places.items()}
         times |= {sensor: block.time for sensor, block in self.given.items()}
         used = {sensor: self.initial.instruments[sensor] for sensor in times}
         return {s: Measured(times[s], i.model.dim, cost_at_gate(i)) for s, i in used.items()}
@@ -169,21 +166,21 @@ class Chain:
 
     def gates(self, point: State) -> Gates:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
-        within = self._at(point).squares <= self._sensors[self.rows.which, GATE] ** 2
+        within = self._at(point).squares <= self._sensors[self.problem.which, GATE] ** 2
         known = {sensor: within[places] for sensor, places in self._places.items()}
         return {**known, **gates_of(self.seen(point, self.given))}
 
     def cost(self, point: State, gates: Gates) -> float:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
         here = self._at(point)
-        total = here.cost + robust_costs(here.squares, self.rows.which, self._sensors, self._entered(gates))
+        total = here.cost + robust_costs(here.squares, self.problem.which, self._sensors, self._entered(gates))
         return total + measurement_cost(self.seen(point, self.given), gates)
 
     def _at(self, point: State) -> "_PointCosts":
         """What does not depend on gates; kept of the newest points, which are asked for with other gates next."""
         known = next((one for one in self._newest if one.point() is point), None)
         if known is None:
-            motions = self.rows.motion_residuals(point)
+            motions = self.problem.motion_residuals(point)
             cost = 0.5 * float(np.vdot(motions, motions))
             cost += 0.5 * sum(float(np.sum(p**2)) for p in self.prior_residuals(point))
             cost += 0.5 * float(np.sum(self.walk_residuals(point) ** 2))
@@ -198,15 +195,15 @@ class Chain:
 
     def _squared_lengths(self, point: State) -> Array:
         """Of the whitened innovations of what kernels know, shape (m,)."""
-        r, out = self.rows, np.empty(len(self.rows.rows))
+        r, out = self.problem, np.empty(len(self.problem.rows))
         gravity = self.initial.gravity
-        dive = r.rows, r.which, r.first, r.row_scales, self._sensors
+        dive = r.compiled_rows, r.which, r.first, r.row_scales, self._sensors
         squared_lengths(*dive, *self._arrays(point), gravity, out)
         return out
 
     def _entered(self, gates: Gates) -> NDArray[np.bool_]:
         """Gates of what kernels know, shape (m,)."""
-        out = np.zeros(len(self.rows.rows), bool)
+        out = np.zeros(len(self.problem.rows), bool)
         for sensor, places in self._places.items():
             out[places] = gates[sensor]
         return out
@@ -214,7 +211,7 @@ class Chain:
     def _arrays(self, point: State) -> tuple[Array, Array, Array, Array, Array]:
         """A point as `rovgraph.kernels.dive` takes it."""
         walked = any(value.ndim > 1 for value in point.calibration.values())  # also of what is held where it has walked
-        c = np.empty((len(self.intervals) if walked else 1, calibration_size()))
+        c = np.empty((len(self.problem) if walked else 1, calibration_size()))
         for name, part in LAYOUT.items():
             c[:, part] = point.calibration[name]
         R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
@@ -248,7 +245,7 @@ class Chain:
         values = {name: np.asarray(v, float).ravel() for name, v in (calibration or self.unknowns.fixed).items()}
         known = {**self.unknowns.fixed, **{name: values[name] for name in self.unknowns.estimated}}
         for name in self.layout.walking:
-            known[name] = np.tile(known[name], (len(self.intervals), 1))
+            known[name] = np.tile(known[name], (len(self.problem), 1))
         return State(states.R_nb, states.p_n, states.v_n, states.bias, known)
 
     # factors
@@ -309,8 +306,8 @@ class Chain:
         self._put_priors(given, point, clones)
         for place, (sensor, block) in enumerate(self.given.items(), PRIORS):
             self._put_block(given, place, block, point, gates[sensor])
-        r, n, d, c = self.rows, len(self.intervals), self.layout.d, self.layout.c + clones
-        dive = r.motions, r.weights, r.scales, r.rows, r.which, r.first, r.row_scales, self._sensors
+        r, n, d, c = self.problem, len(self.problem), self.layout.d, self.layout.c + clones
+        dive = r.motions, r.weights, r.scales, r.compiled_rows, r.which, r.first, r.row_scales, self._sensors
         gravity = self.initial.gravity
         walks = *self.walk, -self.walk_residuals(point)
         point_and_layout: Any = *self._arrays(point), self.layout.column, gravity, *walks
@@ -346,7 +343,7 @@ class Chain:
         keyframes = [first, first, first, *(b.keyframe.astype(np.int64) for b in blocks)]
         dims = [MOTION, walking, clones, *(b.z.shape[1] for b in blocks)]
         others = [sum(TABLE[n].dim for n in self._columns_of(b)) for b in blocks]
-        return MeasurementRows(len(self.intervals), MOTION, keyframes, dims, max([walking, clones, *others]))
+        return MeasurementRows(len(self.problem), MOTION, keyframes, dims, max([walking, clones, *others]))
 
     def _put_priors(self, rows: MeasurementRows, point: State, clones: int) -> None:
         """The prior of the first keyframe, that of what walks, and the tie of the first attitude's clone."""

@@ -12,12 +12,11 @@ from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING
 from rovgraph.engine.chain_window import window
-from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Solution, left_after, whole_share
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, weights_of
 from rovgraph.engine.optimum import Knowledge
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.stretches import Searches, at_rest, resume, solve
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.engine.widened_chain import widened
@@ -46,8 +45,8 @@ class ChainOptimum:
     begun: State | None = None
 
     @property
-    def intervals(self) -> Sequence[KeyframeInterval]:
-        return self.chain.intervals
+    def problem(self) -> Problem:
+        return self.chain.problem
 
     @property
     def beliefs(self) -> Mapping[str, Belief]:
@@ -108,7 +107,7 @@ class ChainOptimum:
     @property
     def _short(self) -> bool:
         """Whether all conditionals may stay in memory."""
-        return len(self.intervals) <= SHORT
+        return len(self.problem) <= SHORT
 
     @property
     def _at_hand(self) -> bool:
@@ -225,7 +224,7 @@ class ChainOptimum:
         if not border:
             return self._marginals[0][:, part, part]
         P = self._marginals[1][part, part]
-        return np.broadcast_to(P, (len(self.intervals), *P.shape))
+        return np.broadcast_to(P, (len(self.problem), *P.shape))
 
     def forget_covariances(self) -> None:
         """As `rovgraph.engine.optimum.Optimum`."""
@@ -253,7 +252,7 @@ class ChainOptimum:
     def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
         """As `rovgraph.engine.optimum.Optimum`."""
         held = replace(self.chain, unknowns=self.unknowns.of(()))
-        white = np.random.default_rng(seed).standard_normal((len(self.intervals), MOTION))
+        white = np.random.default_rng(seed).standard_normal((len(self.problem), MOTION))
         # the border does not touch what the keyframes' own columns are eliminated to
         own = held.eliminate(self.linearised_at, self.solution.gates) if self.wide.layout.walking else self.root
         noise = own.draw(white)
@@ -288,11 +287,10 @@ class ChainOptimum:
 
 
 def smooth_chain(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     initial: InitialConditions,
     states: State,
     calibration: Mapping[str, Array] | None = None,
-    rows: DiveRows | None = None,
     searches: Searches | None = None,
     freed: bool = False,
 ) -> ChainOptimum:
@@ -300,10 +298,9 @@ def smooth_chain(
 
     Parameters
     ----------
-    intervals, initial : the dive
+    problem, initial : the dive
     states : State of its keyframes to begin with
     calibration : to begin with, its prior means where it is None
-    rows : the dive as arrays, where they are at hand
     searches : of other solutions of the dive, as configured the same
     freed : what is considered is estimated
 
@@ -311,9 +308,9 @@ def smooth_chain(
     ------
     InputError : the data do not determine some variable, which is named
     """
-    beliefs, rows = initial.beliefs, rows or DiveRows.of(intervals, [*initial.instruments])
-    wanted = unknowns(beliefs, rows.used)
-    chain = Chain(intervals, initial, beliefs, wanted.estimating(wanted.considered) if freed else wanted, rows)
+    beliefs = initial.beliefs
+    wanted = unknowns(beliefs, problem.used)
+    chain = Chain(problem, initial, beliefs, wanted.estimating(wanted.considered) if freed else wanted)
     held = [name for name in chain.unknowns.considered if not beliefs[name].variable.time_offset]
     free = partial(widened, chain, names=tuple(held)) if held else None
     solution = solve(chain, chain.start(states, calibration), free, window, searches, gauss_newton.REST)

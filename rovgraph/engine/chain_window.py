@@ -11,7 +11,6 @@ import numpy as np
 from rovgraph.engine.chain import CLONED, Chain
 from rovgraph.engine.chain_information import MeasurementRows
 from rovgraph.engine.chain_layout import MOTION
-from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates, Solution
 from rovgraph.geometry import Array, log_rotation, right_jacobian
 from rovgraph.state import State
@@ -58,12 +57,12 @@ def window(chain: Chain, solution: Solution[State], begin: float, end: float) ->
     chain, solution : the dive, and where what lies before the window is linearised
     begin, end : [s]
     """
-    rows = chain.rows
+    rows = chain.problem
     first, last = (int(k) for k in np.searchsorted(rows.time, (begin, end)))
     if 2 * (last - first) > len(rows) or chain.given:
         return None
     m = int(rows.first[first + (first > 0)]), int(rows.first[last])  # the head has those of the first keyframe
-    here = replace(chain, intervals=chain.intervals[first:last], rows=_between(rows, first, last, *m))
+    here = replace(chain, problem=rows.part(first, last, *m))
     if first > 0:
         own = {f.name: getattr(here, f.name) for f in fields(Chain)}
         head = _known_before(chain, solution, first)
@@ -71,22 +70,6 @@ def window(chain: Chain, solution: Solution[State], begin: float, end: float) ->
     places = {sensor: rows.of_sensor(sensor).searchsorted(m).tolist() for sensor in rows.sensors}
     within = {sensor: slice(*place) for sensor, place in places.items() if place[0] < place[1]}
     return ChainWindow(here, slice(first, last), within)
-
-
-def _between(rows: DiveRows, first: int, last: int, begin: int, end: int) -> DiveRows:
-    """Keyframes ``first`` to ``last`` with measurements ``begin`` to ``end``."""
-    return DiveRows(
-        rows.motions[first : last - 1],
-        rows.weights[first : last - 1],
-        rows.scales[first : last - 1],
-        rows.rows[begin:end],
-        rows.which[begin:end],
-        rows.row_scales[begin:end],
-        np.maximum(rows.first[first : last + 1] - begin, 0),
-        np.clip(rows.taken[first:last] - begin, 0, end - begin),
-        rows.time[first:last],
-        rows.sensors,
-    )
 
 
 def _known_before(chain: Chain, solution: Solution[State], keyframe: int) -> Array:
@@ -130,7 +113,7 @@ class _HeadedChain(Chain):
 
     def _room(self, clones: int) -> MeasurementRows:
         size = len(self.head)
-        return MeasurementRows(len(self.intervals), MOTION, [np.zeros(1, np.int64)], [size], size - MOTION)
+        return MeasurementRows(len(self.problem), MOTION, [np.zeros(1, np.int64)], [size], size - MOTION)
 
     def _put_priors(self, rows: MeasurementRows, point: State, clones: int) -> None:
         r, _ = self.prior_residuals(point)

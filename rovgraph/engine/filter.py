@@ -9,29 +9,25 @@ Per interval, the measurements between two keyframes correct the earlier one, as
 goes on to the next keyframe with the IMU; what was measured there corrects it.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from rovgraph.engine.alignment import POORLY_KNOWN, aligned, poorly_known, with_attitude
-from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.error_layout import ErrorLayout
 from rovgraph.engine.filter_step import (
     FilterRun,
     FilterStep,
     Gates,
     Gaussian,
-    ProcessedMeasurement,
+    Met,
     Transition,
     calibration_vector,
     state_vector,
 )
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
-from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import Block, make_block
+from rovgraph.engine.problem import Index, Problem
 from rovgraph.engine.remembered_places import (
     RememberedPlace,
     columns,
@@ -47,14 +43,25 @@ from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import correct
-from rovgraph.kernels.filtering import filter_intervals
+from rovgraph.kernels.correction import Corrected, GivenRows, correct
+from rovgraph.kernels.filter_state import FilterModel, FilterState
+from rovgraph.kernels.filtering import Filtered, Intervals, filter_intervals
+from rovgraph.kernels.measurement_row import MeasurementRows
 from rovgraph.kernels.moves import difference, move_estimate
-from rovgraph.kernels.prediction import predict_filter
+from rovgraph.kernels.prediction import Predicted, predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 
 ORIGIN = np.zeros(PLACE_DIM)  # where a place is put to begin with
 _EXACT = np.zeros((0, 6, 6))  # of an IMU without scale errors
+
+
+def _state(known: Gaussian) -> FilterState:
+    """A copy for kernels, which write to it."""
+    return FilterState(known.x.copy(), known.c.copy(), known.P.copy(), known.B.copy(), known.L)
+
+
+def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> Gaussian:
+    return Gaussian(known.x, known.c, known.P, places, known.B, known.L)
 
 
 class FilterEngine:
@@ -80,19 +87,21 @@ class FilterEngine:
         self.layout = ErrorLayout(self.unknowns.estimated, self.unknowns.considered, initial.instruments)
         self._wide = self.unknowns.estimating(self.unknowns.considered)  # all that has a place in the error
         self._gravity = initial.gravity
-        self._walk = np.zeros((3, self.layout.size))  # as `rovgraph.kernels.prediction` takes it
-        for name, walk in self.unknowns.walks.items():
-            self._walk[0, self.layout.columns[name]] = walk**2
+        walk = np.zeros((3, self.layout.size))
+        for name, sd in self.unknowns.walks.items():
+            walk[0, self.layout.columns[name]] = sd**2
         for name, seconds in self.unknowns.time_constants.items():
-            self._walk[1, self.layout.columns[name]] = 1.0 / seconds
-            self._walk[2, self.layout.columns[name]] = self.unknowns.fixed[name]
+            walk[1, self.layout.columns[name]] = 1.0 / seconds
+            walk[2, self.layout.columns[name]] = self.unknowns.fixed[name]
         instruments = initial.instruments
         self._given = {  # linearised outside the kernels
             s for s, i in instruments.items() if not compiled(i, i.time_offset in self.unknowns.walks) or s == PLACE
         }
-        self._sensors = sensor_table(instruments, sorted(self._given))
-        self._no_rows = np.empty(0), np.empty((0, self.layout.width))
+        sensors = sensor_table(instruments, sorted(self._given))
+        self._model = FilterModel(sensors, self.layout.column, self.layout.coordinates, walk, initial.gravity)
+        self._no_rows = GivenRows(np.empty(0), np.empty((0, self.layout.width)))
         self._index = {sensor: k for k, sensor in enumerate(instruments)}
+        self._outside = np.array([sensor in self._given for sensor in instruments])
 
     def start(self) -> Gaussian:
         """The prior: the smoother's."""
@@ -105,102 +114,109 @@ class FilterEngine:
         B, L = np.zeros((layout.size, layout.width - layout.size)), np.diag(sd[layout.size :])
         return Gaussian(state_vector(prior.state), calibration_vector(self.unknowns.fixed), P, (), B, L)
 
-    def step(self, interval: KeyframeInterval, before: Gaussian, gates: Gates) -> FilterStep:
-        """Take one interval.
+    def step(self, problem: Problem, k: int, before: Gaussian, gates: Gates) -> FilterStep:
+        """Take the interval that ends with keyframe k.
 
         Parameters
         ----------
-        interval : the next one
+        problem : the dive
         before : the keyframe before, or at the first `start`
         gates : renewed in place
         """
         assert len(before.L) == self.layout.width - self.layout.size  # kernels do not check where they write
-        processed: list[ProcessedMeasurement] = []
+        here = self._first_here(problem, k)
+        met = Met.of(problem, k, len(before.c))
         departed = transition = None
         predicted = before
-        if interval.motion is not None:
-            departed = self._align(before, interval)
-            departed = self.correct(departed, interval.between, gates, processed)
-            transition = self.predict(interval, self._changed(departed, interval))
+        if k > 0:
+            departed = self._align(before, problem, k)
+            departed = self.correct(departed, problem, slice(met.begin, here), gates, met)
+            transition = self.predict(problem, k, self._changed(departed, problem, k))
             predicted = transition.predicted
-        filtered = self.correct(predicted, interval.here, gates, processed)
-        return FilterStep(departed, transition, filtered, processed)
+        filtered = self.correct(predicted, problem, slice(here, met.end), gates, met)
+        return FilterStep(departed, transition, filtered, met)
 
-    def run(self, rows: DiveRows, begin: int, end: int, before: Gaussian, gates: Gates) -> FilterRun:
+    def _first_here(self, problem: Problem, k: int) -> int:
+        """The first measurement at keyframe k of those of the interval that ends with it."""
+        begin, end = problem.measured_in(k)
+        return end - int(np.count_nonzero(problem.keyframe[begin:end] == k))
+
+    def _rows(self, problem: Problem, some: "slice | Index") -> MeasurementRows:
+        """Measurements as kernels take them."""
+        scales = problem.row_scales[some] if len(problem.row_scales) else problem.row_scales
+        rows = np.ascontiguousarray(problem.rows[some, : at.ROW])
+        return MeasurementRows(rows, np.ascontiguousarray(problem.which[some]), scales)
+
+    def run(self, problem: Problem, begin: int, end: int, before: Gaussian, gates: Gates) -> FilterRun:
         """Take intervals of a dive as `step` does, as far as kernels know how.
 
         Parameters
         ----------
-        rows : the dive, its sensors those of the configuration
+        problem : the dive
         begin, end : the intervals, the first beyond 0
         before : the keyframe before them, without places
         gates : renewed in place
         """
-        size, C = self.layout.size, len(before.c)
-        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
-        some = rows.between(begin, end)
-        k, m, since = end - begin, len(some.rows), self._since(gates)
-        out: Any = [np.empty(shape) for shape in ((k, 21), (k, C)) * 2]
-        out += [np.empty(shape) for shape in ((k, 6, 6), (k, 3, 3), (k, size), (m,), (m,))]
-        known: Any = x, c, P, B, before.L, some.motions, some.scales, some.rows, some.which, some.row_scales
-        tables: Any = self._sensors, self.layout.column, self._walk, *self.layout.coordinates
-        order: Any = np.append(0, some.taken), some.first[:k]
-        limits: Any = since, self._gravity, POORLY_KNOWN
-        kernels: Any = correct, predict_filter
-        taken = filter_intervals(*known, *order, *tables, *limits, *out, *kernels)
+        known, since = _state(before), self._since(gates)
+        own = slice(int(problem.taken[begin - 1]), int(problem.taken[end - 1]))
+        taken, first = problem.taken[begin:end] - own.start, problem.first[begin:end] - own.start
+        k, m, C, size = end - begin, own.stop - own.start, len(before.c), self.layout.size
+        shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
+        out = Filtered._make(np.empty(shape) for shape in shapes)
+        intervals = Intervals(some.motions, some.scales, np.append(0, some.taken), some.first[:k], POORLY_KNOWN)
+        measured = MeasurementRows(some.rows, some.which, some.row_scales)
+        taken = filter_intervals(known, intervals, measured, self._model, since, out, correct, predict_filter)
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
         interval = np.arange(taken).repeat(np.diff(some.taken[:taken], prepend=0))
-        met = rows.sensors, some.which[:m], interval, np.arange(m) < some.first[interval], *(a[:m] for a in out[-2:])
-        return FilterRun(before, Gaussian(x, c, P, (), B, before.L), *(a[:taken] for a in out[:-2]), *met)
+        own = Filtered._make(a[: m if a.ndim == 1 else taken] for a in out)
+        met = rows.sensors, some.which[:m], interval, np.arange(m) < some.first[interval]
+        return FilterRun(before, _estimate(known), own, *met)
 
-    def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:
-        """The next keyframe, from the IMU alone; calibration walks."""
-        assert interval.motion is not None
+    def predict(self, problem: Problem, k: int, before: Gaussian) -> Transition:
+        """Keyframe k from the one before, by the IMU alone; calibration walks."""
         n = len(before.P)
-        scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
+        scale = problem.scales[k - 1] if len(problem.scales) else _EXACT[:, 0]
         P, B = before.P.copy(), before.B.copy()
-        x, c, F, Q = np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n))
-        walk = self._walk if n == self.layout.size else np.pad(self._walk, ((0, 0), (0, n - self.layout.size)))
-        tables = interval.motion.row, scale, self.layout.column, walk, self.layout.size
-        predict_filter(before.x, before.c, P, B, before.L, *tables, x, c, F, Q)
-        return Transition(F, Q, Gaussian(x, c, P, before.places, B, before.L))
+        out = Predicted(np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n)))
+        known = FilterState(before.x, before.c, P, B, before.L)
+        predict_filter(known, problem.motions[k - 1], scale, self._model, out)
+        return Transition(out.F, out.Q, Gaussian(out.x, out.c, P, before.places, B, before.L))
 
     def correct(
-        self,
-        before: Gaussian,
-        measurements: Sequence[KeyframeMeasurement],
-        gates: Gates | None,
-        processed: list[ProcessedMeasurement],
+        self, before: Gaussian, problem: Problem, some: slice, gates: Gates | None, met: "Met | None" = None
     ) -> Gaussian:
-        """The estimate corrected by measurements that belong to its keyframe, places last; without gates all count."""
-        landmarks = [m for m in measurements if m.landmark is not None]
-        others = [m for m in measurements if m.landmark is None] if landmarks else measurements
-        known = self._correct(before, others, gates, processed) if others else before
-        for m in landmarks:
-            known = self._see(known, m, processed)
+        """The estimate corrected by measurements of its keyframe, places last; without gates all count.
+
+        ``met`` is told how they were met.
+        """
+        index = np.arange(some.start, some.stop)
+        seen = problem.number[some] >= 0
+        known = self._correct(before, problem, index[~seen], gates, met) if not seen.all() else before
+        for row in index[seen].tolist():
+            known = self._see(known, problem, row, met)
         return known
 
-    def linearize(self, known: Gaussian, measurements: Sequence[KeyframeMeasurement]) -> tuple[Array, Array]:
+    def linearize(self, known: Gaussian, problem: Problem, index: Index) -> tuple[Array, Array]:
         """Whitened innovations, shape (m,), and Jacobians, shape (m, width), of measurements of no places."""
-        r, H = [], []
-        for m in measurements:
-            if m.sensor in self._given:
-                own_r, own_H = self._of_block(known, m)
+        r, H = [np.empty(0)], [np.empty((0, self.layout.width))]
+        for row in index.tolist():
+            if problem.sensors[problem.which[row]] in self._given:
+                own_r, own_H = self._of_block(known, problem, row)
             else:
-                own_r, own_H = self.rows([m]).linearize(known.x, known.c)
+                own_r, own_H = self.rows(problem, np.array([row])).linearize(known.x, known.c)
             r.append(own_r)
             H.append(own_H)
         return np.concatenate(r), np.vstack(H)
 
-    def considered_share(self, known: Gaussian, measurement: KeyframeMeasurement) -> Array:
+    def considered_share(self, known: Gaussian, problem: Problem, row: int) -> Array:
         """Variance that what is considered adds to an innovation, in units of the rest of it; shape (dim,).
 
         Gates and gains depend on P alone, so innovations of a consistent filter vary by as much more.
         """
         if not len(known.L):
-            return np.zeros(self.initial.instruments[measurement.sensor].model.dim)
-        _, H = self.linearize(known, [measurement])
+            return np.zeros(problem.dims[problem.which[row]])
+        _, H = self.linearize(known, problem, np.array([row]))
         own, considered = H[:, : self.layout.size], H[:, self.layout.size : self.layout.width]
         B, P = known.B[: self.layout.size], known.P[: self.layout.size, : self.layout.size]
         by_considered = own @ B + considered @ known.L
@@ -210,26 +226,21 @@ class FilterEngine:
         """Whether the kernels know a sensor's equation."""
         return sensor not in self._given
 
-    def rows(self, measurements: Sequence[KeyframeMeasurement]) -> KeyframeRows:
+    def rows(self, problem: Problem, index: Index) -> KeyframeRows:
         """Measurements of one keyframe that the kernels know."""
-        scaled = measurements[0].scale_to_bias is not None
-        scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
-        rows = np.array([m.row[: at.ROW] for m in measurements])
-        which = np.array([self._index[m.sensor] for m in measurements])
-        layout = self.layout
-        return KeyframeRows(rows, which, self._sensors, layout.column, layout.width, scale, self._gravity)
+        layout, (rows, which, scale) = self.layout, self._rows(problem, index)
+        return KeyframeRows(rows, which, self._model.sensors, layout.column, layout.width, scale, self._gravity)
 
-    def block(self, measured: MeasurementTable | Sequence[KeyframeMeasurement]) -> Block:
+    def block(self, problem: Problem, index: Index) -> Block:
         """Measurements of one sensor, with the filter's unknowns."""
-        table = measured if isinstance(measured, MeasurementTable) else MeasurementTable.of(measured)
-        instrument = self.initial.instruments[table.sensors[int(table.which[0])]]
-        return make_block(table, instrument, self._gravity, self._wide)
+        instrument = self.initial.instruments[problem.sensors[problem.which[index[0]]]]
+        return make_block(problem, index, instrument, self._gravity, self._wide)
 
     def retract(self, known: Gaussian, delta: Array, P: Array, B: Array | None = None) -> Gaussian:
         """The estimate that lies ``delta``, shape (d,), away; P, and B (None = its own), are about the old one."""
-        x, c, P, B = known.x.copy(), known.c.copy(), P.copy(), (known.B if B is None else B).copy()
-        move_estimate(x, c, P, B, delta, *self.layout.coordinates)
-        return Gaussian(x, c, P, moved(known.places, delta[self.layout.size :]), B, known.L)
+        there = _state(replace(known, P=P, B=known.B if B is None else B))
+        move_estimate(there, delta, self.layout.coordinates)
+        return _estimate(there, moved(known.places, delta[self.layout.size :]))
 
     def local(self, some: Gaussian, other: Gaussian) -> tuple[Array, Array]:
         """The error, shape (size,), that leads from one estimate to another, and the basis, shape (size, size).
@@ -238,7 +249,7 @@ class FilterEngine:
         """
         size = self.layout.size
         delta, basis = np.empty(size), np.eye(size)
-        difference(some.x, some.c, other.x, other.c, *self.layout.coordinates, delta, basis)
+        difference(some.x, some.c, other.x, other.c, self.layout.coordinates, delta, basis)
         return delta, basis
 
     def considering(self, known: Gaussian, other: Gaussian) -> Gaussian:
@@ -253,10 +264,9 @@ class FilterEngine:
         """What of the calibration takes another value after one time and up to another [s]."""
         return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
 
-    def _changed(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
-        """The keyframe before an interval, with the variance of what takes another value in it."""
-        assert interval.motion is not None
-        names = self.changes_in(interval.time - interval.motion.duration, interval.time)
+    def _changed(self, known: Gaussian, problem: Problem, k: int) -> Gaussian:
+        """The keyframe before keyframe k, with the variance of what takes another value up to it."""
+        names = self.changes_in(float(problem.time[k - 1]), float(problem.time[k]))
         if not names:
             return known
         P = known.P.copy()
@@ -265,42 +275,32 @@ class FilterEngine:
             P[own, own] += self.beliefs[name].sd ** 2
         return replace(known, P=P)
 
-    def _align(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
-        """The keyframe before an interval; where its attitude is poorly known, with the one it is corrected to."""
+    def _align(self, known: Gaussian, problem: Problem, k: int) -> Gaussian:
+        """The keyframe before keyframe k; where its attitude is poorly known, with the one it is corrected to."""
         if not poorly_known(known):
             return known
-        near = aligned(known, interval, self.linearize, self._gravity)
-        after = self.correct(near, interval.between, None, [])
+        own = slice(problem.measured_in(k)[0], self._first_here(problem, k))
+        near = aligned(known, problem, k, own, self.linearize, self._gravity)
+        after = self.correct(near, problem, own, None)
         return with_attitude(known, after.state.R_nb[0])
 
     def _correct(
-        self,
-        before: Gaussian,
-        measurements: Sequence[KeyframeMeasurement],
-        gates: Gates | None,
-        processed: list[ProcessedMeasurement],
+        self, before: Gaussian, problem: Problem, index: Index, gates: Gates | None, met: "Met | None"
     ) -> Gaussian:
         """The estimate corrected by measurements of no places."""
-        given = [self._of_block(before, m) for m in measurements if m.sensor in self._given]
-        r, H = self._no_rows
+        which, m = problem.which[index], len(index)
+        given = [self._of_block(before, problem, row) for row in index[self._outside[which]].tolist()]
+        others = self._no_rows
         if given:
-            r, H = np.concatenate([own for own, _ in given]), np.vstack([own for _, own in given])
-        scaled = measurements[0].scale_to_bias is not None
-        scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
-        rows = np.array([m.row[: at.ROW] for m in measurements])
-        which = np.array([self._index[m.sensor] for m in measurements])
-        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
-        since = self._since(gates or {})
-        nis, weight = np.empty(len(rows)), np.empty(len(rows))
-        places = np.zeros(len(P) - self.layout.size)
-        tables = (self._sensors, self.layout.column, scale, r, H, *self.layout.coordinates)
-        limits = since, gates is not None, self._gravity
-        correct(x, c, P, B, before.L, rows, which, *tables, *limits, nis, weight, places)
+            others = GivenRows(np.concatenate([r for r, _ in given]), np.vstack([H for _, H in given]))
+        known, measured, since = _state(before), self._rows(problem, index), self._since(gates or {})
+        out = Corrected(np.empty(m), np.empty(m), np.zeros(len(before.P) - self.layout.size))
+        correct(known, measured, others, self._model, since, gates is not None, out)
         if gates is not None:
             self._renew(gates, since)
-        met = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
-        processed += [ProcessedMeasurement(m, before.x, before.c, own, w) for m, own, w in met]
-        return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places, B, before.L)
+        if met is not None:
+            met.put(index, before, out.nis, out.weight)
+        return _estimate(known, moved(before.places, out.places) if len(out.places) else before.places)
 
     def _since(self, gates: Gates) -> Array:
         """Since when each sensor is left out, nan where it is not [s]."""
@@ -310,43 +310,41 @@ class FilterEngine:
         gates.clear()
         gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
 
-    def _of_block(self, known: Gaussian, m: KeyframeMeasurement) -> tuple[Array, Array]:
+    def _of_block(self, known: Gaussian, problem: Problem, row: int) -> tuple[Array, Array]:
         """The same of a sensor whose equation the kernels do not know."""
-        state = known.state if m.landmark is None else known.state.seeing(ORIGIN)
-        r, jacobians = self.block([m]).linearize(state)
+        state = known.state if problem.number[row] < 0 else known.state.seeing(ORIGIN)
+        r, jacobians = self.block(problem, np.array([row])).linearize(state)
         return r[0], self.layout.matrix(jacobians)[0]
 
-    def _see(self, before: Gaussian, m: KeyframeMeasurement, processed: list[ProcessedMeasurement]) -> Gaussian:
+    def _see(self, before: Gaussian, problem: Problem, row: int, met: "Met | None") -> Gaussian:
         """The estimate corrected by a place that is seen again, or with one place more."""
-        assert m.landmark is not None
-        instrument, size = self.initial.instruments[m.sensor], self.layout.size
-        r, H = self._of_block(before, m)
+        instrument, size = self.initial.instruments[PLACE], self.layout.size
+        name, number = float(problem.names[row]), int(problem.number[row])
+        time, sd = float(problem.rows[row, at.TIME]), problem.sd(np.array([row]), PLACE_DIM)[0]
+        r, H = self._of_block(before, problem, row)
         H, H_y = H[:, :size], H[:, size:]
-        match = nearest(before.P, r, H, m.sd, size, before.places, m.landmark.name)
+        match = nearest(before.P, r, H, sd, size, before.places, name)
         gate = instrument.gate_sd or np.inf
         if match is not None and match.nis <= gate**2:
             found = before.places[match.index]
-            known, weight = self._correct_by(before, m, match.r, np.hstack([match.H, H_y]))
-            seen = replace(m, landmark=m.landmark._replace(number=found.number))
-            processed.append(ProcessedMeasurement(seen, before.x, before.c, match.nis, weight, found.position))
-            return replace(known, places=seen_at(known.places, match.index, m.time))
-        place = RememberedPlace(m.landmark.name, m.landmark.number, -m.sd * r, m.time)
+            known, weight = self._correct_by(before, match.r, np.hstack([match.H, H_y]))
+            if met is not None:
+                met.see(row, before, match.nis, weight, found.position, found.number)
+            return replace(known, places=seen_at(known.places, match.index, time))
+        place = RememberedPlace(name, number, -sd * r, time)
         other, nis = (place, 0.0) if match is None else (before.places[match.index], match.nis)
-        processed.append(
-            ProcessedMeasurement(m, before.x, before.c, nis, 1.0 if match is None else 0.0, other.position)
-        )
-        by = m.sd[:, None] * H, m.sd[:, None] * H_y @ before.L
-        P, B, places = with_another(before.P, before.B, before.places, place, *by, m.sd)
+        if met is not None:
+            met.see(row, before, nis, 1.0 if match is None else 0.0, other.position, number)
+        by = sd[:, None] * H, sd[:, None] * H_y @ before.L
+        P, B, places = with_another(before.P, before.B, before.places, place, *by, sd)
         most = self.initial.config.place.remembered
         P, B, places = without_oldest(P, B, places, size, most)
         return Gaussian(before.x, before.c, P, places, B, before.L)
 
-    def _correct_by(self, before: Gaussian, m: KeyframeMeasurement, r: Array, H: Array) -> tuple[Gaussian, float]:
-        """The estimate corrected by whitened rows that are at hand, and the weight of the measurement."""
-        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
-        nis, weight, places = np.empty(1), np.empty(1), np.zeros(len(P) - self.layout.size)
-        rows, which = np.zeros((1, at.ROW)), np.array([self._index[m.sensor]])
-        tables = (self._sensors, self.layout.column, _EXACT, r, H, *self.layout.coordinates)
-        since = np.full(len(self._index), np.nan)
-        correct(x, c, P, B, before.L, rows, which, *tables, since, False, self._gravity, nis, weight, places)
-        return Gaussian(x, c, P, moved(before.places, places), B, before.L), float(weight[0])
+    def _correct_by(self, before: Gaussian, r: Array, H: Array) -> tuple[Gaussian, float]:
+        """The estimate corrected by whitened rows of a place that are at hand, and the weight of the measurement."""
+        known, since = _state(before), np.full(len(self._index), np.nan)
+        out = Corrected(np.empty(1), np.empty(1), np.zeros(len(before.P) - self.layout.size))
+        measured = MeasurementRows(np.zeros((1, at.ROW)), np.array([self._index[PLACE]]), _EXACT)
+        correct(known, measured, GivenRows(r, H), self._model, since, False, out)
+        return _estimate(known, moved(before.places, out.places)), float(out.weight[0])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import LAYOUT, calibration_size
-from rovgraph.engine.keyframes import KeyframeMeasurement
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.geometry import Array
 from rovgraph.state import State
@@ -78,7 +78,7 @@ class Gaussian:
         return states_of(self.x[None], self.c)
 
 
-def stack_states(known: Sequence["Gaussian | ProcessedMeasurement"]) -> State:
+def stack_states(known: Sequence[Gaussian]) -> State:
     """The states of n estimates as one `State`; calibration has shape (n, dim)."""
     return states_of(np.array([k.x for k in known]), np.array([k.c for k in known]))
 
@@ -99,25 +99,68 @@ class Transition:
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessedMeasurement:
-    """A measurement as the filter met it.
+class Met:
+    """The m measurements of an interval as the filter met them.
 
     Attributes
     ----------
-    measurement : at its keyframe
-    x, c : ndarray, shapes (21,), (C,), the keyframe before it entered, as of `Gaussian`
-    nis : normalised innovation squared
-    weight : 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits none of its
-        name counts as rejected, and is remembered as another
-    place : ndarray, shape (2,), where the place that is seen was believed to be, or None
+    problem, begin, end : they are from ``begin`` to before ``end`` of it
+    x, c : ndarray, shapes (m, 21), (m, C), the keyframe before each entered, as of `Gaussian`
+    nis : ndarray, shape (m,), normalised innovation squared
+    weight : ndarray, shape (m,), 1 for a full measurement, less by its loss, 0 for a rejected one; a place that fits
+        none of its name counts as rejected, and is remembered as another
+    place : ndarray, shape (m, 2), where the place that is seen was believed to be, nan where none is
+    number : ndarray of int, shape (m,), of the place that is seen, as the filter has it
     """
 
-    measurement: KeyframeMeasurement
+    problem: Problem
+    begin: int
+    end: int
     x: Array
     c: Array
-    nis: float
-    weight: float
-    place: Array | None = None
+    nis: Array
+    weight: Array
+    place: Array
+    number: NDArray[np.int64]
+
+    @staticmethod
+    def of(problem: Problem, k: int, C: int) -> "Met":
+        """Room for those of the interval that ends with keyframe k."""
+        begin, end = problem.measured_in(k)
+        m = end - begin
+        numbers = np.empty((m, 21)), np.empty((m, C)), np.zeros(m), np.zeros(m), np.full((m, 2), np.nan)
+        return Met(problem, begin, end, *numbers, problem.number[begin:end].copy())
+
+    @staticmethod
+    def none(problem: Problem, C: int) -> "Met":
+        """No measurements."""
+        m = len(problem.rows)
+        numbers = np.empty((0, 21)), np.empty((0, C)), np.empty(0), np.empty(0), np.empty((0, 2))
+        return Met(problem, m, m, *numbers, np.empty(0, np.int64))
+
+    def __len__(self) -> int:
+        return self.end - self.begin
+
+    @property
+    def index(self) -> NDArray[np.int64]:
+        """Which they are of the problem's, shape (m,)."""
+        return np.arange(self.begin, self.end)
+
+    @property
+    def sensors(self) -> list[str]:
+        """Of each."""
+        return [self.problem.sensors[k] for k in self.problem.which[self.begin : self.end].tolist()]
+
+    def put(self, index: NDArray[np.int64], before: Gaussian, nis: Array, weight: Array) -> None:
+        """Some of them, met by an estimate."""
+        own = index - self.begin
+        self.x[own], self.c[own], self.nis[own], self.weight[own] = before.x, before.c, nis, weight
+
+    def see(self, row: int, before: Gaussian, nis: float, weight: float, place: Array, number: int) -> None:
+        """One of a place."""
+        own = row - self.begin
+        self.x[own], self.c[own], self.nis[own], self.weight[own] = before.x, before.c, nis, weight
+        self.place[own], self.number[own] = place, number
 
 
 @dataclass(frozen=True)
@@ -129,13 +172,13 @@ class FilterStep:
     departed : the keyframe before, with what was measured after it; None at the first keyframe
     transition : the way from there; None at the first keyframe
     filtered : the keyframe that ends the interval
-    processed : the measurements
+    met : the measurements
     """
 
     departed: Gaussian | None
     transition: Transition | None
     filtered: Gaussian
-    processed: list[ProcessedMeasurement]
+    met: Met
 
 
 @dataclass(frozen=True)
@@ -151,7 +194,7 @@ class FilterRun:
     sensors, which : names, and ndarray of int, shape (m,), whose of them each measurement is
     interval, between : ndarray of int and of bool, shape (m,), the interval of each, and whether it belongs to the
         keyframe before that
-    nis, weight : ndarray, shape (m,), of the measurements, as of `ProcessedMeasurement`
+    nis, weight : ndarray, shape (m,), of the measurements, as of `Met`
     """
 
     before: Gaussian
@@ -176,7 +219,7 @@ class FilterRun:
 
 @dataclass(frozen=True)
 class MetStates:
-    """x and c of n measurements that a filter met while it ran through intervals, as of `ProcessedMeasurement`.
+    """x and c of n measurements that a filter met while it ran through intervals, as of `Met`.
 
     Attributes
     ----------

@@ -204,7 +204,7 @@ class _Baseline:
         begin = begin_at(wider, self.solution.point)
         values = begin.calibration[name].copy()
         for time, step in steps:
-            values[self.chain.rows.time >= time] += step
+            values[self.chain.problem.time >= time] += step
         return self.reopened(wider, replace(begin, calibration={**begin.calibration, name: values}))
 
 
@@ -302,7 +302,7 @@ def _fit_steps(now: _Baseline, error: LastingError) -> tuple[LastingError, _Base
     Costs compare where other measurements are taken out, which determinants do not.
     """
     stepped = now.with_steps(error.variable, error.sd, error.steps)
-    path, time = stepped.solution.point.calibration[error.variable], now.chain.rows.time
+    path, time = stepped.solution.point.calibration[error.variable], now.chain.problem.time
     times = [when for when, _ in error.steps]
     after = np.minimum(time.searchsorted(times), len(path) - 1)
     sizes = path[after] - path[after - 1]
@@ -479,7 +479,7 @@ def _most_likely(now: _Baseline, begin: LastingError) -> LastingError:
 
 def _time_constants(chain: Chain, sensor: str) -> tuple[float, float]:
     """The shortest and the longest that is looked for [s]."""
-    duration = float(chain.rows.time[-1] - chain.rows.time[0])
+    duration = float(chain.problem.time[-1] - chain.problem.time[0])
     shortest = SHORTEST * float(np.median(np.diff(chain.blocks[sensor].time)))
     return shortest, max(duration, shortest)
 

@@ -7,20 +7,15 @@ interpolated: rotation along its geodesic, velocity and position linearly. Predi
 for any tau, in the smoother and in filters alike.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.engine.motion import Snapshot
-from rovgraph.engine.preintegration import PreintegrationParams, integrate_motion
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rotate, transpose
-from rovgraph.instruments import Instrument
 from rovgraph.state import BIAS, POSE, VELOCITY, Delta, Jacobians, State
 
 KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
-HALF_WINDOW_S = 0.1  # around a knot, over which the rate is taken; the less noise there is in its slope the better
 
 
 @dataclass(frozen=True)
@@ -46,20 +41,12 @@ class LateStampWindow:
     bias: Array
 
     @staticmethod
-    def of(keyframe: Array, knots: Array, lag: Array, rate_b: Array, bias: Array) -> "LateStampWindow":
-        """The window of one stamp, from snapshots, shape (16,) and (K, 16), that begin at one time before them all."""
-        i, own = Snapshot.of(keyframe), knots - keyframe
-        dt, dR = own[:, 0], i.dR.T @ knots[:, 1:10].reshape(-1, 3, 3)
-        dv, dp = own[:, 10:13], own[:, 13:16] - dt[:, None] * i.dv
-        dv, dp = dv @ i.dR, dp @ i.dR  # into the keyframe's axes
-        return LateStampWindow(*(a[None] for a in (lag, dt, dR, dv, dp, rate_b, bias)))
-
-    @staticmethod
-    def stack(windows: Sequence["LateStampWindow"]) -> "LateStampWindow":
-        """Many windows as one."""
-        return LateStampWindow(
-            *(np.concatenate([getattr(t, f.name) for t in windows]) for f in fields(LateStampWindow))
-        )
+    def of(lag: Array, knots: Array, bias: Array) -> "LateStampWindow":
+        """The windows of n stamps of one sensor, shape (n, K or more, KNOT), as of `rovgraph.kernels.assembly`."""
+        n, K = len(knots), len(lag)
+        dt, dR, dv, dp, rate_b = np.split(knots[:, :K], [1, 10, 13, 16], axis=2)
+        shared = np.broadcast_to(lag, (n, K)), np.broadcast_to(bias, (n, 6))
+        return LateStampWindow(shared[0], dt[..., 0], dR.reshape(n, K, 3, 3), dv, dp, rate_b, shared[1])
 
     def at(self, index: slice | Array) -> "LateStampWindow":
         """Some of the windows."""
@@ -134,62 +121,3 @@ class LateStampWindow:
         x = (late - self.lag[:, 0]) / KNOT_S
         k = np.clip(np.floor(x).astype(int), 1, self.lag.shape[1] - 3)
         return np.arange(len(x)), k, (x - k)[:, None]
-
-
-def window_around(
-    time: float,
-    lag: Array,
-    imu: Array,
-    start: float,
-    integration: tuple[PreintegrationParams, Array],
-    longest_step: float,
-) -> LateStampWindow | None:
-    """The motion around a stamp, from IMU samples.
-
-    Parameters
-    ----------
-    time : the stamp [s]
-    lag : ndarray, shape (K,), ascending by `KNOT_S` [s]
-    imu : ndarray, shape (m, 7), time, specific force, rate in body axes
-    start : of the keyframe [s]
-    integration : parameters and bias, shape (6,), to integrate with
-    longest_step : between samples [s]
-
-    Returns
-    -------
-    LateStampWindow of one stamp, or None where samples are missing
-    """
-    params, bias = integration
-    knots = time - lag
-    around = np.append(knots, start)
-    begin, end = float(around.min()), float(around.max())
-    t = imu[:, 0]
-    if not t[0] <= begin < end <= t[-1]:
-        return None
-    within = t[t.searchsorted(begin, side="right") - 1 : t.searchsorted(end) + 1]
-    if np.diff(within).max() > longest_step:
-        return None
-    stops, place = np.unique(around, return_inverse=True)
-    _, found = integrate_motion(params, bias, imu, begin, stops, end, 0.0)
-    return LateStampWindow.of(found[place[-1]], found[place[:-1]], lag, _rate(imu, knots), bias)
-
-
-def beyond_samples(instrument: Instrument) -> str:
-    """Why a measurement of an instrument is left out that has no window."""
-    return f"calibration.{instrument.time_offset} reaches beyond the IMU's samples"
-
-
-def _rate(imu: Array, time: Array) -> Array:
-    """Rate at some times, shape (n, 3) [rad/s].
-
-    From its means over a window and over half of it, extrapolated to none: what curves cancels, noise averages.
-    """
-    t, rate = imu[:, 0], imu[:, 4:]
-    angle = np.vstack([np.zeros(3), np.cumsum(0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1]), axis=0)])
-
-    def mean(half: float) -> Array:
-        begin, end = np.clip(time - half, t[0], t[-1]), np.clip(time + half, t[0], t[-1])
-        turned = [np.interp(end, t, a) - np.interp(begin, t, a) for a in angle.T]
-        return np.column_stack(turned) / (end - begin)[:, None]
-
-    return (4.0 * mean(0.5 * HALF_WINDOW_S) - mean(HALF_WINDOW_S)) / 3.0

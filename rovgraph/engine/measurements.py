@@ -5,19 +5,17 @@ rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero wher
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 """
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from rovgraph.engine.gauss_newton import Gates
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.late_stamp_window import LateStampWindow
-from rovgraph.engine.measurement_table import MeasurementTable
+from rovgraph.engine.problem import Problem, sd_of
 from rovgraph.engine.scale import COLUMNS, SCALES, biased
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, rotate
@@ -48,7 +46,7 @@ class Block:
     Attributes
     ----------
     instrument : model, noise and loss
-    keyframe, segment : ndarray of int, shape (n,)
+    keyframe : ndarray of int, shape (n,)
     time, line : ndarray, shape (n,), and in the log
     z : ndarray, shape (n, dim)
     W : ndarray, shape (n, dim, dim), square-root information, lower triangular
@@ -59,13 +57,12 @@ class Block:
     unknowns : the calibration variables that are estimated, of those that the instrument has
     window : along which the motion goes on to where a stamp that may be late belongs, or None
     scale_to_bias : ndarray, shape (n, 6, 6), of `rovgraph.engine.scale`, or None where the IMU's scale is exact
-    place, believed : ndarray of int and of bool, shape (n,), of `LandmarkObservation`; place is -1,
-        and all are believed, where it is no place that is measured
+    place, believed : ndarray of int and of bool, shape (n,), number of the place that is seen, -1 where none is, and
+        False where the vehicle cannot have been there: it is not let in unless the optimum says otherwise
     """
 
     instrument: Instrument
     keyframe: Array
-    segment: Array
     time: Array
     line: Array
     z: Array
@@ -187,24 +184,36 @@ class Block:
         return replace(self, **arrays, motion=motion, window=window, scale_to_bias=scale_to_bias)
 
 
-_PER_MEASUREMENT = ("keyframe", "segment", "time", "line", "z", "W", "rate_b", "rate_sd", "place", "believed")
+_PER_MEASUREMENT = ("keyframe", "time", "line", "z", "W", "rate_b", "rate_sd", "place", "believed")
 
 
-def make_block(measured: MeasurementTable, instrument: Instrument, gravity: float, unknowns: Unknowns) -> Block:
-    """The measurements of one sensor; ``unknowns`` are those of the whole graph."""
-    m, dim = measured, instrument.model.dim
-    W = whitening(instrument, m.sd(dim), m.rate_sd)
-    arrays: Any = m.keyframe, m.segment, m.time, m.line, m.z(dim), W, m.rate_b, m.rate_sd, motions_of(m.rows)
-    windows = [extra.window for extra in measured.extras.values() if extra.window is not None]
-    window = LateStampWindow.stack(windows) if windows else None
-    scales = measured.scales
-    own = unknowns.of((*instrument.calibration, *(() if scales is None else SCALES)))
-    place, believed = np.full(len(measured), -1), np.full(len(measured), True)
-    for k, (_, landmark) in measured.extras.items():
-        if landmark is not None:
-            place[k], believed[k] = landmark.number, landmark.believed
-    rest: Any = gravity, own, place, believed, window, scales
-    return Block(instrument, *arrays, *rest)
+def make_block(
+    problem: Problem, index: NDArray[np.int64], instrument: Instrument, gravity: float, unknowns: Unknowns
+) -> Block:
+    """Some measurements of one sensor; ``unknowns`` are those of the whole graph."""
+    dim, rows, sensor = instrument.model.dim, problem.rows[index], problem.sensors[problem.which[index[0]]]
+    sd, rate_sd = rows[:, sd_of(dim) : sd_of(dim) + dim], rows[:, at.RATE_SD]
+    window, scales = None, problem.row_scales[index] if len(problem.row_scales) else None
+    if sensor in problem.lags:
+        knots = problem.windows[problem.window[index]]
+        window = LateStampWindow.of(problem.lags[sensor], knots, problem.bias)
+    return Block(
+        instrument,
+        problem.keyframe[index],
+        rows[:, at.TIME],
+        problem.line[index],
+        rows[:, at.Z : at.Z + dim],
+        whitening(instrument, sd, rate_sd),
+        rows[:, at.RATE : at.RATE + 3],
+        rate_sd,
+        motions_of(rows),
+        gravity,
+        unknowns.of((*instrument.calibration, *(() if scales is None else SCALES))),
+        problem.number[index],
+        problem.believed[index],
+        window,
+        scales,
+    )
 
 
 def motions_of(rows: Array) -> Delta:
@@ -299,16 +308,15 @@ def measurement_cost(seen: Seen, gates: Gates) -> float:
 
 
 def blocks_of(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     sensors: Container[str],
     instruments: Mapping[str, Instrument],
     gravity: float,
     unknowns: Unknowns,
 ) -> dict[str, Block]:
     """The measurements of a dive, by sensor, of some sensors."""
-    measured = MeasurementTable.of_dive(intervals)
     return {
-        sensor: make_block(measured.of_sensor(sensor), instruments[sensor], gravity, unknowns)
-        for sensor in measured.used
+        sensor: make_block(problem, problem.of_sensor(sensor), instruments[sensor], gravity, unknowns)
+        for sensor in problem.used
         if sensor in sensors
     }

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.engine.gauss_newton import Solution
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
 from rovgraph.state import State
@@ -45,7 +45,7 @@ class Optimum(Protocol):
 
     Attributes
     ----------
-    intervals : the dive, each landmark given to its place
+    problem : the dive, each landmark given to its place
     beliefs, unknowns : the calibration variables
     blocks : sensor -> its measurements
     state : State of n epochs; calibration that walks has shape (n, dim), all other (dim,)
@@ -55,7 +55,7 @@ class Optimum(Protocol):
     """
 
     @property
-    def intervals(self) -> Sequence[KeyframeInterval]: ...
+    def problem(self) -> Problem: ...
     @property
     def beliefs(self) -> Mapping[str, Belief]: ...
     @property
@@ -139,7 +139,7 @@ def joint_prior_sd(optimum: Optimum, keyframe: int) -> dict[str, Array]:
     -------
     dict : name -> ndarray, shape (dim,)
     """
-    seconds = optimum.intervals[keyframe].time - optimum.intervals[0].time
+    seconds = float(optimum.problem.time[keyframe] - optimum.problem.time[0])
     beliefs = optimum.beliefs
     out = {}
     for name in optimum.unknowns.estimated:

@@ -5,21 +5,19 @@ know without the angular acceleration that (3.1) neglects. Samples are rotated i
 axes first, so biases are in body axes. The equations are in `rovgraph.kernels.preintegration`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rovgraph.config import Config
-from rovgraph.engine.motion import Motion, Snapshot
+from rovgraph.engine.constant_velocity import NO_BIAS_SD, has_constant_velocity
 from rovgraph.geometry import Array, earth_rate_n
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.kernels.preintegration import preintegrate as integrate
 
 INTEGRATION_SD = 1e-3  # per root second; smaller makes the covariance nearly singular
-ROWS_AT_ONCE = 512
-KNOCK = 3.0  # times the believed noise, before an interval's own scatter is taken
 
 
 @dataclass(frozen=True)
@@ -35,41 +33,26 @@ class PreintegrationParams:
 
     densities: Sequence[float]
     gravity: float
-    earth_rate_n: Sequence[float]
-
-    def __post_init__(self) -> None:
-        row = np.zeros(at.ROW)
-        row[at.NOISE : at.NOISE + 5], row[at.GRAVITY] = self.densities, self.gravity
-        row[at.EARTH_RATE : at.EARTH_RATE + 3] = self.earth_rate_n
-        object.__setattr__(self, "_rows", _copies(row))
+    earth_rate_n: Sequence[float] | Array
 
     def row(self, bias: Array, gap_s: float) -> Array:
         """The row of a motion that is yet to be integrated."""
-        row: Array = next(self._rows)  # type: ignore[attr-defined]
+        row = np.zeros(at.ROW)
+        row[at.NOISE : at.NOISE + 5], row[at.GRAVITY] = self.densities, self.gravity
+        row[at.EARTH_RATE : at.EARTH_RATE + 3] = self.earth_rate_n
         row[at.BIAS : at.BIAS + 6], row[at.GAP] = bias, gap_s
         return row
 
 
-def _copies(row: Array) -> Iterator[Array]:
-    """Copies of a row, side by side in arrays that grow: freed together, they leave no holes in the memory."""
-    count = 1
-    while True:
-        yield from np.tile(row, (count, 1))
-        count = min(2 * count, ROWS_AT_ONCE)
-
-
-def preintegration_params(config: Config, acc: float, gyr: float) -> PreintegrationParams:
-    """Parameters for a configuration and noise densities.
-
-    Parameters
-    ----------
-    config : Config
-    acc, gyr : noise densities [m/s^2/rtHz, rad/s/rtHz]
-    """
+def preintegration_params(config: Config) -> PreintegrationParams:
+    """Parameters of a configuration; without an IMU those of a motion without gravity, whose biases stay."""
+    if has_constant_velocity(config):
+        motion = config.motion
+        return PreintegrationParams((motion.acc, motion.gyr, NO_BIAS_SD, NO_BIAS_SD, INTEGRATION_SD), 0.0, np.zeros(3))
     noise, env = config.imu.noise, config.environment
     rate = earth_rate_n(np.deg2rad(env.latitude_deg or 0.0)) if env.earth_rotation else np.zeros(3)
-    densities = (acc, gyr, noise.acc_walk, noise.gyr_walk, INTEGRATION_SD)
-    return PreintegrationParams(densities, env.gravity_mps2, rate.tolist())
+    densities = (noise.acc, noise.gyr, noise.acc_walk, noise.gyr_walk, INTEGRATION_SD)
+    return PreintegrationParams(densities, env.gravity_mps2, rate)
 
 
 def scatter(time: Array, samples: Array) -> Array:
@@ -99,7 +82,7 @@ def preintegrate(
     stops: Array,
     end: float,
     gap_s: float = 0.0,
-) -> tuple[Motion, list[Snapshot]]:
+) -> tuple[Array, Array]:
     """Integrate IMU samples from ``start`` to ``end``.
 
     Parameters
@@ -114,19 +97,9 @@ def preintegrate(
 
     Returns
     -------
-    motion : Motion
-    snapshots : list of Snapshot, k
+    motion : ndarray, shape (ROW,), of `rovgraph.kernels.motion_row`
+    snapshots : ndarray, shape (k, SNAPSHOT), of `rovgraph.kernels.preintegration`
     """
-    motion, snapshots = integrate_motion(params, bias, imu, start, stops, end, gap_s)
-    return motion, [Snapshot.of(snapshot) for snapshot in snapshots]
-
-
-def integrate_motion(
-    params: PreintegrationParams, bias: Array, imu: Array, start: float, stops: Array, end: float, gap_s: float
-) -> tuple[Motion, Array]:
-    """The same with all snapshots in one array, shape (k, SNAPSHOT)."""
     row, snapshots = params.row(bias, gap_s), np.empty((len(stops), SNAPSHOT))
-    times = np.array([start, end])
-    counts = np.array([0, len(imu), 0, len(stops)])
-    integrate(imu, counts[:1], counts[1:2], times[:1], times[1:], stops, counts[2:], row[None], snapshots)
-    return Motion(row, imu, start, end, stops), snapshots
+    integrate(imu, start, end, stops, row, snapshots)
+    return row, snapshots

@@ -15,7 +15,6 @@ import numpy as np
 
 from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.optimum import Optimum
@@ -54,10 +53,8 @@ def as_chain(best: Optimum, initial: InitialConditions) -> ChainOptimum:
     """
     if isinstance(best, ChainOptimum):
         return best
-    intervals = [replace(i, measurements=[m for m in i.measurements if m.sensor != PLACE]) for i in best.intervals]
-    rows = DiveRows.of(intervals, [*initial.instruments])
     gates = {sensor: gate for sensor, gate in best.solution.gates.items() if sensor != PLACE}
-    chain = Chain(intervals, initial, best.beliefs, best.unknowns, rows)
+    chain = Chain(best.problem.without(PLACE), initial, best.beliefs, best.unknowns)
     return ChainOptimum(chain, replace(best.solution, point=best.state, gates=gates))
 
 

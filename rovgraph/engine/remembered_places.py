@@ -27,7 +27,7 @@ class RememberedPlace:
 
     Attributes
     ----------
-    name, number : of `rovgraph.engine.keyframes.LandmarkObservation`
+    name, number : of the sightings
     position : ndarray, shape (2,), north and east [m]
     time : when it was last seen [s]
     """

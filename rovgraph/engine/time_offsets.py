@@ -1,4 +1,4 @@
-"""TimeOffsets that may be late, and where on the time line a measurement is put for that.
+"""How late stamps may be, and where on the time line a measurement is put for that.
 
 A measurement stands at its stamp less the time_offset that is assumed; what remains until the
 time_offset that is estimated is bridged by a `LateStampWindow`. So the assumption need not be right, but the
@@ -6,9 +6,8 @@ nearer it is, the less of the IMU's noise lies between a measurement and its key
 assumption may be renewed while measurements come.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,31 +15,8 @@ from rovgraph.calibration import LAYOUT, Belief
 from rovgraph.engine.late_stamp_window import KNOT_S
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
-from rovgraph.log import Measurement
-from rovgraph.log.packing import pack, unpack
 
 REACH_SD = 4.0  # of the prior, that a time_offset may be off
-
-
-class StampedMeasurement(NamedTuple):
-    """A `rovgraph.log.Measurement` at the time where it is put; ``stamp`` is the time that it came with [s]."""
-
-    time: float
-    sensor: str
-    values: Array
-    row: int
-    stamp: float
-
-
-def pack_stamped(placed: Sequence[StampedMeasurement]) -> dict[str, Any]:
-    """As arrays."""
-    return {"measurements": pack([Measurement(*p[:4]) for p in placed]), "stamps": [p.stamp for p in placed]}
-
-
-def unpack_stamped(packed: Mapping[str, Any]) -> list[StampedMeasurement]:
-    """The inverse of `pack_stamped`."""
-    both = zip(unpack(packed["measurements"]), packed["stamps"], strict=True)
-    return [StampedMeasurement(*m, stamp) for m, stamp in both]
 
 
 @dataclass
@@ -78,10 +54,6 @@ class TimeOffsets:
         every = np.concatenate([[0.0], *self.lags.values(), list(self.assumed.values())])
         return float(np.ptp(every))
 
-    def placed(self, m: Measurement) -> StampedMeasurement:
-        """A measurement where it is assumed to belong."""
-        return StampedMeasurement(m.time - self.of_sensor(m.sensor), m.sensor, m.values, m.row, m.time)
-
     def of_sensor(self, sensor: str) -> float:
         """By how much measurements of a sensor are put earlier [s]."""
         return self.assumed.get(self.variable.get(sensor, ""), 0.0)
@@ -100,7 +72,7 @@ class TimeOffsets:
         return max((float(np.abs(calibration[n] - self.assumed[n]).mean()) for n in self.lags), default=0.0)
 
     def centred(self, calibration: Mapping[str, Array], reach: float) -> "TimeOffsets":
-        """TimeOffsets that are about as late as was estimated, shape (n, 1) or (1,) each, within ``reach`` [s]."""
+        """Offsets that are about as late as was estimated, shape (n, 1) or (1,) each, within ``reach`` [s]."""
         assumed = self.assumed | {name: float(np.mean(calibration[name])) for name in self.lags}
         lags = {name: around(assumed[name], reach + float(np.ptp(calibration[name]))) for name in self.lags}
         return TimeOffsets(self.variable, lags, assumed)

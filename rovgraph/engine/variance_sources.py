@@ -103,7 +103,7 @@ def _of_noise(chain: Chain, point: State, step: ChainStep) -> list[tuple[str, fl
     """What the IMU's noise, priors and walks bring: their residuals are differenced along the step."""
     ahead, behind = (chain.moved(point, step, sign * STEP / _size(step)) for sign in (1.0, -1.0))
     scale = (_size(step) / (2 * STEP)) ** 2
-    out = [("imu", scale * _squares(chain.rows.motion_residuals(ahead) - chain.rows.motion_residuals(behind)))]
+    out = [("imu", scale * _squares(chain.problem.motion_residuals(ahead) - chain.problem.motion_residuals(behind)))]
     starts, priors = (a - b for a, b in zip(chain.prior_residuals(ahead), chain.prior_residuals(behind), strict=True))
     out += [(f"start {name}", scale * _squares(starts[part])) for name, part in PRIOR.items()]
     ends = np.cumsum([TABLE[name].dim for name in chain.unknowns.estimated])

@@ -37,19 +37,19 @@ def widened(chain: Chain, state: State, names: tuple[str, ...], beliefs: Mapping
     names : constants that are not estimated, and whose sensors are in use
     beliefs : of all of the calibration; None = the chain's own
     """
-    wide, timed, rows = chain.unknowns.estimating(names), {}, chain.rows
+    wide, timed, rows = chain.unknowns.estimating(names), {}, chain.problem
     offsets = {i.time_offset for i in chain.initial.instruments.values()}
     for sensor, block in chain.blocks.items() if offsets & set(names) else ():
         if block.instrument.time_offset in names and block.window is None:
             timed[sensor] = _timed(block, wide, chain, state)
     if {*SCALES} & set(names) and not len(rows.scales):
         rows = replace(rows, scales=_mean_signal_to_bias(chain, state))
-    return _WidenedChain(chain.intervals, chain.initial, beliefs or chain.beliefs, wide, rows, timed)
+    return _WidenedChain(rows, chain.initial, beliefs or chain.beliefs, wide, timed)
 
 
 def begin_at(chain: Chain, point: State) -> State:
     """A point of a chain, from one of a chain with other unknowns."""
-    n, calibration = len(chain.intervals), dict(point.calibration)
+    n, calibration = len(chain.problem), dict(point.calibration)
     for name in chain.layout.walking:
         calibration[name] = np.array(np.broadcast_to(calibration[name], (n, TABLE[name].dim)))
     return replace(point, calibration=calibration)
@@ -106,7 +106,7 @@ def _timed(block: Block, wide: Unknowns, chain: Chain, state: State) -> _TimedBl
     """A block that knows how its predictions change with time [unit/s], from the keyframes around each."""
     scales = SCALES if block.scale_to_bias is not None else ()
     wider = replace(block, unknowns=wide.of([*block.instrument.calibration, *scales]))
-    model, time, rate_b = block.instrument.model, chain.rows.time, np.array([i.rate_b for i in chain.intervals])
+    model, time, rate_b = block.instrument.model, chain.problem.time, chain.problem.rate_b
     before = np.maximum(block.keyframe - (block.motion.dt < SHORT_S), 0)
     after, slope = np.minimum(block.keyframe + 1, len(time) - 1), np.empty(block.z.shape)
     for part in pieces(0, len(block)):
@@ -120,7 +120,7 @@ def _timed(block: Block, wide: Unknowns, chain: Chain, state: State) -> _TimedBl
 
 def _mean_signal_to_bias(chain: Chain, state: State) -> Array:
     """As `rovgraph.engine.scale.scale_to_bias`, from the preintegrated motions, shape (n - 1, 6, 6)."""
-    rows: Array = chain.rows.motions
+    rows: Array = chain.problem.motions
     bias = state.bias[:-1]
     R_bs = mount_matrix(chain.initial.config.imu.mount_rpy_deg)
     seconds = np.maximum(rows[:, at.DURATION], 1e-6)[:, None]

@@ -7,7 +7,7 @@ none for longer it is that through the water, if that is measured, and the curre
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import motions_of
+from rovgraph.engine.problem import Problem
 from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
 from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity, rotate, transpose
 from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.kernels.dead_reckoning import reckon_attitude
+from rovgraph.kernels.measurement_row import RATE, RATE_SD, TIME
 from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
 
@@ -45,7 +45,8 @@ class _Epochs:
     assumed : ndarray, shape (m, 6), bias that the motion is for
     bridged, outage : ndarray of bool, shape (m,), samples of the IMU are missing; for so long that it is an outage
     keyframe : ndarray of int, shape (n,), epochs of the keyframes
-    measured, epoch : measurements in the order of time, and ndarray of int, the epoch of each
+    problem : the dive
+    measured, epoch : ndarray of int, measurements in the order of time, and the epoch of each
     """
 
     time: Array
@@ -56,13 +57,14 @@ class _Epochs:
     bridged: NDArray[np.bool_]
     outage: NDArray[np.bool_]
     keyframe: NDArray[np.intp]
-    measured: MeasurementTable
+    problem: Problem
+    measured: NDArray[np.int64]
     epoch: NDArray[np.intp]
 
-    def of(self, sensor: str | None) -> tuple[NDArray[np.intp], MeasurementTable]:
+    def of(self, sensor: str | None) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Epochs and measurements of a sensor."""
-        own = self.measured.places_of(sensor)
-        return self.epoch[own], self.measured.at(own)
+        own = np.isin(self.measured, self.problem.of_sensor(sensor))
+        return self.epoch[own], self.measured[own]
 
 
 @dataclass(frozen=True)
@@ -88,60 +90,58 @@ class _Pings:
 
 
 def dead_reckon(
-    intervals: Sequence[KeyframeInterval], initial: InitialConditions, calibration: Mapping[str, Array]
+    problem: Problem, initial: InitialConditions, calibration: Mapping[str, Array]
 ) -> State:
     """The state at every keyframe, at the IMU.
 
     Parameters
     ----------
-    intervals : of `rovgraph.engine.assembly.Assembler`, the first without motion
+    problem : n keyframes
     initial : the resolved start
     calibration : all calibration variables, at their means
 
     Returns
     -------
-    State of ``len(intervals)`` epochs
+    State of n epochs
     """
     sources: list[str] = [s for s in HEADING_STREAMS if s in initial.instruments]
     compass = next(iter(trusted_first(initial.config, sources)), None)
-    epochs = _gather(intervals, {"dvl", "dvl_water", compass})
+    epochs = _gather(problem, {"dvl", "dvl_water", compass})
     bottom, water = (_pings(epochs, sensor, initial, calibration) for sensor in ("dvl", "dvl_water"))
     R_nb, bias = _attitudes(epochs, bottom, compass, initial, calibration)
     v_n = _velocities(epochs, R_nb, bias, bottom, water, calibration["current"])
     step = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(epochs.time)[:, None]
     k = epochs.keyframe
     p_n = (initial.prior.state.p_n[0] + np.vstack([np.zeros(3), np.cumsum(step, axis=0)]))[k]
-    p_n[:, 2] = _depths(intervals, p_n[:, 2], R_nb[k], initial, calibration)
+    p_n[:, 2] = _depths(problem, p_n[:, 2], R_nb[k], initial, calibration)
     return State(R_nb[k], p_n, v_n[k], bias[k], dict(calibration))
 
 
-def _motions(intervals: Sequence[KeyframeInterval]) -> tuple[Array, Array, Array, Array]:
+def _motions(problem: Problem) -> tuple[Array, Array, Array, Array]:
     """Duration of n intervals, their rotations and velocities, and the biases that they are for; zero where none."""
-    rows = np.zeros((len(intervals), at.NOISE))
-    for k, interval in enumerate(intervals):
-        if interval.motion is not None:
-            rows[k] = interval.motion.row[: at.NOISE]
+    rows = np.zeros((len(problem), at.NOISE))
+    rows[1:] = problem.motions[:, : at.NOISE]
     tangent = rows[:, at.TANGENT : at.BIAS]
     return rows[:, at.DURATION], exp_rotation(tangent[:, :3]), tangent[:, 6:], rows[:, at.BIAS :]
 
 
-def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | None]) -> _Epochs:
+def _gather(problem: Problem, sensors: Collection[str | None]) -> _Epochs:
     """The epochs of all keyframes and of some sensors."""
-    every, n = MeasurementTable.of_dive(intervals), len(intervals)
-    wanted = np.isin(every.which, [k for k, sensor in enumerate(every.sensors) if sensor in sensors])
-    found = every.at(np.flatnonzero(wanted))
-    own = np.arange(n).repeat([len(i.measurements) for i in intervals])[wanted]
-    here = found.keyframe == np.array([i.index for i in intervals])[own]
+    n = len(problem)
+    wanted = np.isin(problem.which, [k for k, sensor in enumerate(problem.sensors) if sensor in sensors])
+    found = np.flatnonzero(wanted)
+    own, rows = problem.interval[found], problem.rows[found]
+    here = problem.keyframe[found] == own
     # in an interval first what lies between the keyframes, then its own, then what is measured there
     order = np.argsort(np.concatenate([3 * np.arange(n) + 1, 3 * own + 2 * here]), kind="stable")
     place = np.empty(len(order), np.intp)
     place[order] = np.arange(len(order))
     keyframe, k, of = place[:n], place[n:], np.concatenate([np.arange(n), own])[order]
-    m, motion = len(order), motions_of(found.rows)
+    m, motion = len(order), motions_of(rows)
     time, dt, dR, dv, assumed = np.empty(m), np.empty(m), np.empty((m, 3, 3)), np.empty((m, 3)), np.empty((m, 6))
-    time[keyframe] = [i.time for i in intervals]
-    dt[keyframe], dR[keyframe], dv[keyframe], assumed[keyframe] = _motions(intervals)
-    time[k], dt[k], dR[k], dv[k], assumed[k] = found.time, motion.dt, motion.dR, motion.dv, motion.bias
+    time[keyframe] = problem.time
+    dt[keyframe], dR[keyframe], dv[keyframe], assumed[keyframe] = _motions(problem)
+    time[k], dt[k], dR[k], dv[k], assumed[k] = rows[:, TIME], motion.dt, motion.dR, motion.dv, motion.bias
     begin, begin_R, begin_v = np.roll(dt, 1), np.roll(dR, 1, axis=0), np.roll(dv, 1, axis=0)
     first = (keyframe + 1) % m
     begin[first], begin_R[first], begin_v[first] = 0.0, identity(3), 0.0
@@ -151,9 +151,10 @@ def _gather(intervals: Sequence[KeyframeInterval], sensors: Collection[str | Non
         transpose(begin_R) @ dR,
         rotate(transpose(begin_R), dv - begin_v),
         assumed,
-        np.array([i.bridged for i in intervals])[of],
-        np.array([i.motion is not None and i.motion.coasted for i in intervals])[of],
+        problem.bridged[of],
+        problem.coasted[of],
         keyframe,
+        problem,
         found,
         k,
     )
@@ -167,10 +168,12 @@ def _pings(epochs: _Epochs, sensor: str, initial: InitialConditions, calibration
     R_bs = dvl_mounting(State(np.eye(3)[None], still, still, np.zeros((1, 6)), calibration))[0]
     model: Any = initial.instruments[sensor].model
     arm = model.lever_arm_b + calibration["dvl_lever_arm"]
-    velocity_b = pings.z(3) @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(pings.rate_b, arm)
-    var = pings.sd(3) ** 2
+    rows = epochs.problem.rows[pings]
+    rate_b, rate_sd = rows[:, RATE : RATE + 3], rows[:, RATE_SD]
+    velocity_b = epochs.problem.z(pings, 3) @ R_bs.T / (1.0 + calibration["dvl_scale"]) - cross(rate_b, arm)
+    var = epochs.problem.sd(pings, 3) ** 2
     own = 0.5 * (np.sum(var, axis=1) - np.min(var, axis=1))  # the smallest is that of the vertical
-    return _Pings(k, velocity_b, own + np.dot(arm, arm) * pings.rate_sd**2, arm)
+    return _Pings(k, velocity_b, own + np.dot(arm, arm) * rate_sd**2, arm)
 
 
 def _attitudes(
@@ -198,7 +201,7 @@ def _attitudes(
     k, headings = epochs.of(compass)
     if compass is not None and len(k):
         instrument = initial.instruments[compass]
-        z = headings.z(instrument.model.dim)
+        z = epochs.problem.z(headings, instrument.model.dim)
         turn = solve_turn(instrument, z, R_nb[k], calibration)
         noise = turn_noise(instrument, R_nb[k], turn, calibration, beliefs(config))
         turns[k], reference[:] = np.column_stack([turn, noise.variance, noise.by_tilt]), R_nb
@@ -260,17 +263,17 @@ def _through_water(
 
 
 def _depths(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     integrated: Array,
     R_nb: Array,
     initial: InitialConditions,
     calibration: Mapping[str, Array],
 ) -> Array:
     """Depth of the IMU from the pressure sensor, where there is one."""
-    found = MeasurementTable.of_dive(intervals).of_sensor("depth")
+    found = problem.of_sensor("depth")
     if not len(found):
         return integrated
     arm = initial.instruments["depth"].model.lever_arm_b  # type: ignore[attr-defined]
-    own = np.interp([i.time for i in intervals], found.time, found.z(1)[:, 0]) - calibration["depth_offset"]
+    own = np.interp(problem.time, problem.rows[found, TIME], problem.z(found, 1)[:, 0]) - calibration["depth_offset"]
     own /= 1.0 + calibration["depth_scale"]
     return np.asarray(own - rotate(R_nb, arm)[:, 2])

@@ -83,7 +83,7 @@ def _by_rate_noise(best: Optimum, keyframes: Sequence[int], sd: Array) -> Array:
     out = np.zeros((*sd.shape, sd.shape[1]))
     if best.unknowns.walks.get(ARM) == 0.0:
         own = np.r_[estimated_parts(best)[ARM]]
-        until = (np.array(keyframes) + 1.0) / len(best.intervals)
+        until = (np.array(keyframes) + 1.0) / len(best.problem)
         out[:, own, own] = until[:, None] * spurious_information(best).information * sd[:, own] ** 2
     return out
 
@@ -109,7 +109,7 @@ def relative_sd(best: Optimum, covariance: Array, prior: Mapping[str, Array]) ->
     at_stake = [r for name in SPURIOUSLY_OBSERVABLE if name in ratio for r in ratio[name]]
     if not any(DOUBTFUL_ABOVE < r <= UNOBSERVABLE_ABOVE for r in at_stake):
         return ratio
-    end, before = [len(best.intervals) - 1], np.concatenate([prior[name] for name in ratio])
+    end, before = [len(best.problem) - 1], np.concatenate([prior[name] for name in ratio])
     seen = data_information(covariance[None], before)
     without = _sds(relative_covariance(without_spurious_information(best, end, seen, before[None]))[0], prior)
     return without | {name: ratio[name] for name in ratio if name == ARM}
@@ -155,7 +155,7 @@ def without_what_noise_moves(best: Optimum) -> tuple[Optimum, dict[str, Array]]:
     Optimum : the dive
     dict : name -> ndarray, shape (dim,), of what was estimated
     """
-    before = joint_prior_sd(best, len(best.intervals) - 1)
+    before = joint_prior_sd(best, len(best.problem) - 1)
     own = slice(NEWEST, NEWEST + sum(map(len, before.values())))
     covariance = best.newest_covariance()[own, own]
     relative = relative_sd(best, covariance, before)

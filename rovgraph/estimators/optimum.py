@@ -6,10 +6,9 @@ import numpy as np
 
 from rovgraph.engine.chain_optimum import ChainOptimum, smooth_chain
 from rovgraph.engine.constant_velocity import has_constant_velocity
-from rovgraph.engine.dive_rows import DiveRows
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.rate_noise import ARM, noise_moves_arm, with_arm_of_rates
 from rovgraph.engine.stretches import CLEAR, Searches
 from rovgraph.estimators.observability import shown, shown_below
@@ -22,37 +21,34 @@ MOVED = 4.0  # prior sds from its mean, beyond which a constant is named wrongly
 
 
 def optimum(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     initial: InitialConditions,
     states: State,
     calibration: Mapping[str, Array] | None = None,
-    rows: DiveRows | None = None,
     searches: Searches | None = None,
 ) -> Optimum:
     """Solve a dive; what is considered is estimated where the dive shows it.
 
     Parameters
     ----------
-    intervals, initial : the dive
+    problem, initial : the dive
     states : State of its keyframes to begin with
     calibration : to begin with, its prior means where it is None
-    rows : the dive as arrays, where they are at hand
     searches : of other solutions of the dive, as configured the same
 
     Raises
     ------
     InputError : the data do not determine some variable, which is named
     """
-    used = rows.used if rows else {m.sensor for interval in intervals for m in interval.measurements}
-    if PLACE in used:
+    if PLACE in problem.used:
         from rovgraph.graph.places import smooth_graph  # GTSAM is slow to load, and not everywhere to be had
 
-        best: Optimum = smooth_graph(intervals, initial, states, calibration)
+        best: Optimum = smooth_graph(problem, initial, states, calibration)
     else:
-        best = smooth_chain(intervals, initial, states, calibration, rows, searches)
+        best = smooth_chain(problem, initial, states, calibration, searches)
     hidden = unseen(best.blocks) if has_constant_velocity(initial.config) else []
     if isinstance(best, ChainOptimum) and best.unknowns.considered and _contradicted(best):
-        free = smooth_chain(intervals, initial, states, calibration, rows, freed=True)
+        free = smooth_chain(problem, initial, states, calibration, freed=True)
         if _explains(free, best):
             return with_arm_of_rates(_with_what_is_shown(free, best.unknowns.considered, hidden))
     seen = [name for name in shown(best) if name not in hidden]

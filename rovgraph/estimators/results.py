@@ -1,4 +1,4 @@
-"""From GTSAM values and covariances to an `Estimate` of the body's origin."""
+"""From states and covariances at the IMU to an `Estimate` of the body's origin."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -8,12 +8,12 @@ from numpy.typing import ArrayLike
 
 from rovgraph.calibration import CONSIDERED, TABLE, Belief
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
 from rovgraph.estimators.observability import verdict
 from rovgraph.estimators.unchecked import rests_on_doubtful_compass
 from rovgraph.geometry import Array, cross, rotate, skew, transpose
+from rovgraph.kernels.assembly import RATE_B, SPREAD, TIME
 from rovgraph.sensors import innovation
 from rovgraph.state import State
 from rovgraph.trajectory import Trajectory
@@ -22,7 +22,7 @@ _XYZ = ("_x", "_y", "_z")
 
 
 def body_trajectory(
-    intervals: Sequence[KeyframeInterval],
+    keyframes: Array,
     states: State,
     initial: InitialConditions,
     cov_pose: Array | None = None,
@@ -32,16 +32,15 @@ def body_trajectory(
 
     Parameters
     ----------
-    intervals : n, the keyframes
+    keyframes : ndarray, shape (n, KEYFRAME), of `rovgraph.kernels.assembly`
     states : State of n epochs, at the IMU
     initial : of the dive
     cov_pose : ndarray, shape (n, 6, 6), in GTSAM's tangent space, or None
     cov_velocity : ndarray, shape (n, 3, 3), in n, or None
     """
     R, lever_arm_b = np.ascontiguousarray(states.R_nb), np.asarray(initial.config.imu.lever_arm_m)
-    time = np.array([i.time for i in intervals])
-    rate_b = np.array([i.rate_b for i in intervals])
-    rate_sd = np.array([i.rate_sd for i in intervals])[:, None, None]
+    time, rate_b = keyframes[:, TIME].copy(), keyframes[:, RATE_B : RATE_B + 3]
+    rate_sd = keyframes[:, SPREAD, None, None]
     p_n = states.p_n - rotate(R, lever_arm_b)
     v_n = states.v_n - rotate(R, cross(rate_b - states.bias[:, 3:], lever_arm_b))
     if cov_pose is None or cov_velocity is None:

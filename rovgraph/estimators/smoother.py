@@ -7,12 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rovgraph.engine.assembly import Assembler
-from rovgraph.engine.constant_velocity import has_constant_velocity
-from rovgraph.engine.dive_rows import DiveRows
+from rovgraph.engine.assembly import assembly_of
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.log_assembly import assemble_log
 from rovgraph.engine.optimum import NEWEST, Optimum, joint_prior_sd, residual_state
 from rovgraph.engine.stretches import Searches
 from rovgraph.engine.time_offsets import TimeOffsets
@@ -28,7 +24,7 @@ from rovgraph.estimators.results import (
     residual_frame,
 )
 from rovgraph.geometry import Array
-from rovgraph.log import Log, Measurement
+from rovgraph.log import Log
 from rovgraph.state import BIAS, PLACE, POSE, VELOCITY, State
 
 MAX_PLACINGS = 4  # solutions, each with late measurements put where the one before has found them to belong
@@ -38,75 +34,34 @@ CENTRED_REACH_S = 0.1  # around the time_offset that was found
 
 @dataclass
 class BatchSmoother:
-    """Collects a dive and solves it at once.
+    """A dive that is solved at once.
 
     Attributes
     ----------
     initial : of `rovgraph.estimators.initialise.initialise`
-    time_offsets : how late they are; None = as the configuration believes
+    log : the dive
+    time_offsets : how late stamps are; None = as the configuration believes
     searches : for stretches of wrong measurements, shared with whoever solves the same dive
-    intervals : the dive, as far as it has been taken
+    problem : the dive as arrays
+    left_out : (sensor, reason) -> count of measurements that never reach it
     """
 
     initial: InitialConditions
-    time_offsets: TimeOffsets | None = None
+    log: Log
+    time_offsets: TimeOffsets = None  # type: ignore[assignment]
     searches: Searches = field(default_factory=Searches)
 
     def __post_init__(self) -> None:
-        b = self.initial
-        self.assembler = Assembler(
-            b.config, b.instruments, b.prior.state.bias[0], believed=b.beliefs, assumed=self.time_offsets
-        )
-        self.intervals: list[KeyframeInterval] = []
-        self._log: Log | None = None
-        self._rows: DiveRows | None = None
-        self._measurements: list[Measurement] = []
-
-    def take(self, log: Log) -> list[KeyframeInterval]:
-        """Take a whole log, before anything else: what `add` of each of its measurements and `finish` give."""
-        self._log = log
-        b, assembler = self.initial, self.assembler
-        if has_constant_velocity(b.config):  # every measurement may make a keyframe, and no samples lie between
-            for measurement in log.measurements():
-                self.intervals += assembler.add(measurement)
-            return self.finish()
-        bias, offsets, left_out = b.prior.state.bias[0], assembler.time_offsets, assembler.left_out
-        dive = assemble_log(log, b.config, b.instruments, bias, offsets, left_out, b.beliefs)
-        self.intervals, self._rows = dive.intervals, dive.rows
-        return dive.intervals
-
-    @property
-    def measurements(self) -> list[Measurement]:
-        """The dive as it came, where the time offset of a sensor is estimated; else none."""
-        if self._log is None or not self.assembler.time_offsets.lags:
-            return self._measurements
-        return list(self._log.measurements())
-
-    @property
-    def rows(self) -> DiveRows:
-        """The dive as arrays, as far as it has been taken."""
-        if self._rows is None or len(self._rows) != len(self.intervals):
-            self._rows = DiveRows.of(self.intervals, [*self.initial.instruments])
-        return self._rows
+        assembly = assembly_of(self.initial, self.time_offsets)
+        assembly.take(self.log)
+        assembly.extend(finish=True)
+        self.time_offsets = assembly.time_offsets
+        self.problem, self.left_out = assembly.problem, assembly.left_out
 
     def forget_motion_covariances(self) -> None:
         """Free the memory of what a filter needs, and GTSAM's graph of a dive that sees places, but not the chain."""
-        if self._rows is not None and PLACE not in self._rows.used:
-            self._rows = self._rows.without_covariances(self.intervals)
-
-    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
-        """Take a measurement; times must not decrease."""
-        if self.assembler.time_offsets.lags:
-            self._measurements.append(measurement)
-        done = self.assembler.add(measurement)
-        self.intervals += done
-        return done
-
-    def finish(self) -> list[KeyframeInterval]:
-        """Close the last interval."""
-        done = self.assembler.finish()
-        self.intervals += done
-        return done
+        if PLACE not in self.problem.used:
+            self.problem = self.problem.without_covariances()
 
     def solve(self, states: State | None = None) -> Estimate:
         """The smoothed trajectory with its uncertainty; ``states`` as `optimum` takes them."""
@@ -124,8 +79,8 @@ class BatchSmoother:
         calibration = None if states is None else newest_calibration(states.calibration)
         for _ in range(MAX_PLACINGS):
             if states is None:
-                states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in priors.items()})
-            best = optimum(dive.intervals, b, states, calibration, dive.rows, dive.searches)
+                states = dead_reckon(dive.problem, b, {name: belief.mean for name, belief in priors.items()})
+            best = optimum(dive.problem, b, states, calibration, dive.searches)
             found = best.state.calibration
             again = dive.placed_again(found)
             if again is None:
@@ -140,23 +95,16 @@ class BatchSmoother:
         ----------
         calibration : name -> ndarray, shape (dim,) or (n, dim), what was found
         """
-        if self.assembler.time_offsets.off(calibration) < PLACED_WITHIN_S:
+        if self.time_offsets.off(calibration) < PLACED_WITHIN_S:
             return None
-        again = BatchSmoother(self.initial, self.assembler.time_offsets.centred(calibration, CENTRED_REACH_S))
-        if self._log is not None:
-            again.take(self._log)
-            return again
-        for measurement in self._measurements:
-            again.add(measurement)
-        again.finish()
-        return again
+        return BatchSmoother(self.initial, self.log, self.time_offsets.centred(calibration, CENTRED_REACH_S))
 
     def dead_reckoning(self) -> Estimate:
         """Dead reckoning over the same intervals: the baseline."""
         b = self.initial
         means = {name: belief.mean for name, belief in b.beliefs.items()}
-        states = dead_reckon(self.intervals, b, means)
-        trajectory = body_trajectory(self.intervals, states, b)
+        states = dead_reckon(self.problem, b, means)
+        trajectory = body_trajectory(self.problem.keyframes, states, b)
         return Estimate("dead_reckoning", trajectory, [], {}, residual_frame())
 
 
@@ -168,13 +116,13 @@ def newest_calibration(calibration: Mapping[str, Array]) -> dict[str, Array]:
 def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
     """The optimum with its marginal covariances; what the dive does not show is held, where noise may move it."""
     best, relative = without_what_noise_moves(best)
-    states, intervals = best.state, best.intervals
-    trajectory = body_trajectory(intervals, states, b, best.covariances(POSE), best.covariances(VELOCITY))
+    states, problem = best.state, best.problem
+    trajectory = body_trajectory(problem.keyframes, states, b, best.covariances(POSE), best.covariances(VELOCITY))
     bias_sd = np.sqrt(np.diagonal(best.covariances(BIAS), axis1=1, axis2=2))
     history = bias_histories(trajectory.time, states.bias, bias_sd, b.streams)
     final, spread = dict(best.unknowns.fixed), {}
     held = [name for name in best.unknowns.considered if best.beliefs[name].estimate]
-    n, segment = len(intervals), np.array([i.segment for i in intervals])
+    n, segment = len(problem), problem.segment
     ends, begun = np.array([0, n - 1]), np.flatnonzero(np.diff(segment)) + 1
     for name, walk in best.unknowns.walks.items():
         rows = np.concatenate([[0], begun, [n - 1]]) if walk else ends
@@ -204,7 +152,7 @@ def smoothed(best: Optimum, b: InitialConditions) -> Estimate:
             "converged": best.solution.converged,
             "stretches_taken_out": [asdict(stretch) for stretch in best.solution.stretches],
             "runner_up": best.solution.runner_up if isfinite(best.solution.runner_up) else None,
-            "bridged_intervals": sum(i.bridged for i in intervals),
+            "bridged_intervals": int(problem.bridged.sum()),
             "calibration_covariance": _joint_calibration(best),
             "held_at_prior": held,
             "considered": [name for name in best.unknowns.considered if name not in held],
@@ -222,7 +170,7 @@ def _joint_calibration(best: Optimum) -> dict[str, Any] | None:
     names = best.unknowns.estimated
     if not names:
         return None
-    prior = joint_prior_sd(best, len(best.intervals) - 1)
+    prior = joint_prior_sd(best, len(best.problem) - 1)
     sd = np.concatenate([prior[name] for name in names])
     own = slice(NEWEST, NEWEST + len(sd))
     return {

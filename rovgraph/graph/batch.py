@@ -6,7 +6,7 @@ sum. Calibration that walks has a value at each keyframe, as in the chain.
 
 import re
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -20,16 +20,17 @@ from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import gravity
 from rovgraph.engine.gauss_newton import Gates, Measured, Solution
 from rovgraph.engine.initial_conditions import StatePrior
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block, Seen, blocks_of, cost_at_gate, gates_of, measurement_cost, weights_of
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.stretches import resume
 from rovgraph.engine.stretches import solve as solve_problem
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.factors import drift, landmark_prior, motion, priors
+from rovgraph.graph.factors import drift, landmark_prior, priors
 from rovgraph.graph.keys import key_name
 from rovgraph.graph.measurement_factors import measurement_factor, with_places
+from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state, states_from
 from rovgraph.instruments import Instrument
@@ -47,7 +48,7 @@ class GraphStep:
 
 
 @dataclass(frozen=True)
-class Problem:
+class DiveGraph:
     """The whole dive's graph: native factors, and measurements as blocks.
 
     Attributes
@@ -143,39 +144,39 @@ class Problem:
 
     def nonlinear(self) -> gtsam.NonlinearFactorGraph:
         """The same graph with one `gtsam.CustomFactor` per measurement."""
-        graph = gtsam.NonlinearFactorGraph(self.native)
+        whole = gtsam.NonlinearFactorGraph(self.native)
         for block in self.blocks.values():
             for k in range(len(block)):
-                graph.add(measurement_factor(block.at(slice(k, k + 1)), int(self.index[block.keyframe[k]])))
-        return graph
+                whole.add(measurement_factor(block.at(slice(k, k + 1)), int(self.index[block.keyframe[k]])))
+        return whole
 
 
-def make_problem(
-    intervals: Sequence[KeyframeInterval],
+def make_graph(
+    problem: Problem,
     prior: StatePrior,
     config: Config,
     beliefs: Mapping[str, Belief],
     instruments: Mapping[str, Instrument],
     wanted: Unknowns | None = None,
-) -> Problem:
+) -> DiveGraph:
     """Assemble the graph of a dive; calibration that walks has a value at each keyframe.
 
     What is estimated is ``wanted``, or else what is believed to be.
     """
-    index = np.arange(len(intervals))
-    wanted = wanted or unknowns(beliefs, {m.sensor for interval in intervals for m in interval.measurements})
-    factors = _others(intervals, prior, beliefs, wanted, index)
-    blocks = blocks_of(intervals, instruments, instruments, gravity(config), wanted)
+    index = np.arange(len(problem))
+    wanted = wanted or unknowns(beliefs, problem.used)
+    factors = _others(problem, prior, beliefs, wanted, index)
+    blocks = blocks_of(problem, instruments, instruments, gravity(config), wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
     native = gtsam.NonlinearFactorGraph()
     for factor in factors:
         native.add(factor)
-    return Problem(native, blocks, wanted, index)
+    return DiveGraph(native, blocks, wanted, index)
 
 
 def _others(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     prior: StatePrior,
     beliefs: Mapping[str, Belief],
     wanted: Unknowns,
@@ -183,26 +184,25 @@ def _others(
 ) -> list[gtsam.NonlinearFactor]:
     """Priors, motions and walks."""
     factors = priors(prior, beliefs, wanted)
-    for interval, own in zip(intervals, index.tolist(), strict=True):
-        factors += motion(interval, wanted, own)
+    factors += [motion_factor(problem, k, wanted, int(index[k])) for k in range(1, len(problem))]
     begun = np.flatnonzero(np.diff(index, prepend=-1))
     for before, after in pairwise(begun.tolist()):
-        factors += drift(wanted, int(index[after]), intervals[after].time - intervals[before].time)
+        factors += drift(wanted, int(index[after]), float(problem.time[after] - problem.time[before]))
     return factors
 
 
-def make_values(problem: Problem, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:
+def make_values(graph: DiveGraph, states: State, calibration: Mapping[str, Array] | None = None) -> gtsam.Values:
     """GTSAM values of the keyframes' states, calibration at its means unless given; without places."""
     values = gtsam.Values()
-    for i in range(problem.count):
+    for i in range(graph.count):
         insert_state(values, i, states.at([i]))
-    for own in range(int(problem.index[-1]) + 1) if any(problem.unknowns.walks.values()) else (0,):
-        insert_calibration(values, calibration or problem.unknowns.fixed, problem.unknowns, own)
+    for own in range(int(graph.index[-1]) + 1) if any(graph.unknowns.walks.values()) else (0,):
+        insert_calibration(values, calibration or graph.unknowns.fixed, graph.unknowns, own)
     return values
 
 
 def solve(
-    problem: Problem, values: gtsam.Values, known: Solution[gtsam.Values] | None = None
+    graph: DiveGraph, values: gtsam.Values, known: Solution[gtsam.Values] | None = None
 ) -> Solution[gtsam.Values]:
     """The cheapest optimum from ``values``; with ``known``, of a problem close by, that with the same stretches out.
 
@@ -210,7 +210,7 @@ def solve(
     ------
     InputError : the data do not determine some variable, which is named
     """
-    return solve_problem(problem, values) if known is None else resume(problem, values, known)
+    return solve_problem(graph, values) if known is None else resume(graph, values, known)
 
 
 def eliminate_step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:

@@ -1,7 +1,4 @@
-"""The graph as lists of factors: priors, and what an interval adds.
-
-Batch and iSAM2 consume the same lists.
-"""
+"""Priors and walks as lists of factors."""
 
 from collections.abc import Mapping
 
@@ -10,10 +7,8 @@ import numpy as np
 
 from rovgraph.calibration import Belief
 from rovgraph.engine.initial_conditions import StatePrior
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.graph.keys import calibration_key, key
-from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.state import BIAS, PLACE, PLACE_DIM, POSE, VELOCITY
 
 Factor = gtsam.NonlinearFactor
@@ -43,14 +38,6 @@ def landmark_prior(number: int) -> Factor:
     return gtsam.PriorFactorVector(
         key(PLACE, number), np.zeros(PLACE_DIM), gtsam.noiseModel.Isotropic.Sigma(PLACE_DIM, ANYWHERE_M)
     )
-
-
-def motion(interval: KeyframeInterval, unknowns: Unknowns, index: int) -> list[Factor]:
-    """The factor between the keyframe before and the one that ends the interval, where there is one.
-
-    ``index`` is that of the value which calibration that walks has there.
-    """
-    return [] if interval.motion is None else [motion_factor(interval, unknowns, index)]
 
 
 def drift(unknowns: Unknowns, index: int, duration: float) -> list[Factor]:

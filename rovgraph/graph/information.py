@@ -15,17 +15,17 @@ from rovgraph.engine.gauss_newton import Gates
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, indeterminate
+from rovgraph.graph.batch import DiveGraph, indeterminate
 from rovgraph.graph.keys import calibration_key, is_place, key, key_index
 from rovgraph.state import BIAS, DIMENSION, PLACE, PLACE_DIM, POSE, VELOCITY
 
 
-def knowledge(problem: Problem, values: gtsam.Values, gates: Gates, keyframes: Sequence[int]) -> Knowledge:
+def knowledge(graph: DiveGraph, values: gtsam.Values, gates: Gates, keyframes: Sequence[int]) -> Knowledge:
     """What is known from the data up to each of some keyframes.
 
     Parameters
     ----------
-    problem, values, gates : the dive, and where to linearise it
+    graph, values, gates : the dive, and where to linearise it
     keyframes : increasing, the first beyond 0
 
     Raises
@@ -33,11 +33,11 @@ def knowledge(problem: Problem, values: gtsam.Values, gates: Gates, keyframes: S
     InputError : the data do not determine some variable, which is named
     """
     left, joint = gtsam.GaussianFactorGraph(), []
-    for end, piece in zip(keyframes, _pieces(problem, problem.linearize(values, gates), keyframes), strict=True):
+    for end, piece in zip(keyframes, _pieces(graph, graph.linearize(values, gates), keyframes), strict=True):
         piece.push_back(left)
         last = [key(v, end) for v in (POSE, VELOCITY, BIAS)]
-        last += [key(POSE, 0), *_calibration(problem, int(problem.index[end]))]
-        open_places = _seen_again(problem, end)
+        last += [key(POSE, 0), *_calibration(graph, int(graph.index[end]))]
+        open_places = _seen_again(graph, end)
         left, root = eliminate(piece, last + open_places)
         own = len(root) - PLACE_DIM * len(open_places)
         joint.append((root @ root.T)[:own, :own])
@@ -63,16 +63,16 @@ def eliminate(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> tuple[g
     return left, np.linalg.inv(np.linalg.qr(left.jacobian(order)[0], mode="r"))
 
 
-def noise_of_states(problem: Problem, values: gtsam.Values, gates: Gates, seed: int = 1) -> gtsam.VectorValues:
+def noise_of_states(graph: DiveGraph, values: gtsam.Values, gates: Gates, seed: int = 1) -> gtsam.VectorValues:
     """A draw of the error that the data's noise leaves in the states, calibration held.
 
     Parameters
     ----------
-    problem, values, gates : the dive, and where to linearise it
+    graph, values, gates : the dive, and where to linearise it
     seed : of the draw
     """
-    held = list(dict.fromkeys(one for k in range(int(problem.index[-1]) + 1) for one in _calibration(problem, k)))
-    net, rng = _sequential(problem.linearize(values, gates), held), np.random.default_rng(seed)
+    held = list(dict.fromkeys(one for k in range(int(graph.index[-1]) + 1) for one in _calibration(graph, k)))
+    net, rng = _sequential(graph.linearize(values, gates), held), np.random.default_rng(seed)
     white, first_held = gtsam.VectorValues(), net.size() - len(held)
     for i in range(net.size()):
         rows = net.at(i).rows()
@@ -80,12 +80,12 @@ def noise_of_states(problem: Problem, values: gtsam.Values, gates: Gates, seed: 
     return net.backSubstitute(white)
 
 
-def sensitivity(problem: Problem, values: gtsam.Values, gates: Gates, names: Sequence[str]) -> dict[int, Array]:
+def sensitivity(graph: DiveGraph, values: gtsam.Values, gates: Gates, names: Sequence[str]) -> dict[int, Array]:
     """How the optimum of all else moves with calibration variables that are given.
 
     Parameters
     ----------
-    problem, values, gates : the dive, the variables in it, and where to linearise
+    graph, values, gates : the dive, the variables in it, and where to linearise
     names : of constant variables, k components together
 
     Returns
@@ -93,7 +93,7 @@ def sensitivity(problem: Problem, values: gtsam.Values, gates: Gates, names: Seq
     dict : key -> ndarray, shape (dim, k), derivative of the optimum
     """
     given = [key(name) for name in names]
-    net = _sequential(problem.linearize(values, gates), given)
+    net = _sequential(graph.linearize(values, gates), given)
     others = net.size() - len(given)
     root, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
     for i, one in enumerate(given, others):
@@ -122,13 +122,13 @@ def _sequential(linear: gtsam.GaussianFactorGraph, last: Sequence[int]) -> gtsam
         raise InputError(indeterminate(error)) from None
 
 
-def _calibration(problem: Problem, index: int) -> list[int]:
-    return [calibration_key(problem.unknowns, name, index) for name in problem.unknowns.estimated]
+def _calibration(graph: DiveGraph, index: int) -> list[int]:
+    return [calibration_key(graph.unknowns, name, index) for name in graph.unknowns.estimated]
 
 
-def _seen_again(problem: Problem, end: int) -> list[int]:
+def _seen_again(graph: DiveGraph, end: int) -> list[int]:
     """Keys of the places that are seen up to a keyframe and after it."""
-    block = problem.blocks.get("place")
+    block = graph.blocks.get("place")
     if block is None:
         return []
     before = np.unique(block.place[block.keyframe <= end])
@@ -136,13 +136,13 @@ def _seen_again(problem: Problem, end: int) -> list[int]:
 
 
 def _pieces(
-    problem: Problem, linear: gtsam.GaussianFactorGraph, ends: Sequence[int]
+    graph: DiveGraph, linear: gtsam.GaussianFactorGraph, ends: Sequence[int]
 ) -> list[gtsam.GaussianFactorGraph]:
     """Factors by the piece of the dive that they complete; ``ends`` are the last keyframes of each."""
-    begun = np.searchsorted(problem.index, np.arange(int(problem.index[-1]) + 1))  # first keyframe of a value
+    begun = np.searchsorted(graph.index, np.arange(int(graph.index[-1]) + 1))  # first keyframe of a value
     first_seen = {}
-    if "place" in problem.blocks:
-        block = problem.blocks["place"]
+    if "place" in graph.blocks:
+        block = graph.blocks["place"]
         first_seen = {key(PLACE, p): k for p, k in zip(block.place[::-1], block.keyframe[::-1], strict=True)}
     pieces = [gtsam.GaussianFactorGraph() for _ in ends]
     newest = []

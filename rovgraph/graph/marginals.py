@@ -9,19 +9,19 @@ import numpy as np
 from rovgraph.engine.gauss_newton import Gates
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, indeterminate
+from rovgraph.graph.batch import DiveGraph, indeterminate
 from rovgraph.graph.keys import calibration_key, dimension, key
 from rovgraph.state import DIMENSION, PLACE
 
 
-def marginals(problem: Problem, values: gtsam.Values, gates: Gates) -> gtsam.GaussianBayesTree:
+def marginals(graph: DiveGraph, values: gtsam.Values, gates: Gates) -> gtsam.GaussianBayesTree:
     """The optimum's Bayes tree, which gives marginal covariances.
 
     By QR, since small covariances come of large and nearly dependent rows; calibration
     is eliminated last, since all keyframes share it.
     """
-    linear = problem.linearize(values, gates)
-    last = [key(name) for name, walk in problem.unknowns.walks.items() if not walk]
+    linear = graph.linearize(values, gates)
+    last = [key(name) for name, walk in graph.unknowns.walks.items() if not walk]
     ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, last)
     try:
         return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
@@ -29,15 +29,15 @@ def marginals(problem: Problem, values: gtsam.Values, gates: Gates) -> gtsam.Gau
         raise InputError(indeterminate(error)) from None
 
 
-def newest_covariance(problem: Problem, values: gtsam.Values, gates: Gates, places: Sequence[int] = ()) -> Array:
+def newest_covariance(graph: DiveGraph, values: gtsam.Values, gates: Gates, places: Sequence[int] = ()) -> Array:
     """Joint covariance of the newest keyframe, of the calibration there, and of places.
 
     Returns
     -------
-    ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `Problem.unknowns`,
+    ndarray, shape (d, d), pose, velocity, bias, then the calibration in the order of `DiveGraph.unknowns`,
         then the places in the order of their numbers as given
     """
-    linear, last = problem.linearize(values, gates), newest_keys(problem, places)
+    linear, last = graph.linearize(values, gates), newest_keys(graph, places)
     before, order = set(linear.keyVector()) - set(last), gtsam.Ordering()
     for one in last:
         order.push_back(one)
@@ -49,10 +49,10 @@ def newest_covariance(problem: Problem, values: gtsam.Values, gates: Gates, plac
     return np.asarray(root @ root.T)
 
 
-def newest_keys(problem: Problem, places: Sequence[int] = ()) -> list[int]:
+def newest_keys(graph: DiveGraph, places: Sequence[int] = ()) -> list[int]:
     """Keys of the newest keyframe, of the calibration there, and of places."""
-    last = [key(v, problem.count - 1) for v in DIMENSION]
-    last += [calibration_key(problem.unknowns, name, int(problem.index[-1])) for name in problem.unknowns.estimated]
+    last = [key(v, graph.count - 1) for v in DIMENSION]
+    last += [calibration_key(graph.unknowns, name, int(graph.index[-1])) for name in graph.unknowns.estimated]
     return last + [key(PLACE, number) for number in places]
 
 

@@ -10,12 +10,12 @@ import numpy as np
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Knowledge
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, transpose
-from rovgraph.graph.batch import Problem, make_problem, solve
+from rovgraph.graph.batch import DiveGraph, make_graph, solve
 from rovgraph.graph.information import knowledge, noise_of_states, sensitivity
 from rovgraph.graph.keys import calibration_key, key
 from rovgraph.graph.marginals import covariances, marginals, newest_covariance, newest_keys
@@ -26,43 +26,43 @@ from rovgraph.state import PLACE, PLACE_DIM, State
 class GraphOptimum:
     """A graph and where its robust cost is least."""
 
-    intervals: list[KeyframeInterval]
+    problem: Problem
     initial: InitialConditions
     beliefs: Mapping[str, Belief]
-    problem: Problem
+    graph: DiveGraph
     solution: Solution[gtsam.Values]
 
     @property
     def unknowns(self) -> Unknowns:
-        return self.problem.unknowns
+        return self.graph.unknowns
 
     @property
     def blocks(self) -> Mapping[str, Block]:
-        return self.problem.blocks
+        return self.graph.blocks
 
     @cached_property
     def state(self) -> State:
-        return self.problem.states(self.solution.point)
+        return self.graph.states(self.solution.point)
 
     @cached_property
     def weights(self) -> Mapping[str, Array]:
-        return self.problem.weights(self.solution.point, self.solution.gates)
+        return self.graph.weights(self.solution.point, self.solution.gates)
 
     @cached_property
     def places(self) -> Mapping[int, Array]:
-        block = self.problem.blocks.get("place")
+        block = self.graph.blocks.get("place")
         numbers = set() if block is None else set(block.place.tolist())
         return {number: self.solution.point.atVector(key(PLACE, number)) for number in numbers}
 
     @cached_property
     def _covariances(self) -> dict[int, Array]:
-        return covariances(marginals(self.problem, self.solution.point, self.solution.gates))
+        return covariances(marginals(self.graph, self.solution.point, self.solution.gates))
 
     @cached_property
-    def _wide(self) -> tuple[Problem, gtsam.Values]:
+    def _wide(self) -> tuple[DiveGraph, gtsam.Values]:
         """The graph in which what is considered is estimated, and where it is linearised."""
         names = self.unknowns.considered
-        return self._problem(self.unknowns.estimating(names)), self._with_means(self.solution.point, names)
+        return self._graph(self.unknowns.estimating(names)), self._with_means(self.solution.point, names)
 
     @cached_property
     def _sensitivity(self) -> dict[int, Array]:
@@ -77,7 +77,7 @@ class GraphOptimum:
         if variable in self.unknowns.considered:
             belief = self.beliefs[variable]
             return np.broadcast_to(
-                np.eye(belief.variable.dim) * belief.sd**2, (self.problem.count, *[belief.variable.dim] * 2)
+                np.eye(belief.variable.dim) * belief.sd**2, (self.graph.count, *[belief.variable.dim] * 2)
             )
         known = np.array([self._covariances[own] for own in self._keys(variable)])
         if not self.unknowns.considered:
@@ -91,11 +91,11 @@ class GraphOptimum:
 
     def newest_covariance(self, places: Sequence[int] = ()) -> Array:
         """As `rovgraph.engine.optimum.Optimum`."""
-        known = newest_covariance(self.problem, self.solution.point, self.solution.gates, places)
+        known = newest_covariance(self.graph, self.solution.point, self.solution.gates, places)
         names = self.unknowns.considered
         if not names:
             return known
-        K = np.vstack([self._sensitivity[one] for one in newest_keys(self.problem, places)])
+        K = np.vstack([self._sensitivity[one] for one in newest_keys(self.graph, places)])
         beliefs = [self.beliefs[name] for name in names]
         sd = np.concatenate([np.full(b.variable.dim, b.sd) for b in beliefs])
         own, end = K.shape[1], len(K) - PLACE_DIM * len(places)
@@ -106,15 +106,15 @@ class GraphOptimum:
 
     def knowledge(self, keyframes: Sequence[int]) -> Knowledge:
         """As `rovgraph.engine.optimum.Optimum`."""
-        return knowledge(self.problem, self.solution.point, self.solution.gates, keyframes)
+        return knowledge(self.graph, self.solution.point, self.solution.gates, keyframes)
 
     def noisier(self, keyframes: Sequence[int], seed: int = 1) -> tuple[Knowledge, Knowledge]:
         """As `rovgraph.engine.optimum.Optimum`."""
-        noise = noise_of_states(self.problem, self.solution.point, self.solution.gates, seed)
+        noise = noise_of_states(self.graph, self.solution.point, self.solution.gates, seed)
         more, less = (self.solution.point.retract(noise.scale(sign)) for sign in (1.0, -1.0))
         return (
-            knowledge(self.problem, more, self.solution.gates, keyframes),
-            knowledge(self.problem, less, self.solution.gates, keyframes),
+            knowledge(self.graph, more, self.solution.gates, keyframes),
+            knowledge(self.graph, less, self.solution.gates, keyframes),
         )
 
     def considering(self, names: Sequence[str]) -> "GraphOptimum":
@@ -137,12 +137,12 @@ class GraphOptimum:
 
     def _solved(self, unknowns: Unknowns, values: gtsam.Values) -> "GraphOptimum":
         """The optimum with other unknowns, close by."""
-        problem = self._problem(unknowns)
-        return GraphOptimum(self.intervals, self.initial, self.beliefs, problem, solve(problem, values, self.solution))
+        graph = self._graph(unknowns)
+        return GraphOptimum(self.problem, self.initial, self.beliefs, graph, solve(graph, values, self.solution))
 
-    def _problem(self, unknowns: Unknowns) -> Problem:
+    def _graph(self, unknowns: Unknowns) -> DiveGraph:
         initial = self.initial
-        return make_problem(self.intervals, initial.prior, initial.config, self.beliefs, initial.instruments, unknowns)
+        return make_graph(self.problem, initial.prior, initial.config, self.beliefs, initial.instruments, unknowns)
 
     def _with_means(self, values: gtsam.Values, names: Sequence[str]) -> gtsam.Values:
         """The values with those of some constants at their means."""
@@ -154,5 +154,5 @@ class GraphOptimum:
     def _keys(self, variable: str) -> list[int]:
         """Keys of a variable at every keyframe."""
         if variable in TABLE:
-            return [calibration_key(self.unknowns, variable, k) for k in self.problem.index.tolist()]
-        return [key(variable, k) for k in range(self.problem.count)]
+            return [calibration_key(self.unknowns, variable, k) for k in self.graph.index.tolist()]
+        return [key(variable, k) for k in range(self.graph.count)]

@@ -17,21 +17,20 @@ without them, and lets them in if its optimum finds them within their gate after
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.engine.constant_velocity import gravity
 from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement, LandmarkObservation
-from rovgraph.engine.measurement_table import MeasurementTable
 from rovgraph.engine.measurements import Block, make_block
+from rovgraph.engine.problem import Problem
 from rovgraph.geometry import Array
-from rovgraph.graph.batch import Problem, make_problem, make_values, solve
+from rovgraph.graph.batch import DiveGraph, make_graph, make_values, solve
 from rovgraph.graph.information import eliminate
 from rovgraph.graph.keys import key
 from rovgraph.graph.optimum import GraphOptimum
@@ -40,7 +39,7 @@ from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, POSE, State
 
 
 def smooth_graph(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     initial: InitialConditions,
     states: State,
     calibration: Mapping[str, Array] | None = None,
@@ -49,28 +48,27 @@ def smooth_graph(
 
     Parameters
     ----------
-    intervals, initial : the dive
+    problem, initial : the dive
     states, calibration : of the keyframes to begin with, as `make_values` takes them
     """
     config, instruments, beliefs = initial.config, initial.instruments, initial.beliefs
-    given = initial.prior, config, beliefs, instruments
-    apart = _apart(intervals)
-    problem = make_problem(apart, *given)
-    solution = solve(problem, make_values(problem, states, calibration))
-    seen = _landmarks(intervals)
-    if not seen:
-        return GraphOptimum(apart, initial, beliefs, problem, solution)
-    found = recognised(seen, instruments["place"], gravity(config), problem, solution)
-    recognised_dive = _given(intervals, found)
-    together = make_problem(recognised_dive, *given)
+    given, seen = (initial.prior, config, beliefs, instruments), problem.of_sensor(PLACE)
+    apart = problem.without(PLACE) if len(seen) else problem
+    graph = make_graph(apart, *given)
+    solution = solve(graph, make_values(graph, states, calibration))
+    if not len(seen):
+        return GraphOptimum(apart, initial, beliefs, graph, solution)
+    numbers = recognised(problem, instruments[PLACE], gravity(config), graph, solution)
+    dive = resolved(problem, numbers)
+    together = make_graph(dive, *given)
     values = gtsam.Values(solution.point)
-    block = together.blocks["place"]
-    insert_places(values, block, problem.states(solution.point).at(block.keyframe))
-    return GraphOptimum(recognised_dive, initial, beliefs, together, solve(together, values))
+    block = together.blocks[PLACE]
+    insert_places(values, block, graph.states(solution.point).at(block.keyframe))
+    return GraphOptimum(dive, initial, beliefs, together, solve(together, values))
 
 
 def associated_optimum(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     initial: InitialConditions,
     states: State,
     calibration: Mapping[str, Array] | None = None,
@@ -79,56 +77,54 @@ def associated_optimum(
 
     Parameters
     ----------
-    intervals, initial : the dive
+    problem, initial : the dive
     states, calibration : of the keyframes to begin with, as `make_values` takes them
     """
     beliefs = initial.beliefs
-    problem = make_problem(intervals, initial.prior, initial.config, beliefs, initial.instruments)
-    values = make_values(problem, states, calibration)
-    if (block := problem.blocks.get(PLACE)) is not None:
-        insert_places(values, block, problem.states(values).at(block.keyframe))
-    return GraphOptimum(list(intervals), initial, beliefs, problem, solve(problem, values))
+    graph = make_graph(problem, initial.prior, initial.config, beliefs, initial.instruments)
+    values = make_values(graph, states, calibration)
+    if (block := graph.blocks.get(PLACE)) is not None:
+        insert_places(values, block, graph.states(values).at(block.keyframe))
+    return GraphOptimum(problem, initial, beliefs, graph, solve(graph, values))
 
 
 def recognised(
-    seen: Sequence[KeyframeMeasurement],
-    instrument: Instrument,
-    gravity: float,
-    problem: Problem,
-    solution: Solution[gtsam.Values],
-) -> dict[float, KeyframeMeasurement]:
-    """Sightings of what is seen more than once, by their times, each given to its place.
+    problem: Problem, instrument: Instrument, gravity: float, graph: DiveGraph, solution: Solution[gtsam.Values]
+) -> NDArray[np.int64]:
+    """Number of the place that each landmark of a dive is of, shape (k,).
 
     Parameters
     ----------
-    seen : all landmarks, in the order of time
+    problem : the dive
     instrument : of the places
     gravity : [m/s^2]
-    problem, solution : the dive without places, and its optimum
+    graph, solution : the dive without places, and its optimum
     """
-    often = Counter(_name(a) for a in seen)
-    again = [a for a in seen if often[_name(a)] > 1]
-    if not again:
-        return {}
-    block = make_block(MeasurementTable.of(again), instrument, gravity, problem.unknowns)
-    where, covariance = _where(block, problem, solution)
-    return _resolved(again, matched(again, where, covariance, instrument.gate_sd))
+    seen = problem.of_sensor(PLACE)
+    names, numbers = problem.names[seen], problem.number[seen].copy()
+    _, place, often = np.unique(names, return_inverse=True, return_counts=True)
+    again = often[place] > 1
+    if again.any():
+        block = make_block(problem, seen[again], instrument, gravity, graph.unknowns)
+        where, covariance = _where(block, graph, solution)
+        numbers[again] = matched(names[again], numbers[again], where, covariance, instrument.gate_sd)
+    return numbers
 
 
-def resolved_associations(intervals: Sequence[KeyframeInterval]) -> list[KeyframeInterval]:
-    """A dive whose landmarks have been given to places one by one: what fits no other of its name is not believed."""
-    seen = _landmarks(intervals)
-    return _given(intervals, _resolved(seen, [_number(a) for a in seen]))
+def resolved(problem: Problem, numbers: NDArray[np.int64]) -> Problem:
+    """A dive whose landmarks are of the places of some numbers, shape (k,).
 
-
-def apart_from(interval: KeyframeInterval, numbers: Mapping[float, int]) -> KeyframeInterval:
-    """An interval whose landmarks of some times are each of the place of that number."""
-    found = {
-        a.time: replace(a, landmark=a.landmark._replace(number=numbers[a.time]))
-        for a in interval.measurements
-        if a.landmark is not None and a.time in numbers
-    }
-    return _given([interval], found)[0]
+    One that agrees with no other is not believed, where others of its name agree.
+    """
+    seen = problem.of_sensor(PLACE)
+    names, count = problem.names[seen].tolist(), Counter(numbers.tolist())
+    chief: dict[float, int] = {}
+    for name, number in zip(names, numbers.tolist(), strict=True):
+        if count[number] > count.get(chief.get(name, -1), 1):
+            chief[name] = number
+    alone = np.array([count[number] == 1 for number in numbers.tolist()]) & np.isin(names, [*chief])
+    found = [chief[name] if out else n for name, n, out in zip(names, numbers.tolist(), alone.tolist(), strict=True)]
+    return problem.sighting(np.array(found), seen[alone])
 
 
 def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
@@ -146,12 +142,14 @@ def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
             values.insert(own, where[k])
 
 
-def matched(seen: Sequence[KeyframeMeasurement], where: Array, covariance: Array, gate_sd: float | None) -> list[int]:
-    """Number of the place that each landmark is of.
+def matched(
+    names: Array, own: NDArray[np.int64], where: Array, covariance: Array, gate_sd: float | None
+) -> list[int]:
+    """Number of the place that each of m landmarks is of, which are in the order of time.
 
     Parameters
     ----------
-    seen : m landmarks in the order of time
+    names, own : shape (m,), of the landmarks, and the numbers of the places that they are of by themselves
     where : ndarray, shape (m, 2), north and east of each place if its landmark is believed alone [m]
     covariance : ndarray, shape (2 m, 2 m), joint
     gate_sd : beyond which two landmarks are not of one place, or None
@@ -160,8 +158,8 @@ def matched(seen: Sequence[KeyframeMeasurement], where: Array, covariance: Array
     mean, P = where.ravel().copy(), covariance.copy()
     numbers: list[int] = []
     newest: dict[float, dict[int, int]] = {}  # name -> number of each of its places -> its newest landmark
-    for k, a in enumerate(seen):
-        places, here = newest.setdefault(_name(a), {}), _rows(k)
+    for k, name in enumerate(names.tolist()):
+        places, here = newest.setdefault(name, {}), _rows(k)
         best, least = None, gate**2
         for number, other in places.items():
             there = _rows(other)
@@ -171,7 +169,7 @@ def matched(seen: Sequence[KeyframeMeasurement], where: Array, covariance: Array
             if nis <= least:
                 best, least = number, nis
         if best is None:
-            best = _number(a)
+            best = int(own[k])
         else:  # the two are one: condition on that
             there = _rows(places[best])
             H = np.zeros((PLACE_DIM, len(mean)))
@@ -184,46 +182,15 @@ def matched(seen: Sequence[KeyframeMeasurement], where: Array, covariance: Array
     return numbers
 
 
-def _resolved(seen: Sequence[KeyframeMeasurement], numbers: Sequence[int]) -> dict[float, KeyframeMeasurement]:
-    """Sightings by their times; one that agrees with no other is not believed, where others of its name agree.
-
-    Parameters
-    ----------
-    seen : landmarks
-    numbers : of the place that each is of
-    """
-    count = Counter(numbers)
-    chief: dict[float, int] = {}
-    for a, number in zip(seen, numbers, strict=True):
-        if count[number] > count.get(chief.get(_name(a), -1), 1):
-            chief[_name(a)] = number
-    out = {}
-    for a, number in zip(seen, numbers, strict=True):
-        alone = count[number] == 1 and _name(a) in chief
-        landmark = LandmarkObservation(_name(a), chief[_name(a)] if alone else number, not alone)
-        out[a.time] = replace(a, landmark=landmark)
-    return out
-
-
-def _given(intervals: Sequence[KeyframeInterval], found: Mapping[float, KeyframeMeasurement]) -> list[KeyframeInterval]:
-    """The dive with landmarks replaced by those that were found, by their times."""
-    return [
-        replace(i, measurements=[found.get(a.time, a) if a.landmark else a for a in i.measurements])
-        if _landmarks([i])
-        else i
-        for i in intervals
-    ]
-
-
-def _where(block: Block, problem: Problem, solution: Solution[gtsam.Values]) -> tuple[Array, Array]:
+def _where(block: Block, graph: DiveGraph, solution: Solution[gtsam.Values]) -> tuple[Array, Array]:
     """Place of each landmark if it is believed alone, shape (m, 2), and their joint covariance, shape (2 m, 2 m).
 
     The motion from a keyframe to its landmark is short, and taken as exact.
     """
-    states = problem.states(solution.point).at(block.keyframe)
+    states = graph.states(solution.point).at(block.keyframe)
     where, H = block.predict(states.seeing(ORIGIN))
     frames, column = np.unique(block.keyframe, return_inverse=True)
-    linear = problem.linearize(solution.point, solution.gates)
+    linear = graph.linearize(solution.point, solution.gates)
     _, root = eliminate(linear, [key(POSE, int(frame)) for frame in frames])
     by_poses = np.zeros((len(block), PLACE_DIM, len(frames), DIMENSION[POSE]))
     by_poses[np.arange(len(block)), :, column] = H[POSE]
@@ -235,27 +202,5 @@ def _where(block: Block, problem: Problem, solution: Solution[gtsam.Values]) -> 
     return where, covariance
 
 
-def _landmarks(intervals: Sequence[KeyframeInterval]) -> list[KeyframeMeasurement]:
-    return [a for interval in intervals for a in interval.measurements if a.landmark is not None]
-
-
-def _apart(intervals: Sequence[KeyframeInterval]) -> list[KeyframeInterval]:
-    """The same dive without places."""
-    return [
-        replace(i, measurements=[a for a in i.measurements if a.landmark is None]) if _landmarks([i]) else i
-        for i in intervals
-    ]
-
-
 def _rows(k: int) -> slice:
     return slice(PLACE_DIM * k, PLACE_DIM * (k + 1))
-
-
-def _name(a: KeyframeMeasurement) -> float:
-    assert a.landmark is not None
-    return a.landmark.name
-
-
-def _number(a: KeyframeMeasurement) -> int:
-    assert a.landmark is not None
-    return a.landmark.number

@@ -300,13 +300,19 @@ def motion_errors(
                 A_i_out[k, i, j], A_j_out[k, i, j] = A[i, j], A[i, AFTER + j]
 
 
+@helper
+def motion_weight(motion: Array, W_out: Array) -> None:
+    """`motion_weights` of one interval, shape (15, 15)."""
+    S = np.empty((15, 15))
+    motion_covariance(motion, S)
+    _whitening(S, np.empty((15, 15)), W_out)
+
+
 @kernel("void(f8[:, ::1], f8[:, :, ::1])")
 def motion_weights(motions: Array, W_out: Array) -> None:
     """W, with W' W the information of each residual, shape (n, 15, 15).
 
     It whitens biases first, then rotation, position and velocity, so that the rows of biases are those of their walks.
     """
-    S, ordered = np.empty((15, 15)), np.empty((15, 15))
     for k in range(len(motions)):
-        motion_covariance(motions[k], S)
-        _whitening(S, ordered, W_out[k])
+        motion_weight(motions[k], W_out[k])

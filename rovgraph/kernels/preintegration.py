@@ -45,7 +45,7 @@ SNAPSHOT = 16  # numbers of a snapshot: time since the keyframe, dR by rows, dv,
 
 
 @helper
-def _first_after(imu: Array, time: float) -> int:
+def first_after(imu: Array, time: float) -> int:
     """Index of the first sample after a time."""
     low, high = 0, len(imu)
     while low < high:
@@ -59,13 +59,13 @@ def _first_after(imu: Array, time: float) -> int:
 
 @helper
 def _most_steps(imu: Array, start: float, stops: Array, end: float) -> int:
-    return _first_after(imu, end) - _first_after(imu, start) + len(stops) + 1
+    return first_after(imu, end) - first_after(imu, start) + len(stops) + 1
 
 
 @helper
 def _steps(imu: Array, start: float, stops: Array, end: float, bias: Array, steps_out: Array) -> int:
     """From one sample or stop to the next, with the signal in their middle; how many."""
-    sample = _first_after(imu, start)
+    sample = first_after(imu, start)
     after, stop, count, now, last = sample, 0, 0, start, len(imu) - 1
     force, rate, turned = np.empty(3), np.empty(3), np.empty(3)
     while now < end:
@@ -247,61 +247,47 @@ def _write_snapshot(duration: float, zeta: Array, R: Array, snapshot_out: Array)
         snapshot_out[10 + i], snapshot_out[13 + i] = zeta[6 + i], zeta[3 + i]
 
 
-@kernel("void(f8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1])")
+@helper
+def integrate(imu: Array, start: float, end: float, stops: Array, row: Array, snapshots_out: Array) -> None:
+    """Integrate the samples of one interval; parameters as of `preintegrate`, of one interval."""
+    zeta, X, F, work = np.zeros(9), np.zeros((21, 9)), np.empty((4, 3, 3)), np.empty((3, 3))
+    bias, noise = row[BIAS : BIAS + 6], row[NOISE:GRAVITY]
+    steps, duration, taken = np.empty((_most_steps(imu, start, stops, end), STEP)), 0.0, 0
+    count = _steps(imu, start, stops, end, bias, steps)
+    while taken < len(stops) and stops[taken] <= start:
+        _write_snapshot(0.0, zeta, work, snapshots_out[taken])
+        taken += 1
+    for k in range(count):
+        _advance(zeta, steps[k], bias, work, F)
+        _propagate(F, steps[k, 1], noise, duration, X)
+        duration += steps[k, 1]
+        while taken < len(stops) and stops[taken] <= steps[k, 0]:
+            _write_snapshot(duration, zeta, work, snapshots_out[taken])
+            taken += 1
+    row[DURATION] = duration
+    for i in range(9):
+        row[TANGENT + i] = zeta[i]
+        for j in range(6):
+            row[BY_BIAS + 6 * i + j] = X[15 + j, i]
+    _write_covariance(zeta, X, noise, duration, row)
+
+
+@kernel("void(f8[:, ::1], f8, f8, f8[::1], f8[::1], f8[:, ::1])")
 def preintegrate(
-    table: Array,
-    first: Index,
-    last: Index,
-    start: Array,
-    end: Array,
-    stops: Array,
-    first_stop: Index,
-    rows_out: Array,
-    snapshots_out: Array,
+    imu: Array, start: float, end: float, stops: Array, row_out: Array, snapshots_out: Array
 ) -> None:
-    """Integrate IMU samples over n intervals.
+    """Integrate IMU samples over an interval.
 
     Parameters
     ----------
-    table : ndarray, shape (m, 7), time, specific force, rate in body axes
-    first, last : shape (n,), the samples of each interval, from ``first`` to before ``last``; held beyond their ends
-    start, end : shape (n,) [s]
-    stops : ndarray, shape (k,), times at which a snapshot is wanted, increasing within each interval [s]
-    first_stop : shape (n + 1,), the first stop of each interval
-    rows_out : ndarray, shape (n, ROW), with bias, noise and rate of the Earth where `rovgraph.kernels.motion_row` has
+    imu : ndarray, shape (m, 7), time, specific force, rate in body axes; held beyond their ends
+    start, end : [s]
+    stops : ndarray, shape (k,), times at which a snapshot is wanted, increasing [s]
+    row_out : ndarray, shape (ROW,), with bias, noise and rate of the Earth where `rovgraph.kernels.motion_row` has
         them; duration, motion and covariance are written
     snapshots_out : ndarray, shape (k, SNAPSHOT)
     """
-    zeta, X, F, work = np.empty(9), np.empty((21, 9)), np.empty((4, 3, 3)), np.empty((3, 3))
-    for n in range(len(start)):
-        imu, own, row = table[first[n] : last[n]], stops[first_stop[n] : first_stop[n + 1]], rows_out[n]
-        snapshots, bias, noise = (
-            snapshots_out[first_stop[n] : first_stop[n + 1]],
-            row[BIAS : BIAS + 6],
-            row[NOISE:GRAVITY],
-        )
-        steps, duration, taken = np.empty((_most_steps(imu, start[n], own, end[n]), STEP)), 0.0, 0
-        count = _steps(imu, start[n], own, end[n], bias, steps)
-        for j in range(9):
-            zeta[j] = 0.0
-            for i in range(21):
-                X[i, j] = 0.0
-        while taken < len(own) and own[taken] <= start[n]:
-            _write_snapshot(0.0, zeta, work, snapshots[taken])
-            taken += 1
-        for k in range(count):
-            _advance(zeta, steps[k], bias, work, F)
-            _propagate(F, steps[k, 1], noise, duration, X)
-            duration += steps[k, 1]
-            while taken < len(own) and own[taken] <= steps[k, 0]:
-                _write_snapshot(duration, zeta, work, snapshots[taken])
-                taken += 1
-        row[DURATION] = duration
-        for i in range(9):
-            row[TANGENT + i] = zeta[i]
-            for j in range(6):
-                row[BY_BIAS + 6 * i + j] = X[15 + j, i]
-        _write_covariance(zeta, X, noise, duration, row)
+    integrate(imu, start, end, stops, row_out, snapshots_out)
 
 
 @kernel("f8[:, ::1](f8[:, ::1], f8, f8[::1], f8, f8[::1])")

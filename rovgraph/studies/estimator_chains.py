@@ -261,19 +261,19 @@ def assembled(task: Task) -> BatchSmoother:
 
 def stepped(batch: BatchSmoother) -> ErrorStateFilter:
     """The error-state filter over the same keyframes."""
-    return replay(batch.intervals, batch.initial)
+    return replay(batch.problem, batch.initial)
 
 
 def reinitialised(batch: BatchSmoother) -> ErrorStateFilter:
     """The same, going on from the smoothed dive so far now and then."""
-    return replay(batch.intervals, batch.initial, REINITIALISE_AT_S)
+    return replay(batch.problem, batch.initial, REINITIALISE_AT_S)
 
 
 def incremental(batch: BatchSmoother) -> Any:
     """iSAM2 over the same keyframes: an `rovgraph.estimators.incremental.IncrementalEstimator`."""
     from rovgraph.estimators.incremental import run_isam2  # GTSAM is slow to load, and not everywhere to be had
 
-    return run_isam2(batch.intervals, batch.initial, searches=batch.searches)
+    return run_isam2(batch.problem, batch.initial, searches=batch.searches)
 
 
 def filtered_by_isam2(estimator: Any) -> Estimate:

@@ -168,9 +168,9 @@ def solved(log: Log, config: Config, progress: Progress = no_progress) -> Optimu
     """
     progress("smoothing", 0.1)
     batch = assemble(log, initialise(log, config))
-    if len(batch.intervals) < FEWEST_KEYFRAMES:
+    if len(batch.problem) < FEWEST_KEYFRAMES:
         raise InputError(
-            f"{log.source}: {len(batch.intervals)} keyframes say nothing about calibration, "
+            f"{log.source}: {len(batch.problem)} keyframes say nothing about calibration, "
             f"{FEWEST_KEYFRAMES} are the fewest; take a longer log"
         )
     dive = batch.optimum()
@@ -194,7 +194,7 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
     progress : called now and then
     """
     progress("information", 0.6)
-    ends = np.unique(np.linspace(0, len(dive.intervals) - 1, TIMES + 1).round().astype(int)[1:]).tolist()
+    ends = np.unique(np.linspace(0, len(dive.problem) - 1, TIMES + 1).round().astype(int)[1:]).tolist()
     known = dive.knowledge(ends)
     before = np.array([np.concatenate(list(joint_prior_sd(dive, end).values())) for end in ends])
     seen = np.array([data_information(P, sd) for P, sd in zip(known.calibration, before, strict=True)])
@@ -202,7 +202,7 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
     own = without_spurious_information(dive, ends, seen, before) if noisy else seen
     variables = tuple(TABLE[name] for name in dive.unknowns.estimated for _ in TABLE[name].labels)
     labels = tuple(label for name in dive.unknowns.estimated for label in TABLE[name].labels)
-    begin = dive.intervals[0].time
+    begin = float(dive.problem.time[0])
     relative = np.sqrt(np.diagonal(relative_covariance(own), axis1=1, axis2=2))
     return Observability(
         labels,
@@ -211,7 +211,7 @@ def examined(dive: Optimum, config: Config, noisy: bool = True, progress: Progre
         np.sqrt(np.diag(known.calibration[-1])),
         own[-1],
         _correlation(known.covariance[-1], relative_covariance(own[-1]) * np.outer(before[-1], before[-1])),
-        np.array([dive.intervals[end].time - begin for end in ends]),
+        dive.problem.time[ends] - begin,
         relative * before / before[-1],
     )
 

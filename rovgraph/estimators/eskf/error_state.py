@@ -4,23 +4,22 @@
 come. The smoother goes back over the filter's steps (Rauch, Tung and Striebel 1965) without linearising again.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from rovgraph.engine.assembly import Assembler
-from rovgraph.engine.dive_rows import DiveRows
+from rovgraph.engine.assembly import assembly_of
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, Transition
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.remembered_places import columns, common, extended
 from rovgraph.estimators.eskf.history import FilterHistory
 from rovgraph.estimators.eskf.reinitialisation import reinitialised
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array
-from rovgraph.log import Measurement
+from rovgraph.log import Log, Measurement
 from rovgraph.state import PLACE, State
 
 # since the start, for `ErrorStateFilter.reinitialise_at`: while heading, mounting and compasses are known to
@@ -38,6 +37,7 @@ class ErrorStateFilter:
     initial : of `rovgraph.estimators.initialise.initialise`
     reinitialise_at : times since the start at which the dive so far is smoothed, and the filter goes on from there [s]
     learn_noise : of the IMU, from its newest samples
+    problem : the dive, as far as it has been taken
     known : Gaussian of the newest keyframe, or what is believed before the first
     history : of each keyframe so far, from all data up to it
     departed, transitions : for the smoother, of a filter that is not reinitialised: each keyframe but the newest with
@@ -50,32 +50,34 @@ class ErrorStateFilter:
     learn_noise: bool = False
 
     def __post_init__(self) -> None:
-        b = self.initial
-        self.assembler = Assembler(
-            b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise, believed=b.beliefs
-        )
-        self.engine = FilterEngine(b)
+        self.engine = FilterEngine(self.initial)
+        self.assembly = assembly_of(self.initial, learn_noise=self.learn_noise)
+        self.problem = self.assembly.problem
         self.known = self.engine.start()
         self.history = FilterHistory(self.engine)
         self.departed: list[Gaussian] = []
         self.transitions: list[Transition] = []
         self.gates: Gates = {}
         self._due = list(self.reinitialise_at)
-        self._rows: DiveRows | None = None  # of a dive that is known as a whole
         self._smoothed: State | None = None  # of the keyframes up to the newest reinitialisation
 
-    @property
-    def intervals(self) -> list[KeyframeInterval]:
-        """The dive, as far as it has been taken."""
-        return self.history.intervals
+    def take(self, log: Log, progress: Callable[[float], None] = lambda done: None) -> None:
+        """Take a whole log, before anything else, and learn how late stamps are; ``progress`` is told 0 to 1."""
+        self.assembly.take(log)
+        begin, end = self.assembly.span
+        while self._take(self.assembly.extend(one=True)):
+            if len(self.history) % PROGRESS_EVERY == 0:
+                progress((float(self.problem.time[-1]) - begin) / (end - begin))
+        self.finish()
 
-    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
-        """Take a measurement; times must not decrease."""
-        return self._take(self.assembler.add(measurement))
+    def add(self, measurement: Measurement) -> int:
+        """Take a measurement, whose time is not before that of others; how many keyframes it completes."""
+        self.assembly.insert(measurement)
+        return self._take(self.assembly.extend())
 
-    def finish(self) -> list[KeyframeInterval]:
-        """Close the last interval."""
-        return self._take(self.assembler.finish())
+    def finish(self) -> int:
+        """Close the last interval; how many keyframes that completes."""
+        return self._take(self.assembly.extend(finish=True))
 
     def states(self) -> State:
         """Of every keyframe, as well as it is known: smoothed up to the newest reinitialisation, then filtered."""
@@ -95,47 +97,37 @@ class ErrorStateFilter:
         """The newest keyframe's state, at the IMU, calibration included."""
         return self.known.state
 
-    def step(self, interval: KeyframeInterval) -> FilterStep:
-        """Take one interval: correct, predict, correct; from time to time go on from the smoothed dive so far."""
-        done = self.engine.step(interval, self.known, self.gates)
+    def step(self) -> FilterStep:
+        """Take the next interval: correct, predict, correct; now and then go on from the smoothed dive so far."""
+        done = self.engine.step(self.problem, len(self.history), self.known, self.gates)
         if done.departed is not None and done.transition is not None and not self.reinitialise_at:
             self.departed.append(done.departed)
             self.transitions.append(done.transition)
         self.known = done.filtered
-        self.history.append(interval, self.known, done.processed)
+        self.history.append(self.known, done.met)
         self._reinitialise()
-        self.assembler.time_offsets.assume(self.known.c)
+        self.assembly.time_offsets.assume(self.known.c)
         return done
 
-    def run(
-        self, intervals: Sequence[KeyframeInterval], progress: Callable[[float], None], rows: DiveRows | None = None
-    ) -> None:
-        """Take the intervals of a dive, before anything else.
-
-        Parameters
-        ----------
-        progress : is told 0 to 1 now and then
-        rows : the dive as arrays, where they are at hand
-        """
-        sensors = [*self.initial.instruments]
-        self._rows = rows = rows or DiveRows.of(intervals, sensors)
-        compiled = all(self.engine.knows(sensor) or sensor == PLACE for sensor in sensors)
-        while (k := len(self.intervals)) < len(intervals):
-            progress(k / len(intervals))
-            end = min(k + PROGRESS_EVERY, self._due_at(rows.time, k))
-            if self.engine.changes_in(rows.time[max(k - 1, 0)], rows.time[end - 1]):
+    def run(self, problem: Problem, progress: Callable[[float], None]) -> None:
+        """Take the keyframes of a dive, before anything else; ``progress`` is told 0 to 1 now and then."""
+        self.problem, n = problem, len(problem)
+        compiled = all(self.engine.knows(sensor) or sensor == PLACE for sensor in problem.sensors)
+        while (k := len(self.history)) < n:
+            progress(k / n)
+            end = min(k + PROGRESS_EVERY, self._due_at(problem.time, k))
+            if self.engine.changes_in(problem.time[max(k - 1, 0)], problem.time[end - 1]):
                 end = k + 1
             # of a filter that is not reinitialised, the smoother needs every step
             alone = k > 0 and compiled and self.reinitialise_at and not self.known.places
-            if alone and not self.engine.changes_in(rows.time[k - 1], rows.time[end - 1]):
-                run = self.engine.run(rows, k, end, self.known, self.gates)
+            if alone and not self.engine.changes_in(problem.time[k - 1], problem.time[end - 1]):
+                run = self.engine.run(problem, k, end, self.known, self.gates)
                 self.known = run.known
-                self.history.extend(intervals[k : k + len(run)], run)
+                self.history.extend(run)
                 k += len(run)
                 self._reinitialise()
             if k < end:
-                self.step(intervals[k])
-        self._rows = None
+                self.step()
 
     def _due_at(self, time: Array, k: int) -> int:
         """The number of intervals, more than k, after which the next reinitialisation is due, or all."""
@@ -144,20 +136,20 @@ class ErrorStateFilter:
 
     def _reinitialise(self) -> None:
         """Go on from the smoothed dive so far, where that is due."""
-        if self._due and self.intervals[-1].time - self.intervals[0].time >= self._due[0]:
+        n = len(self.history)
+        if self._due and self.problem.time[n - 1] - self.problem.time[0] >= self._due[0]:
             self._due.pop(0)
-            so_far = self._rows and self._rows.upto(len(self.intervals))
-            self.known, best = reinitialised(self.engine, self.intervals, self.states(), so_far)
+            self.known, best = reinitialised(self.engine, self.problem.upto(n), self.states())
             self._smoothed = best.state
             self.history.replace_last(self.known)
 
     def solve(self) -> Estimate:
         """The filter's estimate of every keyframe so far."""
-        return self.history.estimate("filtered" if self.reinitialise_at else "ekf")
+        return self.history.estimate(self.problem, "filtered" if self.reinitialise_at else "ekf")
 
     def smoothed(self) -> Estimate:
         """The smoother's estimate of every keyframe so far; not of a filter that was reinitialised."""
-        return self.history.smoothed("rts", self.backward())
+        return self.history.smoothed(self.problem, "rts", self.backward())
 
     def backward(self) -> list[Gaussian]:
         """Every keyframe so far, from all data, before it and after.
@@ -170,10 +162,12 @@ class ErrorStateFilter:
             known.append(_back(self.engine, departed, transition, known[-1]))
         return known[::-1]
 
-    def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
-        for interval in intervals:
-            self.step(interval)
-        return intervals
+    def _take(self, count: int) -> int:
+        """Filter the newest keyframes of the assembly."""
+        self.problem = self.assembly.problem
+        for _ in range(count):
+            self.step()
+        return count
 
 
 def _back(engine: FilterEngine, departed: Gaussian, transition: Transition, following: Gaussian) -> Gaussian:
@@ -197,13 +191,12 @@ def _back(engine: FilterEngine, departed: Gaussian, transition: Transition, foll
 
 
 def replay(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     initial: InitialConditions,
     reinitialise_at: tuple[float, ...] = (),
     progress: Callable[[float], None] = lambda done: None,
-    rows: DiveRows | None = None,
 ) -> ErrorStateFilter:
-    """A filter that has taken the intervals of a dive; ``progress`` and ``rows`` as of `ErrorStateFilter.run`."""
+    """A filter that has taken the keyframes of a dive; ``progress`` as of `ErrorStateFilter.run`."""
     estimator = ErrorStateFilter(initial, reinitialise_at)
-    estimator.run(intervals, progress, rows)
+    estimator.run(problem, progress)
     return estimator

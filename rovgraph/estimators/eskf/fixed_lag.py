@@ -6,41 +6,28 @@ everything since once more. So the estimate does not depend on the order of arri
 long as nothing is later than the lag; and nothing older than that is kept.
 """
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.assembly import InsertResult, assembly_of
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gates, Gaussian, ProcessedMeasurement, states_of
+from rovgraph.engine.filter_step import Gates, Gaussian, Met, states_of
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.estimators.results import body_trajectory
+from rovgraph.geometry import Array
+from rovgraph.kernels import assembly as at
+from rovgraph.kernels.motion_row import GAP
 from rovgraph.log import Measurement
-from rovgraph.log.packing import pack, unpack
-from rovgraph.log.streams import precedence
 from rovgraph.state import POSE, VELOCITY
 from rovgraph.trajectory import Trajectory
 
-
-class InsertResult(StrEnum):
-    """What became of a measurement."""
-
-    IN = "taken"
-    LATE = "later than the lag"
-    AGAIN = "repeated"
-
-
-def place(measurement: Measurement) -> tuple[float, int, str]:
-    """Order of measurements: by time, and the IMU's before the DVL's before others."""
-    return measurement.time, precedence(measurement.sensor), measurement.sensor
+KEPT_S = 30.0  # of the dive, behind the lag: the filter may have to go back so far
 
 
 @dataclass(frozen=True)
@@ -49,20 +36,27 @@ class FilterSnapshot:
 
     Attributes
     ----------
-    interval : the keyframe's
+    index : of the keyframe, from the first of the dive
+    keyframe : ndarray, shape (KEYFRAME,), of `rovgraph.kernels.assembly`
+    bridged : samples of the IMU are missing before it
+    closed : time of the sample by which it was past [s]
     known : its estimate, with what was measured up to it
     gates : sensors that are being kept out
-    processed : measurements that entered, or did not, since the mark before
-    assembler : what had been assembled
-    taken : count of measurements that had been taken
+    met : measurements that entered, or did not, since the keyframe before
     """
 
-    interval: KeyframeInterval
+    index: int
+    keyframe: Array
+    bridged: bool
+    closed: float
     known: Gaussian
     gates: Gates
-    processed: list[ProcessedMeasurement]
-    assembler: Assembler
-    taken: int
+    met: Met
+
+    @property
+    def time(self) -> float:
+        """Of the keyframe [s]."""
+        return float(self.keyframe[at.TIME])
 
 
 @dataclass
@@ -76,69 +70,47 @@ class FixedLag:
     hold_s : how long measurements are held back before they are taken; later ones cost more [s]
     passed : called with each `FilterSnapshot` that the lag has passed, for good
     learn_noise : of the IMU, from its newest samples
+    keeps_all : of the dive, for whoever smooths it
+    assembly : the dive, as far as it is kept
     """
 
     initial: InitialConditions
     lag_s: float
     hold_s: float
-    passed: Callable[[FilterSnapshot], None] = lambda mark: None
+    passed: Callable[[FilterSnapshot], None] = lambda snapshot: None
     learn_noise: bool = False
-    marks: deque[FilterSnapshot] = field(default_factory=deque)
+    keeps_all: bool = False
+    snapshots: deque[FilterSnapshot] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
         self.filter = FilterEngine(self.initial)
-        self._assembler = self._fresh()
+        self.assembly = assembly_of(self.initial, learn_noise=self.learn_noise)
         self._gates: Gates = {}
-        self._record: list[Measurement] = []  # in order; the first `_taken` have been taken
-        self._forgotten = 0  # measurements that have left the record
-        self._taken = 0
-        self._newest = -float("inf")  # of the IMU
 
     def add(self, measurement: Measurement) -> InsertResult:
         """Take a measurement, whenever it arrives."""
-        record = self._record
-        if record and measurement.time <= record[-1].time and (own := place(measurement)) <= place(record[-1]):
-            position = bisect_right(record, own, key=place)
-            if position < self._settled:
-                return InsertResult.LATE
-            if position > 0 and place(record[position - 1]) == own:
-                return InsertResult.AGAIN
-            record.insert(position, measurement)
-            if position < self._taken:
-                self._back_to(position)
-        else:
-            record.append(measurement)
-        if measurement.sensor == "imu" and measurement.time > self._newest:
-            self._newest = measurement.time
-        self._go_on(self._newest - self.hold_s)
-        return InsertResult.IN
+        outcome = self.assembly.insert(measurement, self._settled)
+        if outcome == InsertResult.IN:
+            self._go_on(self.assembly.newest - self.hold_s)
+        return outcome
 
     def retract(self, sensor: str, since: float) -> None:
         """Take back a sensor's measurements from a time on, as far as the lag goes."""
-        later = range(self._settled, len(self._record))
-        wrong = [k for k in later if self._record[k].sensor == sensor and self._record[k].time >= since]
-        if not wrong:
-            return
-        if wrong[0] < self._taken:
-            self._back_to(wrong[0])
-        for k in reversed(wrong):
-            del self._record[k]
-        self._go_on(self._newest - self.hold_s)
+        self.assembly.remove(sensor, since, self._settled)
+        self._go_on(self.assembly.newest - self.hold_s)
 
     def adopt(self, index: int, known: Gaussian) -> bool:
         """Go on from a better estimate of a keyframe, by the intervals since; False = the lag has passed it."""
-        if not any(mark.interval.index == index for mark in self.marks):
+        if not any(snapshot.index == index for snapshot in self.snapshots):
             return False
         later: list[FilterSnapshot] = []
-        while self.marks[-1].interval.index != index:
-            later.append(self.marks.pop())
-        self.marks[-1] = replace(self.marks[-1], known=known)
-        self._gates = dict(self.marks[-1].gates)
-        for mark in reversed(later):
-            filter_step = self.filter.step(mark.interval, self.marks[-1].known, self._gates)
-            after = replace(mark, known=filter_step.filtered, gates=dict(self._gates), processed=filter_step.processed)
-            self.marks.append(after)
-        self._assembler.time_offsets.assume(self.marks[-1].known.c)
+        while self.snapshots[-1].index != index:
+            later.append(self.snapshots.pop())
+        self.snapshots[-1] = replace(self.snapshots[-1], known=known)
+        self._gates = dict(self.snapshots[-1].gates)
+        for snapshot in reversed(later):
+            self.snapshots.append(self._again(snapshot, self.snapshots[-1].known))
+        self.assembly.time_offsets.assume(self.snapshots[-1].known.c)
         return True
 
     def adopt_passed(self, known: Gaussian, gates: Gates) -> None:
@@ -149,11 +121,19 @@ class FixedLag:
         known, gates : its estimate, and the sensors that were left out there
         """
         self._gates = dict(gates)
-        for k, mark in enumerate(self.marks):
-            done = self.filter.step(mark.interval, known, self._gates)
-            known = done.filtered
-            self.marks[k] = replace(mark, known=known, gates=dict(self._gates), processed=done.processed)
-        self._assembler.time_offsets.assume(known.c)
+        for k, snapshot in enumerate(self.snapshots):
+            self.snapshots[k] = self._again(snapshot, known)
+            known = self.snapshots[k].known
+        self.assembly.time_offsets.assume(known.c)
+
+    def _again(self, snapshot: FilterSnapshot, before: Gaussian) -> FilterSnapshot:
+        """A keyframe filtered once more, from another estimate of the one before."""
+        done = self.filter.step(self.assembly.problem, self.place(snapshot), before, self._gates)
+        return replace(snapshot, known=done.filtered, gates=dict(self._gates), met=done.met)
+
+    def place(self, snapshot: FilterSnapshot) -> int:
+        """The keyframe of a snapshot among those that are kept."""
+        return snapshot.index - self.assembly.forgotten
 
     def continued(self, initial: InitialConditions, position_sd: float = 0.0) -> "FixedLag":
         """A filter that knows more sensors, or less of where it is, and goes on from here.
@@ -164,135 +144,110 @@ class FixedLag:
         position_sd : that is added to north and east [m]
         """
         oldest = self.oldest()
-        while self.marks[0] is not oldest:
-            self.passed(self.marks.popleft())
-        other = FixedLag(initial, self.lag_s, self.hold_s, self.passed, self.learn_noise)
-        known, assembler = _taken_over(self.filter, other.filter, oldest.known), other._fresh()
+        while self.snapshots[0] is not oldest:
+            self.passed(self.snapshots.popleft())
+        other = FixedLag(initial, self.lag_s, self.hold_s, self.passed, self.learn_noise, self.keeps_all)
+        known = _taken_over(self.filter, other.filter, oldest.known)
         here, R_nb = other.filter.layout.columns[POSE], known.state.R_nb[0]
         known.P[here, here][3:, 3:] += R_nb.T @ np.diag([position_sd**2, position_sd**2, 0.0]) @ R_nb
-        assembler.restore(oldest.assembler.state())
-        other.marks = deque([replace(oldest, known=known, assembler=assembler, taken=0)])
-        other._back_to(0)
-        for measurement in self._record[oldest.taken - self._forgotten :]:
-            other.add(measurement)
+        other.assembly.restore(self.assembly.state(self.place(oldest) + 1, whole=True))
+        other.snapshots = deque([replace(oldest, known=known)])
+        other._go_on(other.assembly.newest - other.hold_s)
         return other
 
     def oldest(self) -> FilterSnapshot:
-        """The oldest mark that the filter can go on from: the last of those that came at once."""
-        ends = (a for a, b in pairwise(self.marks) if a.taken != b.taken)
-        return next(ends, self.marks[-1])
-
-    def settle(self) -> None:
-        """Forget the measurements that can be changed no more."""
-        old = self._settled
-        del self._record[:old]
-        self._forgotten += old
-        self._taken -= old
+        """The oldest snapshot that the filter can go on from: the last of those that came at once."""
+        ends = (a for a, b in pairwise(self.snapshots) if a.closed != b.closed)
+        return next(ends, self.snapshots[-1])
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on elsewhere, as plain values and arrays; not before the first keyframe."""
-        mark = self.oldest()
-        known, interval = mark.known, mark.interval
+        oldest = self.oldest()
+        known = oldest.known
         return {
-            "keyframe": [interval.index, interval.time, interval.segment, interval.rate_sd],
-            "rate_b": interval.rate_b,
+            "keyframe": [oldest.index, oldest.time, oldest.bridged, oldest.closed],
             "x": known.x,
             "c": known.c,
             "P": known.P,
             "B": known.B,
             "L": known.L,
             "places": np.array([[p.name, p.number, *p.position, p.time] for p in known.places]).reshape(-1, 5),
-            "gates": mark.gates,
-            "assembler": mark.assembler.state(),
-            "record": pack(self._record[mark.taken - self._forgotten :]),
+            "gates": oldest.gates,
+            "assembly": self.assembly.state(self.place(oldest) + 1),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from where another stood."""
-        index, time, segment, rate_sd = state["keyframe"]
-        interval = KeyframeInterval(index, time, segment, state["rate_b"], rate_sd, None, [])
+        index, _, bridged, closed = state["keyframe"]
         places = tuple(RememberedPlace(row[0], int(row[1]), row[2:4], row[4]) for row in state["places"])
-        assembler = self._fresh()
-        assembler.restore(state["assembler"])
+        self.assembly.restore(state["assembly"])
         known = Gaussian(state["x"], state["c"], state["P"], places, state["B"], state["L"])
-        self.marks = deque([FilterSnapshot(interval, known, state["gates"], [], assembler, 0)])
-        self._record, self._forgotten, self._taken = [], 0, 0
-        self._back_to(0)
-        for measurement in unpack(state["record"]):
-            self.add(measurement)
+        met = Met.none(self.assembly.problem, len(known.c))
+        row = self.assembly.problem.keyframes[-1].copy()
+        self.snapshots = deque([FilterSnapshot(int(index), row, bool(bridged), closed, known, state["gates"], met)])
+        self._go_on(self.assembly.newest - self.hold_s)
 
     @property
-    def _settled(self) -> int:
-        """Measurements of the record that no later one can come before."""
-        return self.marks[0].taken - self._forgotten if self.marks else 0
+    def _settled(self) -> float:
+        """Time before which nothing is taken any more [s]."""
+        return self.snapshots[0].closed if self.snapshots else -np.inf
 
     def finish(self) -> None:
         """Take what is held back, and close the last interval."""
-        self._go_on(float("inf"))
-        if intervals := self._assembler.finish():
-            self._step(intervals)
-        while self.marks:
-            self.passed(self.marks.popleft())
+        self._go_on(np.inf)
+        self._step(self.assembly.extend(finish=True))
+        while self.snapshots:
+            self.passed(self.snapshots.popleft())
 
-    def ahead(self, time: float) -> tuple[KeyframeInterval, Gaussian]:
-        """The newest keyframe's estimate, carried on to a time with the IMU alone."""
-        mark = self.marks[-1]
-        if time <= mark.interval.time:
-            return mark.interval, mark.known
-        later = [m for m in self._record[self._taken :] if m.sensor == "imu" and m.time <= time]
-        interval = self._assembler.ahead(later, time, mark.known.x)
-        return interval, self.filter.predict(interval, mark.known).predicted
+    def ahead(self, time: float) -> tuple[Array, Gaussian]:
+        """The newest keyframe, shape (KEYFRAME,), and its estimate, carried on to a time with the IMU alone."""
+        newest = self.snapshots[-1]
+        if time <= newest.time:
+            return newest.keyframe, newest.known
+        problem = self.assembly.ahead(time, newest.known.x)
+        return problem.keyframes[1].copy(), self.filter.predict(problem, 1, newest.known).predicted
 
-    def trajectory(self, intervals: Sequence[KeyframeInterval], known: Sequence[Gaussian]) -> Trajectory:
+    def trajectory(self, keyframes: Sequence[Array], known: Sequence[Gaussian]) -> Trajectory:
         """The body's origin at keyframes, at least one, in n, with its covariance.
 
         Parameters
         ----------
-        intervals, known : the keyframes and what is known of them, n each
+        keyframes, known : ndarray, shape (KEYFRAME,), and what is known, of n of them
         """
         columns = self.filter.layout.columns
         pose, velocity = (np.array([k.covariance[columns[v], columns[v]] for k in known]) for v in (POSE, VELOCITY))
-        return body_trajectory(intervals, states_of(np.array([k.x for k in known])), self.initial, pose, velocity)
+        states = states_of(np.array([k.x for k in known]))
+        return body_trajectory(np.array(keyframes), states, self.initial, pose, velocity)
 
     def _go_on(self, until: float) -> None:
-        """Take measurements up to a time."""
-        while self._taken < len(self._record) and self._record[self._taken].time <= until:
-            self._taken += 1
-            if intervals := self._assembler.add(self._record[self._taken - 1]):
-                self._step(intervals)
+        """Take measurements up to a time, from the newest keyframe that still stands."""
+        count, unmade = self.assembly.forgotten + len(self.assembly), False
+        while self.snapshots and self.snapshots[-1].index >= count:
+            self.snapshots.pop()
+            unmade = True
+        if unmade:
+            self._gates = dict(self.snapshots[-1].gates) if self.snapshots else {}
+            self.assembly.time_offsets.assume(self.snapshots[-1].known.c if self.snapshots else self.filter.start().c)
+        one = bool(self.assembly.time_offsets.lags)  # which are assumed anew after each keyframe
+        while made := self.assembly.extend(until, one):
+            self._step(made)
 
-    def _step(self, intervals: list[KeyframeInterval]) -> None:
-        """Take intervals that are complete, and forget what the lag has passed."""
-        known = self.marks[-1].known if self.marks else self.filter.start()
-        taken, passed = self._forgotten + self._taken, []
-        for interval in intervals:
-            filter_step = self.filter.step(interval, known, self._gates)
-            known = filter_step.filtered
-            passed.append((interval, known, dict(self._gates), filter_step.processed))
-        self._assembler.time_offsets.assume(known.c)
-        assembler = self._assembler.copy()
-        self.marks += [FilterSnapshot(*one, assembler, taken) for one in passed]
-        while self.marks[0].interval.time < self.marks[-1].interval.time - self.lag_s:
-            self.passed(self.marks.popleft())
-        if self._settled > len(self._record) // 2:
-            self.settle()
-
-    def _back_to(self, position: int) -> None:
-        """Undo the taking of the measurement at a place of the record, and of all after it."""
-        while self.marks and self.marks[-1].taken - self._forgotten > position:
-            self.marks.pop()
-        if self.marks:
-            mark = self.marks[-1]
-            self._assembler, self._gates = mark.assembler.copy(), dict(mark.gates)
-            self._taken = mark.taken - self._forgotten
-        else:
-            self._assembler, self._gates, self._taken = self._fresh(), {}, 0
-
-    def _fresh(self) -> Assembler:
-        b = self.initial
-        return Assembler(
-            b.config, b.instruments, b.prior.state.bias[0], learn_noise=self.learn_noise, believed=b.beliefs
-        )
+    def _step(self, made: int) -> None:
+        """Filter the newest keyframes, and forget what the lag has passed."""
+        if not made:
+            return
+        problem, n = self.assembly.problem, len(self.assembly)
+        known, closed = self.snapshots[-1].known if self.snapshots else self.filter.start(), self.assembly.closed_at
+        for k in range(n - made, n):
+            done = self.filter.step(problem, k, known, self._gates)
+            known, index = done.filtered, self.assembly.forgotten + k
+            own = problem.keyframes[k].copy(), bool(k and problem.motions[k - 1, GAP] > 0.0), closed(k)
+            self.snapshots.append(FilterSnapshot(index, *own, known, dict(self._gates), done.met))
+        self.assembly.time_offsets.assume(known.c)
+        while self.snapshots[0].time < self.snapshots[-1].time - self.lag_s:
+            self.passed(self.snapshots.popleft())
+        if not self.keeps_all:
+            self.assembly.forget(int(problem.time.searchsorted(self.snapshots[0].time - KEPT_S)))
 
 
 def _taken_over(old: FilterEngine, new: FilterEngine, known: Gaussian) -> Gaussian:

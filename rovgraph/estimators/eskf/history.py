@@ -5,12 +5,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import FilterRun, Gaussian, MetStates, ProcessedMeasurement, stack_states, states_of
-from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.measurement_table import MeasurementTable
+from rovgraph.engine.filter_step import FilterRun, Gaussian, Met, MetStates, stack_states, states_of
 from rovgraph.engine.measurements import Block
+from rovgraph.engine.problem import Problem
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.results import (
     bias_histories,
@@ -21,26 +21,26 @@ from rovgraph.estimators.results import (
 )
 from rovgraph.geometry import Array
 from rovgraph.process import give_back
-from rovgraph.state import BIAS, POSE, VELOCITY, State
+from rovgraph.state import BIAS, PLACE, POSE, VELOCITY, State
 
 # of some keyframes, their number first in every shape: state, calibration, covariances of pose and velocity, sd of the
 # error
 Columns = tuple[Array, Array, Array, Array, Array]
 
 
-class _Met(NamedTuple):
-    """Measurements of one sensor as the filter met them in a row.
+class _Part(NamedTuple):
+    """Measurements in a row, as the filter met them.
 
     Attributes
     ----------
-    states : returns x and c of each, as of `ProcessedMeasurement`, shapes (n, 21), (n, C)
-    nis, weight, places : as of it, of each
+    states : returns x and c of each, as of `Met`, shapes (n, 21), (n, C)
+    nis, weight, place : as of it, of each; place is shape (0, 2) where no place is among them
     """
 
     states: Callable[[], tuple[Array, Array]]
-    nis: Sequence[float]
-    weight: Sequence[float]
-    places: Sequence[Array] = ()
+    nis: Array
+    weight: Array
+    place: Array
 
 
 class FilterHistory:
@@ -49,41 +49,34 @@ class FilterHistory:
     Parameters
     ----------
     engine : the filter's
-
-    Attributes
-    ----------
-    intervals : the dive, as far as it has been taken
     """
 
     def __init__(self, engine: FilterEngine) -> None:
         self._engine = engine
         self._pieces: list[Columns] = []
-        self._met: dict[str, list[_Met]] = {}
-        self.intervals: list[KeyframeInterval] = []
+        self._met: list[_Part] = []
+        self._count = 0
 
     def __len__(self) -> int:
-        return len(self.intervals)
+        """Count of keyframes."""
+        return self._count
 
-    def append(self, interval: KeyframeInterval, known: Gaussian, processed: Sequence[ProcessedMeasurement]) -> None:
+    def append(self, known: Gaussian, met: Met) -> None:
         """Take the next keyframe."""
-        self.intervals.append(interval)
+        self._count += 1
         self._pieces.append(self._columns(known))
-        for one in processed:
-            places = () if one.place is None else (one.place,)
-            met = _Met(partial(_state_of, one), (one.nis,), (one.weight,), places)
-            self._met.setdefault(one.measurement.sensor, []).append(met)
+        if len(met):
+            place = met.place if (met.number >= 0).any() else met.place[:0]
+            self._met.append(_Part(partial(_states_of, met), met.nis, met.weight, place))
 
-    def extend(self, intervals: Sequence[KeyframeInterval], run: FilterRun) -> None:
+    def extend(self, run: FilterRun) -> None:
         """Take the intervals that a filter has run through."""
-        for which in dict.fromkeys(run.which.tolist()):
-            own = np.flatnonzero(run.which == which)
-            of_keyframes = run.before, run.x, run.c, run.predicted_x, run.predicted_c
-            states = MetStates(*of_keyframes, run.interval[own], run.between[own])
-            met = _Met(states, run.nis[own].tolist(), run.weight[own].tolist())
-            self._met.setdefault(run.sensors[which], []).append(met)
-        self.intervals += intervals
-        if len(intervals):
-            self._pieces.append((run.x, run.c, run.pose, run.velocity, run.sd))
+        if not len(run):
+            return
+        states = MetStates(run.before, run.x, run.c, run.predicted_x, run.predicted_c, run.interval, run.between)
+        self._met.append(_Part(states, run.nis, run.weight, np.empty((0, 2))))
+        self._count += len(run)
+        self._pieces.append((run.x, run.c, run.pose, run.velocity, run.sd))
 
     def replace_last(self, known: Gaussian) -> None:
         """Take another estimate of the newest keyframe."""
@@ -96,15 +89,15 @@ class FilterHistory:
         x, c = (np.concatenate([piece[column] for piece in self._pieces]) for column in range(2))
         return states_of(x, c)
 
-    def estimate(self, kind: str) -> Estimate:
+    def estimate(self, problem: Problem, kind: str) -> Estimate:
         """The filtered estimate of every keyframe."""
         self._pieces = [_joined(self._pieces)]  # of a long dive they are not kept twice
         give_back()
-        return self._estimate(kind, self._pieces[0], None)
+        return self._estimate(problem, kind, self._pieces[0], None)
 
-    def smoothed(self, kind: str, known: Sequence[Gaussian]) -> Estimate:
+    def smoothed(self, problem: Problem, kind: str, known: Sequence[Gaussian]) -> Estimate:
         """The estimate of every keyframe that a smoother has found."""
-        return self._estimate(kind, _joined([self._columns(one) for one in known]), stack_states(known))
+        return self._estimate(problem, kind, _joined([self._columns(one) for one in known]), stack_states(known))
 
     def _columns(self, known: Gaussian) -> Columns:
         """Of one keyframe."""
@@ -112,57 +105,67 @@ class FilterHistory:
         pose, velocity = (P[columns[v], columns[v]].copy() for v in (POSE, VELOCITY))
         return known.x[None], known.c[None], pose[None], velocity[None], np.sqrt(np.diagonal(P)[:size])[None]
 
-    def _estimate(self, kind: str, found: Columns, smoothed: State | None) -> Estimate:
+    def _estimate(self, problem: Problem, kind: str, found: Columns, smoothed: State | None) -> Estimate:
         """An estimate; residuals are those before the measurements entered where nothing was smoothed."""
         x, c, pose, velocity, sd = found
         engine, states = self._engine, states_of(x, c)
         columns, estimated = engine.layout.columns, engine.unknowns.estimated
-        trajectory = body_trajectory(self.intervals, states, engine.initial, pose, velocity)
+        trajectory = body_trajectory(problem.keyframes, states, engine.initial, pose, velocity)
         history = bias_histories(trajectory.time, states.bias, sd[:, columns[BIAS]], engine.initial.streams)
         for name in estimated:
             history[name] = calibration_history(name, trajectory.time, states.calibration[name], sd[:, columns[name]])
         final = {name: np.diag(sd[-1, columns[name]] ** 2) for name in estimated}
-        sensors = [s for s in engine.initial.streams if s in {*self._met, "imu"}]
+        sensors = [s for s in engine.initial.streams if s in {*problem.used, "imu"}]
         last = {name: value[-1] for name, value in states.calibration.items()}
         calibration = calibration_estimates(engine.beliefs, sensors, last, final)
-        residuals = residual_frame(self._measured(smoothed))
-        return Estimate(kind, trajectory, calibration, history, residuals, self._summary())
+        residuals = residual_frame(self._measured(problem, smoothed))
+        return Estimate(kind, trajectory, calibration, history, residuals, self._summary(problem))
 
-    def _measured(self, smoothed: State | None) -> Iterator[tuple[str, Block, State, Array]]:
+    def _measured(self, problem: Problem, smoothed: State | None) -> Iterator[tuple[str, Block, State, Array]]:
         """Each sensor's measurements, the states they are compared with, and their weights."""
-        measured = MeasurementTable.of_dive(self.intervals)
-        for sensor, parts in self._met.items():
-            block = self._engine.block(measured.of_sensor(sensor))
-            if smoothed is None:
-                x, c = (np.concatenate(column) for column in zip(*(part.states() for part in parts), strict=True))
-                here = states_of(x, c)
-            else:
-                here = smoothed.at(block.keyframe)
-            places = [place for part in parts for place in part.places]
-            if places:
-                here = here.seeing(np.array(places))
-            yield sensor, block, here, np.array([weight for part in parts for weight in part.weight])
+        weight = np.concatenate([np.empty(0), *(part.weight for part in self._met)])
+        if problem.used and PLACE in problem.used:
+            place = [part.place if len(part.place) else np.full((len(part.nis), 2), np.nan) for part in self._met]
+        for sensor in problem.used:
+            own = problem.of_sensor(sensor)
+            block = self._engine.block(problem, own)
+            here = smoothed.at(block.keyframe) if smoothed is not None else states_of(*self._states(own))
+            if sensor == PLACE:
+                here = here.seeing(np.concatenate(place)[own])
+            yield sensor, block, here, weight[own]
 
-    def _summary(self) -> dict[str, Any]:
+    def _states(self, index: NDArray[np.int64]) -> tuple[Array, Array]:
+        """x and c of some measurements, in order, as the filter met them; of a long dive all of them are large."""
+        found, begin = [], 0
+        for part in self._met:
+            end = begin + len(part.nis)
+            own = index[slice(*index.searchsorted([begin, end]))] - begin
+            if len(own):
+                x, c = part.states()
+                found.append((x[own], c[own]))
+            begin = end
+        x, c = (np.concatenate(column) for column in zip(*found, strict=True))
+        return x, c
+
+    def _summary(self, problem: Problem) -> dict[str, Any]:
         """Count of keyframes, and of every sensor its mean NIS, which is its dimension where noise is as believed."""
-        nis = {}
-        for sensor, parts in self._met.items():
-            found = np.array([value for part in parts for value in part.nis])
-            weight = np.array([value for part in parts for value in part.weight])
-            admitted = found[weight > 0.0]
+        every = np.concatenate([np.empty(0), *(part.nis for part in self._met)])
+        weight, nis = np.concatenate([np.empty(0), *(part.weight for part in self._met)]), {}
+        for sensor in problem.used:
+            own = problem.of_sensor(sensor)
+            admitted = every[own][weight[own] > 0.0]
             nis[sensor] = {
                 "mean": float(np.mean(admitted)) if len(admitted) else None,
                 "dim": self._engine.initial.instruments[sensor].model.dim,
                 "count": len(admitted),
-                "rejected": len(found) - len(admitted),
+                "rejected": len(own) - len(admitted),
             }
-        bridged = sum(interval.bridged for interval in self.intervals)
-        return {"keyframes": len(self.intervals), "nis": nis, "bridged_intervals": bridged}
+        return {"keyframes": len(self), "nis": nis, "bridged_intervals": int(problem.bridged.sum())}
 
 
-def _state_of(one: ProcessedMeasurement) -> tuple[Array, Array]:
-    """x and c of one measurement."""
-    return one.x[None], one.c[None]
+def _states_of(met: Met) -> tuple[Array, Array]:
+    """x and c of each."""
+    return met.x, met.c
 
 
 def _joined(pieces: Sequence[Columns]) -> Columns:
