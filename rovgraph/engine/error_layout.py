@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from rovgraph.calibration import LAYOUT, TABLE, calibration_size
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
+from rovgraph.kernels.error_coordinates import ErrorLayout as Coordinates
 from rovgraph.kernels.layout import MOTION
 from rovgraph.sensors import SENSORS, CompiledModel, SensorModel, WaterVelocity
 from rovgraph.state import DIMENSION, Jacobians
-
-Index = NDArray[np.int64]
 
 # the variable that each instrument sees directly: its model is linear in it, and depends on none that follows
 SEEN = {s.name: s.linear_in for s in SENSORS.values() if s.linear_in is not None}
@@ -41,7 +40,7 @@ class ErrorLayout:
     size, width : length of the error, and columns of a Jacobian
     column : ndarray of int, shape (15 + C,), place of each component of state and calibration vector in the
         Jacobian, -1 where it has none
-    coordinates : what `rovgraph.kernels.error_coordinates.ErrorLayout` holds, one by one
+    coordinates : as kernels take them
     """
 
     def __init__(
@@ -61,7 +60,7 @@ class ErrorLayout:
 
         self.coordinates = self._coordinates(instruments)
 
-    def _coordinates(self, instruments: Mapping[str, Instrument]) -> tuple[Index, Index, Array, Index]:
+    def _coordinates(self, instruments: Mapping[str, Instrument]) -> Coordinates:
         """Columns of a full Jacobian, instruments and what they see, their numbers, rows of a basis."""
         estimated = np.flatnonzero((self.column >= 0) & (self.column < self.size))
         columns = estimated[np.argsort(self.column[estimated])]
@@ -73,7 +72,7 @@ class ErrorLayout:
         for row, (model, _) in zip(params, models, strict=True):
             row[: model.packed.shape[1]] = model.packed[0]
         rows = np.concatenate([np.arange(6), *(np.r_[part] for _, part in models)]).astype(np.int64)
-        return columns, np.array(seen, np.int64).reshape(-1, 3), params, rows
+        return Coordinates(columns, np.array(seen, np.int64).reshape(-1, 3), params, rows)
 
     def matrix(self, H: Jacobians) -> Array:
         """Jacobians by variable as one, shape (n, dim, width); what is neither estimated nor considered is left out."""

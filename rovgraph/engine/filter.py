@@ -11,7 +11,6 @@ goes on to the next keyframe with the IMU; what was measured there corrects it.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -47,14 +46,25 @@ from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import correct
-from rovgraph.kernels.filtering import filter_intervals
+from rovgraph.kernels.correction import Corrected, GivenRows, correct
+from rovgraph.kernels.filter_state import FilterModel, FilterState
+from rovgraph.kernels.filtering import Filtered, Intervals, filter_intervals
+from rovgraph.kernels.measurement_row import MeasurementRows
 from rovgraph.kernels.moves import difference, move_estimate
-from rovgraph.kernels.prediction import predict_filter
+from rovgraph.kernels.prediction import Predicted, predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 
 ORIGIN = np.zeros(PLACE_DIM)  # where a place is put to begin with
 _EXACT = np.zeros((0, 6, 6))  # of an IMU without scale errors
+
+
+def _state(known: Gaussian) -> FilterState:
+    """A copy for kernels, which write to it."""
+    return FilterState(known.x.copy(), known.c.copy(), known.P.copy(), known.B.copy(), known.L)
+
+
+def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> Gaussian:
+    return Gaussian(known.x, known.c, known.P, places, known.B, known.L)
 
 
 class FilterEngine:
@@ -80,18 +90,19 @@ class FilterEngine:
         self.layout = ErrorLayout(self.unknowns.estimated, self.unknowns.considered, initial.instruments)
         self._wide = self.unknowns.estimating(self.unknowns.considered)  # all that has a place in the error
         self._gravity = initial.gravity
-        self._walk = np.zeros((3, self.layout.size))  # as `rovgraph.kernels.prediction` takes it
-        for name, walk in self.unknowns.walks.items():
-            self._walk[0, self.layout.columns[name]] = walk**2
+        walk = np.zeros((3, self.layout.size))
+        for name, sd in self.unknowns.walks.items():
+            walk[0, self.layout.columns[name]] = sd**2
         for name, seconds in self.unknowns.time_constants.items():
-            self._walk[1, self.layout.columns[name]] = 1.0 / seconds
-            self._walk[2, self.layout.columns[name]] = self.unknowns.fixed[name]
+            walk[1, self.layout.columns[name]] = 1.0 / seconds
+            walk[2, self.layout.columns[name]] = self.unknowns.fixed[name]
         instruments = initial.instruments
         self._given = {  # linearised outside the kernels
             s for s, i in instruments.items() if not compiled(i, i.time_offset in self.unknowns.walks) or s == PLACE
         }
-        self._sensors = sensor_table(instruments, sorted(self._given))
-        self._no_rows = np.empty(0), np.empty((0, self.layout.width))
+        sensors = sensor_table(instruments, sorted(self._given))
+        self._model = FilterModel(sensors, self.layout.column, self.layout.coordinates, walk, initial.gravity)
+        self._no_rows = GivenRows(np.empty(0), np.empty((0, self.layout.width)))
         self._index = {sensor: k for k, sensor in enumerate(instruments)}
 
     def start(self) -> Gaussian:
@@ -126,6 +137,15 @@ class FilterEngine:
         filtered = self.correct(predicted, interval.here, gates, processed)
         return FilterStep(departed, transition, filtered, processed)
 
+    def _rows(self, measurements: Sequence[KeyframeMeasurement]) -> MeasurementRows:
+        """Measurements as kernels take them."""
+        if not measurements:
+            return MeasurementRows(np.empty((0, at.ROW)), np.empty(0, np.int64), _EXACT)
+        scaled = measurements[0].scale_to_bias is not None
+        scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
+        rows = np.array([m.row[: at.ROW] for m in measurements])
+        return MeasurementRows(rows, np.array([self._index[m.sensor] for m in measurements]), scale)
+
     def run(self, rows: DiveRows, begin: int, end: int, before: Gaussian, gates: Gates) -> FilterRun:
         """Take intervals of a dive as `step` does, as far as kernels know how.
 
@@ -136,23 +156,19 @@ class FilterEngine:
         before : the keyframe before them, without places
         gates : renewed in place
         """
-        size, C = self.layout.size, len(before.c)
-        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
-        some = rows.between(begin, end)
-        k, m, since = end - begin, len(some.rows), self._since(gates)
-        out: Any = [np.empty(shape) for shape in ((k, 21), (k, C)) * 2]
-        out += [np.empty(shape) for shape in ((k, 6, 6), (k, 3, 3), (k, size), (m,), (m,))]
-        known: Any = x, c, P, B, before.L, some.motions, some.scales, some.rows, some.which, some.row_scales
-        tables: Any = self._sensors, self.layout.column, self._walk, *self.layout.coordinates
-        order: Any = np.append(0, some.taken), some.first[:k]
-        limits: Any = since, self._gravity, POORLY_KNOWN
-        kernels: Any = correct, predict_filter
-        taken = filter_intervals(*known, *order, *tables, *limits, *out, *kernels)
+        known, some, since = _state(before), rows.between(begin, end), self._since(gates)
+        k, m, C, size = end - begin, len(some.rows), len(before.c), self.layout.size
+        shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
+        out = Filtered._make(np.empty(shape) for shape in shapes)
+        intervals = Intervals(some.motions, some.scales, np.append(0, some.taken), some.first[:k], POORLY_KNOWN)
+        measured = MeasurementRows(some.rows, some.which, some.row_scales)
+        taken = filter_intervals(known, intervals, measured, self._model, since, out, correct, predict_filter)
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
         interval = np.arange(taken).repeat(np.diff(some.taken[:taken], prepend=0))
-        met = rows.sensors, some.which[:m], interval, np.arange(m) < some.first[interval], *(a[:m] for a in out[-2:])
-        return FilterRun(before, Gaussian(x, c, P, (), B, before.L), *(a[:taken] for a in out[:-2]), *met)
+        own = Filtered._make(a[: m if a.ndim == 1 else taken] for a in out)
+        met = rows.sensors, some.which[:m], interval, np.arange(m) < some.first[interval]
+        return FilterRun(before, _estimate(known), own, *met)
 
     def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:
         """The next keyframe, from the IMU alone; calibration walks."""
@@ -160,11 +176,10 @@ class FilterEngine:
         n = len(before.P)
         scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
         P, B = before.P.copy(), before.B.copy()
-        x, c, F, Q = np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n))
-        walk = self._walk if n == self.layout.size else np.pad(self._walk, ((0, 0), (0, n - self.layout.size)))
-        tables = interval.motion.row, scale, self.layout.column, walk, self.layout.size
-        predict_filter(before.x, before.c, P, B, before.L, *tables, x, c, F, Q)
-        return Transition(F, Q, Gaussian(x, c, P, before.places, B, before.L))
+        out = Predicted(np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n)))
+        known = FilterState(before.x, before.c, P, B, before.L)
+        predict_filter(known, interval.motion.row, scale, self._model, out)
+        return Transition(out.F, out.Q, Gaussian(out.x, out.c, P, before.places, B, before.L))
 
     def correct(
         self,
@@ -212,12 +227,8 @@ class FilterEngine:
 
     def rows(self, measurements: Sequence[KeyframeMeasurement]) -> KeyframeRows:
         """Measurements of one keyframe that the kernels know."""
-        scaled = measurements[0].scale_to_bias is not None
-        scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
-        rows = np.array([m.row[: at.ROW] for m in measurements])
-        which = np.array([self._index[m.sensor] for m in measurements])
-        layout = self.layout
-        return KeyframeRows(rows, which, self._sensors, layout.column, layout.width, scale, self._gravity)
+        layout, (rows, which, scale) = self.layout, self._rows(measurements)
+        return KeyframeRows(rows, which, self._model.sensors, layout.column, layout.width, scale, self._gravity)
 
     def block(self, measured: MeasurementTable | Sequence[KeyframeMeasurement]) -> Block:
         """Measurements of one sensor, with the filter's unknowns."""
@@ -227,9 +238,9 @@ class FilterEngine:
 
     def retract(self, known: Gaussian, delta: Array, P: Array, B: Array | None = None) -> Gaussian:
         """The estimate that lies ``delta``, shape (d,), away; P, and B (None = its own), are about the old one."""
-        x, c, P, B = known.x.copy(), known.c.copy(), P.copy(), (known.B if B is None else B).copy()
-        move_estimate(x, c, P, B, delta, *self.layout.coordinates)
-        return Gaussian(x, c, P, moved(known.places, delta[self.layout.size :]), B, known.L)
+        there = _state(replace(known, P=P, B=known.B if B is None else B))
+        move_estimate(there, delta, self.layout.coordinates)
+        return _estimate(there, moved(known.places, delta[self.layout.size :]))
 
     def local(self, some: Gaussian, other: Gaussian) -> tuple[Array, Array]:
         """The error, shape (size,), that leads from one estimate to another, and the basis, shape (size, size).
@@ -238,7 +249,7 @@ class FilterEngine:
         """
         size = self.layout.size
         delta, basis = np.empty(size), np.eye(size)
-        difference(some.x, some.c, other.x, other.c, *self.layout.coordinates, delta, basis)
+        difference(some.x, some.c, other.x, other.c, self.layout.coordinates, delta, basis)
         return delta, basis
 
     def considering(self, known: Gaussian, other: Gaussian) -> Gaussian:
@@ -282,25 +293,18 @@ class FilterEngine:
     ) -> Gaussian:
         """The estimate corrected by measurements of no places."""
         given = [self._of_block(before, m) for m in measurements if m.sensor in self._given]
-        r, H = self._no_rows
+        others = self._no_rows
         if given:
-            r, H = np.concatenate([own for own, _ in given]), np.vstack([own for _, own in given])
-        scaled = measurements[0].scale_to_bias is not None
-        scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
-        rows = np.array([m.row[: at.ROW] for m in measurements])
-        which = np.array([self._index[m.sensor] for m in measurements])
-        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
-        since = self._since(gates or {})
-        nis, weight = np.empty(len(rows)), np.empty(len(rows))
-        places = np.zeros(len(P) - self.layout.size)
-        tables = (self._sensors, self.layout.column, scale, r, H, *self.layout.coordinates)
-        limits = since, gates is not None, self._gravity
-        correct(x, c, P, B, before.L, rows, which, *tables, *limits, nis, weight, places)
+            others = GivenRows(np.concatenate([r for r, _ in given]), np.vstack([H for _, H in given]))
+        known, measured, since = _state(before), self._rows(measurements), self._since(gates or {})
+        m = len(measurements)
+        out = Corrected(np.empty(m), np.empty(m), np.zeros(len(before.P) - self.layout.size))
+        correct(known, measured, others, self._model, since, gates is not None, out)
         if gates is not None:
             self._renew(gates, since)
-        met = zip(measurements, nis.tolist(), weight.tolist(), strict=True)
+        met = zip(measurements, out.nis.tolist(), out.weight.tolist(), strict=True)
         processed += [ProcessedMeasurement(m, before.x, before.c, own, w) for m, own, w in met]
-        return Gaussian(x, c, P, moved(before.places, places) if len(places) else before.places, B, before.L)
+        return _estimate(known, moved(before.places, out.places) if len(out.places) else before.places)
 
     def _since(self, gates: Gates) -> Array:
         """Since when each sensor is left out, nan where it is not [s]."""
@@ -343,10 +347,8 @@ class FilterEngine:
 
     def _correct_by(self, before: Gaussian, m: KeyframeMeasurement, r: Array, H: Array) -> tuple[Gaussian, float]:
         """The estimate corrected by whitened rows that are at hand, and the weight of the measurement."""
-        x, c, P, B = before.x.copy(), before.c.copy(), before.P.copy(), before.B.copy()
-        nis, weight, places = np.empty(1), np.empty(1), np.zeros(len(P) - self.layout.size)
-        rows, which = np.zeros((1, at.ROW)), np.array([self._index[m.sensor]])
-        tables = (self._sensors, self.layout.column, _EXACT, r, H, *self.layout.coordinates)
-        since = np.full(len(self._index), np.nan)
-        correct(x, c, P, B, before.L, rows, which, *tables, since, False, self._gravity, nis, weight, places)
-        return Gaussian(x, c, P, moved(before.places, places), B, before.L), float(weight[0])
+        known, since = _state(before), np.full(len(self._index), np.nan)
+        out = Corrected(np.empty(1), np.empty(1), np.zeros(len(before.P) - self.layout.size))
+        measured = MeasurementRows(np.zeros((1, at.ROW)), np.array([self._index[m.sensor]]), _EXACT)
+        correct(known, measured, GivenRows(r, H), self._model, since, False, out)
+        return _estimate(known, moved(before.places, out.places)), float(out.weight[0])

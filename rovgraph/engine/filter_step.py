@@ -11,6 +11,7 @@ from rovgraph.calibration import LAYOUT, calibration_size
 from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.geometry import Array
+from rovgraph.kernels.filtering import Filtered
 from rovgraph.state import State
 
 Gates = dict[str, float]  # sensor that is left out -> since when [s]
@@ -145,33 +146,22 @@ class FilterRun:
     Attributes
     ----------
     before, known : Gaussian of the keyframe before them, and of the last one
-    x, c : ndarray, shapes (k, 21), (k, C), the keyframes, as of `Gaussian`
-    predicted_x, predicted_c : the same, before what was measured at them
-    pose, velocity, sd : ndarray, shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
+    filtered : the keyframes, and what became of the measurements
     sensors, which : names, and ndarray of int, shape (m,), whose of them each measurement is
     interval, between : ndarray of int and of bool, shape (m,), the interval of each, and whether it belongs to the
         keyframe before that
-    nis, weight : ndarray, shape (m,), of the measurements, as of `ProcessedMeasurement`
     """
 
     before: Gaussian
     known: Gaussian
-    x: Array
-    c: Array
-    predicted_x: Array
-    predicted_c: Array
-    pose: Array
-    velocity: Array
-    sd: Array
+    filtered: Filtered
     sensors: Sequence[str]
     which: NDArray[np.int64]
     interval: NDArray[np.int64]
     between: NDArray[np.bool_]
-    nis: Array
-    weight: Array
 
     def __len__(self) -> int:
-        return len(self.x)
+        return len(self.filtered.x)
 
 
 @dataclass(frozen=True)
@@ -181,7 +171,7 @@ class MetStates:
     Attributes
     ----------
     before : Gaussian of the keyframe before the intervals
-    x, c, predicted_x, predicted_c : as of `FilterRun`
+    x, c, predicted_x, predicted_c : as of `rovgraph.kernels.filtering.Filtered`
     interval, between : as of it, of the n measurements
     """
 

@@ -21,14 +21,18 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import IO, Any, TypeVar, cast
+from typing import IO, Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
 
 import rovgraph
 from rovgraph.errors import InputError
+from rovgraph.geometry import Array
 
 try:
     import numba
-    from numba import njit
+    from numba import njit, types
     from numba.extending import register_jitable
 
     from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler, UncalledKernelCompiler
@@ -41,6 +45,41 @@ KERNEL: Any = {"error_model": "numpy", "nogil": True}
 HELPER: Any = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # False: as kernels
 HELPS = "ROVGRAPH_HELPS_COMPILE"  # in the environment of a process that compiles for another one
 logger = logging.getLogger("rovgraph")
+
+# arrays that a kernel takes as they lie in memory: contiguous, and writable
+Vector = Annotated[Array, types.float64[::1]]
+Matrix = Annotated[Array, types.float64[:, ::1]]
+Matrices = Annotated[Array, types.float64[:, :, ::1]]  # one for each of n
+Index = Annotated[NDArray[np.int64], types.int64[::1]]
+IndexMatrix = Annotated[NDArray[np.int64], types.int64[:, ::1]]
+# arrays with any strides, which may be read-only; in no NamedTuple, whose fields numba does not convert
+AnyVector = Annotated[Array, types.Array(types.float64, 1, "A", readonly=True)]
+AnyMatrix = Annotated[Array, types.Array(types.float64, 2, "A", readonly=True)]
+_SCALARS = {float: types.float64, int: types.int64, bool: types.boolean, None: types.void, type(None): types.void}
+
+
+def numba_type(annotation: Any) -> Any:
+    """What numba calls a number, an array of the names above, a tuple, a NamedTuple of such, or a kernel's address."""
+    if annotation in _SCALARS:
+        return _SCALARS[annotation]
+    arguments = get_args(annotation)
+    if get_origin(annotation) is Annotated:
+        return arguments[1]
+    if get_origin(annotation) is Callable:
+        return types.FunctionType(numba_type(arguments[1])(*map(numba_type, arguments[0])))
+    if get_origin(annotation) is tuple:
+        return types.Tuple([numba_type(each) for each in arguments])
+    fields = [numba_type(each) for each in get_type_hints(annotation, include_extras=True).values()]
+    if len(set(fields)) == 1:
+        return types.NamedUniTuple(fields[0], len(fields), annotation)
+    return types.NamedTuple(fields, annotation)
+
+
+def signature_of(function: Callable[..., Any]) -> Any:
+    """A kernel's signature for numba, from its annotations."""
+    hints = get_type_hints(function, include_extras=True)
+    result = numba_type(hints.pop("return"))
+    return result(*map(numba_type, hints.values()))
 
 
 def helper(function: F) -> F:
@@ -63,14 +102,14 @@ def given(ndim: int) -> str:
     return f"Array(f8, {ndim}, 'A', True)"
 
 
-def kernel(signature: str, by_address: bool = False) -> Callable[[F], F]:
+def kernel(signature: str | None = None, by_address: bool = False) -> Callable[[F], F]:
     """An entry point, compiled for one signature when its module is imported, or loaded from the cache.
 
     Parameters
     ----------
-    signature : numba's, such as ``"void(f8[:, ::1], f8[::1])"``
-    by_address : can be an argument of other kernels, of type ``FunctionType(signature)``: what calls it so need not
-        be optimised with it once more
+    signature : numba's, such as ``"void(f8[:, ::1], f8[::1])"``; None = that of the annotations (`numba_type`)
+    by_address : can be an argument of other kernels, annotated as a ``Callable``: what calls it so need not be
+        optimised with it once more
 
     Raises
     ------
@@ -80,12 +119,12 @@ def kernel(signature: str, by_address: bool = False) -> Callable[[F], F]:
     options = {**KERNEL, "pipeline_class": KernelCompiler if by_address else UncalledKernelCompiler}
 
     def decorate(function: F) -> F:
-        folder = cache_folder(function.__module__)
+        folder, own = cache_folder(function.__module__), signature or signature_of(function)
         try:
             with _cache_in(folder):
-                compiled = njit(signature, cache=folder is not None, **options)(function)
+                compiled = njit(own, cache=folder is not None, **options)(function)
         except OSError:  # the folder went away, or the disk is full
-            compiled = njit(signature, **options)(function)
+            compiled = njit(own, **options)(function)
         except numba.core.errors.NumbaError as error:
             raise InputError(
                 f"numba {numba.__version__} cannot compile {function.__name__} ({_first_line(error)}): "

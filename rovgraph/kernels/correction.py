@@ -8,19 +8,24 @@
 Which measurements enter, and what a sensor does that was left out for long, is in `rovgraph.kernels.admission`.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.admission import admit, directions_seen
 from rovgraph.kernels.change_of_basis import change_basis, turn_rows
-from rovgraph.kernels.compile import helper, kernel
-from rovgraph.kernels.error_coordinates import ErrorLayout, local, retract
+from rovgraph.kernels.compile import Matrix, Vector, helper, kernel
+from rovgraph.kernels.error_coordinates import local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
+from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
-from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME
+from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME, MeasurementRows
 from rovgraph.kernels.moves import move
 from rovgraph.kernels.robust_update import (
+    Innovations,
+    Weights,
     correction,
     inflate,
     innovation_covariance,
@@ -30,14 +35,6 @@ from rovgraph.kernels.robust_update import (
     reweight,
 )
 from rovgraph.kernels.velocity_coordinates import coordinates_of_velocity
-
-Index = NDArray[np.int64]
-
-CORRECT = (
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], "
-    "f8[:, :, ::1], f8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], f8[::1], b1, f8, f8[::1], "
-    "f8[::1], f8[::1])"
-)  # signature of `correct`
 
 WIDE = 30.0  # sd of a prediction, in those of its measurement, from which it is corrected by iterations
 MAX_RELINEARIZATIONS = 5
@@ -58,28 +55,22 @@ def split(row: Array, L: Array, H_out: Array, H_y_out: Array) -> None:
 
 @helper
 def linearize_keyframe(
-    x: Array,
-    c: Array,
-    measured: tuple[Array, Index, Array, Array, float, int],
-    first: Index,
-    scratch: Scratch,
-    r_out: Array,
-    H_out: Array,
-    H_y_out: Array,
-    L: Array,
+    known: FilterState, measured: MeasurementRows, model: FilterModel, scratch: Scratch, found: Innovations
 ) -> None:
     """Whitened innovations and Jacobians of the measurements of a keyframe but those that are `GIVEN`.
 
-    Columns of what is considered, behind the ``estimated`` ones, are multiplied by L.
+    Columns of what is considered, behind those of what is estimated, are multiplied by L.
     """
-    rows, which, sensors, scale, gravity, estimated = measured
+    rows, which, scale = measured
+    x, c, L, sensors, estimated = known.x, known.c, known.L, model.sensors, len(model.layout.columns)
+    first, r_out, H_out, H_y_out = found.first, found.r, found.H, found.H_y
     wide = np.zeros((len(r_out), estimated + len(L))) if len(L) else H_out
     R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
     for j in range(len(which)):
         sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
         if sensor[KIND] != GIVEN:
             own, own_r, own_H = scale[j] if len(scale) else scratch.exact, r_out[begin:end], wide[begin:end]
-            linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, scratch, own_r, own_H)
+            linearize_measurement(R, p, v, b, c, rows[j], sensor, own, model.gravity, scratch, own_r, own_H)
             if len(L):
                 for a in range(begin, end):
                     split(wide[a], L, H_out[a, :estimated], H_y_out[a])
@@ -96,22 +87,13 @@ def widest(S: Array) -> float:
 
 @helper
 def relinearize(
-    x: Array,
-    c: Array,
-    P: Array,
-    B: Array,
-    L: Array,
-    measured: tuple[Array, Index, Array, Array, float, int],
-    first: Index,
-    losses: tuple[Index, Array, Array, Array, Array],
-    layout: ErrorLayout,
-    scratch: Scratch,
+    known: FilterState,
+    measured: MeasurementRows,
+    model: FilterModel,
     entered: Array,
-    r: Array,
-    H: Array,
-    H_y: Array,
-    HP: Array,
-    S: Array,
+    found: Innovations,
+    weights: Weights,
+    scratch: Scratch,
     behind_out: Array,
 ) -> None:
     """Move a prediction to where its correction leads, and linearise there: the iterated filter (Bell and Cathey 1993).
@@ -121,18 +103,18 @@ def relinearize(
 
     Parameters
     ----------
-    x, c, P, B, r, H, H_y, HP, S : as of `correct`, renewed in place; from r on without what is left out
-    losses : as of `reweight`
+    known, found : renewed in place; the innovations without what is left out
     entered : shape (m,), 0 of a measurement that is left out
     """
+    x, c, P, B, L = known
+    r, H, layout = found.r, found.H, model.layout
     n, size, rows = len(P), len(layout.columns), len(layout.rows)
-    loss, bend, root, inverse, weight = losses
     coordinates = coordinates_of_velocity(x, P, layout)
     predicted_x, predicted_c, predicted_P, predicted_B = x.copy(), c.copy(), P.copy(), B.copy()
     delta, basis, work = np.empty(n), np.eye(size), make_coordinates_scratch(len(layout.seen), len(c))
     for _ in range(MAX_RELINEARIZATIONS):
-        reweight(r, S, first, loss, bend, root, inverse, weight)
-        correction(r, HP, root, inverse, delta)
+        reweight(found, weights)
+        correction(found, weights, delta)
         square = 0.0
         for i in range(size):
             delta[i] += behind_out[i]
@@ -152,106 +134,107 @@ def relinearize(
         turn_rows(B, basis, layout.rows, np.empty((rows, len(L))))
         r.fill(0.0)
         H.fill(0.0)
-        linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
+        linearize_keyframe(known, measured, model, scratch, found)
         for a in range(len(r)):
             for i in range(size):
                 r[a] -= H[a, i] * behind_out[i]
-        innovation_covariance(P, H, HP, S)
+        innovation_covariance(P, found)
         for j in range(len(entered)):
             if entered[j] == 0.0:
-                leave_out(r, H, H_y, HP, S, first[j], first[j + 1])
+                leave_out(found, j)
 
 
-@kernel(CORRECT, by_address=True)
+class GivenRows(NamedTuple):
+    """Whitened rows of the measurements of kind `GIVEN`, in their order; what is considered comes last."""
+
+    r: Vector
+    H: Matrix
+
+
+class Corrected(NamedTuple):
+    """What `correct` writes.
+
+    Attributes
+    ----------
+    nis, weight : shape (m,), of the measurements; weight 0 = left out
+    places : correction of the places
+    """
+
+    nis: Vector
+    weight: Vector
+    places: Vector
+
+
+Correct = Callable[  # type of `correct`
+    [FilterState, MeasurementRows, GivenRows, FilterModel, Vector, bool, Corrected], None
+]
+
+
+@kernel(by_address=True)
 def correct(
-    x: Array,
-    c: Array,
-    P: Array,
-    B: Array,
-    L: Array,
-    rows: Array,
-    which: Index,
-    sensors: Array,
-    column: Index,
-    scale: Array,
-    given_r: Array,
-    given_H: Array,
-    columns: Index,
-    seen: Index,
-    seen_params: Array,
-    basis_rows: Index,
-    since: Array,
+    known: FilterState,
+    measured: MeasurementRows,
+    given: GivenRows,
+    model: FilterModel,
+    since: Vector,
     gated: bool,
-    gravity: float,
-    nis_out: Array,
-    weight_out: Array,
-    places_out: Array,
+    out: Corrected,
 ) -> None:
     """Correct a keyframe by m measurements, in place.
 
     Parameters
     ----------
-    x, c, P, B : state (21,), calibration vector, and of `rovgraph.kernels.robust_update`; places that are remembered
-        come last in P
-    L : shape (h, h), root of the covariance of what is considered
-    rows, which : shapes (m, ROW), (m,), the measurements and the sensor that each is of
-    sensors : shape (s, PARAMS + ...), of `rovgraph.kernels.measurement_row`
-    column : shape (15 + C,), place of each component in the error, -1 where it has none; what is considered comes last
-    scale : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6)
-    given_r, given_H : whitened rows of the measurements of kind `GIVEN`, in their order; what is considered comes last
-    columns to basis_rows : the error's `rovgraph.kernels.error_coordinates.ErrorLayout`
     since : shape (s,), since when each sensor is left out, nan where it is not [s]
     gated : False lets everything in
-    gravity : [m/s^2]
-    nis_out, weight_out : shape (m,); weight 0 = left out
-    places_out : correction of the places
     """
-    m, n, layout = len(which), len(P), ErrorLayout(columns, seen, seen_params, basis_rows)
+    x, P, B, L = known.x, known.P, known.B, known.L
+    rows, which, sensors, layout = measured.rows, measured.which, model.sensors, model.layout
+    nis_out, weight_out, places_out = out
+    m, n = len(which), len(P)
     first = np.zeros(m + 1, np.int64)
     for j in range(m):
         first[j + 1] = first[j] + int(sensors[which[j], DIM])
     r, H, H_y = np.zeros(first[m]), np.zeros((first[m], n)), np.zeros((first[m], len(L)))
-    HP, S = np.empty((first[m], n)), np.empty((first[m], first[m]))
-    loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(c), column)
+    S = np.empty((first[m], first[m]))
+    found = Innovations(first, r, H, H_y, np.empty((first[m], n)), S)
+    loss, bend, taken, scratch = np.empty(m, np.int64), np.empty(m), 0, make_scratch(len(known.c), model.column)
     for j in range(m):
-        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
+        sensor = sensors[which[j]]
         loss[j], bend[j] = int(sensor[LOSS]), sensor[BEND]
         if sensor[KIND] == GIVEN:
-            for a in range(begin, end):
-                r[a] = given_r[taken]
-                split(given_H[taken], L, H[a, : given_H.shape[1] - len(L)], H_y[a])
+            for a in range(first[j], first[j + 1]):
+                r[a] = given.r[taken]
+                split(given.H[taken], L, H[a, : given.H.shape[1] - len(L)], H_y[a])
                 taken += 1
-    measured = (rows, which, sensors, scale, gravity, len(columns))
-    linearize_keyframe(x, c, measured, first, scratch, r, H, H_y, L)
-    innovation_covariance(P, H, HP, S)
+    linearize_keyframe(known, measured, model, scratch, found)
+    innovation_covariance(P, found)
     entered = False
     for j in range(m):
-        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
-        nis_out[j] = normalised_squared(S, r, begin, end)
+        sensor = sensors[which[j]]
+        nis_out[j] = normalised_squared(S, r, first[j], first[j + 1])
         weight_out[j] = 1.0
         if gated and not admit(nis_out[j], rows[j, TIME], sensor, since, which[j]):
             weight_out[j] = 0.0
             elapsed = rows[j, TIME] - since[which[j]]
             if elapsed > sensor[READMIT]:
                 directions, spread = directions_seen(x, sensor, n, elapsed)
-                inflate(P, r, H, begin, end, directions, spread)
-                innovation_covariance(P, H, HP, S)
-            leave_out(r, H, H_y, HP, S, begin, end)
+                inflate(P, found, j, directions, spread)
+                innovation_covariance(P, found)
+            leave_out(found, j)
         else:
             entered = True
     if not entered:
         return
-    root, inverse, weight, delta = np.empty(first[m]), np.empty_like(S), np.empty(m), np.empty(n)
-    behind = np.zeros(len(layout.columns))
+    delta, behind = np.empty(n), np.zeros(len(layout.columns))
+    weights = Weights(loss, bend, np.empty(m), np.empty(first[m]), np.empty_like(S))
     if taken == 0 and widest(S) > WIDE * WIDE:
-        losses = (loss, bend, root, inverse, weight)
-        relinearize(x, c, P, B, L, measured, first, losses, layout, scratch, weight_out, r, H, H_y, HP, S, behind)
-    reweight(r, S, first, loss, bend, root, inverse, weight)
-    joseph(P, B, r, H, H_y, HP, root, inverse, delta)
+        relinearize(known, measured, model, weight_out, found, weights, scratch, behind)
+    reweight(found, weights)
+    joseph(P, B, found, weights, delta)
     for i in range(len(behind)):
         delta[i] += behind[i]
     for j in range(m):
-        weight_out[j] *= weight[j]
-    move(x, c, P, B, delta, coordinates_of_velocity(x, P, layout))
+        weight_out[j] *= weights.weight[j]
+    move(known, delta, coordinates_of_velocity(x, P, layout))
     for i in range(len(places_out)):
         places_out[i] = delta[n - len(places_out) + i]

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import wrap
-from rovgraph.kernels.compile import helper, view_helper
+from rovgraph.kernels.compile import Index, IndexMatrix, Matrix, helper, view_helper
 from rovgraph.kernels.layout import ACC_BIAS, MOTION, TRANSLATION, VELOCITY
 from rovgraph.kernels.measurements import WORK, is_angular, predict
 from rovgraph.kernels.rotations import (
@@ -59,10 +59,10 @@ class ErrorLayout(NamedTuple):
     rows : ndarray of int, shape (r,), rows of a change of basis that differ from the unit matrix
     """
 
-    columns: Indices
-    seen: Indices
-    params: Array
-    rows: Indices
+    columns: Index
+    seen: IndexMatrix
+    params: Matrix
+    rows: Index
 
 
 class Scratch(NamedTuple):

@@ -5,19 +5,17 @@ stops before an interval with a measurement that is `GIVEN`, and where the attit
 be found before it is linearised at (`rovgraph.engine.alignment`).
 """
 
-from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import given, helper, kernel, view_helper
-from rovgraph.kernels.correction import CORRECT
+from rovgraph.kernels.compile import AnyMatrix, AnyVector, Index, Matrices, Matrix, Vector, helper, kernel, view_helper
+from rovgraph.kernels.correction import Correct, Corrected, GivenRows
+from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import VELOCITY
-from rovgraph.kernels.measurement_row import GIVEN, KIND
-from rovgraph.kernels.prediction import PREDICT_FILTER
-
-Index = NDArray[np.int64]
+from rovgraph.kernels.measurement_row import GIVEN, KIND, MeasurementRows
+from rovgraph.kernels.prediction import Predicted, PredictFilter
 
 
 @helper
@@ -31,8 +29,8 @@ def attitude_variances(x: Array, P: Array) -> tuple[float, float]:
     return max(variance[0], variance[1]), variance[2]
 
 
-@kernel(f"UniTuple(f8, 2)({given(1)}, {given(2)})")
-def attitude_variances_of(x: Array, P: Array) -> tuple[float, float]:
+@kernel()
+def attitude_variances_of(x: AnyVector, P: AnyMatrix) -> tuple[float, float]:
     """`attitude_variances`, from Python."""
     return attitude_variances(x, P)
 
@@ -64,97 +62,101 @@ def _covariance(P: Array, B: Array, first: int, P_out: Array) -> None:
             P_out[i, j] = total
 
 
-@kernel(
-    "i8(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], "
-    "f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1], i8[::1], "
-    "f8[::1], f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], "
-    f"f8[:, ::1], f8[::1], f8[::1], FunctionType({CORRECT}), FunctionType({PREDICT_FILTER}))"
-)
+class Intervals(NamedTuple):
+    """k intervals, and where a filter stops before one.
+
+    Attributes
+    ----------
+    motions, scales : shapes (k, ROW), (k, 6, 6) or (0, 6, 6), as of `rovgraph.kernels.dive`
+    taken : shape (k + 1,), the first measurement of each, and how many there are
+    here : shape (k,), the first measurement at the keyframe that ends each
+    poorly_known : shape (2,), variances of tilt and heading beyond which the attitude has to be found first [rad^2]
+    """
+
+    motions: Matrix
+    scales: Matrices
+    taken: Index
+    here: Index
+    poorly_known: Vector
+
+
+class Filtered(NamedTuple):
+    """What `filter_intervals` writes.
+
+    Attributes
+    ----------
+    x, c : shapes (k, 21), (k, C), the keyframes
+    predicted_x, predicted_c : the same before what was measured at them
+    pose, velocity, sd : shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
+    nis, weight : shape (m,), of the measurements
+    """
+
+    x: Matrix
+    c: Matrix
+    predicted_x: Matrix
+    predicted_c: Matrix
+    pose: Matrices
+    velocity: Matrices
+    sd: Matrix
+    nis: Vector
+    weight: Vector
+
+
+@kernel()
 def filter_intervals(
-    x: Array,
-    c: Array,
-    P: Array,
-    B: Array,
-    L: Array,
-    motions: Array,
-    scales: Array,
-    rows: Array,
-    which: Index,
-    row_scales: Array,
-    taken: Index,
-    here: Index,
-    sensors: Array,
-    column: Index,
-    walk: Array,
-    columns: Index,
-    seen: Index,
-    seen_params: Array,
-    basis_rows: Index,
-    since: Array,
-    gravity: float,
-    poorly_known: Array,
-    x_out: Array,
-    c_out: Array,
-    predicted_x_out: Array,
-    predicted_c_out: Array,
-    pose_out: Array,
-    velocity_out: Array,
-    sd_out: Array,
-    nis_out: Array,
-    weight_out: Array,
-    correct: Callable[..., None],
-    predict_filter: Callable[..., None],
+    known: FilterState,
+    intervals: Intervals,
+    measured: MeasurementRows,
+    model: FilterModel,
+    since: Vector,
+    out: Filtered,
+    correct: Correct,
+    predict_filter: PredictFilter,
 ) -> int:
     """Take up to k intervals.
 
     Parameters
     ----------
-    x, c, P, B : the keyframe before them, afterwards that at the end of the last one that is taken
-    L : root of the covariance of what is considered
-    motions, scales : shapes (k, ROW), (k, 6, 6) or (0, 6, 6), as of `rovgraph.kernels.dive`
-    rows, which, row_scales : of their measurements
-    taken : shape (k + 1,), the first measurement of each interval, and how many there are
-    here : shape (k,), the first measurement at the keyframe that ends each
-    sensors, column, since, gravity, columns to basis_rows : as `rovgraph.kernels.correction.correct`
-    walk : shape (3, size), as `rovgraph.kernels.prediction.predict_filter`
-    poorly_known : shape (2,), variances of tilt and heading beyond which the attitude has to be found first [rad^2]
-    x_out, c_out : shapes (k, 21), (k, C), the keyframes
-    predicted_x_out, predicted_c_out : the same before what was measured at them
-    pose_out, velocity_out, sd_out : shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
-    nis_out, weight_out : shape (m,), of the measurements
+    known : the keyframe before them, afterwards that at the end of the last one that is taken
+    measured : of the intervals
+    since : as `rovgraph.kernels.correction.correct`
     correct, predict_filter : of `rovgraph.kernels.correction` and `rovgraph.kernels.prediction`
 
     Returns
     -------
     How many intervals are taken
     """
-    size, nothing, none_given = walk.shape[1], np.empty(0), np.empty((0, len(L)))
-    F, Q, exact, there = np.empty((size, size)), np.empty((size, size)), np.empty((0, 0)), np.empty(21)
+    x, c, P, B, L = known
+    rows, which, scales = measured
+    taken, here = intervals.taken, intervals.here
+    size, nothing = model.walk.shape[1], np.empty(0)
+    given = GivenRows(nothing, np.empty((0, len(L))))
+    exact, there = np.empty((0, 0)), np.empty(21)
+    predicted = Predicted(there, c, np.empty((size, size)), np.empty((size, size)))
     for k in range(len(here)):
         tilt, heading = attitude_variances(x, P)
-        known = knows_all(which[taken[k] : taken[k + 1]], sensors)
-        if tilt > poorly_known[0] or heading > poorly_known[1] or not known:
+        poorly_known = tilt > intervals.poorly_known[0] or heading > intervals.poorly_known[1]
+        if poorly_known or not knows_all(which[taken[k] : taken[k + 1]], model.sensors):
             return k
         for arrived in range(2):
             if arrived:
-                scale = scales[k] if len(scales) else exact
-                predict_filter(x, c, P, B, L, motions[k], scale, column, walk, size, there, c, F, Q)
+                scale = intervals.scales[k] if len(intervals.scales) else exact
+                predict_filter(known, intervals.motions[k], scale, model, predicted)
                 _copy(there, x)
-                _copy(x, predicted_x_out[k])
-                _copy(c, predicted_c_out[k])
+                _copy(x, out.predicted_x[k])
+                _copy(c, out.predicted_c[k])
             begin, end = (here[k], taken[k + 1]) if arrived else (taken[k], here[k])
             if begin < end:
-                own = row_scales[begin:end] if len(row_scales) else row_scales
-                tables = (sensors, column, own, nothing, none_given, columns, seen, seen_params, basis_rows)
-                out = nis_out[begin:end], weight_out[begin:end], nothing
-                correct(x, c, P, B, L, rows[begin:end], which[begin:end], *tables, since, True, gravity, *out)
-        _copy(x, x_out[k])
-        _copy(c, c_out[k])
-        _covariance(P, B, 0, pose_out[k])
-        _covariance(P, B, VELOCITY, velocity_out[k])
+                some = MeasurementRows(rows[begin:end], which[begin:end], scales[begin:end])
+                corrected = Corrected(out.nis[begin:end], out.weight[begin:end], nothing)
+                correct(known, some, given, model, since, True, corrected)
+        _copy(x, out.x[k])
+        _copy(c, out.c[k])
+        _covariance(P, B, 0, out.pose[k])
+        _covariance(P, B, VELOCITY, out.velocity[k])
         for i in range(size):
             variance = P[i, i]
             for j in range(len(L)):
                 variance += B[i, j] * B[i, j]
-            sd_out[k, i] = np.sqrt(variance)
+            out.sd[k, i] = np.sqrt(variance)
     return len(here)

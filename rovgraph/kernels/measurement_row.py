@@ -26,6 +26,10 @@ sensor
 =============  =====  ==========================================================================================
 """
 
+from typing import NamedTuple
+
+from rovgraph.kernels.compile import Index, Matrices, Matrix
+
 TIME, RATE, RATE_SD, SNAPSHOT, ASSUMED, Z = 0, 1, 4, 5, 21, 27
 MOST = 3  # components of a measurement that a kernel takes
 SD = Z + MOST
@@ -35,3 +39,17 @@ DT, DR, DV, DP = SNAPSHOT, SNAPSHOT + 1, SNAPSHOT + 10, SNAPSHOT + 13
 KIND, DIM, LOSS, BEND, GATE, READMIT, SEES, SEEN_FRAME, GAIN, PARAMS = 0, 1, 2, 3, 4, 5, 6, 9, 10, 19
 GIVEN = -1.0
 SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2
+
+
+class MeasurementRows(NamedTuple):
+    """m measurements.
+
+    Attributes
+    ----------
+    rows, which : shapes (m, ROW), (m,), and the sensor that each is of
+    scales : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
+    """
+
+    rows: Matrix
+    which: Index
+    scales: Matrices

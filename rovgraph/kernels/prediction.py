@@ -10,20 +10,17 @@ is a first-order Gauss-Markov process (Gelb 1974), of which F keeps exp(-dt / T)
 """
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper, kernel, view_helper
+from rovgraph.kernels.compile import Matrix, Vector, helper, kernel, view_helper
+from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion import predict_with_transition
 from rovgraph.kernels.motion_row import DURATION
-
-PREDICT_FILTER = (
-    "void(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8, "
-    "f8[::1], f8[::1], f8[:, ::1], f8[:, ::1])"
-)  # signature of `predict_filter`
 
 MOVED = 9  # components that the motion mixes: rotation, position, velocity; biases and calibration stay
 
@@ -75,38 +72,37 @@ def carry_considered(B: Array, F: Array, moved: Array, own: Array) -> None:
             B[i, k] *= F[i, i]
 
 
-@kernel(PREDICT_FILTER, by_address=True)
-def predict_filter(
-    x: Array,
-    c: Array,
-    P: Array,
-    B: Array,
-    L: Array,
-    motion: Array,
-    scale: Array,
-    column: NDArray[np.int64],
-    walk: Array,
-    estimated: int,
-    x_out: Array,
-    c_out: Array,
-    F_out: Array,
-    Q_out: Array,
-) -> None:
+class Predicted(NamedTuple):
+    """What `predict_filter` writes.
+
+    Attributes
+    ----------
+    x, c : state and calibration vector after the interval; c may be that before it
+    F, Q : shape (n, n), transition and noise
+    """
+
+    x: Vector
+    c: Vector
+    F: Matrix
+    Q: Matrix
+
+
+PredictFilter = Callable[[FilterState, Vector, Matrix, FilterModel, Predicted], None]  # type of `predict_filter`
+
+
+@kernel(by_address=True)
+def predict_filter(before: FilterState, motion: Vector, scale: Matrix, model: FilterModel, out: Predicted) -> None:
     """Carry an estimate over an interval.
 
     Parameters
     ----------
-    x, c : state (21,) and calibration vector of the keyframe before
-    P, B : shapes (n, n), (n, h), of `rovgraph.kernels.robust_update`; afterwards those of the keyframe after
-    L : shape (h, h), root of the covariance of what is considered
+    before : the keyframe before; its P and B become those of the keyframe after
     motion : row of `rovgraph.kernels.motion_row`
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
-    column : place of each component of state and calibration in the error, -1 where it is not estimated
-    walk : shape (3, n), variance that walking adds in a second, one over its time constant [1/s], the mean
-    estimated : components of the error; those that are considered have the columns behind them
-    x_out, c_out : state and calibration vector after it; ``c_out`` may be ``c``
-    F_out, Q_out : shape (n, n), transition and noise
     """
+    x, c, P, B, L = before
+    x_out, c_out, F_out, Q_out = out
+    column, walk, estimated = model.column, model.walk, model.walk.shape[1]
     n, moved = len(P), np.zeros((MOVED, len(L)))
     bias, F, Q = x[15:21].copy(), np.zeros((MOTION, MOTION)), np.zeros((MOTION, MOTION))
     if len(scale):
@@ -123,6 +119,7 @@ def predict_filter(
     Q_out.fill(0.0)
     for i in range(n):
         F_out[i, i] = 1.0
+    for i in range(estimated):
         Q_out[i, i] = walk[0, i] * motion[DURATION]
     for i in range(len(c)):
         c_out[i] = c[i]

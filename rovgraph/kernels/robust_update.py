@@ -13,11 +13,11 @@ is B y, y white and of unit variance, so that the covariance of the estimate is 
 
     B <- B - K (H B + H_y)                                              the covariance analysis of Schmidt (1966)
 
-Shapes: P (n, n), B (n, h), r (m,), H (m, n), H_y (m, h), HP (m, n), S (m, m); ``first`` (k + 1,) are the rows where
-each of k measurements begins.
+Shapes: P (n, n), B (n, h).
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +33,46 @@ SETTLED = 1e-3  # change of a weight
 RIDGE = 1e-12  # of the trace, that keeps least squares of what a sensor hardly sees solvable
 
 
+class Innovations(NamedTuple):
+    """Whitened innovations of k measurements, m rows in all.
+
+    Attributes
+    ----------
+    first : shape (k + 1,), the row where each measurement begins
+    r, H, H_y : shapes (m,), (m, n), (m, h), innovations and their Jacobians by the error and by y
+    HP, S : shapes (m, n), (m, m), H P and H P H'
+    """
+
+    first: Lines
+    r: Array
+    H: Array
+    H_y: Array
+    HP: Array
+    S: Array
+
+
+class Weights(NamedTuple):
+    """Weights of k measurements, and what they follow from.
+
+    Attributes
+    ----------
+    loss, bend : shape (k,), of each measurement, of `rovgraph.kernels.weighting`
+    weight : shape (k,), of each measurement
+    root : shape (m,), square roots of the rows' weights
+    inverse : shape (m, m), (W^1/2 S W^1/2 + I)^-1
+    """
+
+    loss: Lines
+    bend: Array
+    weight: Array
+    root: Array
+    inverse: Array
+
+
 @helper
-def innovation_covariance(P: Array, H: Array, HP_out: Array, S_out: Array) -> None:
+def innovation_covariance(P: Array, found: Innovations) -> None:
     """H P and S = H P H'."""
+    H, HP_out, S_out = found.H, found.HP, found.S
     m, n = H.shape
     HP_out.fill(0.0)
     for a in range(m):
@@ -108,9 +145,10 @@ def normalised_squared(S: Array, r: Array, begin: int, end: int) -> float:
 
 
 @helper
-def leave_out(r: Array, H: Array, H_y: Array, HP: Array, S: Array, begin: int, end: int) -> None:
-    """Make nothing of the rows ``begin`` to ``end``."""
-    for a in range(begin, end):
+def leave_out(found: Innovations, j: int) -> None:
+    """Make nothing of the rows of measurement ``j``."""
+    r, H, H_y, HP, S = found.r, found.H, found.H_y, found.HP, found.S
+    for a in range(found.first[j], found.first[j + 1]):
         r[a] = 0.0
         H[a].fill(0.0)
         H_y[a].fill(0.0)
@@ -120,7 +158,7 @@ def leave_out(r: Array, H: Array, H_y: Array, HP: Array, S: Array, begin: int, e
 
 
 @helper
-def inflate(P: Array, r: Array, H: Array, begin: int, end: int, seen: Array, spread: Array) -> None:
+def inflate(P: Array, found: Innovations, measurement: int, seen: Array, spread: Array) -> None:
     """Let something that no model knows have moved what a sensor sees, by as much as its measurement shows.
 
     As a knock does to velocity and position: P += |x|^2 (seen seen' + spread spread'), x the least squares solution
@@ -128,9 +166,9 @@ def inflate(P: Array, r: Array, H: Array, begin: int, end: int, seen: Array, spr
     followed from it; ``spread``, shape (n, s), is how far that is uncertain. H P and S are out of date after it.
     """
     n, s = seen.shape
-    A, x = np.zeros((s, s)), np.zeros(s)
+    r, H, A, x = found.r, found.H, np.zeros((s, s)), np.zeros(s)
     row = np.empty(s)
-    for a in range(begin, end):
+    for a in range(found.first[measurement], found.first[measurement + 1]):
         for j in range(s):
             row[j] = 0.0
             for i in range(n):
@@ -158,18 +196,10 @@ def inflate(P: Array, r: Array, H: Array, begin: int, end: int, seen: Array, spr
 
 
 @helper
-def reweight(
-    r: Array, S: Array, first: Lines, loss: Lines, bend: Array, root_out: Array, inverse_out: Array, weight_out: Array
-) -> None:
-    """Iterate the weights until they rest.
-
-    Parameters
-    ----------
-    loss, bend : shape (k,), of each measurement
-    root_out : shape (m,), square roots of the rows' weights
-    inverse_out : shape (m, m), (W^1/2 S W^1/2 + I)^-1
-    weight_out : shape (k,), weights of the measurements
-    """
+def reweight(found: Innovations, weights: Weights) -> None:
+    """Iterate the weights until they rest."""
+    first, r, S, loss, bend = found.first, found.r, found.S, weights.loss, weights.bend
+    weight_out, root_out, inverse_out = weights.weight, weights.root, weights.inverse
     k, m = len(weight_out), len(r)
     A, L, gain = np.empty((m, m)), np.empty((m, m)), np.empty(m)
     weight_out.fill(1.0)
@@ -208,8 +238,9 @@ def reweight(
 
 
 @helper
-def correction(r: Array, HP: Array, root: Array, inverse: Array, delta_out: Array) -> None:
+def correction(found: Innovations, weights: Weights, delta_out: Array) -> None:
     """The correction by itself: d = P H' W^1/2 (W^1/2 S W^1/2 + I)^-1 W^1/2 r."""
+    r, HP, root, inverse = found.r, found.HP, weights.root, weights.inverse
     delta_out.fill(0.0)
     for a in range(len(r)):
         share = 0.0
@@ -220,10 +251,9 @@ def correction(r: Array, HP: Array, root: Array, inverse: Array, delta_out: Arra
 
 
 @helper
-def joseph(
-    P: Array, B: Array, r: Array, H: Array, H_y: Array, HP: Array, root: Array, inverse: Array, delta_out: Array
-) -> None:
+def joseph(P: Array, B: Array, found: Innovations, weights: Weights, delta_out: Array) -> None:
     """The correction, and P and B after it in place; HP and H become W^1/2 times what they were."""
+    r, H, H_y, HP, root, inverse = found.r, found.H, found.H_y, found.HP, weights.root, weights.inverse
     m, n = HP.shape
     Kt, HA = np.zeros((m, n)), np.zeros((m, n))  # K', and H times the transpose of A = (I - K H) P
     for a in range(m):

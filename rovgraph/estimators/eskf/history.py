@@ -75,15 +75,16 @@ class FilterHistory:
 
     def extend(self, intervals: Sequence[KeyframeInterval], run: FilterRun) -> None:
         """Take the intervals that a filter has run through."""
+        found = run.filtered
         for which in dict.fromkeys(run.which.tolist()):
             own = np.flatnonzero(run.which == which)
-            of_keyframes = run.before, run.x, run.c, run.predicted_x, run.predicted_c
+            of_keyframes = run.before, found.x, found.c, found.predicted_x, found.predicted_c
             states = MetStates(*of_keyframes, run.interval[own], run.between[own])
-            met = _Met(states, run.nis[own].tolist(), run.weight[own].tolist())
+            met = _Met(states, found.nis[own].tolist(), found.weight[own].tolist())
             self._met.setdefault(run.sensors[which], []).append(met)
         self.intervals += intervals
         if len(intervals):
-            self._pieces.append((run.x, run.c, run.pose, run.velocity, run.sd))
+            self._pieces.append((found.x, found.c, found.pose, found.velocity, found.sd))
 
     def replace_last(self, known: Gaussian) -> None:
         """Take another estimate of the newest keyframe."""
