@@ -41,7 +41,15 @@ from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
 from rovgraph.kernels import measurement_row
 from rovgraph.kernels.admission import RETURN_SD
-from rovgraph.kernels.robust_update import MAX_REWEIGHTINGS, SETTLED, innovation_covariance, joseph, reweight
+from rovgraph.kernels.robust_update import (
+    MAX_REWEIGHTINGS,
+    SETTLED,
+    Innovations,
+    Weights,
+    innovation_covariance,
+    joseph,
+    reweight,
+)
 from rovgraph.kernels.weighting import LOSSES
 from rovgraph.log import Log
 from rovgraph.sensors import innovation
@@ -252,12 +260,14 @@ def updated(P: Array, r: list[Array], H: list[Array], loss: str) -> tuple[Array,
     first, P = np.cumsum([0, *map(len, r)]), P.copy()
     rows, J = np.concatenate(r), np.vstack(H)
     m, n = J.shape
-    HP, S, root, inverse, weight, delta = (np.empty(k) for k in ((m, n), (m, m), m, (m, m), len(r), n))
-    innovation_covariance(P, J, HP, S)
+    found, delta = Innovations(first, rows, J, np.zeros((m, 0)), np.empty((m, n)), np.empty((m, m))), np.empty(n)
+    innovation_covariance(P, found)
     bends = np.array([loss_threshold(loss, len(own)) for own in r])
-    reweight(rows, S, first, np.full(len(r), LOSSES.index(loss)), bends, root, inverse, weight)
-    joseph(P, np.zeros((n, 0)), rows, J, np.zeros((m, 0)), HP, root, inverse, delta)
-    return delta, P, weight
+    losses = np.full(len(r), LOSSES.index(loss))
+    weights = Weights(losses, bends, np.empty(len(r)), np.empty(m), np.empty((m, m)))
+    reweight(found, weights)
+    joseph(P, np.zeros((n, 0)), found, weights, delta)
+    return delta, P, weights.weight
 
 
 def test_an_update_without_losses_is_kalmans():

@@ -61,7 +61,7 @@ def one(state: State, k: int) -> list[Array]:
 
 
 def prepared(layout: Layout) -> tuple[ErrorLayout, Scratch, Array]:
-    own = ErrorLayout(*layout.coordinates)
+    own = layout.coordinates
     return own, make_scratch(len(own.seen), SIZE), np.eye(layout.size)
 
 
@@ -146,7 +146,7 @@ def test_the_basis_of_a_retraction_is_that_of_the_difference_back_but_for_the_se
 def test_change_of_basis_of_a_covariance_is_the_dense_product(layout, places):
     rng = np.random.default_rng(5)
     *_, basis = moved_by(layout)[0]
-    rows = layout.coordinates[-1]
+    rows = layout.coordinates.rows
     whole = np.eye(layout.size + places)
     whole[: layout.size, : layout.size] = basis
     root = rng.standard_normal(whole.shape)

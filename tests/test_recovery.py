@@ -10,6 +10,8 @@ from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.geometry import Array
+from rovgraph.kernels.error_coordinates import ErrorLayout
+from rovgraph.kernels.filter_state import FilterState
 from rovgraph.kernels.moves import difference, move_estimate
 from rovgraph.state import VELOCITY
 
@@ -71,7 +73,7 @@ def test_a_correction_of_a_wide_prediction_is_at_the_optimum_of_its_cost(case, s
     r, H = engine.linearize(known, [ping])
     delta = known.P @ H.T @ np.linalg.solve(H @ known.P @ H.T + np.eye(3), r)
     x, c, P = known.x.copy(), known.c.copy(), after.P.copy()
-    move_estimate(x, c, P, np.zeros((len(P), 0)), delta, *along_n(engine))
+    move_estimate(FilterState(x, c, P, np.zeros((len(P), 0)), np.zeros((0, 0))), delta, along_n(engine))
     assert from_optimum(engine, known, after, ping) < 0.1
     assert from_optimum(engine, known, Gaussian(x, c, after.P), ping) > 2.0
 
@@ -92,17 +94,17 @@ def about_to_return(case: Simulated, rng: np.random.Generator) -> tuple[FilterEn
     return engine, Gaussian(off.x, off.c, known.P), ping
 
 
-def along_n(engine: FilterEngine) -> tuple[Array, Array, Array, Array]:
+def along_n(engine: FilterEngine) -> ErrorLayout:
     """The error's coordinates with the velocity along n."""
     columns, seen, params, rows = engine.layout.coordinates
     others = seen[:, 2] != engine.layout.columns[VELOCITY].start
-    return columns, seen[others], params[others], rows
+    return ErrorLayout(columns, seen[others], params[others], rows)
 
 
 def from_optimum(engine: FilterEngine, known: Gaussian, there: Gaussian, ping: KeyframeMeasurement) -> float:
     """The largest component of a Newton step from an estimate, in its sds."""
     back, basis = np.empty(engine.layout.size), np.eye(engine.layout.size)
-    difference(there.x, there.c, known.x, known.c, *along_n(engine), back, basis)
+    difference(there.x, there.c, known.x, known.c, along_n(engine), back, basis)
     r, H = engine.linearize(there, [ping])
     P = basis @ known.P @ basis.T
     step = P @ H.T @ np.linalg.solve(H @ P @ H.T + np.eye(len(r)), r - H @ back) + back

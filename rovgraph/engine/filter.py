@@ -163,15 +163,15 @@ class FilterEngine:
         k, m, C, size = end - begin, own.stop - own.start, len(before.c), self.layout.size
         shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
         out = Filtered._make(np.empty(shape) for shape in shapes)
-        intervals = Intervals(some.motions, some.scales, np.append(0, some.taken), some.first[:k], POORLY_KNOWN)
-        measured = MeasurementRows(some.rows, some.which, some.row_scales)
-        taken = filter_intervals(known, intervals, measured, self._model, since, out, correct, predict_filter)
+        motions, scales = problem.motions[begin - 1 : end - 1], problem.scales[begin - 1 : end - 1]
+        intervals = Intervals(motions, scales, np.append(0, taken), first, POORLY_KNOWN)
+        measured = self._rows(problem, own)
+        done = filter_intervals(known, intervals, measured, self._model, since, out, correct, predict_filter)
         self._renew(gates, since)
-        m = int(some.taken[taken - 1]) if taken else 0
-        interval = np.arange(taken).repeat(np.diff(some.taken[:taken], prepend=0))
-        own = Filtered._make(a[: m if a.ndim == 1 else taken] for a in out)
-        met = rows.sensors, some.which[:m], interval, np.arange(m) < some.first[interval]
-        return FilterRun(before, _estimate(known), own, *met)
+        m = int(taken[done - 1]) if done else 0
+        found = Filtered(*(array[:done] for array in out[:-2]), out.nis[:m], out.weight[:m])
+        interval = np.arange(done).repeat(np.diff(taken[:done], prepend=0))
+        return FilterRun(before, _estimate(known), found, interval, np.arange(m) < first[interval])
 
     def predict(self, problem: Problem, k: int, before: Gaussian) -> Transition:
         """Keyframe k from the one before, by the IMU alone; calibration walks."""

@@ -11,6 +11,7 @@ from rovgraph.calibration import LAYOUT, calibration_size
 from rovgraph.engine.problem import Problem
 from rovgraph.engine.remembered_places import RememberedPlace
 from rovgraph.geometry import Array
+from rovgraph.kernels.filtering import Filtered
 from rovgraph.state import State
 
 Gates = dict[str, float]  # sensor that is left out -> since when [s]
@@ -138,6 +139,10 @@ class Met:
         numbers = np.empty((0, 21)), np.empty((0, C)), np.empty(0), np.empty(0), np.empty((0, 2))
         return Met(problem, m, m, *numbers, np.empty(0, np.int64))
 
+    def states(self) -> tuple[Array, Array]:
+        """x and c."""
+        return self.x, self.c
+
     def __len__(self) -> int:
         return self.end - self.begin
 
@@ -188,59 +193,25 @@ class FilterRun:
     Attributes
     ----------
     before, known : Gaussian of the keyframe before them, and of the last one
-    x, c : ndarray, shapes (k, 21), (k, C), the keyframes, as of `Gaussian`
-    predicted_x, predicted_c : the same, before what was measured at them
-    pose, velocity, sd : ndarray, shapes (k, 6, 6), (k, 3, 3), (k, size), covariances, and sd of the error
-    sensors, which : names, and ndarray of int, shape (m,), whose of them each measurement is
+    filtered : the keyframes, and what became of the measurements
     interval, between : ndarray of int and of bool, shape (m,), the interval of each, and whether it belongs to the
         keyframe before that
-    nis, weight : ndarray, shape (m,), of the measurements, as of `Met`
     """
 
     before: Gaussian
     known: Gaussian
-    x: Array
-    c: Array
-    predicted_x: Array
-    predicted_c: Array
-    pose: Array
-    velocity: Array
-    sd: Array
-    sensors: Sequence[str]
-    which: NDArray[np.int64]
+    filtered: Filtered
     interval: NDArray[np.int64]
     between: NDArray[np.bool_]
-    nis: Array
-    weight: Array
 
     def __len__(self) -> int:
-        return len(self.x)
+        return len(self.filtered.x)
 
-
-@dataclass(frozen=True)
-class MetStates:
-    """x and c of n measurements that a filter met while it ran through intervals, as of `Met`.
-
-    Attributes
-    ----------
-    before : Gaussian of the keyframe before the intervals
-    x, c, predicted_x, predicted_c : as of `FilterRun`
-    interval, between : as of it, of the n measurements
-    """
-
-    before: Gaussian
-    x: Array
-    c: Array
-    predicted_x: Array
-    predicted_c: Array
-    interval: NDArray[np.int64]
-    between: NDArray[np.bool_]
-
-    def __call__(self) -> tuple[Array, Array]:
-        """x and c, shapes (n, 21), (n, C)."""
-        interval, between = self.interval, self.between
-        x, c = self.predicted_x[interval], self.predicted_c[interval]
+    def states(self) -> tuple[Array, Array]:
+        """x and c before each measurement entered, shapes (m, 21), (m, C)."""
+        interval, between, found = self.interval, self.between, self.filtered
+        x, c = found.predicted_x[interval], found.predicted_c[interval]
         former, first = between & (interval > 0), between & (interval == 0)
-        x[former], c[former] = self.x[interval[former] - 1], self.c[interval[former] - 1]
+        x[former], c[former] = found.x[interval[former] - 1], found.c[interval[former] - 1]
         x[first], c[first] = self.before.x, self.before.c
         return x, c

@@ -12,18 +12,18 @@ keyframes share would make every update touch the whole tree, so each constant o
 equal ones, one for each segment of time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rovgraph.calibration import LAYOUT, TABLE, Belief
-from rovgraph.engine.assembly import Assembler
+from rovgraph.engine.assembly import assembly_of
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, ProcessedMeasurement, states_of
+from rovgraph.engine.filter_step import FilterStep, Gates, Gaussian, Met, states_of
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.rate_noise import with_arm_of_rates
 from rovgraph.engine.stretches import Searches
 from rovgraph.estimators.eskf.history import FilterHistory
@@ -31,7 +31,7 @@ from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.optimum import optimum
 from rovgraph.estimators.smoother import newest_calibration, smoothed
 from rovgraph.graph.incremental import Incremental
-from rovgraph.graph.places import apart_from, associated_optimum, resolved_associations
+from rovgraph.graph.places import associated_optimum, resolved
 from rovgraph.kernels.layout import MOTION
 from rovgraph.log import Measurement
 from rovgraph.state import PLACE, State
@@ -58,7 +58,7 @@ class IncrementalEstimator:
     initial : of `rovgraph.estimators.initialise.initialise`
     update_s : of the dive, between updates of iSAM2; in between, the filter goes on from it [s]
     searches : of other solutions of the dive, as configured the same
-    intervals : the dive, as far as it has been taken, landmarks given to their places
+    problem : the dive, as far as it has been taken
     known : Gaussian of the newest keyframe
     history : the filtered estimate of every keyframe
     """
@@ -74,9 +74,10 @@ class IncrementalEstimator:
         self.history = FilterHistory(self.filter)
         self.gates: Gates = {}
         self.engine = Incremental(self.filter, {name: _stiff(belief) for name, belief in b.beliefs.items()})
-        self.assembler = Assembler(b.config, b.instruments, b.prior.state.bias[0], believed=b.beliefs)
-        self.intervals: list[KeyframeInterval] = []
-        self._own_places: dict[float, int] = {}  # time of a landmark -> number of the place that it is by itself
+        self.assembly = assembly_of(b)
+        self.problem = self.assembly.problem
+        self._count = 0  # keyframes that have been taken
+        self._numbers = np.empty(0, np.int64)  # of the places that measurements are of, as the filter has it
         names = self.filter.unknowns.estimated
         tolerance = [np.full(v.dim, ANGLE_TOLERANCE if v.angular else TOLERANCE) for v in (TABLE[n] for n in names)]
         self._tolerance = np.concatenate([np.empty(0), *tolerance])
@@ -88,51 +89,48 @@ class IncrementalEstimator:
         """Newest keyframe that iSAM2 has, -1 = none."""
         return self.engine.updated
 
-    def add(self, measurement: Measurement) -> list[KeyframeInterval]:
-        """Take a measurement; times must not decrease."""
-        return self._take(self.assembler.add(measurement))
+    def add(self, measurement: Measurement) -> int:
+        """Take a measurement, whose time is not before that of others; how many keyframes it completes."""
+        self.assembly.insert(measurement)
+        return self._take(self.assembly.extend())
 
-    def finish(self) -> list[KeyframeInterval]:
-        """Close the last interval."""
-        done = self._take(self.assembler.finish())
+    def finish(self) -> int:
+        """Close the last interval; how many keyframes that completes."""
+        made = self._take(self.assembly.extend(finish=True))
         self.update()
-        return done
+        return made
 
-    def step(self, interval: KeyframeInterval) -> FilterStep:
+    def step(self, problem: Problem, k: int) -> FilterStep:
         """Take an interval: predicted and gated from what iSAM2 knows of the keyframe before, then given to it."""
-        done = self.filter.step(interval, self.known, self.gates)
-        self.take(interval, done.filtered, done.processed)
-        self.history.append(interval, self.known, done.processed)
+        done = self.filter.step(problem, k, self.known, self.gates)
+        self.take(problem, k, done.filtered, done.met)
+        self.history.append(self.known, done.met)
         return done
 
-    def take(self, interval: KeyframeInterval, known: Gaussian, processed: Sequence[ProcessedMeasurement]) -> None:
+    def take(self, problem: Problem, k: int, known: Gaussian, met: Met) -> None:
         """Take a keyframe with what of its measurements was let in.
 
         Parameters
         ----------
-        interval : the keyframe's
+        problem, k : the dive so far, and its keyframe
         known : where to linearise it at first
-        processed : its measurements
+        met : its measurements
         """
-        self.known = known
-        own = {m.time: m.landmark.number for m in interval.measurements if m.landmark is not None}
-        if own:  # a place that fits none of its name is one by itself
-            self._own_places |= own
-            interval = replace(interval, measurements=[one.measurement for one in processed])
-        self.intervals.append(interval)
-        let_in = [p.measurement for p in processed if p.weight > 0.0 or p.measurement.landmark is not None]
-        self.engine.add(interval, known, let_in)
-        if interval.time - self.intervals[max(self.updated, 0)].time >= self.update_s:
+        self.known, self.problem, self._count = known, problem, k + 1
+        self._numbers = np.append(self._numbers, met.number)
+        let_in = (met.weight > 0.0) | (met.number >= 0)
+        self.engine.add(problem, k, known, met.index[let_in], self._numbers)
+        if problem.time[k] - problem.time[max(self.updated, 0)] >= self.update_s:
             self.update()
 
     def update(self) -> None:
         """Have iSAM2 take what has come since; the filter goes on from its newest keyframe."""
-        if self.updated == len(self.intervals) - 1:
+        if self.updated == self._count - 1:
             return
         self.engine.update()
         self._know()
-        now = self.intervals[-1].time
-        since = now - self.intervals[0].time
+        now = float(self.problem.time[self._count - 1])
+        since = now - float(self.problem.time[0])
         if self._optima and since >= self._optima[0]:
             self._optima.pop(0)
             self._restart()
@@ -154,11 +152,11 @@ class IncrementalEstimator:
     def _restart(self) -> None:
         """Go on from the optimum of the dive so far, with what it lets in."""
         best = self._optimum()
-        n, state = len(self.intervals), best.state
+        n, state = self._count, best.state
         calibration = {name: np.broadcast_to(value, (n, value.shape[-1])) for name, value in state.calibration.items()}
         x = np.concatenate([state.R_nb.reshape(n, 9), state.p_n, state.v_n, state.bias], axis=1)
         c = np.concatenate([calibration[name] for name in LAYOUT], axis=1)
-        self.engine.restart(best.intervals, best.solution.gates, x, c)
+        self.engine.restart(best.problem, best.solution.gates, x, c)
         self._know()
 
     def _know(self) -> None:
@@ -178,7 +176,7 @@ class IncrementalEstimator:
 
     def filtered(self) -> Estimate:
         """What was known of each keyframe when it was the newest."""
-        return self.history.estimate("filtered")
+        return self.history.estimate(self.problem, "filtered")
 
     def solve(self) -> Estimate:
         """The smoothed trajectory with its uncertainty."""
@@ -191,36 +189,39 @@ class IncrementalEstimator:
 
     def _optimum(self) -> Optimum:
         """All of the dive so far, from iSAM2's estimate on; a landmark beyond its gate there is of no other's place."""
-        states = self.states()
+        states, problem = self.states(), self.problem.upto(self._count)
         given = self.initial, states, newest_calibration(states.calibration)
-        if not self._own_places:
-            return optimum(self.intervals, *given, searches=self.searches)
-        best = associated_optimum(resolved_associations(self.intervals), *given)
-        block = best.blocks[PLACE]
-        if not (out := block.time[block.believed & ~best.solution.gates[PLACE]]).size:
+        seen = problem.of_sensor(PLACE)
+        if not len(seen):
+            return optimum(problem, *given, searches=self.searches)
+        best = associated_optimum(resolved(problem, self._numbers[seen]), *given)
+        out = best.blocks[PLACE].believed & ~best.solution.gates[PLACE]
+        if not out.any():
             return with_arm_of_rates(best)
-        apart = [apart_from(interval, {t: self._own_places[t] for t in out.tolist()}) for interval in self.intervals]
-        return with_arm_of_rates(associated_optimum(resolved_associations(apart), *given))
+        apart = np.where(out, problem.number[seen], self._numbers[seen])
+        return with_arm_of_rates(associated_optimum(resolved(problem, apart), *given))
 
-    def _take(self, intervals: list[KeyframeInterval]) -> list[KeyframeInterval]:
-        for interval in intervals:
-            self.step(interval)
-        return intervals
+    def _take(self, count: int) -> int:
+        """Take the newest keyframes of the assembly."""
+        problem = self.assembly.problem
+        for k in range(len(problem) - count, len(problem)):
+            self.step(problem, k)
+        return count
 
 
 def run_isam2(
-    intervals: Sequence[KeyframeInterval],
+    problem: Problem,
     initial: InitialConditions,
     progress: Callable[[float], None] = lambda done: None,
     update_s: float = 0.0,
     searches: Searches | None = None,
 ) -> IncrementalEstimator:
-    """iSAM2 that has taken the intervals of a dive; ``progress`` is told 0 to 1 now and then."""
+    """iSAM2 that has taken the keyframes of a dive; ``progress`` is told 0 to 1 now and then."""
     estimator = IncrementalEstimator(initial, update_s, searches)
-    for interval in intervals:
-        estimator.step(replace(interval, measurements=[*interval.measurements]))  # which are asked for again and again
-        if interval.index % 50 == 0:
-            progress(interval.index / len(intervals))
+    for k in range(len(problem)):
+        estimator.step(problem, k)
+        if k % 50 == 0:
+            progress(k / len(problem))
     estimator.update()
     return estimator
 

@@ -21,8 +21,8 @@ from rovgraph.calibration import LAYOUT, Belief
 from rovgraph.engine.filter import ORIGIN, FilterEngine
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.gauss_newton import Gates
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import loss_and_weight
+from rovgraph.engine.problem import Index, Problem
 from rovgraph.errors import InputError
 from rovgraph.gauss_markov import walked
 from rovgraph.geometry import Array, exp_rotation, rotate
@@ -30,6 +30,7 @@ from rovgraph.graph.batch import indeterminate
 from rovgraph.graph.factors import ANYWHERE_M
 from rovgraph.graph.keys import CALIBRATION, key
 from rovgraph.graph.linear_intervals import IntervalTerms, LinearInterval, Linearization
+from rovgraph.kernels.assembly import SEGMENT
 from rovgraph.kernels.layout import MOTION
 from rovgraph.state import PLACE, PLACE_DIM, POSE
 
@@ -77,6 +78,7 @@ class Incremental:
         self._begun: list[int] = []  # first keyframe of each segment
         self._slots: list[list[int]] = []  # of each interval's factors in iSAM2
         self.updated = -1
+        self._numbers = np.empty(0, np.int64)
         self._engine = gtsam.ISAM2(isam2_params())
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # what waits for the next update
         self._owners: list[int] = []  # interval of each factor that waits
@@ -87,21 +89,24 @@ class Incremental:
         """Count of intervals, with those that wait."""
         return len(self._terms)
 
-    def add(self, interval: KeyframeInterval, known: Gaussian, let_in: Sequence[KeyframeMeasurement]) -> None:
+    def add(self, problem: Problem, k: int, known: Gaussian, let_in: Index, numbers: Index) -> None:
         """Have an interval wait for the next update.
 
         Parameters
         ----------
-        interval : the next one, its landmarks given to their places
+        problem, k : the next one, which ends with keyframe k
         known : where to linearise it at first
         let_in : of its measurements, those that count
+        numbers : of the places that all measurements so far are of, -1 where they are of none
         """
-        if interval.segment == len(self._c):
+        term = IntervalTerms(self._filter, problem, k, let_in)
+        if term.segment == len(self._c):
             self._c.append(known.c)
-            self._begun.append(interval.index)
-        self._terms.append(IntervalTerms(self._filter, interval, let_in))
+            self._begun.append(k)
+        self._terms.append(term)
         self._x.append(known.x)
-        self._push(interval.index)
+        self._numbers = numbers
+        self._push(k)
 
     def update(self) -> None:
         """Take what has been added.
@@ -135,7 +140,7 @@ class Incremental:
         P : ndarray, shape (size + 2 m, size + 2 m), joint covariance
         positions : ndarray, shape (2,), of each place
         """
-        k, s = self.updated, self._terms[self.updated].interval.segment
+        k, s = self.updated, self._terms[self.updated].segment
         keys = [key(POSE, k), key(CALIBRATION, s), *(key(PLACE, number) for number in places)]
         R, d = self._engine.jointBayesNet(keys).matrix()  # of the root, in the order of the keys
         root = np.linalg.inv(R)
@@ -149,12 +154,12 @@ class Incremental:
 
     def estimate(self) -> tuple[Array, Array]:
         """All keyframes that iSAM2 has, and the calibration at each: shapes (n, 21), (n, C)."""
-        n, segments = self.updated + 1, self._terms[self.updated].interval.segment + 1
+        n, segments = self.updated + 1, self._terms[self.updated].segment + 1
         delta = self._engine.getDelta().vector()  # in the order of keys
         c = np.array(self._c[:segments])
         c[:, self._parts] += delta[: segments * len(self._parts)].reshape(segments, -1)
         x = moved(np.array(self._x[:n]), delta[len(delta) - n * MOTION :].reshape(n, MOTION))
-        return x, c[[term.interval.segment for term in self._terms[:n]]]
+        return x, c[[term.segment for term in self._terms[:n]]]
 
     def knows(self, place: int) -> bool:
         """Whether a place of that number is part of the graph."""
@@ -189,18 +194,21 @@ class Incremental:
             self._restart()
         self._replace(segment)
 
-    def restart(self, intervals: Sequence[KeyframeInterval], let_in: Gates, x: Array, c: Array) -> None:
+    def restart(self, problem: Problem, let_in: Gates, x: Array, c: Array) -> None:
         """Go on from another point, and with other measurements.
 
         Parameters
         ----------
-        intervals : those that have been added, landmarks perhaps given to other places
+        problem : what has been added, landmarks perhaps given to other places
         let_in : which of their measurements count, as an optimum has it
         x, c : ndarray, shapes (n, 21), (n, C), of their keyframes
         """
-        chosen = {sensor: iter(own.tolist()) for sensor, own in let_in.items()}
-        kept = ([m for m in interval.measurements if next(chosen[m.sensor])] for interval in intervals)
-        self._terms = [IntervalTerms(self._filter, *one) for one in zip(intervals, kept, strict=True)]
+        kept = np.empty(len(problem.rows), bool)
+        for sensor, own in let_in.items():
+            kept[problem.of_sensor(sensor)] = own
+        every = (np.arange(*problem.measured_in(k)) for k in range(len(problem)))
+        self._terms = [IntervalTerms(self._filter, problem, k, own[kept[own]]) for k, own in enumerate(every)]
+        self._numbers = problem.number
         self._x, self._c, self._places = list(x), [c[begun] for begun in self._begun], {}
         self._restart()
         self._replace(0)
@@ -229,15 +237,15 @@ class Incremental:
 
     def _push(self, first: int) -> None:
         """Have the factors from a keyframe on wait for the next update."""
-        terms, segments = self._terms[first:], [term.interval.segment for term in self._terms[first:]]
+        terms, segments = self._terms[first:], [term.segment for term in self._terms[first:]]
         x, c = np.array(self._x[max(first - 1, 0) :]), np.array([self._c[s] for s in segments])
         if first == 0:
             x = np.concatenate([x[:1], x])
         for k, (term, rows) in enumerate(zip(terms, self._linearization.linearize(terms, x, c), strict=True)):
-            index, s = term.interval.index, segments[k]
+            index, s = term.k, segments[k]
             factors = [_interval_factor(index, s, rows), *self._landmarks(term, x[k : k + 2], c[k])]
             if self._begun[s] == index:
-                factors.append(self._calibration_factor(s, term.interval.time))
+                factors.append(self._calibration_factor(s, term.time))
                 self._insert(key(CALIBRATION, s), len(self._parts))
             self._insert(key(POSE, index), MOTION)
             for factor in factors:
@@ -254,7 +262,7 @@ class Incremental:
         own, here = key(CALIBRATION, s), self._c[s][self._parts]
         if s == 0:
             return gtsam.JacobianFactor(own, np.diag(1.0 / self._sd), (self._mean - here) / self._sd, _unit(len(here)))
-        duration = time - self._terms[self._begun[s - 1]].interval.time
+        duration = time - self._terms[self._begun[s - 1]].time
         kept, sd = walked(self._walk, self._time_constant, duration)
         off = (self._mean + kept * (self._c[s - 1][self._parts] - self._mean) - here) / sd
         return gtsam.JacobianFactor(
@@ -264,10 +272,11 @@ class Incremental:
     def _landmarks(self, term: IntervalTerms, x: Array, c: Array) -> list[gtsam.JacobianFactor]:
         """Factors of the places that are seen in an interval, and priors of those that are new; ``x`` of its ends."""
         factors = []
-        for m in term.landmarks:
-            assert m.landmark is not None
-            number, here = m.landmark.number, m.keyframe == term.interval.index
-            block, state = self._filter.block([m]), Gaussian(x[int(here)], c, np.empty((0, 0))).state
+        for row in term.landmarks:
+            number, keyframe = int(self._numbers[row]), int(term.problem.keyframe[row])
+            segment = int(term.problem.keyframes[keyframe, SEGMENT])
+            block, here = self._filter.block(term.problem, np.array([row])), keyframe == term.k
+            state = Gaussian(x[int(here)], c, np.empty((0, 0))).state
             name = key(PLACE, number)
             if number not in self._places:
                 self._places[number] = block.predicted(state.seeing(ORIGIN))[0]
@@ -278,7 +287,7 @@ class Incremental:
             r, jacobians = block.linearize(state.seeing(self._places[number]))
             H = self._filter.layout.matrix(jacobians)[0]
             root = np.sqrt(loss_and_weight(r, block.instrument.loss)[1][0])
-            states = key(POSE, m.keyframe), root * H[:, :MOTION], key(CALIBRATION, m.segment), root * H[:, MOTION:]
+            states = key(POSE, keyframe), root * H[:, :MOTION], key(CALIBRATION, segment), root * H[:, MOTION:]
             factors.append(
                 gtsam.JacobianFactor(*states, name, root * jacobians[PLACE][0], root * r[0], _unit(len(r[0])))
             )

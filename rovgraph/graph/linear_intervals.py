@@ -17,11 +17,12 @@ import numpy as np
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import states_of
 from rovgraph.engine.initial_conditions import StatePrior
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.problem import Index, Problem
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.geometry import Array, log_rotation, right_jacobian, rotate
+from rovgraph.kernels.assembly import SEGMENT
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
-from rovgraph.kernels.motion_residual import motion_errors, motion_weights
+from rovgraph.kernels.motion_residual import motion_errors
 
 _LET_IN = np.ones(1, bool)
 _SCALE = slice(ACC_SCALE, ACC_SCALE + 6)  # of the calibration vector
@@ -43,13 +44,13 @@ class KeyframeTerms:
     Parameters
     ----------
     filter : knows their equations
-    measurements : at least one
+    problem, index : the dive, and which of its measurements; at least one
     """
 
-    def __init__(self, filter: FilterEngine, measurements: Sequence[KeyframeMeasurement]) -> None:
-        known = [m for m in measurements if filter.knows(m.sensor)]
-        self._rows = filter.rows(known) if known else None
-        self._blocks = [filter.block([m]) for m in measurements if not filter.knows(m.sensor)]
+    def __init__(self, filter: FilterEngine, problem: Problem, index: Index) -> None:
+        known = np.array([filter.knows(problem.sensors[k]) for k in problem.which[index].tolist()])
+        self._rows = filter.rows(problem, index[known]) if known.any() else None
+        self._blocks = [filter.block(problem, np.array([row])) for row in index[~known].tolist()]
         self._matrix = filter.layout.matrix
 
     def linearize(self, x: Array, c: Array) -> tuple[Array, Array]:
@@ -70,24 +71,29 @@ class IntervalTerms:
     Parameters
     ----------
     filter : knows the equations
-    interval : the interval
-    let_in : its measurements that count
+    problem, k : the interval that ends with keyframe k
+    let_in : ndarray of int, its measurements that count
 
     Attributes
     ----------
-    interval : the interval
-    landmarks : those of places
+    problem, k : the same
+    segment : of time that it lies in
+    landmarks : measurements of places
     before, here : at the keyframe before, and at the one that ends the interval, where there are any
     """
 
-    def __init__(self, filter: FilterEngine, interval: KeyframeInterval, let_in: Sequence[KeyframeMeasurement]) -> None:
-        self.interval = interval
-        self.landmarks = [m for m in let_in if m.landmark is not None]
-        others = [m for m in let_in if m.landmark is None]
-        before = [m for m in others if m.keyframe < interval.index]
-        here = [m for m in others if m.keyframe == interval.index]
-        self.before = KeyframeTerms(filter, before) if before else None
-        self.here = KeyframeTerms(filter, here) if here else None
+    def __init__(self, filter: FilterEngine, problem: Problem, k: int, let_in: Index) -> None:
+        self.problem, self.k, self.segment = problem, k, int(problem.keyframes[k, SEGMENT])
+        seen = problem.number[let_in] >= 0
+        self.landmarks, others = let_in[seen].tolist(), let_in[~seen]
+        here = problem.keyframe[others] == k
+        self.before = KeyframeTerms(filter, problem, others[~here]) if not here.all() else None
+        self.here = KeyframeTerms(filter, problem, others[here]) if here.any() else None
+
+    @property
+    def time(self) -> float:
+        """Of the keyframe [s]."""
+        return float(self.problem.time[self.k])
 
 
 class Linearization:
@@ -130,21 +136,19 @@ class Linearization:
 
     def _motions(self, terms: Sequence[IntervalTerms], x: Array, c: Array) -> tuple[Array, Array, Array, Array]:
         """Rows of the motions, or at the first keyframe of its prior: r, A_i, A_j, C."""
-        n, first = len(terms), int(terms[0].interval.motion is None)
+        n, first = len(terms), int(terms[0].k == 0)
         r, A_i, A_j = np.zeros((n, MOTION)), np.zeros((n, MOTION, MOTION)), np.zeros((n, MOTION, MOTION))
         C = np.zeros((n, MOTION, self._size - MOTION))
         if first:
             r[0], A_j[0] = self._of_prior(x[1])
-        intervals = [term.interval for term in terms[first:]]
-        if not intervals:
+        if not terms[first:]:
             return r, A_i, A_j, C
-        rows = np.array([interval.motion.row for interval in intervals if interval.motion is not None])
-        W = np.empty((len(rows), MOTION, MOTION))
-        motion_weights(rows, W)
+        problem, some = terms[-1].problem, slice(terms[first].k - 1, terms[-1].k)
+        rows, W = problem.motions[some], problem.weights[some]
         bias = x[first:, 15:21].copy()
         b_i, b_j, S = bias[:-1], bias[1:], None
-        if intervals[0].scale_to_bias is not None:
-            S = np.array([interval.scale_to_bias for interval in intervals])
+        if len(problem.scales):
+            S = problem.scales[some]
             shift = np.einsum("nij,nj->ni", S, c[first:, _SCALE])
             b_i, b_j = b_i + shift, b_j + shift
         R, p, v = x[first:, :9].reshape(-1, 3, 3).copy(), x[first:, 9:12].copy(), x[first:, 12:15].copy()

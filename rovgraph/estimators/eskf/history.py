@@ -1,14 +1,13 @@
 """What a filter has found on its way through a dive, and the estimate that comes of it."""
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import FilterRun, Gaussian, Met, MetStates, stack_states, states_of
+from rovgraph.engine.filter_step import FilterRun, Gaussian, Met, stack_states, states_of
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.problem import Problem
 from rovgraph.estimators.estimate import Estimate
@@ -67,16 +66,16 @@ class FilterHistory:
         self._pieces.append(self._columns(known))
         if len(met):
             place = met.place if (met.number >= 0).any() else met.place[:0]
-            self._met.append(_Part(partial(_states_of, met), met.nis, met.weight, place))
+            self._met.append(_Part(met.states, met.nis, met.weight, place))
 
     def extend(self, run: FilterRun) -> None:
         """Take the intervals that a filter has run through."""
         if not len(run):
             return
-        states = MetStates(run.before, run.x, run.c, run.predicted_x, run.predicted_c, run.interval, run.between)
-        self._met.append(_Part(states, run.nis, run.weight, np.empty((0, 2))))
+        found = run.filtered
+        self._met.append(_Part(run.states, found.nis, found.weight, np.empty((0, 2))))
         self._count += len(run)
-        self._pieces.append((run.x, run.c, run.pose, run.velocity, run.sd))
+        self._pieces.append((found.x, found.c, found.pose, found.velocity, found.sd))
 
     def replace_last(self, known: Gaussian) -> None:
         """Take another estimate of the newest keyframe."""
@@ -161,11 +160,6 @@ class FilterHistory:
                 "rejected": len(own) - len(admitted),
             }
         return {"keyframes": len(self), "nis": nis, "bridged_intervals": int(problem.bridged.sum())}
-
-
-def _states_of(met: Met) -> tuple[Array, Array]:
-    """x and c of each."""
-    return met.x, met.c
 
 
 def _joined(pieces: Sequence[Columns]) -> Columns:
