@@ -29,7 +29,7 @@ from rovgraph.engine.stretches import Searches
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.engine.variance_sources import variance_sources
 from rovgraph.estimators.attitude_gaps import AttitudeGap, without_attitude_gaps
-from rovgraph.estimators.eskf.error_state import PROGRESS_EVERY, REINITIALISE_AT_S, ErrorStateFilter, replay
+from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother, smoothed

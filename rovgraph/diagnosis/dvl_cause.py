@@ -22,6 +22,7 @@ from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Optimum
 from rovgraph.geometry import Array, cross, rotate, signed_permutations, transpose
+from rovgraph.kernels import motion_row
 from rovgraph.log import Log
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
 

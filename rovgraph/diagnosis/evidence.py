@@ -10,8 +10,8 @@ import pandas as pd
 from rovgraph.check import Finding
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.lasting import Rival
-from rovgraph.engine.problem import Problem
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.problem import Problem
 from rovgraph.estimators.attitude_gaps import AttitudeGap
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.geometry import Array

@@ -11,7 +11,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import InitVar, dataclass, replace
 from enum import StrEnum
 from typing import Any, cast
 
@@ -81,21 +81,20 @@ class Assembly:
     instruments : the sensors in use, by stream
     bias : ndarray, shape (6,), for preintegration
     believed : priors of the calibration; None = the configuration's
-    time_offsets : how late stamps are assumed to be; None = as these have it
+    assumed : how late stamps are; None = as these have it
     learn_noise : raise the IMU's noise to what its newest samples show, where the log is not known as a whole
     """
 
     config: Config
     instruments: Mapping[str, Instrument]
     bias: Array
-    believed: Mapping[str, Belief] | None = None
-    time_offsets: TimeOffsets = None  # type: ignore[assignment]  # after `__post_init__` it is one
+    believed: InitVar[Mapping[str, Belief] | None] = None
+    assumed: InitVar[TimeOffsets | None] = None
     learn_noise: bool = False
 
-    def __post_init__(self) -> None:
-        believed = beliefs(self.config) if self.believed is None else self.believed
-        if self.time_offsets is None:
-            self.time_offsets = TimeOffsets.of(believed, self.instruments)
+    def __post_init__(self, believed: Mapping[str, Belief] | None, assumed: TimeOffsets | None) -> None:
+        believed = beliefs(self.config) if believed is None else believed
+        self.time_offsets = assumed or TimeOffsets.of(believed, self.instruments)
         self.names = tuple(self.instruments)
         self._which = {sensor: k for k, sensor in enumerate(self.names)}
         self._no_imu = has_constant_velocity(self.config)
@@ -245,7 +244,7 @@ class Assembly:
         pieces = self._pieces(max(begin, 1)) if "thruster" in self.instruments else self._events[:0]
         first = int(dive.keyframes[begin - 1, at.UPTO]) if begin else 0
         own = streams.events[streams.order[first : int(dive.keyframes[n - 1, at.UPTO])], at.SENSOR].astype(np.int64)
-        late = np.count_nonzero(self._sensors[own, at.LAG] >= 0) if len(self._sensors) else 0
+        late = int(np.count_nonzero(self._sensors[own, at.LAG] >= 0)) if len(self._sensors) else 0
         rows, windows = int(dive.counts[at.ROWS]), int(dive.counts[at.WINDOWS])
         more, scaled = rows + len(own) + len(pieces), int(self._rule.scaled)
         self._dive = dive._replace(
@@ -453,7 +452,7 @@ class Assembly:
         table, twin = self._table, copy(self)
         twin._imu, twin._events, twin._order = table.copy(), self._events.copy(), self._order.copy()
         twin._fresh, twin._signals, twin._no_pieces = [], self._signals[:], self._no_pieces[:]
-        twin._left_out, twin._dive = self._left_out.copy(), at.Dive(*(array.copy() for array in self._dive))
+        twin._left_out, twin._dive = self._left_out.copy(), at.Dive._make(array.copy() for array in self._dive)
         return twin
 
     @property
@@ -467,9 +466,8 @@ class Assembly:
         events = self._events[: self._come][some]
         events = events[events[:, at.FATE] != at.IN][:, [at.SENSOR, at.FATE]].astype(np.int64)
         found, counts = np.unique(events, axis=0, return_counts=True) if len(events) else (events, events[:, 0])
-        return Counter(
-            {(self.names[k], self._why(k, fate)): n for (k, fate), n in zip(found.tolist(), counts.tolist(), strict=True)}
-        )
+        each = zip(found.tolist(), counts.tolist(), strict=True)
+        return Counter({(self.names[k], self._why(k, fate)): n for (k, fate), n in each})
 
     def _why(self, sensor: int, fate: int) -> str:
         """Why a measurement of a sensor is left out."""

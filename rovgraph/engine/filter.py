@@ -169,7 +169,7 @@ class FilterEngine:
         done = filter_intervals(known, intervals, measured, self._model, since, out, correct, predict_filter)
         self._renew(gates, since)
         m = int(taken[done - 1]) if done else 0
-        found = Filtered(*(array[:done] for array in out[:-2]), out.nis[:m], out.weight[:m])
+        found = Filtered._make([*(array[:done] for array in out[:-2]), out.nis[:m], out.weight[:m]])
         interval = np.arange(done).repeat(np.diff(taken[:done], prepend=0))
         return FilterRun(before, _estimate(known), found, interval, np.arange(m) < first[interval])
 

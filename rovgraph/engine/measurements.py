@@ -62,9 +62,9 @@ class Block:
     """
 
     instrument: Instrument
-    keyframe: Array
+    keyframe: NDArray[np.int64]
     time: Array
-    line: Array
+    line: NDArray[np.int64]
     z: Array
     W: Array
     rate_b: Array

@@ -3,7 +3,7 @@
 Every solver takes it: chain, GTSAM's graph, iSAM2 and the filter, and whoever looks at what they have found.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,6 +22,7 @@ from rovgraph.kernels.preintegration import integrated_steps
 from rovgraph.state import State
 
 Index = NDArray[np.int64]
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -114,32 +115,32 @@ class Problem:
     @property
     def which(self) -> Index:
         """The sensor of each, of `sensors`, shape (m,)."""
-        return self.of[at.WHICH]
+        return np.asarray(self.of[at.WHICH])
 
     @property
     def keyframe(self) -> Index:
         """The keyframe that each belongs to, shape (m,)."""
-        return self.of[at.KEYFRAME_OF]
+        return np.asarray(self.of[at.KEYFRAME_OF])
 
     @property
     def interval(self) -> Index:
         """The keyframe at the end of the interval that each lies in, shape (m,)."""
-        return self.of[at.INTERVAL_OF]
+        return np.asarray(self.of[at.INTERVAL_OF])
 
     @property
     def line(self) -> Index:
         """Of each in the log, shape (m,)."""
-        return self.of[at.LINE_OF]
+        return np.asarray(self.of[at.LINE_OF])
 
     @property
     def window(self) -> Index:
         """Of each whose stamp may be late, else -1, shape (m,)."""
-        return self.of[at.WINDOW_OF]
+        return np.asarray(self.of[at.WINDOW_OF])
 
     @property
     def number(self) -> Index:
         """Of the place that is seen, that of its first sighting to begin with, else -1, shape (m,)."""
-        return self.of[at.NUMBER_OF]
+        return np.asarray(self.of[at.NUMBER_OF])
 
     @property
     def believed(self) -> NDArray[np.bool_]:
@@ -240,6 +241,19 @@ class Problem:
         R, p, v, b = (np.ascontiguousarray(a) for a in (state.R_nb, state.p_n, state.v_n, state.bias))
         motion_residuals(self.motions, self.weights, R, p, v, b, shift, r)
         return r
+
+
+def gathered(measurements: Sequence[tuple[Problem, int]]) -> Problem:
+    """Measurements of one dive, at least one, from problems of it as it grew; without keyframes."""
+    last, rows = measurements[-1][0], np.array([problem.rows[k] for problem, k in measurements])
+    of, scaled = np.column_stack([problem.of[:, k] for problem, k in measurements]), len(last.row_scales) > 0
+    late = of[at.WINDOW_OF] >= 0
+    knots = [problem.windows[problem.window[k]] for problem, k in measurements if problem.window[k] >= 0]
+    of[at.WINDOW_OF, late] = np.arange(np.count_nonzero(late))
+    row_scales = np.array([problem.row_scales[k] for problem, k in measurements]) if scaled else last.row_scales
+    more = replace(last, rows=rows, of=of, row_scales=row_scales, keyframes=last.keyframes[:0])
+    names = np.array([problem.names[k] for problem, k in measurements])
+    return replace(more, names=names, windows=np.array(knots) if knots else last.windows[:0])
 
 
 def sd_of(dim: int) -> int:

@@ -89,9 +89,7 @@ class _Pings:
         return self.velocity_b + cross(bias[self.epoch, 3:], self.arm)
 
 
-def dead_reckon(
-    problem: Problem, initial: InitialConditions, calibration: Mapping[str, Array]
-) -> State:
+def dead_reckon(problem: Problem, initial: InitialConditions, calibration: Mapping[str, Array]) -> State:
     """The state at every keyframe, at the IMU.
 
     Parameters

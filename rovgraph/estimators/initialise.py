@@ -12,7 +12,6 @@ import numpy as np
 from rovgraph.config import Config, beliefs, with_priors_stated
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
-from rovgraph.engine.noise_floor import NOISIER
 from rovgraph.engine.preintegration import scatter
 from rovgraph.errors import InputError
 from rovgraph.estimators.first_seconds import Level, first_heading, first_position, level
@@ -20,6 +19,7 @@ from rovgraph.estimators.unchecked import nothing_checks, unchecked, unchecked_c
 from rovgraph.estimators.without_imu import TILT, first_tilt, no_bias, with_motion_model
 from rovgraph.geometry import Array, earth_rate_n, level_from_force, matrix_from_rpy, rpy_from_matrix
 from rovgraph.instruments import Instrument, heading_sources, instruments
+from rovgraph.kernels.assembly import NOISIER
 from rovgraph.log import Log
 from rovgraph.sensors import SENSORS
 from rovgraph.state import State

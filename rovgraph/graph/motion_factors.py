@@ -50,9 +50,7 @@ def preintegrated(motion: Array, steps: Array) -> gtsam.PreintegratedCombinedMea
     return pim
 
 
-def custom_factor(
-    problem: Problem, k: int, fixed: Mapping[str, Array], keys: Mapping[str, int]
-) -> gtsam.CustomFactor:
+def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Mapping[str, int]) -> gtsam.CustomFactor:
     """The residual of `rovgraph.kernels.motion_residual` as a factor, which knows the IMU's scales.
 
     Parameters

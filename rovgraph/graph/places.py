@@ -142,9 +142,7 @@ def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
             values.insert(own, where[k])
 
 
-def matched(
-    names: Array, own: NDArray[np.int64], where: Array, covariance: Array, gate_sd: float | None
-) -> list[int]:
+def matched(names: Array, own: NDArray[np.int64], where: Array, covariance: Array, gate_sd: float | None) -> list[int]:
     """Number of the place that each of m landmarks is of, which are in the order of time.
 
     Parameters

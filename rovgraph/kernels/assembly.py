@@ -56,9 +56,11 @@ from rovgraph.kernels.imu_samples import (
     survey,
     typical_scatter,
 )
-from rovgraph.kernels.measurement_row import ASSUMED, MOST, RATE, RATE_SD, SNAPSHOT, TIME as AT, Z
+from rovgraph.kernels.measurement_row import ASSUMED, MOST, RATE, RATE_SD, SNAPSHOT, Z
+from rovgraph.kernels.measurement_row import TIME as AT
 from rovgraph.kernels.motion_residual import motion_weight
-from rovgraph.kernels.preintegration import SNAPSHOT as NUMBERS, first_after, integrate
+from rovgraph.kernels.preintegration import SNAPSHOT as NUMBERS
+from rovgraph.kernels.preintegration import first_after, integrate
 
 STAMP, PLACED, SENSOR, LINE, NAME, FATE, VALUES = 0, 1, 2, 3, 4, 5, 6
 TIME, COUNT, UPTO, HERE, SEGMENT, BEGUN, RATE_B, SPREAD, FIRST, LAST = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11
@@ -171,7 +173,7 @@ class Dive(NamedTuple):
 @helper
 def _longest_step(steps: Array, count: int) -> float:
     """Step between two samples that is no gap, as it is known after so many samples [s]."""
-    return steps[min(max(count, 1), len(steps)) - 1]
+    return float(steps[min(max(count, 1), len(steps)) - 1])
 
 
 @helper

@@ -273,9 +273,7 @@ def integrate(imu: Array, start: float, end: float, stops: Array, row: Array, sn
 
 
 @kernel("void(f8[:, ::1], f8, f8, f8[::1], f8[::1], f8[:, ::1])")
-def preintegrate(
-    imu: Array, start: float, end: float, stops: Array, row_out: Array, snapshots_out: Array
-) -> None:
+def preintegrate(imu: Array, start: float, end: float, stops: Array, row_out: Array, snapshots_out: Array) -> None:
     """Integrate IMU samples over an interval.
 
     Parameters

@@ -28,8 +28,9 @@ from rovgraph.diagnosis.rules import RULES
 from rovgraph.diagnosis.sensors import frozen_for
 from rovgraph.diagnosis.stretches import taken_out_in
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement, stack_states
+from rovgraph.engine.filter_step import Gaussian, Met, states_of
 from rovgraph.engine.gauss_newton import Stretch
+from rovgraph.engine.problem import gathered
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot
 from rovgraph.estimators.estimate import CalibrationEstimate
 from rovgraph.geometry import Array
@@ -85,7 +86,7 @@ class LiveAlarms:
     def __post_init__(self) -> None:
         self._start = self._due = self._due_lasting = np.nan
         self._counts: deque[dict[str, _Count]] = deque([{}], maxlen=round(MINUTE / EVERY_S))
-        self._samples: dict[str, list[tuple[ProcessedMeasurement, Array]]] = {}  # with the share of its count
+        self._samples: dict[str, list[tuple[Met, int, Array]]] = {}  # one of those met, with the share of its count
         self._pieces: deque[dict[str, SensorResiduals]] = deque(maxlen=round(MINUTE / LASTING_EVERY_S))
         self._work: Iterator[list[Statistic]] = iter(())  # looks at the residuals, of one sensor at each keyframe
         self._lasting: list[Statistic] = []
@@ -105,37 +106,37 @@ class LiveAlarms:
         """Of the estimate now."""
         return verdict_of(self.active)
 
-    def passed(self, mark: FilterSnapshot, engine: FilterEngine, watches: Mapping[str, Watch], now: float) -> None:
+    def passed(self, snapshot: FilterSnapshot, engine: FilterEngine, watches: Mapping[str, Watch], now: float) -> None:
         """Take a keyframe that the lag has passed.
 
         Parameters
         ----------
-        mark : the keyframe
+        snapshot : the keyframe
         engine : the filter that made it
         watches : of the sensors, by name
         now : the estimate's time, that of events [s]
         """
-        time, index = mark.interval.time, mark.interval.index
+        time, index = snapshot.time, snapshot.index
         if np.isnan(self._start):
             self._start = time
             self._due, self._due_lasting = time + SETTLED_S + EVERY_S, time + LASTING_FROM_S + LASTING_EVERY_S
         if time < self._start + SETTLED_S:
             return
         counts = self._counts[-1]
-        for one in mark.processed:
-            sensor = one.measurement.sensor
+        met = snapshot.met
+        for k, (sensor, nis, weight) in enumerate(zip(met.sensors, met.nis.tolist(), met.weight.tolist(), strict=True)):
             count = counts.get(sensor)
             if count is None:
-                share = ALLOWED_SDS**2 * engine.considered_share(mark.known, one.measurement)
+                share = ALLOWED_SDS**2 * engine.considered_share(snapshot.known, met.problem, met.begin + k)
                 count = counts[sensor] = _Count(share)
-            if one.weight > 0.0:
+            if weight > 0.0:
                 count.used += 1
-                count.nis += one.nis
+                count.nis += nis
             else:
                 count.rejected += 1
             if count.keyframe != index and time >= self._start + LASTING_FROM_S:
                 count.keyframe = index
-                self._samples.setdefault(sensor, []).append((one, count.share))
+                self._samples.setdefault(sensor, []).append((met, k, count.share))
         if time >= self._due_lasting:
             self._due_lasting += LASTING_EVERY_S * np.ceil((time - self._due_lasting + 1e-6) / LASTING_EVERY_S)
             for found in self._work:  # that few keyframes have left
@@ -145,7 +146,7 @@ class LiveAlarms:
         self._lasting = next(self._work, self._lasting)
         if time >= self._due:
             self._due += EVERY_S * np.ceil((time - self._due + 1e-6) / EVERY_S)
-            self._look([*self._statistics(mark.known, engine, watches, time)], now)
+            self._look([*self._statistics(snapshot.known, engine, watches, time)], now)
             self._counts.append({})
 
     def reinitialised(self, adopted: Adopted) -> None:
@@ -202,7 +203,7 @@ class LiveAlarms:
             yield earth_rate_of(float(sd[columns[BIAS]][3:].min()), self._start, time)
 
     def _look_at_lasting(
-        self, engine: FilterEngine, time: float, samples: dict[str, list[tuple[ProcessedMeasurement, Array]]]
+        self, engine: FilterEngine, time: float, samples: dict[str, list[tuple[Met, int, Array]]]
     ) -> Iterator[list[Statistic]]:
         """What residuals of the last minute show, sensor by sensor; before the last one, what is known so far."""
         self._pieces.append({})
@@ -260,15 +261,14 @@ class LiveAlarms:
         self.events.append(Event(time, sensor, kind, text))
 
 
-def _innovations(
-    engine: FilterEngine, sensor: str, samples: list[tuple[ProcessedMeasurement, Array]]
-) -> SensorResiduals:
+def _innovations(engine: FilterEngine, sensor: str, samples: list[tuple[Met, int, Array]]) -> SensorResiduals:
     """Innovations in units of their sd: along those in units of the noise, and as long as the NIS says."""
-    met = [one for one, _ in samples]
-    block = engine.block([one.measurement for one in met])
-    r = block.normalised(stack_states(met))
-    length = np.sqrt(np.array([one.nis for one in met]))[:, None]
-    r *= length / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), 1e-12)
-    weight = np.array([one.weight for one in met])
-    shared = np.array([share for _, share in samples])
+    problem = gathered([(met.problem, met.begin + k) for met, k, _ in samples])
+    block = engine.block(problem, np.arange(len(samples)))
+    x, c, nis, weight = (
+        np.array([getattr(met, name)[k] for met, k, _ in samples]) for name in ("x", "c", "nis", "weight")
+    )
+    r = block.normalised(states_of(x, c))
+    r *= np.sqrt(nis)[:, None] / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), 1e-12)
+    shared = np.array([share for _, _, share in samples])
     return SensorResiduals(sensor, tuple(block.instrument.components), block.time, r, weight, shared)

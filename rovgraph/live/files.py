@@ -152,7 +152,7 @@ class Files:
             return True
         passed = navigator.passed
         try:
-            self.track.add(engine.trajectory([m.interval for m in passed], [m.known for m in passed]), navigator.origin)
+            self.track.add(engine.trajectory([s.keyframe for s in passed], [s.known for s in passed]), navigator.origin)
         except InputError as error:
             path = str(self.track.path)
             self.warnings.complain(path, "disk", str(error).removeprefix(f"{path}: "))

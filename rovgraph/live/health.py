@@ -27,15 +27,15 @@ class Health:
     _out: set[str] = field(default_factory=set)
     _gap_until: float = -float("inf")
 
-    def passed(self, mark: FilterSnapshot) -> None:
+    def passed(self, snapshot: FilterSnapshot) -> None:
         """Count a keyframe's measurements."""
-        for one in mark.processed:
-            (self.used if one.weight > 0.0 else self.rejected)[one.measurement.sensor] += 1
+        for sensor, weight in zip(snapshot.met.sensors, snapshot.met.weight.tolist(), strict=True):
+            (self.used if weight > 0.0 else self.rejected)[sensor] += 1
 
-    def step(self, marks: deque[FilterSnapshot]) -> None:
+    def step(self, snapshots: deque[FilterSnapshot]) -> None:
         """After a keyframe."""
-        newest = marks[-1]
-        time, gates = newest.interval.time, newest.gates
+        newest = snapshots[-1]
+        time, gates = newest.time, newest.gates
         for sensor, since in gates.items():
             if time - since > REJECTED_S and sensor not in self._out:
                 self._out.add(sensor)
@@ -43,9 +43,9 @@ class Health:
         for sensor in self._out - gates.keys():
             self._out.remove(sensor)
             self._say(time, sensor, "readmitted", f"{sensor}: used again")
-        if newest.interval.bridged and time > self._gap_until:
+        if newest.bridged and time > self._gap_until:
             self._say(time, "imu", "gap", "imu: samples are missing and are bridged")
-        if newest.interval.bridged:
+        if newest.bridged:
             self._gap_until = max(self._gap_until, time + 1.0)
 
     def of(self, watches: Mapping[str, Watch], time: float) -> dict[str, SensorHealth]:

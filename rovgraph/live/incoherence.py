@@ -10,7 +10,7 @@ and alarms say so.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from rovgraph.engine.gauss_newton import Stretch
 from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
@@ -43,10 +43,10 @@ class Incoherence:
         """Whether a measurement is left out."""
         return sensor == SENSOR and self._begin < time < self._end
 
-    def passed(self, mark: FilterSnapshot) -> None:
+    def passed(self, snapshot: FilterSnapshot) -> None:
         """Remember a keyframe that the lag has passed, for as long as the filter may go back to it."""
-        self._recent.append(mark)
-        while self._recent[0].interval.time < mark.interval.time - WITHIN_S - REJECTED_S:
+        self._recent.append(snapshot)
+        while self._recent[0].time < snapshot.time - WITHIN_S - REJECTED_S:
             self._recent.popleft()
 
     def forget(self) -> None:
@@ -64,8 +64,8 @@ class Incoherence:
 
     def step(self, engine: FixedLag) -> Stretch | None:
         """After a keyframe: leave the DVL out where it is rejected too often, and return that time if it is new."""
-        newest = engine.marks[-1]
-        time, since = newest.interval.time, newest.gates.get(SENSOR)
+        newest = engine.snapshots[-1]
+        time, since = newest.time, newest.gates.get(SENSOR)
         if not self._rejections:
             self._rejections.append(time)
         if since is None or since <= self._end or time - since <= REJECTED_S or since in self._rejections:
@@ -95,13 +95,11 @@ class Incoherence:
         """Have the filter go on from before a time, without the DVL."""
         engine.retract(SENSOR, since)
         oldest = engine.oldest()
-        before = [mark for mark in self._recent if mark.interval.time < since]
-        if not before or oldest.interval.time < since:
+        before = [snapshot for snapshot in self._recent if snapshot.time < since]
+        if not before or oldest.time < since:
             return
         known, gates = before[-1].known, dict(before[-1].gates)
-        waiting = [mark.interval for mark in engine.marks if mark.interval.index <= oldest.interval.index]
-        later = [mark.interval for mark in self._recent if mark.interval.index > before[-1].interval.index]
-        for interval in [*later, *waiting]:
-            others = [m for m in interval.measurements if m.sensor != SENSOR]
-            known = engine.filter.step(replace(interval, measurements=others), known, gates).filtered
-        engine.adopt(oldest.interval.index, known)
+        others = engine.assembly.problem.without(SENSOR)
+        for k in range(engine.place(before[-1]) + 1, engine.place(oldest) + 1):
+            known = engine.filter.step(others, k, known, gates).filtered
+        engine.adopt(oldest.index, known)

@@ -23,7 +23,7 @@ def is_late(m: Measurement, engine: FixedLag) -> bool:
 def can_join(m: Measurement, engine: FixedLag) -> bool:
     """Whether the filter can go on with its sensor from this measurement on."""
     as_many = m.sensor != "thruster" or len(m.values) == len(engine.initial.config.vehicle.thrusters)
-    return as_many and bool(engine.marks) and bool(np.isfinite(m.values[:3]).all())
+    return as_many and bool(engine.snapshots) and bool(np.isfinite(m.values[:3]).all())
 
 
 def joined(engine: FixedLag, sensor: str) -> FixedLag:

@@ -15,10 +15,11 @@ import numpy as np
 
 from rovgraph.calibration import LAYOUT, TABLE
 from rovgraph.config import Config
+from rovgraph.engine.assembly import InsertResult
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions, restored
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
+from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.geometry import Array
 from rovgraph.live.alarms import LiveAlarms
 from rovgraph.live.clocks import Clocks
@@ -58,7 +59,7 @@ class Navigator:
     isam2 : iSAM2, where it was asked for; it takes each keyframe that the lag has passed
     engine : None until the first seconds are over
     time : of the newest measurement, or of the last `tick` [s]
-    passed : marks that the lag has passed, since they were last taken
+    passed : snapshots that the lag has passed, since they were last taken
     left_out : (sensor or source, reason) -> count
     updates, update_s : count of updates of the filter, and the time that the newest took [s]
     """
@@ -162,7 +163,7 @@ class Navigator:
         """Take what had been received before, on the estimator's clock."""
         if self.origin is None:
             self._intake.origin = log.origin
-        known = self.engine.marks[0].interval.time if self.engine is not None else -np.inf
+        known = self.engine.snapshots[0].time if self.engine is not None else -np.inf
         if self._reinitialisations is not None:
             self._reinitialisations.patient = True
         for measurement in log.measurements():
@@ -194,7 +195,7 @@ class Navigator:
             self._begin(initial)
         if self.engine is not None:
             self.engine.finish()
-            self.engine.marks.extend(self.passed[-1:])  # for a last solution
+            self.engine.snapshots.extend(self.passed[-1:])  # for a last solution
         self.close()
 
     def close(self) -> None:
@@ -205,13 +206,13 @@ class Navigator:
     def solution(self) -> Solution | None:
         """Where the vehicle is now; None before the beginning."""
         engine = self.engine
-        if engine is None or not engine.marks:
+        if engine is None or not engine.snapshots:
             return None
-        interval, known = engine.ahead(self.time)
-        t = engine.trajectory([interval], [known])
+        keyframe, known = engine.ahead(self.time)
+        t = engine.trajectory([keyframe], [known])
         latitude, longitude = self._intake.geodetic(t.p_n[0])
         return Solution(
-            time=interval.time,
+            time=float(t.time[0]),
             position=t.p_n[0],
             velocity=t.v_n[0],
             rpy=t.rpy[0],
@@ -228,14 +229,14 @@ class Navigator:
             alarms=self.alarms.active,
             distance=self._travelled(t.p_n[0], t.p_sd[0]),
             altitude=self._altitude[1] if self.time - self._altitude[0] < ALTITUDE_S else None,
-            predicted_s=interval.time - engine.marks[-1].interval.time,
+            predicted_s=float(t.time[0]) - engine.snapshots[-1].time,
             latency_s=None if self.clocks.trust else max(host.time() - self._arrival, 0.0),
             update_s=self.update_s,
         )
 
     def state(self) -> dict[str, Any] | None:
         """All that is needed to go on after a crash, as plain values and arrays; None before the beginning."""
-        if self.engine is None or not self.engine.marks:
+        if self.engine is None or not self.engine.snapshots:
             return None
         return {
             "beginning": self.engine.initial.dump(),
@@ -295,7 +296,8 @@ class Navigator:
             from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator  # GTSAM is not everywhere
 
             self.isam2 = IncrementalEstimator(initial, UPDATE_S)
-        self.engine = FixedLag(initial, config.graph.lag_s, config.online.hold_s, self._pass, learn_noise=True)
+        whole = self.smooth or self._reinitialisations is not None
+        self.engine = FixedLag(initial, config.graph.lag_s, config.online.hold_s, self._pass, True, whole)
         if state is not None:
             self.engine.restore(state)
             return
@@ -314,14 +316,15 @@ class Navigator:
         if joining is None:
             return
         engine = joining
-        before = engine.marks[-1] if engine.marks else None
+        before = engine.snapshots[-1] if engine.snapshots else None
         outcome = engine.add(m)
         if outcome != InsertResult.IN:
             self.left_out[m.sensor, outcome.value] += 1
-        if engine.marks and engine.marks[-1] is not before:
+        if engine.snapshots and engine.snapshots[-1] is not before:
             waited = 0.0
             if self._reinitialisations is not None:
                 waited = self._reinitialisations.step(engine, self._crosscheck.dvl_contradicted)
+                engine.keeps_all = self._reinitialisations.pending
                 if (adopted := self._reinitialisations.adopted) is not None:
                     self.alarms.reinitialised(adopted)
                     self._reinitialisations.adopted = None
@@ -329,7 +332,7 @@ class Navigator:
                 self._adopt(engine, self.isam2)
             if (stretch := self._incoherence.step(engine)) is not None:
                 self.alarms.taken_out(stretch)
-            self.health.step(engine.marks)
+            self.health.step(engine.snapshots)
             self.faults.tick(self.time)
             self.updates, self.update_s = self.updates + 1, host.perf_counter() - began - waited
 
@@ -341,7 +344,7 @@ class Navigator:
                 return None
             engine = self._go_on_with(joined(engine, m.sensor))
             self.say(m.sensor, "joined", f"{m.sensor}: began after the first seconds, and is used from now on")
-        elif m.sensor == "fix" and not self._located and engine.marks:
+        elif m.sensor == "fix" and not self._located and engine.snapshots:
             self._located = True
             if not self.smooth:
                 engine = self._go_on_with(unlocated(engine))
@@ -364,23 +367,23 @@ class Navigator:
     def _adopt(self, engine: FixedLag, isam2: "IncrementalEstimator") -> None:
         """Have the filter go on from iSAM2's newest keyframe."""
         newest = self.passed[-1]
-        if isam2.updated == newest.interval.index:
+        if isam2.updated == newest.index:
             engine.adopt_passed(engine.filter.considering(isam2.known, newest.known), newest.gates)
             self._adopted = isam2.updated
 
-    def _pass(self, mark: FilterSnapshot) -> None:
-        self.passed.append(mark)
+    def _pass(self, snapshot: FilterSnapshot) -> None:
+        assert self.engine is not None
+        self.passed.append(snapshot)
         if self._reinitialisations is not None:
-            self._reinitialisations.take(mark)
+            self._reinitialisations.take(snapshot)
         if self.isam2 is not None:
             try:
-                self.isam2.take(mark.interval, mark.known, mark.processed)
+                self.isam2.take(self.engine.assembly.problem, snapshot.index, snapshot.known, snapshot.met)
             except InputError as error:
                 self.lose_isam2(str(error))
-        self.health.passed(mark)
-        self._incoherence.passed(mark)
-        assert self.engine is not None
-        self.alarms.passed(mark, self.engine.filter, self.faults.watches, self.time)
+        self.health.passed(snapshot)
+        self._incoherence.passed(snapshot)
+        self.alarms.passed(snapshot, self.engine.filter, self.faults.watches, self.time)
 
     def _take_events(self) -> tuple[Event, ...]:
         """All that happened since they were last taken."""

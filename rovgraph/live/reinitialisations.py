@@ -20,8 +20,8 @@ from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian, states_of
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.optimum import Optimum
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.released import as_chain
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S
@@ -31,7 +31,7 @@ from rovgraph.geometry import Array
 from rovgraph.state import BIAS, VELOCITY
 from rovgraph.trajectory import Trajectory
 
-Keyframe = tuple[KeyframeInterval, Array, Array]  # its interval, state vector and calibration vector
+Keyframe = tuple[int, Array, Array]  # its index, state vector and calibration vector
 _Smoothed = tuple[Gaussian, list[Statistic]]
 
 EXAMINED_FROM_S = 60.0  # of the dive: what was held wrongly for less shows little
@@ -101,6 +101,11 @@ class Reinitialisations:
             del self._passed[-FREED:]
         return self.waited - before
 
+    @property
+    def pending(self) -> bool:
+        """Whether any reinitialisation is to come, so that the dive has to be kept."""
+        return bool(self._due)
+
     def again(self) -> None:
         """What is being smoothed is of no use to a filter that knows more sensors; begin it once more."""
         self._running = None
@@ -117,14 +122,13 @@ class Reinitialisations:
 
     def _begin(self, engine: FixedLag, dvl_contradicted: bool) -> None:
         """Have the dive up to the oldest keyframe smoothed that the filter can go on from, if it is time to."""
-        oldest = engine.oldest()
-        first = self._passed[0][0] if self._passed else engine.marks[0].interval
-        if oldest.interval.time - first.time < self._due[0]:
+        oldest, dive = engine.oldest(), engine.assembly.problem
+        if oldest.time - float(dive.time[0]) < self._due[0]:
             return
-        waiting = [_keyframe(mark) for mark in engine.marks if mark.interval.index <= oldest.interval.index]
-        keyframes = [*self._passed, *waiting]
-        work = self._thread.submit(_smoothed, engine.filter, keyframes, self._shown, dvl_contradicted)
-        self._running = oldest.interval.index, work
+        waiting = [_keyframe(snapshot) for snapshot in engine.snapshots if snapshot.index <= oldest.index]
+        keyframes, dive = [*self._passed, *waiting], dive.upto(engine.place(oldest) + 1)
+        work = self._thread.submit(_smoothed, engine.filter, dive, keyframes, self._shown, dvl_contradicted)
+        self._running = oldest.index, work
 
     def _adopt(self, engine: FixedLag, index: int, future: "Future[_Smoothed]") -> None:
         """Go on from the thread's result, if it is there; the keyframes that the lag has passed since are filtered."""
@@ -133,15 +137,13 @@ class Reinitialisations:
         began = host.perf_counter()
         known, self._shown = future.result()
         self.waited += host.perf_counter() - began
-        oldest, gates = engine.oldest().interval.index, dict[str, float]()
-        waiting = (mark.interval for mark in engine.marks if mark.interval.index <= oldest)
-        for interval in [*(i for i, _, _ in self._passed if i.index > index), *waiting]:
-            if index < interval.index <= oldest:
-                known = engine.filter.step(interval, known, gates).filtered
+        oldest, gates, dive = engine.oldest().index, dict[str, float](), engine.assembly.problem
+        for k in range(index + 1, oldest + 1):
+            known = engine.filter.step(dive, k - engine.assembly.forgotten, known, gates).filtered
         newest = max(index, oldest)
-        before = next((mark for mark in engine.marks if mark.interval.index == newest), None)
+        before = next((snapshot for snapshot in engine.snapshots if snapshot.index == newest), None)
         if engine.adopt(newest, known) and before is not None:
-            after, filtered = (engine.trajectory([before.interval], [one]) for one in (known, before.known))
+            after, filtered = (engine.trajectory([before.keyframe], [one]) for one in (known, before.known))
             self.adopted = Adopted(after, filtered, self._shown)
         self._due.pop(0)
         self._running = None
@@ -150,21 +152,26 @@ class Reinitialisations:
 
 
 def _keyframe(snapshot: FilterSnapshot) -> Keyframe:
-    return snapshot.interval, snapshot.known.x, snapshot.known.c
+    return snapshot.index, snapshot.known.x, snapshot.known.c
 
 
 def _smoothed(
-    engine: FilterEngine, keyframes: Sequence[Keyframe], before: list[Statistic], dvl_contradicted: bool
+    engine: FilterEngine,
+    dive: Problem,
+    keyframes: Sequence[Keyframe],
+    before: list[Statistic],
+    dvl_contradicted: bool,
 ) -> _Smoothed:
     """The newest of some keyframes, from all data so far, and what these show.
 
     Parameters
     ----------
+    dive, keyframes : the dive so far
     before : what fewer keyframes have shown
     dvl_contradicted : the DVL's axes or clock are wrong, which looks like noise and like another place of the DVL
     """
     states = states_of(np.array([x for _, x, _ in keyframes]), np.array([c for _, _, c in keyframes]))
-    known, best = reinitialised(engine, [interval for interval, _, _ in keyframes], states)
+    known, best = reinitialised(engine, dive, states)
     return known, _shown(best, engine.initial, before, dvl_contradicted)
 
 
@@ -172,7 +179,7 @@ def _shown(
     best: Optimum, initial: InitialConditions, before: list[Statistic], dvl_contradicted: bool
 ) -> list[Statistic]:
     """What is held wrongly, or not stated, by the smoothed dive so far."""
-    begin, end = best.intervals[0].time, best.intervals[-1].time
+    begin, end = float(best.problem.time[0]), float(best.problem.time[-1])
     if end - begin < EXAMINED_FROM_S:
         return []
     config, variance = initial.config, np.diag(best.newest_covariance())

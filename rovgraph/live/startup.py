@@ -7,10 +7,10 @@ from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import has_constant_velocity
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.fixed_lag import place
 from rovgraph.estimators.first_seconds import WINDOW_S, WITHIN_S
 from rovgraph.estimators.initialise import initialise
 from rovgraph.log import Measurement, gathered
+from rovgraph.log.streams import precedence
 from rovgraph.sensors import SENSORS
 
 MARGIN_S = 0.5  # beyond the window, for data that come late
@@ -68,7 +68,7 @@ class Startup:
 
     def begin(self, origin: tuple[float, float] | None) -> InitialConditions | None:
         """The beginning from what is there, or None; then `waits_for` says why."""
-        self.measurements.sort(key=place)
+        self.measurements.sort(key=lambda m: (m.time, precedence(m.sensor)))
         imu = [m.time for m in self.measurements if m.sensor == "imu"]
         if not imu:
             self.waits_for = NEEDS_IMU

@@ -15,9 +15,7 @@ from rovgraph.kernels.measurement_row import TIME
 from rovgraph.state import PLACE, PLACE_DIM, State
 
 
-def reinitialised(
-    engine: FilterEngine, problem: Problem, states: State
-) -> tuple[Gaussian, Optimum]:
+def reinitialised(engine: FilterEngine, problem: Problem, states: State) -> tuple[Gaussian, Optimum]:
     """The newest keyframe, with every factor of the dive linearised at the optimum.
 
     Parameters
