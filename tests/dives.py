@@ -201,6 +201,9 @@ def same(a: object, b: object) -> None:
         for f in fields(a):
             if not callable(getattr(a, f.name)):
                 same(getattr(a, f.name), getattr(b, f.name))
+    elif isinstance(a, Mapping):
+        assert isinstance(b, Mapping) and [*a] == [*b]
+        same([*a.values()], [*b.values()])
     elif isinstance(a, Sequence) and not isinstance(a, str):
         assert isinstance(b, Sequence) and len(a) == len(b)
         for one, other in zip(a, b, strict=True):

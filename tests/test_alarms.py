@@ -135,9 +135,7 @@ def test_a_considered_mounting_that_is_turned_by_90_degrees_makes_the_dive_wrong
 @pytest.mark.parametrize(("name", "off"), [("dvl_scale", 0.02), ("dvl_pitch", 0.03), ("gyr_scale", 0.005)])
 def test_a_constant_that_is_held_wrongly_is_found_with_its_value(name, off):
     case = simulated(falcon(), SECONDS, 2, calibration={name: off * np.ones(3 if name == "gyr_scale" else 1)})
-    batch = BatchSmoother(initialise(case.log, case.config))
-    batch.take(case.log)
-    best = batch.optimum()
+    best = BatchSmoother(initialise(case.log, case.config), case.log).optimum()
     assert isinstance(best, ChainOptimum)
     found = release(best, [name])
     mean = case.config.dvl.mount_rpy_deg[1] if name == "dvl_pitch" else 0.0
@@ -165,9 +163,8 @@ def test_constants_that_are_held_rightly_are_standard_normal_where_they_are_rele
     steps = []
     for seed in range(1, 5):
         case = simulated(falcon(), 120.0, seed)
-        batch = BatchSmoother(initialise(case.log, case.config))
-        batch.take(case.log)
-        found = release(batch.optimum(), ["dvl_roll", "dvl_pitch", "dvl_scale", "gyr_scale", *TIME_OFFSETS])
+        best = BatchSmoother(initialise(case.log, case.config), case.log).optimum()
+        found = release(best, ["dvl_roll", "dvl_pitch", "dvl_scale", "gyr_scale", *TIME_OFFSETS])
         steps += [r.step / r.sd for r in found]
     assert len(steps) == 36
     assert 0.5 < float(np.std(steps)) < 1.6

@@ -30,7 +30,7 @@ from rovgraph.engine import gauss_newton
 from rovgraph.engine.measurements import loss_and_weight
 from rovgraph.errors import InputError
 from rovgraph.estimators.dead_reckoning import dead_reckon
-from rovgraph.graph.batch import Problem, indeterminate, make_problem, make_values, solve
+from rovgraph.graph.batch import DiveGraph, indeterminate, make_graph, make_values, solve
 from rovgraph.graph.keys import key
 from rovgraph.graph.marginals import covariances, marginals
 from rovgraph.log import Log
@@ -41,12 +41,12 @@ BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "batch.py"
 HELD = {name: {"estimate": False} for name in TABLE}
 
 
-def problem_of(log, config) -> tuple[Problem, gtsam.Values]:
+def problem_of(log, config) -> tuple[DiveGraph, gtsam.Values]:
     """The graph of a log, and dead reckoning to begin with."""
     smoother = batch(log, config)
     b = smoother.initial
-    problem = make_problem(smoother.intervals, b.prior, b.config, beliefs(b.config), b.instruments)
-    return problem, make_values(problem, dead_reckon(smoother.intervals, b, problem.unknowns.fixed))
+    graph = make_graph(smoother.problem, b.prior, b.config, beliefs(b.config), b.instruments)
+    return graph, make_values(graph, dead_reckon(smoother.problem, b, graph.unknowns.fixed))
 
 
 # perfect logs
@@ -158,17 +158,17 @@ def noisy():
 
 def test_cost_never_rises(noisy, monkeypatch):
     """Within one set of gates every step lowers the robust cost."""
-    problem, values = problem_of(noisy.log, noisy.config)
+    graph, values = problem_of(noisy.log, noisy.config)
     searched = []
     search = gauss_newton._search
 
-    def recorded(problem, values, gates, cost, tolerance):
-        there = search(problem, values, gates, cost, tolerance)
-        searched.append((cost, there[1], problem.cost(there[0], gates)))
+    def recorded(graph, values, gates, cost, tolerance):
+        there = search(graph, values, gates, cost, tolerance)
+        searched.append((cost, there[1], graph.cost(there[0], gates)))
         return there
 
     monkeypatch.setattr(gauss_newton, "_search", recorded)
-    solution = solve(problem, values)
+    solution = solve(graph, values)
     assert solution.converged and len(searched) == solution.iterations > 2
     for before, after, true in searched:
         assert after <= before
@@ -176,21 +176,21 @@ def test_cost_never_rises(noisy, monkeypatch):
 
 
 def test_from_a_bad_guess_the_same_optimum_is_found(noisy):
-    problem, values = problem_of(noisy.log, noisy.config)
+    graph, values = problem_of(noisy.log, noisy.config)
     rng, delta = np.random.default_rng(0), gtsam.VectorValues()
-    for i in range(problem.count):
+    for i in range(graph.count):
         delta.insert(key("pose", i), rng.normal(0.0, [0.02, 0.02, 0.1, 1.0, 1.0, 1.0]))
         delta.insert(key("velocity", i), rng.normal(0.0, 0.2, 3))
-    good, bad = solve(problem, values), solve(problem, values.retract(delta))
-    assert problem.cost(values.retract(delta), problem.initial_gates()) > 10 * good.cost
+    good, bad = solve(graph, values), solve(graph, values.retract(delta))
+    assert graph.cost(values.retract(delta), graph.initial_gates()) > 10 * good.cost
     assert bad.cost == pytest.approx(good.cost, rel=1e-5)
 
 
 def test_gradient_vanishes_at_the_optimum(noisy):
-    problem, values = problem_of(noisy.log, noisy.config)
-    solution = solve(problem, values)
-    step = problem.linearize(solution.point, solution.gates).optimize()
-    moved = problem.states(solution.point.retract(step)).p_n - problem.states(solution.point).p_n
+    graph, values = problem_of(noisy.log, noisy.config)
+    solution = solve(graph, values)
+    step = graph.linearize(solution.point, solution.gates).optimize()
+    moved = graph.states(solution.point.retract(step)).p_n - graph.states(solution.point).p_n
     assert np.abs(moved).max() < 2e-3
 
 
@@ -260,9 +260,9 @@ def small():
 
 
 def test_bulk_linearisation_is_that_of_gtsam_factor_by_factor(small):
-    problem, values = small
-    mine = problem.linearize(values, problem.initial_gates())
-    gtsams = problem.nonlinear().linearize(values)
+    graph, values = small
+    mine = graph.linearize(values, graph.initial_gates())
+    gtsams = graph.nonlinear().linearize(values)
     assert mine.size() < gtsams.size()  # one factor a keyframe
     ordering = gtsam.Ordering.ColamdGaussianFactorGraph(gtsams)
     for a, b in zip(mine.hessian(ordering), gtsams.hessian(ordering), strict=True):
@@ -271,68 +271,68 @@ def test_bulk_linearisation_is_that_of_gtsam_factor_by_factor(small):
 
 
 def test_cost_is_that_of_gtsam(small):
-    problem, values = small
-    assert problem.cost(values, problem.initial_gates()) == pytest.approx(problem.nonlinear().error(values), rel=1e-9)
+    graph, values = small
+    assert graph.cost(values, graph.initial_gates()) == pytest.approx(graph.nonlinear().error(values), rel=1e-9)
 
 
 def test_gated_measurements_add_neither_cost_nor_information(small):
-    problem, values = small
-    gates = problem.initial_gates()
+    graph, values = small
+    gates = graph.initial_gates()
     gates["dvl"][3] = False
-    alone = problem.blocks["dvl"].at([3])
-    rho = loss_and_weight(alone.normalised(problem.states(values).at(alone.keyframe)), "huber")[0][0]
-    assert problem.cost(values, gates) == pytest.approx(problem.cost(values, problem.initial_gates()) - rho)
+    alone = graph.blocks["dvl"].at([3])
+    rho = loss_and_weight(alone.normalised(graph.states(values).at(alone.keyframe)), "huber")[0][0]
+    assert graph.cost(values, gates) == pytest.approx(graph.cost(values, graph.initial_gates()) - rho)
     zeros = [
-        np.sum(~problem.linearize(values, g).augmentedJacobian().any(axis=1)) for g in (gates, problem.initial_gates())
+        np.sum(~graph.linearize(values, g).augmentedJacobian().any(axis=1)) for g in (gates, graph.initial_gates())
     ]
     assert zeros[0] - zeros[1] == 3
 
 
 def test_marginals_are_those_of_gtsam(small):
-    problem, values = small
-    solution = solve(problem, values)
-    known = covariances(marginals(problem, solution.point, solution.gates))
-    linear = problem.linearize(solution.point, solution.gates)
+    graph, values = small
+    solution = solve(graph, values)
+    known = covariances(marginals(graph, solution.point, solution.gates))
+    linear = graph.linearize(solution.point, solution.gates)
     gtsams = gtsam.Marginals(linear, solution.point)
     for variable in ("pose", "velocity", "bias"):
-        mine = np.array([known[key(variable, i)] for i in range(problem.count)])
-        for i in range(0, problem.count, 7):
+        mine = np.array([known[key(variable, i)] for i in range(graph.count)])
+        for i in range(0, graph.count, 7):
             expected = gtsams.marginalCovariance(key(variable, i))
             np.testing.assert_allclose(mine[i], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
-    for name in problem.unknowns.estimated:
+    for name in graph.unknowns.estimated:
         np.testing.assert_allclose(known[key(name)], gtsams.marginalCovariance(key(name)), rtol=1e-4)
 
 
 def test_the_step_does_not_depend_on_the_order_of_elimination(small):
-    problem, values = small
-    linear = problem.linearize(values, problem.initial_gates())
+    graph, values = small
+    linear = graph.linearize(values, graph.initial_gates())
     kinds = (gtsam.Ordering.MetisGaussianFactorGraph, gtsam.Ordering.ColamdGaussianFactorGraph)
     steps = [linear.optimize(kind(linear)) for kind in kinds]
-    for i in range(0, problem.count, 10):
+    for i in range(0, graph.count, 10):
         np.testing.assert_allclose(steps[0].at(key("pose", i)), steps[1].at(key("pose", i)), atol=1e-6)
 
 
 # what cannot be determined
 
 
-def without_priors(problem: Problem, of: set[int]) -> Problem:
+def without_priors(graph: DiveGraph, of: set[int]) -> DiveGraph:
     native = gtsam.NonlinearFactorGraph()
-    for k in range(problem.native.size()):
-        factor = problem.native.at(k)
+    for k in range(graph.native.size()):
+        factor = graph.native.at(k)
         if not (len(factor.keys()) == 1 and factor.keys()[0] in of):
             native.add(factor)
-    return Problem(native, problem.blocks, problem.unknowns, problem.index)
+    return DiveGraph(native, graph.blocks, graph.unknowns, graph.index)
 
 
-def complaint(problem: Problem, values: gtsam.Values, of: set[int]) -> str:
+def complaint(graph: DiveGraph, values: gtsam.Values, of: set[int]) -> str:
     with pytest.raises(InputError) as caught:
-        solve(without_priors(problem, of), values)
+        solve(without_priors(graph, of), values)
     return str(caught.value)
 
 
 def test_an_error_of_gtsam_becomes_one_line_that_names_the_variable(noisy):
-    problem, values = problem_of(noisy.log, noisy.config)
-    linear = without_priors(problem, {key("pose", 0)}).linearize(values, problem.initial_gates())
+    graph, values = problem_of(noisy.log, noisy.config)
+    linear = without_priors(graph, {key("pose", 0)}).linearize(values, graph.initial_gates())
     with pytest.raises(RuntimeError) as caught:
         linear.optimize(gtsam.Ordering.MetisGaussianFactorGraph(linear))
     said = indeterminate(caught.value)
@@ -341,8 +341,8 @@ def test_an_error_of_gtsam_becomes_one_line_that_names_the_variable(noisy):
 
 
 def test_a_start_that_nothing_determines_is_refused_in_one_line(noisy):
-    problem, values = problem_of(noisy.log, noisy.config)
-    said = complaint(problem, values, {key("pose", 0)})
+    graph, values = problem_of(noisy.log, noisy.config)
+    said = complaint(graph, values, {key("pose", 0)})
     assert said.startswith("the data do not determine ") and "\n" not in said and len(said) < 300
 
 
@@ -385,7 +385,7 @@ def test_a_sensor_that_its_gate_keeps_out_altogether_does_no_harm(noisy):
 
 
 def test_gates_that_flip_for_ever_come_to_rest(noisy, monkeypatch):
-    problem, values = problem_of(noisy.log, noisy.config)
+    graph, values = problem_of(noisy.log, noisy.config)
     asked = []
 
     def flipping(self, values):
@@ -394,8 +394,8 @@ def test_gates_that_flip_for_ever_come_to_rest(noisy, monkeypatch):
         gates = self.initial_gates()
         return {s: g & ((np.arange(len(g)) + len(asked)) % 2 == 0) for s, g in gates.items()}
 
-    monkeypatch.setattr(Problem, "gates", flipping)
-    assert np.isfinite(solve(problem, values).cost)
+    monkeypatch.setattr(DiveGraph, "gates", flipping)
+    assert np.isfinite(solve(graph, values).cost)
 
 
 def test_dead_reckoning_has_the_depth_of_the_body_not_of_the_sensor():
@@ -424,10 +424,10 @@ def test_what_walks_does_so_by_the_time_between_its_values_however_short_a_segme
     case, walk = simulated(falcon(), 40.0, noise=False), 0.01
     config = started(case, graph={"segment_s": 0.2}, calibration={"field_scale": {"walk": walk}})
     log = kept(case.log, "dvl", case.log["dvl"].time < 1.0)
-    problem, _ = problem_of(log, config)
-    intervals = batch(log, config).intervals
-    factors = [problem.native.at(k) for k in range(problem.native.size())]
+    graph, _ = problem_of(log, config)
+    time = batch(log, config).problem.time
+    factors = [graph.native.at(k) for k in range(graph.native.size())]
     steps = [f.noiseModel().sigmas()[0] for f in factors if isinstance(f, gtsam.BetweenFactorVector)]
-    seconds = intervals[-1].time - intervals[0].time
+    seconds = time[-1] - time[0]
     assert np.sum(np.square(steps)) == pytest.approx(walk**2 * seconds)
     assert seconds > 39.0

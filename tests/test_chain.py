@@ -100,8 +100,8 @@ def solved(request) -> tuple[ChainOptimum, GraphOptimum]:
         patch.setattr(gauss_newton, "REST", EXACT)
         dive = batch(*SCENARIOS[request.param]())
         b = dive.initial
-        states = dead_reckon(dive.intervals, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
-        both = smooth_chain(dive.intervals, b, states), smooth_graph(dive.intervals, b, states)
+        states = dead_reckon(dive.problem, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
+        both = smooth_chain(dive.problem, b, states), smooth_graph(dive.problem, b, states)
     assert IS_SO[request.param](both[0]), "the scenario is not what it is called"
     return both
 
@@ -112,7 +112,7 @@ IS_SO: dict[str, Callable[[ChainOptimum], bool]] = {
     "errors that last": lambda best: len(best.chain.unknowns.time_constants) == 3,
     "scales of the IMU": lambda best: {"acc_scale", "gyr_scale"} <= set(best.unknowns.estimated),
     "time offset of the DVL": lambda best: "dvl_time_offset" in best.unknowns.estimated,
-    "IMU outage": lambda best: any(i.motion is not None and i.motion.coasted for i in best.intervals),
+    "IMU outage": lambda best: best.problem.coasted.any(),
     "outliers": lambda best: 5 < int((~best.solution.gates["dvl"]).sum()) < 20,
 }
 
@@ -178,11 +178,11 @@ def test_what_is_estimated_or_considered_afterwards_is_as_if_it_had_been_from_th
     considered = {"dvl_pitch": {"estimate": "considered", "sd_deg": 1.0}}
     case = simulated(falcon(calibration=considered), 60.0, seed=4, **SHORT)
     b = batch(case.log, case.config)
-    states = dead_reckon(b.intervals, b.initial, {n: belief.mean for n, belief in beliefs(b.initial.config).items()})
+    states = dead_reckon(b.problem, b.initial, {n: belief.mean for n, belief in beliefs(b.initial.config).items()})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton, "FINE", EXACT)
         patch.setattr(gauss_newton, "REST", EXACT)
-        held = smooth_chain(b.intervals, b.initial, states)
+        held = smooth_chain(b.problem, b.initial, states)
         assert held.unknowns.considered == ("dvl_pitch",)
         found = held.estimating(["dvl_pitch"])
         exact = replace(held.chain, unknowns=found.unknowns)
@@ -214,7 +214,7 @@ def test_both_weigh_the_measurements_alike(solved):
 
 def test_both_say_the_same_of_the_calibration_as_the_dive_goes_on(solved):
     chain, graph = solved
-    end = len(chain.intervals) - 1
+    end = len(chain.problem) - 1
     keyframes = [end // 3, 2 * end // 3, end]
     a, b = chain.knowledge(keyframes), graph.knowledge(keyframes)
     assert a.keyframe.tolist() == b.keyframe.tolist() == keyframes
@@ -226,7 +226,7 @@ def test_both_say_the_same_of_the_calibration_as_the_dive_goes_on(solved):
 def test_noise_of_the_states_adds_as_much_information_to_both(solved):
     """The draws differ: so the mean of some is compared, to what a draw of them may differ by."""
     chain, graph = solved
-    end = [len(chain.intervals) - 1]
+    end = [len(chain.problem) - 1]
     sd = np.sqrt(np.diag(graph.knowledge(end).calibration[0]))
 
     def gained(best: Optimum) -> Array:
@@ -307,7 +307,7 @@ def test_a_dive_with_places_says_in_one_line_that_gtsam_is_missing(recorded):
 
 def test_a_step_promises_what_the_slope_of_the_cost_says(solved):
     chain, graph = solved
-    rng, n, layout = np.random.default_rng(1), len(chain.intervals), chain.chain.layout
+    rng, n, layout = np.random.default_rng(1), len(chain.problem), chain.chain.layout
     x, y = 1e-3 * rng.standard_normal((n, layout.d)), 1e-3 * rng.standard_normal(layout.c)
     there = chain.chain.moved(chain.state, ChainStep(x, y), 1.0)
     for problem, point in ((chain.chain, there), (graph.problem, make_values(graph.problem, there))):

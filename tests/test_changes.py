@@ -82,14 +82,13 @@ def changing(case):
     log = stepped(case.log, "fix", (6.0, -4.0))
     initial = initialise(log, case.config)
     belief = lasting_belief(initial.beliefs["fix_error"], 5.0, np.inf, (AT,))
-    dive = BatchSmoother(initial.believing(Beliefs({"fix_error": belief})))
-    dive.take(log)
+    dive = BatchSmoother(initial.believing(Beliefs({"fix_error": belief})), log)
     return dive, dive.optimum()
 
 
 def test_what_changes_is_constant_before_and_after(case, changing):
     dive, best = changing
-    path, late = best.state.calibration["fix_error"], np.array([i.time for i in dive.intervals]) >= AT
+    path, late = best.state.calibration["fix_error"], dive.problem.time >= AT
     assert np.ptp(path[~late], axis=0).max() < 0.01 and np.ptp(path[late], axis=0).max() < 0.01
     np.testing.assert_allclose(path[late][0] - path[~late][0], [6.0, -4.0], atol=0.7)
     sd = np.sqrt(best.covariances("fix_error")[:, 0, 0])
@@ -98,7 +97,7 @@ def test_what_changes_is_constant_before_and_after(case, changing):
 
 def test_the_filter_opens_where_the_smoother_does(changing):
     dive, best = changing
-    end = replay(dive.intervals, dive.initial).known
+    end = replay(dive.problem, dive.initial).known
     own = FilterEngine(dive.initial).layout.columns["fix_error"]
     sd = np.sqrt(np.diag(best.covariances("fix_error")[-1]))
     np.testing.assert_allclose(np.sqrt(np.diag(end.P[own, own])), sd, rtol=0.05)

@@ -48,7 +48,7 @@ def case() -> Simulated:
 def optimum(case: Simulated, config: Config) -> ChainOptimum:
     dive = batch(case.log, config)
     means = {name: belief.mean for name, belief in beliefs(config).items()}
-    return smooth_chain(dive.intervals, dive.initial, dead_reckon(dive.intervals, dive.initial, means))
+    return smooth_chain(dive.problem, dive.initial, dead_reckon(dive.problem, dive.initial, means))
 
 
 def plain_filter(case: Simulated, config: Config) -> ErrorStateFilter:
@@ -119,9 +119,9 @@ def test_filter_and_smoother_agree_on_the_newest_keyframe(case):
 def test_a_filter_goes_on_from_the_smoothers_covariance_with_what_is_considered(case):
     config = started(case)
     again = renewed(case.log, config)
-    k = next(k for k, i in enumerate(again.intervals) if i.time - again.intervals[0].time >= 20.0)
+    k = int(np.flatnonzero(again.problem.time - again.problem.time[0] >= 20.0)[0])
     n, columns = len(again.engine.start().L), again.engine.layout.columns
-    assert again.known.B.shape == (again.engine.layout.size, n) and 0 < k < len(again.intervals)
+    assert again.known.B.shape == (again.engine.layout.size, n) and 0 < k < len(again.problem)
     for name, sd in sds():
         own = np.r_[columns[name]] - again.engine.layout.size
         assert (np.sqrt(np.diag(again.known.L @ again.known.L.T))[own] <= 1.001 * sd).all()

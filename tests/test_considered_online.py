@@ -35,7 +35,7 @@ def flown(case: Simulated, used: Callable[[Measurement], bool], smooth: bool = F
 
 def newest(nav: Navigator) -> Gaussian:
     assert nav.engine is not None
-    return nav.engine.marks[-1].known
+    return nav.engine.snapshots[-1].known
 
 
 def test_a_filter_that_a_sensor_joins_knows_no_more_than_before(case):
@@ -43,7 +43,7 @@ def test_a_filter_that_a_sensor_joins_knows_no_more_than_before(case):
     assert nav.engine is not None
     before, engine = nav.engine.oldest().known, nav.engine.filter
     other = joined(nav.engine, "dvl_water")
-    after = other.marks[0].known
+    after = other.snapshots[0].known
     for name in engine.layout.columns:
         if name in CONSIDERED:
             continue
@@ -64,4 +64,4 @@ def test_after_a_sensor_has_joined_no_way_leads_back_to_keyframes_without_it(cas
     nav = flown(case, lambda m: m.sensor != "dvl_water" or m.time > END_S - 1.0)
     assert nav.engine is not None and "dvl_water" in nav.engine.initial.instruments
     size = nav.engine.filter.layout.size
-    assert all(len(mark.known.P) == size for mark in [*nav.engine.marks, *nav._incoherence._recent])
+    assert all(len(mark.known.P) == size for mark in [*nav.engine.snapshots, *nav._incoherence._recent])

@@ -25,6 +25,7 @@ from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.headings import solve_turn, turn_noise
 from rovgraph.geometry import exp_rotation, wrap_angle
 from rovgraph.instruments import instruments
+from rovgraph.kernels.measurement_row import DT
 from rovgraph.log import Log
 from rovgraph.simulate import Style
 from rovgraph.state import State
@@ -76,8 +77,8 @@ def test_without_noise_it_is_exact_through_starts_stops_and_turns(exact):
 def test_pings_between_keyframes_count_as_those_at_keyframes(exact):
     far = started(exact, graph={"min_gap_s": 0.9})
     smoother = batch(exact.log, far)
-    pings = [a for i in smoother.intervals for a in i.measurements if a.sensor == "dvl"]
-    assert np.mean([a.motion.dt > 0.0 for a in pings]) > 0.7
+    pings = smoother.problem.of_sensor("dvl")
+    assert np.mean(smoother.problem.rows[pings, DT] > 0.0) > 0.7
     assert position_errors(smoother.dead_reckoning().trajectory, exact).max() < 0.01
 
 
@@ -142,7 +143,7 @@ BIAS = np.array([0.002, -0.001, 0.003])
 def test_without_a_heading_the_bias_of_the_heading_gyro_stays_as_it_was():
     config = Config.model_validate({"start": {"heading_deg": 0.0}})
     smoother = batch(turning_gyro(120.0, BIAS), config)
-    states = dead_reckon(smoother.intervals, smoother.initial, means(config))
+    states = dead_reckon(smoother.problem, smoother.initial, means(config))
     np.testing.assert_allclose(states.bias[-1, 3:5], BIAS[:2], atol=2e-4)  # the others are found
     assert np.abs(states.bias[:, 5]).max() < 0.01 * BIAS[2]
 
@@ -151,7 +152,7 @@ def test_with_a_heading_the_bias_of_the_heading_gyro_is_found():
     time = np.arange(0.05, 120.0, 0.1)
     log = turning_gyro(120.0, BIAS, ahrs=(time, np.tile([0.5, np.nan, np.nan], (len(time), 1))))
     smoother = batch(log, Config())
-    states = dead_reckon(smoother.intervals, smoother.initial, means(smoother.initial.config))
+    states = dead_reckon(smoother.problem, smoother.initial, means(smoother.initial.config))
     np.testing.assert_allclose(states.bias[-1, 3:], BIAS, atol=3e-4)
 
 

@@ -22,6 +22,8 @@ from dives import (
     started,
     without,
 )
+from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
+from rovgraph.engine.transition import predict, transitions
 from scipy.optimize import minimize
 from test_consistency import OVERCONFIDENT, band, drawn, nees
 
@@ -31,10 +33,8 @@ from rovgraph.engine import error_layout
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement
 from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
 from rovgraph.engine.measurements import loss_and_weight, loss_threshold
 from rovgraph.engine.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
-from rovgraph.engine.transition import predict, transitions
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter, replay
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose

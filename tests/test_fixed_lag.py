@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from dives import RecordingFilter, Simulated, falcon, fed, simulated
 
+from rovgraph.engine.assembly import InsertResult
 from rovgraph.engine.filter_step import Gaussian
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.errors import InputError
-from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag, InsertResult
+from rovgraph.estimators.eskf.fixed_lag import FilterSnapshot, FixedLag
 from rovgraph.estimators.initialise import initialise
 from rovgraph.live import reinitialisations
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
@@ -46,7 +47,7 @@ def live(
 ) -> tuple[FixedLag, list[Gaussian]]:
     """The filter after all measurements, and its estimate of every keyframe."""
     known: list[Gaussian] = []
-    engine = FixedLag(initial, LAG, hold, passed=lambda mark: known.append(mark.known))
+    engine = FixedLag(initial, LAG, hold, passed=lambda snapshot: known.append(snapshot.known))
     for measurement in measurements:
         engine.add(measurement)
     engine.finish()
@@ -103,7 +104,7 @@ def test_pings_that_are_found_to_be_late_are_put_where_they_belong_from_then_on(
     engine, known = live(initial, list(case.log.measurements()))
     recorded = fed(RecordingFilter(initial), case.log)
     same(known, recorded.filtered, 1e-12)
-    assert engine._assembler.time_offsets.off(known[-1].state.calibration) < 0.02
+    assert engine.assembly.time_offsets.off(known[-1].state.calibration) < 0.02
     assert abs(known[-1].state.calibration["dvl_time_offset"][0] - 0.1) < 0.02
 
 
@@ -128,16 +129,16 @@ def test_retracted_pings_leave_no_trace(case, initial, measurements):
     for m in measurements[:cut]:
         if not any(m is g for g in gone):
             never.add(m)
-    same([engine.marks[-1].known], [never.marks[-1].known], 1e-9)
+    same([engine.snapshots[-1].known], [never.snapshots[-1].known], 1e-9)
 
 
 def test_prediction_ahead_grows_uncertain_and_beyond_the_imu_more_so(initial, measurements):
     engine = FixedLag(initial, LAG, HOLD)
     for m in measurements[:2500]:
         engine.add(m)
-    mark = engine.marks[-1]
+    newest_keyframe = engine.snapshots[-1]
     newest = max(m.time for m in measurements[:2500] if m.sensor == "imu")
-    sd = [np.sqrt(np.diag(engine.ahead(t)[1].P)[6:9]).max() for t in (mark.interval.time, newest, newest + 3.0)]
+    sd = [np.sqrt(np.diag(engine.ahead(t)[1].P)[6:9]).max() for t in (newest_keyframe.time, newest, newest + 3.0)]
     assert sd[0] < sd[1] < 0.1 * sd[2]
 
 
@@ -148,9 +149,9 @@ def test_restored_from_its_state_it_goes_on_as_if_nothing_had_happened(tmp_path,
         before.add(m)
     write_checkpoint(tmp_path / "state", before.state())
     known: list[Gaussian] = []
-    after = FixedLag(initial, LAG, HOLD, passed=lambda mark: known.append(mark.known))
+    after = FixedLag(initial, LAG, HOLD, passed=lambda snapshot: known.append(snapshot.known))
     after.restore(read_checkpoint(tmp_path / "state"))
-    for t in (before.marks[-1].interval.time, measurements[cut - 1].time):
+    for t in (before.snapshots[-1].time, measurements[cut - 1].time):
         np.testing.assert_allclose(after.ahead(t)[1].P, before.ahead(t)[1].P, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(after.ahead(t)[1].state.p_n, before.ahead(t)[1].state.p_n, atol=1e-9)
     for m in measurements[cut:]:
@@ -164,7 +165,7 @@ def test_memory_does_not_grow(initial, measurements):
     for k, m in enumerate(measurements):
         engine.add(m)
         if k in (len(measurements) // 2, len(measurements) - 1):
-            sizes.append((len(engine.marks), len(engine._record)))
+            sizes.append((len(engine.snapshots), len(engine.assembly)))
     assert sizes[1][0] <= sizes[0][0] + 2
     assert sizes[1][1] <= 2 * sizes[0][1] + 100
 
@@ -187,16 +188,16 @@ def reinitialised(
     """Every keyframe; ``at`` is called with the time since the start at each of them."""
     known: list[Gaussian] = []
 
-    def passed(mark: FilterSnapshot) -> None:
-        known.append(mark.known)
-        thread.take(mark)
+    def passed(snapshot: FilterSnapshot) -> None:
+        known.append(snapshot.known)
+        thread.take(snapshot)
 
-    engine, newest = FixedLag(initial, lag, HOLD, passed=passed), -1
+    engine, newest = FixedLag(initial, lag, HOLD, passed=passed, keeps_all=True), -1
     for measurement in measurements:
         engine.add(measurement)
-        if engine.marks and engine.marks[-1].interval.index > newest:
-            newest = engine.marks[-1].interval.index
-            at(engine.marks[-1].interval.time - measurements[0].time)
+        if engine.snapshots and engine.snapshots[-1].index > newest:
+            newest = engine.snapshots[-1].index
+            at(engine.snapshots[-1].time - measurements[0].time)
             thread.step(engine, False)
     engine.finish()
     thread.close()

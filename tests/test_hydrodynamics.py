@@ -8,6 +8,7 @@ from dives import altered, as_log, batch, changed, initial_conditions, kept, rms
 
 from rovgraph.config import Config
 from rovgraph.engine.aiding import OLDEST_SIGNAL_S, PIECE_S
+from rovgraph.engine.assembly import assembly_of
 from rovgraph.errors import InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, replay
 from rovgraph.estimators.estimate import Estimate
@@ -15,6 +16,7 @@ from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, rotate
 from rovgraph.instruments import hydrodynamics, instruments
+from rovgraph.kernels.measurement_row import RATE, TIME
 from rovgraph.log import Log, Stream
 from rovgraph.sensors import ModelAiding, WaterVelocity
 from rovgraph.simulate import Choices, Dive, simulate
@@ -132,14 +134,15 @@ def test_the_water_seen_from_the_vehicle_has_the_derivatives_of_its_differences(
 
 def at_truth(case: Case, graph: BatchSmoother) -> Array:
     """Measured less predicted specific force at the true motion, shape (n, 3) [m/s^2]."""
-    attached = [a for i in graph.intervals for a in i.measurements if a.sensor == "thruster"]
-    motion = case.dive.path.motion(np.array([a.time for a in attached]))
+    attached = graph.problem.of_sensor("thruster")
+    rows = graph.problem.rows[attached]
+    motion = case.dive.path.motion(rows[:, TIME])
     arm = rotate(motion.R_nb, np.cross(motion.w_b, case.config.imu.lever_arm_m))
     truth = dict.fromkeys(COEFFICIENTS, np.full(3, TRUE_DRAG - 1.0))
     truth |= {"current": CURRENT, "water_oscillation": np.zeros(3)}
     state = State(motion.R_nb, motion.p_n, motion.v_n + arm, np.zeros((len(attached), 6)), truth)
     aiding = instruments(case.config, case.config.imu.lever_arm_m)["thruster"].model
-    return np.array([a.z for a in attached]) - aiding.predict(state, np.array([a.rate_b for a in attached]))[0]
+    return graph.problem.z(attached, 3) - aiding.predict(state, rows[:, RATE : RATE + 3])[0]
 
 
 def test_true_motion_explains_the_specific_force_also_while_it_turns_and_reverses(still, graph):
@@ -152,14 +155,14 @@ def test_true_motion_explains_the_specific_force_also_while_it_turns_and_reverse
 
 
 def test_pieces_are_short_where_keyframes_are_far_apart_and_their_noise_is_that_of_their_length(graph):
-    for before, interval in zip(graph.intervals, graph.intervals[1:], strict=False):
-        pieces = [a for a in interval.measurements if a.sensor == "thruster"]
-        length = (interval.time - before.time) / max(len(pieces), 1)
-        assert length <= PIECE_S + 1e-9
-        for piece in pieces:
-            np.testing.assert_allclose(piece.sd, BELIEVED_SD / np.sqrt(length), rtol=1e-6)
-    lost = [i for i in graph.intervals if LOST[0] + 2.0 < i.time < LOST[1]]
-    assert {len([a for a in i.measurements if a.sensor == "thruster"]) for i in lost} == {4}
+    problem, pieces = graph.problem, graph.problem.of_sensor("thruster")
+    count = np.bincount(problem.interval[pieces], minlength=len(problem))
+    length = np.diff(problem.time) / np.maximum(count[1:], 1)
+    assert (length <= PIECE_S + 1e-9).all()
+    believed = BELIEVED_SD / np.sqrt(length[problem.interval[pieces] - 1])[:, None]
+    np.testing.assert_allclose(problem.sd(pieces, 3), np.broadcast_to(believed, (len(pieces), 3)), rtol=1e-6)
+    lost = (problem.time > LOST[0] + 2.0) & (problem.time < LOST[1])
+    assert {*count[lost].tolist()} == {4}
 
 
 # estimates
@@ -171,13 +174,13 @@ def test_drag_current_and_track_are_recovered_without_noise(still, graph, smooth
     current = [c.value for c in smoothed.calibration if c.label.startswith("current")]
     np.testing.assert_allclose(current, CURRENT, atol=2e-3)
     assert still.errors(smoothed).max() < 0.05
-    filtered = replay(graph.intervals, graph.initial, REINITIALISE_AT_S).solve()
+    filtered = replay(graph.problem, graph.initial, REINITIALISE_AT_S).solve()
     np.testing.assert_allclose(coefficients(filtered)[0], TRUE_DRAG - 1.0, atol=0.1)
 
 
 def test_graph_and_rts_smoother_agree(graph, smoothed):
     """To half an sd of the track and 10 percent of drag: one pass linearises with drag a quarter off."""
-    rts = replay(graph.intervals, graph.initial).smoothed()
+    rts = replay(graph.problem, graph.initial).smoothed()
     far = np.linalg.norm(rts.trajectory.p_n - smoothed.trajectory.p_n, axis=1)
     sd = np.sqrt(np.trace(smoothed.trajectory.cov_p, axis1=1, axis2=2))
     assert np.all(far < 0.5 * sd)
@@ -201,16 +204,22 @@ def test_no_thrusters_or_too_few_are_refused_in_one_line(still):
 def test_signals_that_stop_or_start_late_are_left_out_and_counted(still):
     time = still.log["thruster"].time
     some = batch(kept(still.log, "thruster", (time > 10.0) & (time < 30.0)), still.config)
-    used = np.array([a.time for i in some.intervals for a in i.measurements if a.sensor == "thruster"])
+    used = some.problem.rows[some.problem.of_sensor("thruster"), TIME]
     assert 10.0 < used.min() < 11.0 and 29.0 < used.max() < 30.0 + OLDEST_SIGNAL_S
-    reasons = {reason for sensor, reason in some.assembler.left_out if sensor == "thruster"}
+    reasons = {reason for sensor, reason in some.left_out if sensor == "thruster"}
     assert reasons == {"pieces before the first signal", f"pieces without a signal for {OLDEST_SIGNAL_S:g} s"}
 
 
 def test_signals_of_a_whole_log_are_taken_as_those_that_come_one_by_one(still):
-    one, whole = batch(still.log, still.config), BatchSmoother(initial_conditions(still.log, still.config))
-    same(one.intervals, whole.take(still.log))
-    assert whole.assembler.left_out == one.assembler.left_out
+    whole, one = (assembly_of(initial_conditions(still.log, still.config)) for _ in range(2))
+    whole.take(still.log)
+    for measurement in still.log.measurements():
+        one.insert(measurement)
+        one.extend()
+    for assembly in (whole, one):
+        assembly.extend(finish=True)
+    same(one.problem, whole.problem)
+    assert whole.left_out == one.left_out
 
 
 def test_without_hydrodynamics_signals_change_nothing(still):
@@ -218,8 +227,7 @@ def test_without_hydrodynamics_signals_change_nothing(still):
     noisy = altered(still.log, "thruster", 0.0 * still.log["thruster"].data + 50.0)
     start = initial_conditions(still.log, config)
     assert "thruster" not in start.instruments
-    for a, b in zip(batch(still.log, config).intervals, batch(noisy, config).intervals, strict=True):
-        assert a.time == b.time and len(a.measurements) == len(b.measurements)
+    same(batch(still.log, config).problem, batch(noisy, config).problem)
 
 
 # comparison

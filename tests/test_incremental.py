@@ -29,10 +29,10 @@ from rovgraph.estimators.incremental import UPDATE_S, IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import smoothed as smoothed_results
 from rovgraph.geometry import Array, log_rotation, transpose
-from rovgraph.graph.factors import motion
 from rovgraph.graph.keys import CALIBRATION, key
 from rovgraph.graph.linear_intervals import IntervalTerms, Linearization
 from rovgraph.graph.measurement_factors import measurement_factor
+from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.kernels.layout import MOTION
 from rovgraph.live.clocks import Clocks
@@ -83,13 +83,13 @@ def test_filter_ends_where_the_batch_does(case, filtered):
 def test_the_filter_is_as_good_as_isam2_at_its_newest_keyframe(case, filtered):
     isam2 = IncrementalEstimator(filtered.initial)
     newest: dict[int, Array] = {}
-    for interval in filtered.intervals:
-        isam2.step(interval)
-        if isam2.updated == interval.index:
-            newest[interval.index] = isam2.latest().p_n[0]
+    for k in range(len(filtered.problem)):
+        isam2.step(filtered.problem, k)
+        if isam2.updated == k:
+            newest[k] = isam2.latest().p_n[0]
     arm = np.array(case.config.imu.lever_arm_m)
     keyframes = list(newest)
-    true = case.truth.at(np.array([filtered.intervals[k].time for k in keyframes]))
+    true = case.truth.at(filtered.problem.time[keyframes])
     at_imu = true.p_n + true.R_nb @ arm
     errors = [
         rms(np.linalg.norm(p - at_imu, axis=1))
@@ -106,7 +106,7 @@ def test_filtered_errors_lie_within_what_is_said_of_them(case, filtered):
 
 
 def test_feeding_measurements_and_replaying_intervals_are_the_same(case, filtered):
-    again = replay(batch(case.log, case.config).intervals, initialise(case.log, case.config), REINITIALISE_AT_S)
+    again = replay(batch(case.log, case.config).problem, initialise(case.log, case.config), REINITIALISE_AT_S)
     a, b = filtered.solve(), again.solve()
     np.testing.assert_allclose(a.trajectory.p_n, b.trajectory.p_n, atol=1e-9)
     np.testing.assert_allclose(a.trajectory.cov_p, b.trajectory.cov_p, atol=1e-9)
@@ -129,7 +129,7 @@ def _until(stream, end):
 def test_progress_is_reported():
     case = simulated(falcon(), 33.0, seed=6, dvl_rate=5.0)
     told: list[float] = []
-    replay(batch(case.log, case.config).intervals, initialise(case.log, case.config), progress=told.append)
+    replay(batch(case.log, case.config).problem, initialise(case.log, case.config), progress=told.append)
     assert told and all(0.0 <= done <= 1.0 for done in told)
     assert told == sorted(told)
 
@@ -199,9 +199,9 @@ def test_what_isam2_knows_of_its_newest_keyframe_is_what_the_dive_so_far_shows(c
     """Each filtered keyframe against the optimum of all data up to it, from the graph of a chain."""
     dive = batch(case.log, case.config)
     filtered, off = whole.history.states, []
-    for end in range(30, len(dive.intervals), 30):
+    for end in range(30, len(dive.problem), 30):
         states = filtered.at(np.arange(end + 1))
-        best = smooth_chain(dive.intervals[: end + 1], dive.initial, states)
+        best = smooth_chain(dive.problem.upto(end + 1), dive.initial, states)
         sd = np.sqrt(np.diag(best.newest_covariance()))
         newest = best.state.at([end])
         turn = log_rotation(transpose(newest.R_nb) @ filtered.R_nb[end : end + 1])[0]
@@ -241,26 +241,28 @@ def test_isam2_keeps_gross_outliers_out_by_its_own_innovations(case, whole):
 def test_the_rows_of_an_interval_are_gtsams_factors_of_it(whole):
     """The motion's, and the robust ones of its measurements, at two keyframes that are somewhat off."""
     engine, unknowns = whole.filter, whole.filter.unknowns
-    interval = next(i for i in whole.intervals[50:] if i.here and len(i.between) > 1)
-    states = whole.history.states.at([interval.index - 1, interval.index])
+    problem = whole.problem
+    between = np.bincount(problem.interval[problem.keyframe < problem.interval], minlength=len(problem))
+    here = np.bincount(problem.interval[problem.keyframe == problem.interval], minlength=len(problem))
+    j = 50 + int(np.flatnonzero(((between > 1) & (here > 0))[50:])[0])
+    own = np.arange(*problem.measured_in(j))
+    states = whole.history.states.at([j - 1, j])
     x = np.concatenate([states.R_nb.reshape(2, 9), states.p_n + 0.01, states.v_n - 0.02, states.bias], axis=1)
     c = calibration_vector({name: value[-1] for name, value in states.calibration.items()})
-    (rows,) = Linearization(engine, whole.initial.prior).linearize(
-        [IntervalTerms(engine, interval, interval.measurements)], x, c[None]
-    )
+    (rows,) = Linearization(engine, whole.initial.prior).linearize([IntervalTerms(engine, problem, j, own)], x, c[None])
     values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for k in range(2):
-        insert_state(values, interval.index - 1 + k, states_of(x[k : k + 1], c))
+        insert_state(values, j - 1 + k, states_of(x[k : k + 1], c))
     insert_calibration(values, states_of(x[:1], c).calibration, unknowns)
-    for factor in motion(interval, unknowns, 0):
-        graph.add(factor)
-    for m in interval.measurements:
-        graph.add(measurement_factor(engine.block([m]), 0))
+    graph.add(motion_factor(problem, j, unknowns, 0))
+    blocks = [engine.block(problem, np.array([row])) for row in own]
+    for block in blocks:
+        graph.add(measurement_factor(block, 0))
     order = gtsam.Ordering()
-    for k in (interval.index - 1, interval.index):
+    for k in (j - 1, j):
         for variable in (POSE, VELOCITY, BIAS):
             order.push_back(key(variable, k))
-    touched = {name for m in interval.measurements for name in engine.block([m]).unknowns.estimated}
+    touched = {name for block in blocks for name in block.unknowns.estimated}
     names = [name for name in unknowns.estimated if name in touched]
     for name in names:
         order.push_back(key(name))
@@ -273,8 +275,8 @@ def test_the_rows_of_an_interval_are_gtsams_factors_of_it(whole):
 
 def test_what_isam2_tells_of_its_newest_keyframe_is_its_joint_marginal(whole):
     """The root of the tree has it, also after iSAM2 has been put up again."""
-    engine, last = whole.engine, whole.intervals[-1]
-    keys = [key(POSE, last.index), key(CALIBRATION, last.segment)]
+    engine, problem = whole.engine, whole.problem
+    keys = [key(POSE, len(problem) - 1), key(CALIBRATION, int(problem.segment[-1]))]
     x, _, P, _ = engine.newest()
     np.testing.assert_allclose(P, engine._engine.jointMarginalCovariance(keys).fullMatrix(), rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(x, engine.estimate()[0][-1], atol=1e-3)
@@ -285,8 +287,8 @@ def test_isam2_claims_no_more_of_the_heading_than_the_dive_so_far_shows(case, wh
     ratio, dive = [], batch(case.log, case.config)
     heading = whole.filtered().trajectory.rpy_sd[:, 2]
     for seconds in range(6, 40, 2):
-        end = int(np.searchsorted([i.time for i in dive.intervals], dive.intervals[0].time + seconds))
-        best = smooth_chain(dive.intervals[: end + 1], dive.initial, whole.history.states.at(np.arange(end + 1)))
+        end = int(dive.problem.time.searchsorted(dive.problem.time[0] + seconds))
+        best = smooth_chain(dive.problem.upto(end + 1), dive.initial, whole.history.states.at(np.arange(end + 1)))
         so_far = smoothed_results(best, dive.initial).trajectory.rpy_sd[-1, 2]
         ratio.append(heading[end] / so_far)
     assert min(ratio) > 0.8
@@ -342,7 +344,7 @@ def test_a_filter_that_goes_on_from_its_own_estimate_stays_where_it_is(case):
     for m in case.log.measurements():
         if m.time < 30.0:
             engine.add(m)
-    before = engine.marks[-1].known
+    before = engine.snapshots[-1].known
     engine.adopt_passed(passed[-1].known, passed[-1].gates)
-    np.testing.assert_allclose(engine.marks[-1].known.x, before.x, atol=1e-12)
-    np.testing.assert_allclose(engine.marks[-1].known.P, before.P, atol=1e-15)
+    np.testing.assert_allclose(engine.snapshots[-1].known.x, before.x, atol=1e-12)
+    np.testing.assert_allclose(engine.snapshots[-1].known.P, before.P, atol=1e-15)

@@ -23,9 +23,7 @@ SLOW = {"dvl_rate": 2.0, "imu_rate": 50.0, "fix_interval": 1.0, "start_error": T
 
 
 def optimum_of(log, config):
-    dive = BatchSmoother(initialise(log, config))
-    dive.take(log)
-    return dive.optimum()
+    return BatchSmoother(initialise(log, config), log).optimum()
 
 
 @pytest.fixture(scope="module")
@@ -54,22 +52,21 @@ def test_a_time_constant_without_end_is_a_random_walk():
 
 
 def test_sd_of_an_error_stays_where_nothing_measures_it(best):
-    for keyframe in (0, len(best.intervals) // 2, len(best.intervals) - 1):
+    for keyframe in (0, len(best.problem) // 2, len(best.problem) - 1):
         np.testing.assert_allclose(joint_prior_sd(best, keyframe)["fix_error"], 1.0)
 
 
 def test_prediction_is_the_process_and_its_mean():
     config = falcon(calibration={"current": {"mean": [0.3, -0.2], "sd": 0.1, "time_constant_s": 5.0}})
     case = simulated(config, 32.0, water_track=True, **SLOW)
-    dive = BatchSmoother(initialise(case.log, case.config))
-    dive.take(case.log)
+    dive = BatchSmoother(initialise(case.log, case.config), case.log)
     engine = FilterEngine(dive.initial)
-    before, interval = engine.start(), dive.intervals[5]
-    own, seconds = engine.layout.columns["current"], interval.time - dive.intervals[4].time
+    before, time = engine.start(), dive.problem.time
+    own, seconds = engine.layout.columns["current"], time[5] - time[4]
     before.c[LAYOUT["current"]] = 1.3, 0.8
     before.P[own, own] *= 0.25
     before.P[own, 0:3] = before.P[0:3, own].T[:] = 1e-4
-    done = engine.predict(interval, before)
+    done = engine.predict(dive.problem, 5, before)
     kept = np.exp(-seconds / 5.0)
     np.testing.assert_allclose(done.predicted.c[LAYOUT["current"]], [0.3 + kept, -0.2 + kept])
     expected = done.F @ before.P @ done.F.T + done.Q

@@ -31,11 +31,11 @@ from rovgraph.cli.app import main
 from rovgraph.config import Config
 from rovgraph.dive import smooth
 from rovgraph.engine import gauss_newton
+from rovgraph.engine.assembly import assembly_of
 from rovgraph.engine.chain_optimum import smooth_chain
 from rovgraph.errors import InputError
 from rovgraph.estimators.attitude_gaps import without_attitude_gaps
 from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, wrap_angle
 from rovgraph.interchange.formats import read_recording
 from rovgraph.live.startup import Startup
@@ -158,11 +158,15 @@ def test_a_log_without_imu_is_smoothed_and_no_bias_is_reported(dive):
 def test_measurements_one_by_one_and_a_whole_log_give_the_same_keyframes(dive):
     case, config = dive
     initial = initialise(case.log, config)
-    whole = BatchSmoother(initial)
+    whole, one_by_one = assembly_of(initial), assembly_of(initial)
     whole.take(case.log)
-    one_by_one = batch(case.log, config)
-    assert len(whole.intervals) > SECONDS
-    same(whole.intervals, one_by_one.intervals)
+    for measurement in case.log.measurements():
+        one_by_one.insert(measurement)
+        one_by_one.extend()
+    for assembly in (whole, one_by_one):
+        assembly.extend(finish=True)
+    assert len(whole) > SECONDS
+    same(whole.problem, one_by_one.problem)
 
 
 @pytest.mark.parametrize("sensor", ["dvl", "vehicle_heading", "vehicle_tilt"])
@@ -362,7 +366,7 @@ def test_gtsam_finds_the_same_optimum(dive, monkeypatch):
 
     case, config = dive
     smoother = batch(case.log, config)
-    problem = smoother.intervals, smoother.initial, smoother.optimum().state
+    problem = smoother.problem, smoother.initial, smoother.optimum().state
     chain, graph = smooth_chain(*problem), smooth_graph(*problem)
     np.testing.assert_allclose(graph.state.p_n, chain.state.p_n, atol=1e-5)
 

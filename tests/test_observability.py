@@ -23,7 +23,7 @@ from rovgraph.estimators.observability import (
     relative_covariance,
     without_spurious_information,
 )
-from rovgraph.graph.batch import make_problem, make_values
+from rovgraph.graph.batch import make_graph, make_values
 from rovgraph.graph.keys import key
 from rovgraph.simulate import CALM, SCENARIOS, Style, scenario
 from rovgraph.simulate.files import write_log
@@ -70,8 +70,8 @@ def dense(linear, order):
 
 def as_graph(dive, b):
     """GTSAM's graph of a dive whose calibration is constant, and its values where the chain is linearised."""
-    problem, point = make_problem(dive.intervals, b.prior, b.config, dive.beliefs, b.instruments), dive.linearised_at
-    return problem, make_values(problem, point, point.calibration)
+    graph, point = make_graph(dive.problem, b.prior, b.config, dive.beliefs, b.instruments), dive.linearised_at
+    return graph, make_values(graph, point, point.calibration)
 
 
 def test_information_agrees_with_a_dense_inversion_at_every_time():
@@ -81,19 +81,19 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
         log = kept(log, sensor, (log[sensor].time > 18.0) & (log[sensor].time < 24.0))
     smoother = batch(log, ONE_COMPASS)
     dive = smoother.optimum()
-    problem, values = as_graph(dive, smoother.initial)
-    ends = [7, 12, problem.count - 1]
+    graph, values = as_graph(dive, smoother.initial)
+    ends = [7, 12, graph.count - 1]
     seen = dive.knowledge(ends)
-    linear = problem.linearize(values, dive.solution.gates)
+    linear = graph.linearize(values, dive.solution.gates)
     for row, end in enumerate(ends):
-        later = {key(v, i) for v in ("pose", "velocity", "bias") for i in range(end + 1, problem.count)}
+        later = {key(v, i) for v in ("pose", "velocity", "bias") for i in range(end + 1, graph.count)}
         so_far, order = gtsam.GaussianFactorGraph(), gtsam.Ordering()
         for k in range(linear.size()):
             if not later & set(linear.at(k).keys()):
                 so_far.push_back(linear.at(k))
         for one in [key(v, i) for i in range(end + 1) for v in ("pose", "velocity", "bias")]:
             order.push_back(one)
-        for name in problem.unknowns.estimated:
+        for name in graph.unknowns.estimated:
             order.push_back(key(name))
         P = dense(so_far, order)
         states = 15 * (end + 1)
@@ -105,14 +105,14 @@ def test_information_agrees_with_a_dense_inversion_at_every_time():
 
 def test_information_at_the_end_is_that_of_the_smoother(straight):
     _, dive = straight
-    last = dive.knowledge([len(dive.intervals) - 1])
+    last = dive.knowledge([len(dive.problem) - 1])
     expected = np.concatenate([np.sqrt(np.diag(dive.covariances(n)[-1])) for n in dive.unknowns.estimated])
     np.testing.assert_allclose(np.sqrt(np.diag(last.calibration[0])), expected, rtol=1e-8)
 
 
 def at_truth(case, dive):
     """The dive at the true states and calibration."""
-    time, truth = np.array([i.time for i in dive.intervals]), case.truth
+    time, truth = dive.problem.time, case.truth
     there = truth.at(time)
     bias = np.array([np.interp(time, truth.time, column) for column in case.dive.hidden["bias"].T]).T
     hidden = {**dive.unknowns.fixed, **case.dive.hidden["calibration"]}
@@ -124,7 +124,7 @@ def test_what_noise_pretends_is_taken_off(straight):
     """Ahead at constant speed the information at the truth says that nothing is known of the misalignment."""
     case, dive = straight
     sd = np.concatenate([np.full(TABLE[n].dim, TABLE[n].sd) for n in dive.unknowns.estimated])
-    end = [len(dive.intervals) - 1]
+    end = [len(dive.problem) - 1]
 
     def seen(dive):
         return data_information(dive.knowledge(end).calibration, sd)
@@ -171,7 +171,7 @@ def test_a_filter_goes_on_without_what_noise_feigned(straight):
     """Reinitialised from a dive that does not show the misalignment, it has the prior of it."""
     case, dive = straight
     engine = FilterEngine(initialise(case.log, ONE_COMPASS))
-    known, _ = reinitialised(engine, dive.intervals, dive.state)
+    known, _ = reinitialised(engine, dive.problem, dive.state)
     belief, (column,) = engine.beliefs["dvl_yaw"], np.r_[engine.layout.columns["dvl_yaw"]]
     assert known.state.calibration["dvl_yaw"] == belief.mean
     assert np.sqrt(known.covariance[column, column]) == pytest.approx(belief.sd)

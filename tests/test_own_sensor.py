@@ -135,7 +135,7 @@ def test_its_faults_are_left_out(case):
     estimate = smoother.solve()
     found = scale_of(estimate)
     assert abs(found.value - TRUE_SCALE) < SURE * found.sd
-    assert smoother.assembler.left_out["depth2", "beyond its range"] == 1
+    assert smoother.left_out["depth2", "beyond its range"] == 1
     rows = estimate.residuals[estimate.residuals["sensor"] == "depth2"]
     off, out = rows["normalised"].abs() > 6.0, rows["weight"] == 0.0
     assert off.sum() > 5 and out[off].all()

@@ -38,7 +38,7 @@ def optimum(log: Log, case: Simulated) -> ChainOptimum:
 
 def dead_reckoned(smoother: BatchSmoother) -> State:
     b = smoother.initial
-    return dead_reckon(smoother.intervals, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
+    return dead_reckon(smoother.problem, b, {name: belief.mean for name, belief in beliefs(b.config).items()})
 
 
 def on_water(data: Array, time: Array) -> None:
@@ -160,7 +160,7 @@ def test_a_healthy_dive_is_solved_once(case, monkeypatch):
     monkeypatch.setattr(Chain, "eliminate", counted)
     smoother = batch(case.log, case.config)
     states = dead_reckoned(smoother)
-    best = smooth_chain(smoother.intervals, smoother.initial, states)
+    best = smooth_chain(smoother.problem, smoother.initial, states)
     assert counts[0] == best.solution.iterations
     assert (best.solution.stretches, best.solution.runner_up) == ((), np.inf)
 
@@ -170,8 +170,8 @@ def test_chain_and_graph_take_out_the_same_stretch():
     case = simulated(falcon(), 120.0, 2, dvl_rate=3.0, imu_rate=50.0)
     smoother = batch(BROKEN["DVL biased by 0.3 m/s for 20 s"].breaks(case.log), case.config)
     states = dead_reckoned(smoother)
-    chain = smooth_chain(smoother.intervals, smoother.initial, states).solution
-    graph = smooth_graph(smoother.intervals, smoother.initial, states).solution
+    chain = smooth_chain(smoother.problem, smoother.initial, states).solution
+    graph = smooth_graph(smoother.problem, smoother.initial, states).solution
     assert len(chain.stretches) == 1
     assert chain.stretches == graph.stretches
     assert chain.cost == pytest.approx(graph.cost, rel=1e-4)

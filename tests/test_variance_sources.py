@@ -32,7 +32,7 @@ def with_part(config, part, **keys):
 def test_the_parts_add_up_to_the_variance_anywhere_in_the_dive(share):
     dive = simulated()
     best = assemble(dive.log, initialise(dive.log, dive.config)).optimum(None)
-    k = int(share * (len(best.intervals) - 1))
+    k = int(share * (len(best.problem) - 1))
     R = best.state.R_nb[k]
     P = R @ best.covariances(POSE)[k][3:6, 3:6] @ R.T
     assert sum(variance_sources(best, k).values()) == pytest.approx(P[0, 0] + P[1, 1], rel=1e-5)

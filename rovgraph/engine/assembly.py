@@ -272,6 +272,8 @@ class Assembly:
         order = self._order[: counts[at.ORDERED]]
         order = order[order < read]
         self._order[: len(order)] = order
+        if 0 < n < len(self) and dive.keyframes[n, at.COUNT] == last[at.COUNT]:
+            counts[at.SAMPLES] -= 1  # by that sample others are past, too
         counts[at.READ], counts[at.ORDERED], counts[at.KEYFRAMES] = read, len(order), n
         counts[at.ROWS] = int(last[at.TAKEN])
         counts[at.WINDOWS] = dive.of[at.WINDOW_OF, : counts[at.ROWS]].max(initial=-1) + 1
