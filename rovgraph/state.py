@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, exp_rotation, rotate
 from rovgraph.kernels.propagation import propagate_many
@@ -46,7 +47,7 @@ class State:
     def __len__(self) -> int:
         return len(self.p_n)
 
-    def at(self, index: Array | slice | list[int]) -> "State":
+    def at(self, index: NDArray[np.int64] | slice | list[int]) -> "State":
         """The epochs ``index``; per-epoch calibration is indexed alike."""
         calibration = {k: v[index] if v.ndim == 2 else v for k, v in self.calibration.items()}
         return State(self.R_nb[index], self.p_n[index], self.v_n[index], self.bias[index], calibration)

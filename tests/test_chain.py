@@ -310,7 +310,7 @@ def test_a_step_promises_what_the_slope_of_the_cost_says(solved):
     rng, n, layout = np.random.default_rng(1), len(chain.problem), chain.chain.layout
     x, y = 1e-3 * rng.standard_normal((n, layout.d)), 1e-3 * rng.standard_normal(layout.c)
     there = chain.chain.moved(chain.state, ChainStep(x, y), 1.0)
-    for problem, point in ((chain.chain, there), (graph.problem, make_values(graph.problem, there))):
+    for problem, point in ((chain.chain, there), (graph.graph, make_values(graph.graph, there))):
         gates = chain.solution.gates
         step, small = problem.step(point, gates), 1e-5
         ends = [problem.cost(problem.moved(point, step, sign * small), gates) for sign in (1.0, -1.0)]

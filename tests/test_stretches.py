@@ -180,7 +180,7 @@ def test_chain_and_graph_take_out_the_same_stretch():
 def test_a_window_of_a_dive_knows_what_came_before_it(case):
     """Up to the end of the dive, it has the dive's optimum from anywhere near, and its last covariance."""
     best, rng = optimum(case.log, case), np.random.default_rng(3)
-    time, gates = best.chain.rows.time, best.solution.gates
+    time, gates = best.problem.time, best.solution.gates
     part = window(best.chain, best.solution, time[-1] - 60.0, np.inf)
     assert part is not None
     whole, own = part.point(best.state), part.gates(gates)
@@ -198,7 +198,7 @@ def test_a_window_of_a_dive_knows_what_came_before_it(case):
 
 def test_there_is_no_window_where_it_would_be_most_of_the_dive(case):
     best = optimum(case.log, case)
-    time = best.chain.rows.time
+    time = best.problem.time
     assert window(best.chain, best.solution, time[0] + 50.0, time[-1]) is None
 
 

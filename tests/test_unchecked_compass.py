@@ -140,11 +140,11 @@ def both(log: Log, config: Config, monkeypatch) -> list[tuple[Trajectory, Trajec
     """Tracks of the smoother, of the filter, and live, as they are and with linear covariances."""
     initial, passed = initialise(log, config), []
     live = fed(FixedLag(initial, 5.0, 0.3, passed=passed.append), log)
-    marks = [m.interval for m in passed], [m.known for m in passed]
+    track = [s.keyframe for s in passed], [s.known for s in passed]
     best, filtered = batch(log, config).optimum(), renewed(log, config)
 
     def tracks() -> list[Trajectory]:
-        return [smoothed(best, initial).trajectory, filtered.solve().trajectory, live.trajectory(*marks)]
+        return [smoothed(best, initial).trajectory, filtered.solve().trajectory, live.trajectory(*track)]
 
     whole = tracks()
     with monkeypatch.context() as patch:

@@ -4,6 +4,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from rovgraph.engine.measurements import Block, loss_threshold
 from rovgraph.geometry import Array
@@ -13,7 +14,7 @@ from rovgraph.instruments import Instrument
 from rovgraph.state import PLACE, State
 
 
-def measurement_keys(block: Block, segment: Array) -> list[list[int]]:
+def measurement_keys(block: Block, segment: NDArray[np.int64]) -> list[list[int]]:
     """Keys of every measurement, in the order of ``block.variables``.
 
     Parameters
