@@ -1,6 +1,7 @@
 # make demo   rovgraph demo: a dive, its track, and how far it is from the truth
 # make test   linters, types and tests
 # make docs   this documentation as pages, in build/site
+# make mutants   faults are planted in a copy, and those that the fast tests miss are named
 # Each makes the environment that it needs in .venv.
 
 PYTHON ?= python3
@@ -12,11 +13,11 @@ DEMO   ?= results/demo
 # Tests start many programs, which load faster from bytecode that is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help venv demo test lint docs bench clean
+.PHONY: help venv demo test lint docs bench mutants clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n 's/^# //p' Makefile | head -4
+	@sed -n 's/^# //p' Makefile | head -5
 
 venv: $(VENV)/dev.stamp
 
@@ -55,6 +56,9 @@ docs: $(VENV)/docs.stamp
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python benchmarks/batch.py
+
+mutants: $(VENV)/dev.stamp
+	$(BIN)/python benchmarks/mutants.py
 
 clean:
 	rm -rf $(VENV) build dist rovgraph.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis $(DEMO)

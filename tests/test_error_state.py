@@ -27,7 +27,7 @@ from rovgraph.engine.transition import predict, transitions
 from scipy.optimize import minimize
 from test_consistency import OVERCONFIDENT, band, drawn, nees
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import LAYOUT, TABLE, calibration_size
 from rovgraph.config import Config, beliefs
 from rovgraph.engine import error_layout
 from rovgraph.engine.filter import FilterEngine
@@ -40,7 +40,10 @@ from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
 from rovgraph.kernels import measurement_row
-from rovgraph.kernels.admission import RETURN_SD
+from rovgraph.kernels.admission import DISTRUSTED_S, RETURN_SD, admit, directions_seen
+from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.motion_row import DURATION, ROW
+from rovgraph.kernels.prediction import predict_filter
 from rovgraph.kernels.robust_update import (
     MAX_REWEIGHTINGS,
     SETTLED,
@@ -244,6 +247,67 @@ def test_what_an_instrument_sees_is_linear_in_the_error(sensor):
     np.testing.assert_allclose(innovation(model, moved, z)[0], linear, atol=1e-9 * max(np.abs(z).max(), 1.0))
 
 
+# prediction
+
+
+def test_an_error_that_lasts_keeps_its_stationary_variance_and_what_walks_gains_by_time():
+    """A fix_error of sd 0.7 m and 30 s, and a scale that walks, over 8 s without motion."""
+    names, seconds, sd, walk = ("fix_error", "dvl_scale"), 8.0, 0.7, 0.02
+    column, n = np.full(MOTION + calibration_size(), -1), MOTION + 3
+    column[:MOTION] = np.arange(MOTION)
+    own = [MOTION + k for name in names for k in range(LAYOUT[name].start, LAYOUT[name].stop)]
+    column[own] = np.arange(MOTION, n)
+    x, c, P = np.zeros(21), np.zeros(calibration_size()), np.zeros((n, n))
+    x[:9] = np.eye(3).ravel()
+    c[LAYOUT["fix_error"]] = 1.0
+    P[MOTION:, MOTION:] = np.diag([sd**2, sd**2, 0.5**2])
+    walks = np.zeros((3, n))
+    walks[0, MOTION:], walks[1, MOTION : MOTION + 2] = [2.0 / 30.0 * sd**2] * 2 + [walk**2], 1.0 / 30.0
+    motion, nothing, out = np.zeros(ROW), np.zeros((0, 0)), (np.empty_like(x), np.empty_like(c), P.copy(), P.copy())
+    motion[DURATION] = seconds
+    predict_filter(x, c, P, np.zeros((n, 0)), nothing, motion, nothing, column, walks, n, *out)
+    np.testing.assert_allclose(np.diag(P)[MOTION:], [sd**2, sd**2, 0.5**2 + walk**2 * seconds])
+    np.testing.assert_allclose(out[1][LAYOUT["fix_error"]], np.exp(-seconds / 30.0))
+
+
+# admission
+
+
+def admitted(nis: float, time: float, since: float, gate: float = 4.0, readmit: float = 20.0) -> tuple[bool, float]:
+    """Whether a measurement is let in, and since when its sensor is left out after it."""
+    sensor, out = np.zeros(measurement_row.PARAMS), np.array([since])
+    sensor[measurement_row.GATE], sensor[measurement_row.READMIT] = gate, readmit
+    return admit(nis, time, sensor, out, 0), out[0]
+
+
+def test_a_gate_lets_in_what_lies_within_it_and_remembers_since_when_a_sensor_is_out():
+    assert admitted(3.99**2, 7.0, np.nan) == (True, pytest.approx(np.nan, nan_ok=True))
+    assert admitted(4.01**2, 7.0, np.nan) == (False, 7.0)
+    assert admitted(4.01**2, 8.0, 7.0) == (False, 7.0)
+    assert admitted(3.99**2, 7.0 + 0.99 * DISTRUSTED_S, 7.0)[0]
+
+
+def test_after_two_seconds_of_being_left_out_a_sensor_returns_within_three_sd():
+    late = 7.0 + 1.01 * DISTRUSTED_S
+    assert (DISTRUSTED_S, RETURN_SD) == (2.0, 3.0)
+    assert admitted(3.01**2, late, 7.0) == (False, 7.0)
+    assert admitted(2.99**2, late, 7.0)[0]
+    assert not admitted(3.01**2, 7.0 + 1.01, 7.0, readmit=1.0)[0]  # sooner where the sensor's own time is shorter
+
+
+def test_a_knock_at_any_time_since_has_the_moments_of_a_uniform_time():
+    """The way t v of a velocity v since t, uniform from 0 to T: T/2 v in the mean, T^2/3 in the square."""
+    T, x, sensor = 6.0, np.zeros(21), np.zeros(measurement_row.PARAMS)
+    x[:9] = matrix_from_rpy(np.array([0.3, -0.2, 1.0])).ravel()
+    sensor[measurement_row.SEES : measurement_row.SEES + 3] = 1.0
+    sensor[measurement_row.SEEN_FRAME] = measurement_row.SEES_VELOCITY
+    seen, spread = directions_seen(x, sensor, MOTION, T)
+    R_nb, second = x[:9].reshape(3, 3), seen @ seen.T + spread @ spread.T
+    np.testing.assert_allclose(second[6:9, 6:9], np.eye(3))
+    np.testing.assert_allclose(second[6:9, 3:6], 0.5 * T * R_nb, atol=1e-12)
+    np.testing.assert_allclose(second[3:6, 3:6], T**2 / 3.0 * np.eye(3), atol=1e-12)
+
+
 # update
 
 
@@ -278,6 +342,20 @@ def test_an_update_without_losses_is_kalmans():
     np.testing.assert_allclose(posterior, np.linalg.inv(information), atol=1e-9)
     np.testing.assert_allclose(delta, np.linalg.solve(information, J.T @ np.concatenate(r)), atol=1e-9)
     np.testing.assert_array_equal(weights, 1.0)
+
+
+def test_an_update_carries_what_is_considered_as_its_estimate_would_move():
+    """Schmidt's: of an error B y the correction leaves (B - K (H B + H_y)) y."""
+    rng = np.random.default_rng(4)
+    P, r, H = problem(rng)
+    J, innovation_, B, H_y = np.vstack(H), np.concatenate(r), rng.standard_normal((5, 2)), rng.standard_normal((6, 2))
+    K = P @ J.T @ np.linalg.inv(J @ P @ J.T + np.eye(6))
+    expected = B - K @ (J @ B + H_y)
+    HP, S, delta = np.empty((6, 5)), np.empty((6, 6)), np.empty(5)
+    innovation_covariance(P, J, HP, S)
+    joseph(P, B, innovation_, J, H_y, HP, np.ones(6), np.linalg.inv(S + np.eye(6)), delta)
+    np.testing.assert_allclose(B, expected, atol=1e-12)
+    np.testing.assert_allclose(delta, K @ innovation_, atol=1e-12)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])

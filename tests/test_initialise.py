@@ -20,6 +20,7 @@ from dives import (
 )
 
 from rovgraph.config import Config, parse_config
+from rovgraph.engine.initial_conditions import StatePrior
 from rovgraph.errors import InputError
 from rovgraph.estimators.headings import trusted_first
 from rovgraph.estimators.initialise import UNKNOWN_HEADING_SD, initialise, sample_density
@@ -27,6 +28,7 @@ from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix, wrap_angle
 from rovgraph.log import Log
 from rovgraph.simulate import Path, Style, scenario
 from rovgraph.simulate.scenario import SCENARIOS
+from rovgraph.state import State
 from rovgraph.trajectory import Trajectory
 
 DEG = np.deg2rad(1.0)
@@ -83,6 +85,23 @@ def test_a_start_in_motion_is_less_sure_of_its_level():
     assert (b.prior.rpy_sd[:2] > 2.0 * falcon().start.tilt_sd_deg * DEG).all()
     assert any("begins in motion" in line for line in b.assumptions)
     assert not any("assumed to be at rest" in line for line in b.assumptions)
+
+
+def test_a_prior_about_the_axes_of_n_is_turned_into_the_bodys():
+    """Errors drawn about n's axes are those of the right-hand perturbation R exp(theta), p + R rho."""
+    rng = np.random.default_rng(1)
+    R, rpy_sd, p_sd = (
+        matrix_from_rpy(np.array([0.1, -0.2, 2.0])),
+        np.array([0.01, 0.02, 0.3]),
+        np.array([1.0, 3.0, 0.2]),
+    )
+    zero = np.zeros((1, 3))
+    prior = StatePrior(State(R[None], zero, zero, np.zeros((1, 6)), {}), rpy_sd, p_sd, np.ones(3), np.ones(6))
+    theta, rho = (rng.standard_normal((20_000, 3)) * sd @ R for sd in (rpy_sd, p_sd))  # R' times each
+    P = prior.covariance()
+    for part, drawn in ((P[:3, :3], theta), (P[3:6, 3:6], rho)):
+        sd = np.sqrt(np.diag(part))
+        np.testing.assert_allclose(np.cov(drawn.T) / np.outer(sd, sd), part / np.outer(sd, sd), atol=0.03)
 
 
 def test_a_start_in_motion_settles_in_the_graph():

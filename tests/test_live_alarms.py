@@ -10,7 +10,8 @@ from dives import Simulated, falcon, simulated
 from live import message
 from rich.console import Console
 
-from rovgraph.live.alarms import OVER_S
+from rovgraph.diagnosis import RULES, Statistic
+from rovgraph.live.alarms import OVER_S, LiveAlarms
 from rovgraph.live.clocks import Clocks
 from rovgraph.live.navigator import Navigator
 from rovgraph.live.outputs.lines import json_line
@@ -80,6 +81,20 @@ def test_an_alarm_is_said_once_when_it_begins_and_once_when_it_is_over(case):
     assert 45.0 + OVER_S < over < 45.0 + OVER_S + 15.0
     assert last.verdict == "trusted"
     assert [a.kind for a in nav.alarms.history.values()] == ["frozen"]
+
+
+def test_an_alarm_needs_its_looks_in_a_row_and_is_over_after_half_a_minute():
+    alarms, odd = LiveAlarms(), Statistic("too large", "dvl", 0.0, 60.0, 2.5, "so", "do")
+    alarms._start = 0.0
+    beyond = [1, 1, 0, 1, 1, 1, 0, 1, 1, 0]  # at looks 5 s apart, then never again
+    said = []
+    for k in range(20):
+        alarms._look([odd] if k < len(beyond) and beyond[k] else [], 5.0 * k)
+        said += [(event.time, event.kind) for event in alarms.events]
+        alarms.events.clear()
+    assert RULES["too large"].looks == 3
+    assert said == [(25.0, "doubtful"), (40.0 + OVER_S, "over")] and OVER_S == 30.0
+    assert alarms.verdict == "trusted"
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rovgraph.live.faults import FROZEN, Faults, Verdict
+from rovgraph.live.faults import FROZEN, TURNED, Faults, Verdict
 from rovgraph.log import Measurement
 
 RNG = np.random.default_rng(5)
@@ -181,6 +181,37 @@ def test_a_frozen_imu_is_left_out():
     stuck = sample(0.01)
     verdicts = [faults.look(stuck._replace(time=0.01 * k)).use for k in range(1, 100)]
     assert verdicts == [True] * (FROZEN["imu"] - 1) + [False] * (100 - FROZEN["imu"])
+
+
+def test_three_equal_pings_are_frozen_and_two_are_not():
+    for equal, used in ((2, True), (3, False)):
+        faults = Faults()
+        verdicts = [faults.look(ping(0.2 * k, 0.41, 0.05, 0.01)).use for k in range(equal)]
+        assert verdicts[-1] == used
+
+
+@pytest.mark.parametrize(("turned", "used"), [(0.99, True), (1.01, False)])
+def test_a_heading_may_stand_still_while_the_vehicle_turns_by_its_limit(turned, used):
+    """A turn at a constant rate of the gyro, seen by three headings."""
+    assert np.rad2deg(TURNED) == pytest.approx(15.0)
+    faults, rate = Faults(), turned * TURNED / 2.0
+    for k in range(201):
+        faults.look(Measurement(0.01 * k, "imu", np.array([0.01 * k, 0.0, -9.8, 0.0, 0.0, rate]), 0))
+        if k % 100 == 0:
+            verdict = faults.look(heading(0.01 * k, 1.0))
+    assert verdict.use == used
+
+
+@pytest.mark.parametrize(("period", "longest"), [(0.2, 3.0), (1.0, 10.0)])
+def test_a_sensor_is_silent_after_three_seconds_or_ten_of_its_periods(period, longest):
+    faults = Faults()
+    for k in range(20):
+        faults.look(moving(period * k))
+    newest = 19 * period
+    faults.tick(newest + longest - 0.1)
+    assert kinds(faults) == []
+    faults.tick(newest + longest + 0.1)
+    assert kinds(faults) == ["silent"]
 
 
 def test_silence_is_said_once_and_so_is_the_return():

@@ -9,7 +9,8 @@ from dives import fed, simulated
 from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
-from rovgraph.calibration import TABLE
+from rovgraph.calibration import TABLE, calibration_size
+from rovgraph.config import Config
 from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_rows, sd_of
 from rovgraph.engine.late_stamp_window import KNOT_S, LateStampWindow
 from rovgraph.engine.measurement_table import MeasurementTable
@@ -22,14 +23,16 @@ from rovgraph.engine.measurements import (
 )
 from rovgraph.engine.motion import Snapshot
 from rovgraph.engine.scale import scale_to_bias
+from rovgraph.engine.sensor_rows import KeyframeRows, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
-from rovgraph.geometry import Array, exp_rotation
+from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy
 from rovgraph.graph.keys import key
 from rovgraph.graph.measurement_factors import measurement_factor, measurement_keys, robust_noise
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state
+from rovgraph.instruments import instruments
 from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
@@ -107,6 +110,18 @@ def test_linearised_block_is_the_finite_difference_of_its_innovations(sensor, mo
             numeric[..., k] = -(ahead - behind) / (2 * STEP)  # innovations fall where predictions rise
         scale = max(np.abs(J).max(), 1.0)
         np.testing.assert_allclose(J / scale, numeric / scale, atol=1e-6, err_msg=variable)
+
+
+def test_a_heading_across_the_wrap_has_a_small_innovation():
+    """Where headings wrap, as a filter's kernel linearises it: 179 degrees are measured as -179."""
+    instrument, degree = instruments(Config())["ahrs"], np.deg2rad(1.0)
+    x, row = np.zeros(21), np.zeros(at.ROW)
+    x[:9] = matrix_from_rpy(np.array([0.0, 0.0, np.pi - degree])).ravel()
+    row[at.DR : at.DV], row[at.Z], row[at.SD] = np.eye(3).ravel(), -np.pi + degree, 1.0
+    column, table = np.full(15 + calibration_size(), -1), sensor_table({"ahrs": instrument}, [])
+    rows = KeyframeRows(row[None], np.zeros(1, np.int64), table, column, 1, np.zeros((0, 6, 6)), 9.81)
+    r, _ = rows.linearize(x, np.zeros(calibration_size()))
+    np.testing.assert_allclose(r, [2.0 * degree])
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -188,6 +188,32 @@ def test_a_gap_in_the_imu_is_bridged_with_an_inflated_covariance():
     assert inside and all(a.rate_sd == BRIDGE_GYR for a in inside)
 
 
+@pytest.mark.parametrize("rate", [10.0, 30.0, 100.0])
+def test_the_rate_is_that_of_its_own_time(rate):
+    """Of a slow IMU on the line between the samples around it, of a fast one on the parabola through those near it."""
+    curved = rate > 50.0
+    pings = np.array([0.523, 0.55, 1.101, 1.7, 2.318, 3.071])  # two of them close together, one at a sample
+    log = level_log(
+        4.0, np.array([0.0, 0.0, -9.81]), np.zeros(3), rate, dvl=(pings, np.tile([0, 0, 0, 1, np.nan], (6, 1)))
+    )
+    time, rng = log["imu"].time, np.random.default_rng(3)
+    gyr = np.outer(np.square(time), [0.1, -0.2, 0.3]) if curved else rng.standard_normal((len(time), 3))
+    log = altered(log, "imu", np.column_stack([log["imu"].data[:, :3], gyr]))
+
+    def true(t: float) -> list[float]:
+        return [np.square(t) * s for s in (0.1, -0.2, 0.3)] if curved else [np.interp(t, time, g) for g in gyr.T]
+
+    own = {"dvl": {"lever_arm_m": [0.3, 0.0, 0.1]}, "graph": {"min_gap_s": 0.1}, "start": {"heading_deg": 0.0}}
+    config = changed(Config(), **own)
+    intervals = batch(log, config).intervals
+    seen = [m for i in intervals for m in i.measurements if m.sensor == "dvl"]
+    assert sorted(m.time for m in seen) == pings.tolist() and {m.motion.dt > 0.0 for m in seen} == {True, False}
+    for m in seen:
+        np.testing.assert_allclose(m.rate_b, true(m.time), atol=1e-9)
+    for i in intervals[1:-1]:
+        np.testing.assert_allclose(i.rate_b, true(i.time), atol=1e-9)
+
+
 def test_keyframes_stand_at_the_pings_within_a_gap_of_the_imu():
     case, log = silent(3.0)
     times = np.array([i.time for i in batch(log, case.config).intervals])

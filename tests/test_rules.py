@@ -12,6 +12,7 @@ import pytest
 from dives import falcon, level_log
 from scipy.stats import chi2, norm
 
+from rovgraph.calibration import TABLE
 from rovgraph.diagnosis import (
     RULES,
     Evidence,
@@ -31,6 +32,7 @@ from rovgraph.diagnosis.alarm import Alarm, alarm_of
 from rovgraph.diagnosis.evidence import SensorResiduals
 from rovgraph.diagnosis.rules import CHANCE, rule_table
 from rovgraph.engine.gauss_newton import Stretch
+from rovgraph.engine.released import Released
 from rovgraph.estimators.estimate import CalibrationEstimate, Estimate, History
 from rovgraph.geometry import EARTH_RATE, Array, matrix_from_rpy
 from rovgraph.trajectory import Trajectory
@@ -359,6 +361,38 @@ def test_uncertain_is_an_sd_against_the_way_or_ten_metres(speed, allowed, limit,
     assert span_of(one) == (220.0, 220.0)
 
 
+def of_motions(residuals_: Array, monkeypatch: pytest.MonkeyPatch) -> Evidence:
+    """A dive with these whitened residuals of its motions, shape (n, 15), evenly over its time."""
+    monkeypatch.setattr(motion, "_motion_residuals", lambda _: residuals_)
+    times = START + (np.arange(len(residuals_) + 1) - 0.5) * SECONDS / len(residuals_)  # none ends where a window does
+    bias = History(("x", "y", "z"), "", times, np.zeros((len(times), 3)), np.ones((len(times), 3)))
+    seen = evidence(optimum=SimpleNamespace())
+    smoothed = replace(seen.estimates[0], history={"acc_bias": bias, "gyr_bias": bias})
+    intervals = [SimpleNamespace(time=float(t), bridged=False) for t in times]
+    return replace(seen, estimates=[smoothed, seen.estimates[1]], intervals=intervals)
+
+
+@levels
+@pytest.mark.parametrize(("column", "said"), [(2, "its rotation about z"), (6, "its velocity along x")])
+def test_imu_by_the_variance_of_its_means(column, said, limit, times, severity, monkeypatch):
+    ratio, r = figure_of("imu", limit, times), np.zeros((600, 15))
+    r[:, column] = sqrt(ratio / 40.0)  # 40 motions in 20 s
+    r[280:320, column] *= 1.0 + 1e-5
+    (one,) = [one for one in motion.imu(of_motions(r, monkeypatch)) if one.figure > 0.0]
+    assert one.cause.startswith(f"{said} contradicts")
+    assert (one.figure, one.severity, span_of(one)) == (pytest.approx(ratio, rel=1e-5), severity, (140.0, 160.0))
+
+
+@levels
+@pytest.mark.parametrize(("column", "key"), [(10, "acc"), (12, "gyr")])
+def test_bias_drift_by_the_sum_of_its_steps(column, key, limit, times, severity, monkeypatch):
+    gone, r = figure_of("bias drift", limit, times), np.zeros((600, 15))
+    r[:, column] = -gone / sqrt(600.0)  # of a walk whose every step has an sd of 1
+    (one,) = [one for one in motion.bias_drift(of_motions(r, monkeypatch)) if one.figure > 0.0]
+    assert f"imu.noise.{key}_walk" in one.remedy
+    assert (one.figure, one.severity, span_of(one)) == (pytest.approx(gone), severity, (0.0, SECONDS))
+
+
 # constants
 
 
@@ -413,6 +447,24 @@ def test_the_start_is_compared_with_where_it_is_stated(limit, times, severity):
 def test_the_earth_rate_against_the_sd_of_the_gyros_bias(limit, times, severity):
     one = constants.earth_rate_of(EARTH_RATE / figure_of("earth rate", limit, times), START, END)
     assert (one.severity, span_of(one)) == (severity, (0.0, SECONDS))
+
+
+@levels
+@pytest.mark.parametrize("considered", [False, True])
+def test_held_by_the_step_of_a_released_constant(considered, limit, times, severity, monkeypatch):
+    """What is feigned and what is considered are part of its sd; a considered one is wrong from ten sds on."""
+    sd, feigned, prior_sd = 0.002, constants.FEIGNED["dvl_scale"], 0.004
+    allowed = hypot(sd, feigned, prior_sd if considered else 0.0)
+    figure = times * (RULES["moved"].wrong if considered and limit == "wrong" else getattr(RULES["held"], limit))
+    step = -figure * allowed
+    hardly_seen = Released("dvl_roll", "dvl_roll", 99.0, 1.01 * constants.SHOWN * TABLE["dvl_roll"].sd)
+    monkeypatch.setattr(constants, "release", lambda *_: [Released("dvl_scale", "dvl_scale", step, sd), hardly_seen])
+    belief = SimpleNamespace(mean=np.zeros(1), sd=prior_sd)
+    unknowns = SimpleNamespace(considered=("dvl_scale",) if considered else ())
+    best: Any = SimpleNamespace(state=track(), beliefs={"dvl_scale": belief}, unknowns=unknowns)
+    (one,) = constants.held_in(best, falcon(), 0.01, START, END)
+    assert (one.sensor, one.figure, one.severity) == ("dvl", pytest.approx(figure), severity)
+    assert span_of(one) == (0.0, SECONDS)
 
 
 @levels

@@ -159,6 +159,12 @@ def test_heading_of_the_dvl_is_that_of_its_own_x_axis():
     np.testing.assert_allclose(np.rad2deg(z[0, 0]), 45.0)
 
 
+def test_the_heading_of_a_mounted_imu_is_that_of_its_own_x_axis():
+    model = instruments(parse_config("imu: {mount_rpy_deg: [0, 0, 30]}"))["ahrs"].model
+    z = model.predict(at_rest(rpy=(0.0, 0.0, np.deg2rad(20))), np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(np.rad2deg(z[0, 0]), 50.0)
+
+
 @pytest.mark.parametrize(
     ("sensor", "offset", "curve"),
     [("ahrs", "ahrs_offset", "ahrs_deviation"), ("dvl_heading", "dvl_compass_offset", "dvl_compass_deviation")],

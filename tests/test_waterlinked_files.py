@@ -13,6 +13,7 @@ from wire import report
 from rovgraph.errors import InputError
 from rovgraph.interchange.formats import recognise
 from rovgraph.interchange.recording import Recording
+from rovgraph.interchange.waterlinked_reports import velocity_report
 from rovgraph.log import Log
 
 START = 1_638_191_471.0
@@ -48,6 +49,17 @@ def test_a_simulated_dive_comes_back_as_it_was_sent(tmp_path):
     np.testing.assert_array_equal(after.data[:, :4], before.data[:, :4])
     assert recording.clocks["DVL"].unix_offset == 0.0
     assert recording.left == recording.warnings == ()
+
+
+def test_the_sd_of_a_ping_is_that_of_one_axis_or_its_figure_of_merit():
+    def sd(**changes: object) -> float:
+        found = velocity_report(json.loads(report(**changes)))
+        assert found is not None
+        return found.sd
+
+    assert sd() == pytest.approx(0.002)  # variances of 1, 2 and 9 mm^2/s^2
+    assert sd(covariance=...) == 0.004
+    assert np.isnan(sd(covariance=..., fom=...))
 
 
 def test_water_track_is_no_bottom_track(tmp_path):
