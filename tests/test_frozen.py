@@ -8,6 +8,7 @@ from rovgraph.check import examine
 from rovgraph.config import Config
 from rovgraph.dive import smooth
 from rovgraph.geometry import Array
+from rovgraph.live.faults import Faults
 from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.log.frozen import (
     BRAKING,
@@ -50,6 +51,27 @@ def test_a_value_held_for_a_minute_is_frozen_and_no_other_is(case, sensor):
     assert found.first == pytest.approx(FROM, abs=0.5)
     assert found.last == pytest.approx(TO, abs=0.5)
     assert frozen_stretches(case.log, case.config) == []
+
+
+def left_out_live(log: Log, config: Config) -> dict[str, list[float]]:
+    """Times of what is left out, or taken back, as the measurements of a log come."""
+    faults, out = Faults(config), {}
+    for m in log.measurements():
+        verdict, own = faults.look(m), out.setdefault(m.sensor, {})
+        own.update({late.time: True for late in verdict.late})
+        own[m.time] = verdict.use
+        if verdict.retract_since is not None:
+            own.update({time: False for time in own if time >= verdict.retract_since})
+    return {sensor: [time for time, use in own.items() if not use] for sensor, own in out.items()}
+
+
+@pytest.mark.parametrize("sensor", ["dvl", "mag", "dvl_heading", "ahrs", "depth"])
+def test_what_is_frozen_in_a_log_is_left_out_as_it_comes_and_no_more(case, sensor):
+    log = held(case.log, sensor)
+    left_out = left_out_live(log, case.config)
+    (found,) = frozen_stretches(log, case.config)
+    assert left_out.pop(sensor) == found.time.tolist()
+    assert not any(left_out.values())
 
 
 def test_without_frozen_leaves_out_the_stretch_alone(case):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from rovgraph.live.faults import FROZEN, TURNED, Faults, Verdict
+from rovgraph.live.faults import WAIT, Faults, Verdict
 from rovgraph.log import Measurement
+from rovgraph.log.frozen import HOLDS, TURNED
 
 RNG = np.random.default_rng(5)
 
@@ -96,14 +97,45 @@ def test_a_lost_bottom_lock_is_said_once():
     assert kinds(faults) == ["no lock"]
 
 
-def test_a_frozen_ping_is_taken_back_from_its_first_appearance():
-    faults = Faults()
+def looked(faults: Faults, m: Measurement) -> Verdict:
+    """A measurement after the samples of an IMU that works, until then."""
     for k in range(10):
-        faults.look(moving(0.2 * k))
-    verdicts = [faults.look(ping(2.0 + 0.2 * k, 0.41, 0.05, 0.01)) for k in range(10)]
-    assert [v.use for v in verdicts] == [True] * (FROZEN["dvl"] - 1) + [False] * (11 - FROZEN["dvl"])
-    assert [v.retract_since for v in verdicts if v.retract_since is not None] == [2.0]
-    assert faults.look(moving(5.0)) == Verdict()
+        faults.look(sample(m.time - 0.2 + 0.02 * k))
+    return faults.look(m)
+
+
+def equal_pings(count: int, before: int = 20) -> tuple[list[Verdict], Faults]:
+    """What is done with equal pings, one every 0.2 s, after others."""
+    faults = Faults()
+    for k in range(before):
+        looked(faults, moving(0.2 * (k - before)))
+    return [looked(faults, ping(0.2 * k, 0.41, 0.05, 0.01)) for k in range(count)], faults
+
+
+def test_equal_pings_wait_and_are_taken_back_from_the_first_when_they_last_as_long_as_in_a_log():
+    longest = round(HOLDS["dvl"].seconds / 0.2)
+    verdicts, faults = equal_pings(longest + 5)
+    assert [v.use for v in verdicts] == [True] * (WAIT["dvl"] - 1) + [False] * (longest + 6 - WAIT["dvl"])
+    assert [(k, v.retract_since) for k, v in enumerate(verdicts) if v.retract_since is not None] == [(2, 0.0)]
+    assert sum(v.count for v in verdicts if not v.use) == longest + 5
+    assert looked(faults, moving(4.0)) == Verdict()
+    assert kinds(faults) == ["frozen", "back"]
+
+
+def test_equal_pings_that_do_not_last_as_long_are_used_after_all():
+    verdicts, faults = equal_pings(10)
+    after = looked(faults, moving(2.0))
+    assert after.use and [m.time for m in after.late] == pytest.approx([0.2 * k for k in range(10)])
+    assert not any(v.count for v in verdicts if not v.use) and faults.events == []
+
+
+def test_a_dvl_whose_values_a_driver_repeats_is_used():
+    faults = Faults()
+    for k in range(200):
+        if k % 5 == 0:
+            newest = moving(0.0)
+        assert looked(faults, newest._replace(time=0.2 * k)).use or k < 10
+    assert faults.events == []
 
 
 def depth(time: float, metres: float) -> Measurement:
@@ -158,14 +190,17 @@ def test_a_depth_that_says_nothing_is_not_frozen():
     assert all(used) and faults.events == []
 
 
-def test_a_compass_that_stands_still_while_the_vehicle_turns_is_frozen():
+@pytest.mark.parametrize(("part", "frozen"), [(0.95, False), (1.05, True)])
+@pytest.mark.parametrize("bias", [0.0, 0.05])
+def test_a_compass_that_stands_still_while_the_vehicle_turns_is_frozen_by_the_limit_of_a_log(part, frozen, bias):
     faults, used = Faults(), []
-    for k in range(1000):
-        faults.look(sample(0.01 * k, 0.2))
+    for k in range(2800):  # it stands still for 8 s, and the vehicle turns in the first two of them
+        turns, still = 2000 <= k < 2200, k >= 2000
+        faults.look(sample(0.01 * k, bias + 0.5 * part * TURNED * turns))
         if k % 10 == 0:
-            used.append(faults.look(heading(0.01 * k, 1.0)).use)
-    assert used[0] and not used[-1]
-    assert kinds(faults) == ["frozen"]
+            used.append(faults.look(heading(0.01 * k, 1.0 + 0.01 * RNG.standard_normal() * (not still))).use)
+    assert all(used[:230]) and used[-1] != frozen
+    assert kinds(faults) == ["frozen"] * frozen
 
 
 def test_a_coarse_compass_of_a_vehicle_that_does_not_turn_is_not_frozen():
@@ -175,25 +210,32 @@ def test_a_coarse_compass_of_a_vehicle_that_does_not_turn_is_not_frozen():
         assert faults.look(heading(0.01 * k, 1.0)).use
 
 
-def test_a_frozen_imu_is_left_out():
+def test_a_fix_that_is_repeated_while_the_dvl_moves_is_used_once():
+    faults, verdicts = Faults(), []
+    for k in range(150):
+        looked(faults, moving(0.2 * k))
+        if k % 5 == 0:
+            verdicts.append(faults.look(Measurement(0.2 * k, "fix", np.array([1.0, 2.0, np.nan]), 0)))
+    assert not verdicts[-1].use
+    (since,) = [v.retract_since for v in verdicts if v.retract_since is not None]
+    assert 0.0 < since < 1.0
+    assert kinds(faults) == ["frozen"]
+
+
+def test_a_frozen_imu_waits_and_is_taken_back_after_a_second():
     faults = Faults()
     faults.look(sample(0.0))
     stuck = sample(0.01)
-    verdicts = [faults.look(stuck._replace(time=0.01 * k)).use for k in range(1, 100)]
-    assert verdicts == [True] * (FROZEN["imu"] - 1) + [False] * (100 - FROZEN["imu"])
-
-
-def test_three_equal_pings_are_frozen_and_two_are_not():
-    for equal, used in ((2, True), (3, False)):
-        faults = Faults()
-        verdicts = [faults.look(ping(0.2 * k, 0.41, 0.05, 0.01)).use for k in range(equal)]
-        assert verdicts[-1] == used
+    verdicts = [faults.look(stuck._replace(time=0.01 * k)) for k in range(1, 150)]
+    assert [v.use for v in verdicts] == [True] * (WAIT["imu"] - 1) + [False] * (150 - WAIT["imu"])
+    (known,) = [k for k, v in enumerate(verdicts) if v.count > 1]
+    assert known * 0.01 == pytest.approx(HOLDS["imu"].seconds) and verdicts[known].count == known + 1
 
 
 @pytest.mark.parametrize(("turned", "used"), [(0.99, True), (1.01, False)])
 def test_a_heading_may_stand_still_while_the_vehicle_turns_by_its_limit(turned, used):
     """A turn at a constant rate of the gyro, seen by three headings."""
-    assert np.rad2deg(TURNED) == pytest.approx(15.0)
+    assert np.rad2deg(TURNED) == pytest.approx(17.0)
     faults, rate = Faults(), turned * TURNED / 2.0
     for k in range(201):
         faults.look(Measurement(0.01 * k, "imu", np.array([0.01 * k, 0.0, -9.8, 0.0, 0.0, rate]), 0))

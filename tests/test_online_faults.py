@@ -13,7 +13,7 @@ from dives import Simulated, as_log, changed, falcon, simulated, true_at, withou
 from live import Flight, flown, message, navigator, turned
 
 from rovgraph.config import Config
-from rovgraph.errors import InputError
+from rovgraph.errors import DataWarning, InputError
 from rovgraph.estimators.eskf.fixed_lag import FixedLag
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.live.clocks import Clocks
@@ -192,7 +192,7 @@ def test_a_flood_is_thinned_out_and_the_estimate_is_the_same(case):
         plain.take(message(m))
         for k in range(100 if m.sensor == "imu" else 1):
             nav.take(message(m._replace(time=m.time + 1e-6 * k)))
-    assert nav.left_out["imu", "more often than can be used"] == 99 * 1001
+    assert nav.left_out["imu", "at the time of another"] == 99 * 1001
     assert nav.updates == plain.updates
     same(nav, plain, 1e-6)
 
@@ -271,6 +271,26 @@ def test_what_is_read_again_after_a_crash_is_no_event(case):
 def stream_until(stream: Stream, time: float) -> Stream:
     keep = stream.time < time
     return Stream(stream.sensor, stream.columns, stream.time[keep], stream.data[keep], stream.row[keep])
+
+
+def test_what_comes_close_together_is_taken_online_as_from_a_log():
+    """Depths at any distance, a tenth of a millisecond among them, in bursts that are longer than that."""
+    rng = np.random.default_rng(3)
+    time = np.cumsum(rng.choice([0.0, 2e-5, 9.5e-5, 1.05e-4, 1e-3, 0.005, 0.2], 2000))
+    depth = np.arange(2000.0)
+    with pytest.warns(DataWarning, match="at the time of another"):
+        log = Log.from_arrays({"time": time, "depth": depth})
+    intake = Intake(Config(), Counter())
+    read = [intake.measurement(t, Reading("depth", np.array([d]))) for t, d in zip(time, depth, strict=True)]
+    assert log["depth"]["depth"].tolist() == [m.values.item() for m in read if m is not None]
+    assert 1e-4 <= np.diff(log["depth"].time).min() < 1.06e-4
+
+
+@pytest.mark.parametrize(("sensor", "rate"), [("imu", 2000.0), ("dvl", 200.0), ("ahrs", 400.0)])
+def test_no_measurement_of_a_fast_sensor_is_left_out(sensor, rate):
+    size = {"imu": 6, "dvl": 5, "ahrs": 3}[sensor]
+    intake, read = Intake(Config(), Counter()), Reading(sensor, np.zeros(size))
+    assert all(intake.measurement(1.7e9 + k / rate, read) is not None for k in range(1000))
 
 
 def test_a_fix_in_degrees_is_as_late_as_one_in_metres(case):

@@ -1,11 +1,9 @@
 """What a check has to say, and helpers that the checks share."""
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.config import Config
 from rovgraph.geometry import Array
@@ -116,12 +114,6 @@ def _without_nan(value: object) -> Any:
     return None if isinstance(value, float) and value != value else value
 
 
-def repeats(values: Array) -> NDArray[np.bool_]:
-    """Whether each row of (n, k) repeats the one before exactly, NaN included; shape (n,)."""
-    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
-    return np.concatenate([[False], same.all(axis=1)])[: len(values)]
-
-
 def told(stream: Stream) -> Array:
     """What a sensor measured, shape (n, k): NaN in pings without bottom lock, which hold nothing or a sentinel."""
     if stream.sensor != "dvl":
@@ -143,18 +135,6 @@ def without_spikes(stream: Stream) -> Stream:
     off = np.abs(stream.data[:, :3] - np.median(five, axis=-1))
     limit = np.maximum(LEAST_SPIKE, SPIKE * np.median(off, axis=0))
     return stream.take(np.asarray((off <= limit).all(axis=1)))
-
-
-def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """First and last index of every stretch of True."""
-    edges = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
-    yield from zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True)
-
-
-def frozen_runs(values: Array) -> Iterator[tuple[int, int]]:
-    """First and last index of every stretch of identical rows, two or more."""
-    for first, last in runs(repeats(values)):
-        yield first - 1, last
 
 
 def since(log: Log, time: float) -> str:

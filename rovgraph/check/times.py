@@ -5,12 +5,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rovgraph.check.epochs import shift_of_epoch
-from rovgraph.check.findings import Finding, Timing, repeats, since, told
+from rovgraph.check.findings import Finding, Timing, since, told
 from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import motion_model
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
-from rovgraph.log.frozen import MIN_REPEATS, MIN_SECONDS, FrozenStretch, equal_runs, without
+from rovgraph.log.frozen import FrozenStretch, Runs, repeats, without
 from rovgraph.sensors import SENSORS
 from rovgraph.stamps import few_digits
 
@@ -155,13 +155,9 @@ def _burst_period(stream: Stream) -> float | None:
 def _repeated_for_a_moment(stream: Stream) -> int:
     """Measurements that repeat the one before, but for zeros, and times in which the sensor may be frozen."""
     values = told(stream)
-    first, last = equal_runs(values).T
-    known = ~np.isnan(values[first]).all(axis=1) & (values[first, :3] != 0.0).any(axis=1)
-    if not known.any():
-        return 0
-    counts, seconds = (last - first + 1)[known], (stream.time[last] - stream.time[first])[known]
-    frozen = (counts >= MIN_REPEATS * np.median(counts)) & (seconds >= MIN_SECONDS)
-    return int((counts - 1)[~frozen].sum())
+    runs = Runs.of(stream.time, values)
+    known = runs.take(~np.isnan(runs.values).all(axis=1) & (runs.values[:, :3] != 0.0).any(axis=1))
+    return int((known.count - 1)[~known.are_long()].sum())
 
 
 def _moves(stream: Stream) -> bool:

@@ -5,17 +5,17 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding, frozen_runs, repeats, since
+from rovgraph.check.findings import Finding, since
 from rovgraph.config import Config, mount_matrix
 from rovgraph.geometry import Array
 from rovgraph.log import Log, Stream
+from rovgraph.log.frozen import HOLDS, Runs, repeats
 from rovgraph.sensors import SENSORS, Level
 
 GRAVITY_RANGE = (9.3, 10.3)  # plausible mean specific force [m/s2]
 GRAVITY_ANGLE = np.deg2rad(25.0)  # of mean specific force from upwards
 FAST_TURN = 3.0  # no vehicle of this kind turns faster for long [rad/s]
 FAST_SPIKE = 10.0  # nor for a moment [rad/s]
-FROZEN_SECONDS = 1.0  # a noisy signal never repeats for so long
 CLIPPED = 10  # samples at one extreme, which noise does not make
 PILED = 3.0  # times as many as at any of the values next to it
 NEAR = 5  # values
@@ -133,8 +133,14 @@ def frozen_imu(log: Log, config: Config) -> Iterator[Finding]:
     if "imu" not in log:
         return
     for name, first in (("acc", 0), ("gyr", 3)):
-        stretches = frozen_runs(log["imu"].data[:, first : first + 3])
-        yield from _longest(log, "imu", name, [r for r in stretches if r[1] - r[0] >= 9], FROZEN_SECONDS)
+        runs = Runs.of(log["imu"].time, log["imu"].data[:, first : first + 3])
+        stuck = runs.take(runs.are_long(HOLDS["imu"]))
+        if not len(stuck.count):
+            continue
+        k = int(np.argmax(stuck.last - stuck.first))
+        text = f"{name} repeats one value exactly for {stuck.last[k] - stuck.first[k]:.1f} s from "
+        text += f"{since(log, stuck.first[k])} on ({len(stuck.count)} such intervals); a working sensor always shows "
+        yield Finding("imu", "warning", f"{text}noise: check its connection and driver", "stuck")
 
 
 def saturated(log: Log, config: Config) -> Iterator[Finding]:
@@ -184,17 +190,3 @@ def _like_a_range(name: str, limit: float) -> str:
     unit, size = ("g", STANDARD_GRAVITY) if name == "acc" else ("deg/s", float(np.deg2rad(1.0)))
     near = [a for a in RANGES[name] if abs(limit / size - a) < LIKE_A_RANGE * a]
     return f" ({near[0]:g} {unit})" if near else ""
-
-
-def _longest(log: Log, sensor: str, name: str, stretches: list[tuple[int, int]], seconds: float) -> Iterator[Finding]:
-    time = log[sensor].time
-    long = [(time[b] - time[a], time[a]) for a, b in stretches if time[b] - time[a] >= seconds]
-    if long:
-        duration, start = max(long)
-        yield Finding(
-            sensor,
-            "warning",
-            f"{name} repeats one value exactly for {duration:.1f} s from {since(log, start)} on "
-            f"({len(long)} such intervals); a working sensor always shows noise: check its connection and driver",
-            "stuck",
-        )

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Literal
 
+from rovgraph.log.frozen import HOLD
+
 Severity = Literal["advice", "doubtful", "wrong"]
 
 
@@ -83,7 +85,7 @@ _ROWS = (
         "moved", "shift of an estimated variable or a first bias, in sds of that shift", 4.0, 10.0, 1.6e-3, live="now"
     ),
     Rule("earth rate", "the Earth's rate over the sd of the gyro's bias, where it is not modelled", 10.0, live="now"),
-    Rule("frozen", "seconds in which a sensor repeats itself", 3.0, live="as it happens"),
+    Rule("frozen", "seconds in which a sensor repeats itself", HOLD.seconds, live="as it happens"),
     Rule("no heading", "seconds without heading, without an IMU", 10.0, rate=0.0),
     Rule("no tilt", "seconds without roll and pitch, without an IMU", 10.0, rate=0.0),
     Rule("taken out", "seconds in which a sensor was ignored, since it contradicts all others", 0.0, live="of the DVL"),

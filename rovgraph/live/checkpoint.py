@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rovgraph.errors import InputError
 
-VERSION = 6
+VERSION = 7
 NAME = b"rovgraph checkpoint"
 ARRAY = "$array"
 NUMBERS = "biufc"  # kinds of dtypes: boolean, integer, unsigned, float, complex

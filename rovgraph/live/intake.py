@@ -12,10 +12,9 @@ from rovgraph.config import Config, Mag
 from rovgraph.geometry import Array
 from rovgraph.live.message import GEODETIC, Reading
 from rovgraph.log import Measurement
+from rovgraph.log.streams import SPACING_S
 from rovgraph.sensors import MOSTLY, SENSORS, placeholders
 
-SPACING_S = {"imu": 1e-3, "dvl": 0.03}  # least time between measurements of a sensor that are used
-OTHERS_SPACING_S = 0.005
 _STREAM = {GEODETIC: "fix"}  # where a reading goes by another name
 ENOUGH_SDS = 10  # of a sensor, that show whether they are placeholders
 PATCH_M = 10.0  # so far around a point latitude and longitude are linear, to a tenth of a millimetre up to 80 degrees
@@ -55,7 +54,7 @@ class _Patch(NamedTuple):
 
 
 class Intake:
-    """Calibrates, puts fixes on the map, and thins out what comes more often than can be used.
+    """Calibrates, puts fixes on the map, and takes one measurement of a sensor at a time, as a log does.
 
     Parameters
     ----------
@@ -88,7 +87,7 @@ class Intake:
         return [(time - self._delays.get(_STREAM.get(r.sensor, r.sensor), 0.0), (r,)) for r in readings]
 
     def measurement(self, time: float, reading: Reading) -> Measurement | None:
-        """A reading as the engine takes it; None where the sensor has just been heard."""
+        """A reading as the engine takes it; None where the sensor has just been heard at that time."""
         sensor, values = reading
         if sensor == GEODETIC:
             if self.origin is None:
@@ -104,8 +103,8 @@ class Intake:
             self._left_out[sensor, f"{size} signals, and {self._sizes[sensor]} before"] += 1
             return None
         newest = self._newest.get(sensor, -np.inf)
-        if abs(time - newest) < SPACING_S.get(sensor, OTHERS_SPACING_S):
-            self._left_out[sensor, "more often than can be used"] += 1
+        if abs(time - newest) < SPACING_S:
+            self._left_out[sensor, "at the time of another"] += 1
             return None
         self._newest[sensor] = max(time, newest)
         return Measurement(time, sensor, self._with_known_sd(sensor, values), 0)

@@ -34,7 +34,6 @@ from rovgraph.live.reinitialisations import Reinitialisations
 from rovgraph.live.solution import Event, Solution
 from rovgraph.live.startup import Startup
 from rovgraph.log import Log, Measurement
-from rovgraph.log.frozen import companies
 
 if TYPE_CHECKING:
     from rovgraph.estimators.incremental import IncrementalEstimator
@@ -69,7 +68,7 @@ class Navigator:
     reinitialise: bool = True
     smooth: bool = False
     clocks: Clocks = field(default_factory=Clocks)
-    faults: Faults = field(default_factory=Faults)
+    faults: Faults = field(init=False)
     health: Health = field(default_factory=Health)
     alarms: LiveAlarms = field(default_factory=LiveAlarms)
     engine: FixedLag | None = None
@@ -83,7 +82,7 @@ class Navigator:
     def __post_init__(self) -> None:
         imu = self.config.imu.model_copy(update={"max_gap_s": NO_GAP_IS_TOO_LONG_S})
         self._intake = Intake(self.config, self.left_out)
-        self.faults.companies = companies(self.config)
+        self.faults = Faults(self.config)
         self._crosscheck = Crosscheck(self.config)
         self._startup = Startup(self.config.model_copy(update={"imu": imu}))
         self._reinitialisations = Reinitialisations(self.patient) if self.reinitialise and not self.smooth else None
@@ -190,6 +189,9 @@ class Navigator:
 
     def finish(self) -> None:
         """No more measurements: take what is held back."""
+        for watch in self.faults.watches.values():
+            for m in watch.release():
+                self._use(m)
         self._events += self._crosscheck.finish()
         if self.engine is None and (initial := self._startup.begin(self.origin)) is not None:
             self._begin(initial)
@@ -277,9 +279,13 @@ class Navigator:
             self._ticked = self.time
         if verdict.retract_since is not None and self.engine is not None:
             self.engine.retract(m.sensor, verdict.retract_since)
-        if not verdict.use:
-            self.left_out[m.sensor, verdict.reason or self.faults.watches[m.sensor].state] += 1
-            return
+        for one in (*verdict.late, *[m] * verdict.use):
+            self._use(one)
+        if not verdict.use and verdict.count:
+            self.left_out[m.sensor, verdict.reason or self.faults.watches[m.sensor].state] += verdict.count
+
+    def _use(self, m: Measurement) -> None:
+        """Give a measurement to what compares sensors, and to the engine."""
         self._events += self._crosscheck.add(m)
         if self._incoherence.keeps_out(m.sensor, m.time):
             self.left_out[m.sensor, "incoherent"] += 1

@@ -10,9 +10,11 @@ are further from zero than the vehicle can come and go meanwhile, so zeros of a 
 another sensor nor its clock.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +24,6 @@ from rovgraph.geometry import Array, rotate, wrap_angle
 from rovgraph.log.log import Log
 from rovgraph.log.streams import Stream
 
-MIN_REPEATS = 5  # measurements, times as many as the sensor usually repeats
-MIN_SECONDS = 3.0
 NEVER_REPEATS = 1.05  # measurements that a value lasts, in the mean
 ROUNDING = 1e-9  # relative, of numbers that are converted
 NOISE_STEPS = 4.0  # of a sensor's resolution, that its second differences exceed if its noise hides it
@@ -44,7 +44,6 @@ OUTLIES, QUIET = 8.0, 0.25  # times the distance from the mean of both neighbour
 FEWEST = 3  # that tell of a habit
 ENOUGH_VALUES = 20  # that show whether there is noise
 CHANCE = 10.0  # times as many repetitions of the last value as of the one before it are no chance
-HELD_FIX, HELD_FIX_SECONDS = 5, 10.0  # of fixes that repeat
 SURE = 5.0  # standard deviations
 TURN_RATE = 0.05  # sd of the rate about any axis that is no standstill [rad/s]
 FIX_DISTANCE = 10.0  # between fixes that is no standstill [m]
@@ -56,6 +55,86 @@ SLOPE = 0.1  # and more than this part of the way, which a tilted mounting feign
 DIVE_SECONDS = 20.0  # over which it is looked for
 LEVEL_SECONDS = 2.0  # over which the specific force shows the vertical
 LONGEST_STEP = 1.0  # between pings over which a velocity is integrated [s]
+
+
+@dataclass(frozen=True)
+class Hold:
+    """When the values of a sensor that returns them exactly are held, and no measurements, if the vehicle moves.
+
+    Attributes
+    ----------
+    columns : count of the first ones, which are held together
+    repeats : measurements, times as many as the sensor usually repeats
+    seconds : that they last
+    few : runs of equal values, up to which a sensor is not taken to repeat its values usually
+    right : measurements at the beginning that are right
+    """
+
+    columns: int = 3
+    repeats: int = 5
+    seconds: float = 3.0
+    few: int = 0
+    right: int = 0
+
+
+HOLD, HEADING = Hold(), Hold(columns=1)
+HOLDS: Mapping[str, Hold] = {
+    "imu": Hold(columns=6, repeats=10, seconds=1.0, few=sys.maxsize),
+    "dvl": HOLD,
+    "dvl_water": HOLD,
+    "mag": HOLD,
+    "depth": HOLD,
+    "ahrs": HEADING,
+    "dvl_heading": HEADING,
+    "vehicle_heading": HEADING,
+    "vehicle_tilt": HOLD,
+    "fix": Hold(columns=2, seconds=10.0, few=3, right=1),
+}
+
+
+class Run(NamedTuple):
+    """Equal measurements of a sensor, shape (k,), and the times of the first and last of them [s]."""
+
+    values: Array
+    first: float
+    last: float
+
+
+@dataclass(frozen=True)
+class Runs:
+    """m runs of equal measurements of a sensor, single ones too, in the order of time.
+
+    Attributes
+    ----------
+    values : ndarray, shape (m, k)
+    count : ndarray of int, shape (m,), measurements
+    first, last : ndarray, shape (m,), times of these [s]
+    """
+
+    values: Array
+    count: NDArray[np.int64]
+    first: Array
+    last: Array
+
+    @staticmethod
+    def of(time: Array, values: Array) -> "Runs":
+        """Those of n measurements, shapes (n,) [s] and (n, k); NaN equal."""
+        begin, end = equal_runs(values).T
+        return Runs(values[begin], end - begin + 1, time[begin], time[end])
+
+    def take(self, mask: NDArray[np.bool_]) -> "Runs":
+        """Some of them."""
+        return Runs(self.values[mask], self.count[mask], self.first[mask], self.last[mask])
+
+    def are_long(self, hold: Hold = HOLD) -> NDArray[np.bool_]:
+        """Which are longer than the sensor usually holds its values, shape (m,)."""
+        usual = float(np.median(self.count)) if len(self.count) > hold.few else 1.0
+        return (self.count >= hold.repeats * usual) & (self.last - self.first >= hold.seconds)
+
+    def show_noise(self, long: NDArray[np.bool_]) -> bool:
+        """Whether the values of all but the long ones, shape (m,), show noise."""
+        others = ~np.isin(self.count, self.count[long])
+        return np.count_nonzero(others) >= ENOUGH_VALUES and shows_noise(self.values[others, 0], self.count[others])
 
 
 @dataclass(frozen=True)
@@ -166,14 +245,15 @@ def frozen_stretches(log: Log, config: Config) -> list[FrozenStretch]:
     found = false_values(log, config)
     if "dvl" in log:
         found += _zeros_meanwhile(log, found)
-    for sensor in ("dvl", "dvl_water", "mag"):
-        found += _held(log, sensor)
-    found += _held_depth(log, config)
-    for sensor in ("ahrs", "dvl_heading"):
-        found += _held_heading(log, config, sensor)
-    for sensor in ("dvl", "vehicle_heading", "vehicle_tilt") if "imu" not in log else ():
-        found += _held_in_motion(log, sensor)
-    found += _held_fix(log, config)
+    for sensor, hold in HOLDS.items():
+        if sensor not in log or sensor == "imu":
+            continue
+        stream = _valid(log[sensor])
+        runs = Runs.of(stream.time, stream.data[:, : hold.columns])
+        end = np.cumsum(runs.count)
+        for k, why in held(sensor, runs, log, config):
+            time = stream.time[end[k] - runs.count[k] + hold.right : end[k]]
+            found.append(FrozenStretch(sensor, "held", time, why))
     return sorted(found, key=lambda stretch: stretch.first)
 
 
@@ -218,29 +298,21 @@ def without_frozen(log: Log, config: Config) -> tuple[Log, list[FrozenStretch]]:
     return log_without(log, found), found
 
 
+def repeats(values: Array) -> NDArray[np.bool_]:
+    """Whether each row of (n, k) repeats the one before exactly, NaN included; shape (n,)."""
+    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+    return np.concatenate([[False], same.all(axis=1)])[: len(values)]
+
+
 def equal_runs(values: Array) -> NDArray[np.int64]:
     """First and last index of every run of identical rows of (n, k), single ones too, NaN equal; shape (m, 2)."""
-    if not len(values):
-        return np.empty((0, 2), dtype=np.int64)
-    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
-    ends = np.append(np.flatnonzero(~same.all(axis=1)), len(values) - 1)
-    return np.column_stack([np.append(0, ends[:-1] + 1), ends])
+    begin = np.flatnonzero(~repeats(values))
+    return np.column_stack([begin, np.append(begin, len(values))[1:] - 1])
 
 
 def _valid(stream: Stream) -> Stream:
     """Pings with bottom lock; of other sensors everything."""
     return stream.take(stream["dvl_valid"] == 1.0) if stream.sensor == "dvl" else stream
-
-
-def _long(stream: Stream, values: Array) -> list[tuple[int, int]]:
-    """Runs of equal values that are longer than the sensor usually holds them."""
-    runs = equal_runs(values)
-    return [(int(a), int(b)) for a, b in runs[_is_long(stream.time, runs, runs[:, 1] - runs[:, 0] + 1)]]
-
-
-def _is_long(time: Array, runs: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    usual = float(np.median(counts)) if len(counts) else 1.0
-    return (counts >= MIN_REPEATS * usual) & (time[runs[:, 1]] - time[runs[:, 0]] >= MIN_SECONDS)
 
 
 def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
@@ -269,7 +341,7 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
         sides.append((near, left, np.abs(time[near] - time[edge])))
     near, left, seconds = (np.array(part) for part in zip(*sides, strict=True))
     abrupt, moves, counts = company.cannot_stop(left, seconds), left > company.least, last - first + 1
-    lasts = time[last] - time[first] >= MIN_SECONDS
+    lasts = time[last] - time[first] >= HOLD.seconds
     if noise:
         mean = _mean(values, time, near[0], first, near[1], company)
         false = abrupt.any(axis=0) | (moves.all(axis=0) & (company.size(mean) > company.least) & ~lasts)
@@ -280,7 +352,7 @@ def _zeros(stream: Stream, company: Company) -> Iterator[FrozenStretch]:
     else:
         false, guilty = abrupt.all(axis=0) if company.rests else abrupt.any(axis=0), False
     size = company.scale * company.size(values[near])
-    long = false & lasts & (counts >= MIN_REPEATS)
+    long = false & lasts & (counts >= HOLD.repeats)
     for k in np.flatnonzero(long):
         side = int(np.argmax(left[:, k]))
         why = f"{company.told.format(size[side, k])} just {('before', 'after')[side]}"
@@ -342,7 +414,7 @@ def _halves(pings: Stream, company: Company) -> Iterator[FrozenStretch]:
     low = index[~full & (before >= 0) & (after < len(v))]
     before, after = before[low], after[low]
     mean = _mean(v, time, before, low, after, company)
-    short = time[after] - time[before] < max(MIN_SECONDS, AROUND_PERIODS * float(np.median(np.diff(time))))
+    short = time[after] - time[before] < max(HOLD.seconds, AROUND_PERIODS * float(np.median(np.diff(time))))
     dips = short & (np.linalg.norm(v[low] - mean, axis=1) > clear) & _alike(v[before], v[after], mean)
     half = dips & _is_part(v[low], mean, HALF)
     peaks = (off > clear) & _alike(v[:-2], v[2:], usual) & _is_part(v[1:-1], usual, 1.0 + HALF)
@@ -362,15 +434,14 @@ def _is_part(v: Array, mean: Array, part: float) -> NDArray[np.bool_]:
 def _repeated(pings: Stream) -> Iterator[FrozenStretch]:
     """Pings that repeat the one before, now and then, and so often that resolution does not make them."""
     values = pings.data[:, :3]
-    runs = equal_runs(values)
-    counts = np.diff(runs, axis=1)[:, 0] + 1
-    short = (counts > 1) & ~_is_long(pings.time, runs, counts)
-    again = int((counts - 1)[short].sum())
-    if again < MIN_REPEATS or np.median(counts) > 1.0 or not _noise_shows(values):
+    runs = Runs.of(pings.time, values)
+    short = (runs.count > 1) & ~runs.are_long()
+    again = int((runs.count - 1)[short].sum())
+    if again < HOLD.repeats or np.median(runs.count) > 1.0 or not _noise_shows(values):
         return
-    distinct = values[runs[:, 0]]
-    if again > CHANCE * (distinct[2:] == distinct[:-2]).all(axis=1).sum():
-        index = np.concatenate([np.arange(a + 1, b + 1) for a, b in runs[short]])
+    if again > CHANCE * (runs.values[2:] == runs.values[:-2]).all(axis=1).sum():
+        ends = np.cumsum(runs.count)[short]
+        index = np.concatenate([np.arange(b - n + 1, b) for b, n in zip(ends, runs.count[short], strict=True)])
         yield FrozenStretch(pings.sensor, "repeated", pings.time[index], "values hardly ever return otherwise", True)
 
 
@@ -397,82 +468,112 @@ def _zeros_meanwhile(log: Log, found: Sequence[FrozenStretch]) -> Iterator[Froze
     pings = without(_valid(log["dvl"]), found)
     for a, b in equal_runs(pings.data[:, :3]):
         first, last = float(pings.time[a]), float(pings.time[b])
-        if pings.data[a, :3].any() or b - a + 1 < MIN_REPEATS or last - first < MIN_SECONDS:
+        if pings.data[a, :3].any() or b - a + 1 < HOLD.repeats or last - first < HOLD.seconds:
             continue
         if why := _meanwhile(log, first, last):
             yield FrozenStretch("dvl", "zero", pings.time[a : b + 1], why)
 
 
-def _held(log: Log, sensor: str) -> Iterator[FrozenStretch]:
-    """Values of a sensor whose noise shows, all components held."""
-    if sensor not in log:
-        return
-    stream = _valid(log[sensor])
-    values = stream.data[:, :3]
-    for a, b in _long(stream, values):
-        first, last = float(stream.time[a]), float(stream.time[b])
-        if values[a].any() and np.isfinite(values[a]).all() and _alive(log, first, last):
-            yield FrozenStretch(sensor, "held", stream.time[a : b + 1], "the IMU shows motion")
+def held(sensor: str, runs: Runs, log: Log, config: Config, turning: float | None = None) -> Iterator[tuple[int, str]]:
+    """Runs in which a sensor held its values although the vehicle moved: the place of each, and what shows it.
+
+    Parameters
+    ----------
+    sensor : key of `HOLDS`
+    runs : of its valid measurements
+    log : with the IMU, where there is one, and the DVL meanwhile
+    config : for mountings and sds
+    turning : rate of turn that the gyro shows at rest [rad/s]; None = the median of the log
+    """
+    long = runs.are_long(HOLDS[sensor])
+    shown = _motion_shown(sensor, runs, long, log, config, turning) if long.any() else None
+    for k in np.flatnonzero(long).tolist() if shown is not None else ():
+        if why := shown(Run(runs.values[k], float(runs.first[k]), float(runs.last[k]))):
+            yield k, why
 
 
-def _held_in_motion(log: Log, sensor: str) -> Iterator[FrozenStretch]:
-    """Values without the noise that they have otherwise, while the DVL moves: all that a log without an IMU shows."""
-    if not {sensor, "dvl"} <= log.sensors:
-        return
-    stream = _valid(log[sensor])
-    values = stream.data[:, :3]
-    long = _long(stream, values)
-    if not _shows_noise(values, long):
-        return
-    for a, b in long:
-        first, last = float(stream.time[a]), float(stream.time[b])
-        speeds = np.linalg.norm(_between(log, "dvl", first, last)[:, :3], axis=1)
+Shown = Callable[[Run], str]
+
+
+def _motion_shown(
+    sensor: str, runs: Runs, long: NDArray[np.bool_], log: Log, config: Config, turning: float | None
+) -> Shown | None:
+    """What tells whether the vehicle moved during a run so that the values of a sensor would have changed.
+
+    Where its noise shows it has failed if anything moves; where resolution may hide it, only if what it measures does.
+    """
+    imu = "imu" in log and len(log["imu"]) > 1
+    pings = _valid(log["dvl"]) if "dvl" in log else None
+    if sensor == "fix":
+        return _way_by_dvl(pings, config) if pings is not None else None
+    if not imu:
+        alone = sensor in ("dvl", "vehicle_heading", "vehicle_tilt") and runs.show_noise(long)
+        return _speed_by_dvl(pings) if alone and pings is not None else None
+    if sensor in ("ahrs", "dvl_heading", "vehicle_heading"):
+        return _turn_by_gyro(log, config, turning)
+    if sensor == "depth" and not runs.show_noise(long):
+        return _dive_by_dvl(pings, log["imu"], config, runs) if pings is not None and len(pings) > 1 else None
+    return partial(_alive, log) if sensor != "vehicle_tilt" else None
+
+
+def _speed_by_dvl(pings: Stream) -> Shown:
+    """That the DVL moves: all that a log without an IMU shows."""
+
+    def shown(run: Run) -> str:
+        speeds = np.linalg.norm(_during(pings, run.first, run.last)[:, :3], axis=1)
         speed = float(np.median(speeds[np.isfinite(speeds)])) if np.isfinite(speeds).any() else 0.0
-        if speed > CLEAR_SPEED:
-            why = f"it moves at {speed:.2f} m/s without any noise"
-            yield FrozenStretch(sensor, "held", stream.time[a : b + 1], why)
+        return f"it moves at {speed:.2f} m/s without any noise" if speed > CLEAR_SPEED else ""
+
+    return shown
 
 
-def _held_depth(log: Log, config: Config) -> Iterator[FrozenStretch]:
-    """A depth that stands still though it never does, or while the DVL, levelled, shows a descent or climb."""
-    if not {"depth", "imu"} <= log.sensors:
-        return
-    stream = log["depth"]
-    long = _long(stream, stream.data[:, :1])
-    if not long:
-        return
-    if _shows_noise(stream.data[:, :1], long):
-        yield from _held(log, "depth")
-        return
-    if "dvl" not in log or len(log["dvl"]) < 2:
-        return
-    pings = _valid(log["dvl"])
+def _way_by_dvl(pings: Stream, config: Config) -> Shown:
+    """That the DVL goes further than fixes are off."""
+
+    def shown(run: Run) -> str:
+        during = _during(pings, run.first, run.last)[:, :3]
+        way = (run.last - run.first) * (float(np.median(np.linalg.norm(during, axis=1))) if len(during) else 0.0)
+        return f"the DVL moves by {way:.0f} m" if way > max(FIX_DISTANCE, SURE * config.fix.sd_m) else ""
+
+    return shown
+
+
+def _turn_by_gyro(log: Log, config: Config, turning: float | None) -> Shown:
+    """That the gyro turns."""
+    imu = log["imu"]
+    rate = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])[:, 2]
+    rate = rate - (np.median(rate) if turning is None else turning)
+    turned = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(imu.time)))
+
+    def shown(run: Run) -> str:
+        during = turned[_slice(imu, run.first, run.last)]
+        turn = float(np.ptp(during)) if len(during) else 0.0
+        least = max(TURNED, TURN_DRIFT * (run.last - run.first))
+        return f"the gyro turns by {np.rad2deg(turn):.0f} deg" if turn > least else ""
+
+    return shown
+
+
+def _dive_by_dvl(pings: Stream, imu: Stream, config: Config, runs: Runs) -> Shown:
+    """That the DVL, levelled, shows a descent or climb beyond what depths tell apart."""
     v_b = rotate(mount_matrix(config.dvl.mount_rpy_deg), pings.data[:, :3])
-    downwards = np.sum(v_b * _down(log["imu"], config, pings.time), axis=1)
+    downwards = np.sum(v_b * _down(imu, config, pings.time), axis=1)
     step = np.minimum(np.diff(pings.time), LONGEST_STEP)
     down, way = (
         np.append(0.0, np.cumsum(0.5 * (v[1:] + v[:-1]) * step)) for v in (downwards, np.linalg.norm(v_b, axis=1))
     )
-    levels = np.unique(stream.data[:, 0])
+    levels = np.unique(runs.values[:, 0])
     resolution = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
     least = max(DIVED, 10.0 * config.depth.sd_m, 2.0 * resolution)
-    for a, b in long:
-        first, last = float(stream.time[a]), float(stream.time[b])
-        during = slice(*np.searchsorted(pings.time, [first, last]))
+
+    def shown(run: Run) -> str:
+        during = _slice(pings, run.first, run.last)
         if during.stop - during.start < 2:
-            continue
+            return ""
         dived = _most_dived(pings.time[during], down[during], way[during])
-        if dived > least:
-            why = f"the DVL moves up or down by {dived:.1f} m"
-            yield FrozenStretch("depth", "held", stream.time[a : b + 1], why)
+        return f"the DVL moves up or down by {dived:.1f} m" if dived > least else ""
 
-
-def _shows_noise(values: Array, long: list[tuple[int, int]]) -> bool:
-    """Whether values show noise outside some runs."""
-    runs = equal_runs(values)
-    counts = np.diff(runs, axis=1)[:, 0] + 1
-    others = ~np.isin(counts, [b - a + 1 for a, b in long])
-    return shows_noise(values[runs[others, 0], 0], counts[others])
+    return shown
 
 
 def shows_noise(values: Array, counts: Array) -> bool:
@@ -504,46 +605,11 @@ def _down(imu: Stream, config: Config, time: Array) -> Array:
     return np.asarray(-force / np.maximum(np.linalg.norm(force, axis=1), 1e-9)[:, None])
 
 
-def _held_heading(log: Log, config: Config, sensor: str) -> Iterator[FrozenStretch]:
-    """A heading that stands still while the gyro turns."""
-    if sensor not in log or "imu" not in log or len(log["imu"]) < 2:
-        return
-    imu, stream = log["imu"], log[sensor]
-    long = _long(stream, stream.data[:, :1])
-    if not long:
-        return
-    rate = rotate(mount_matrix(config.imu.mount_rpy_deg), imu.data[:, 3:])[:, 2]
-    rate = rate - np.median(rate)
-    turned = np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(imu.time)))
-    turned = np.interp(stream.time, imu.time, turned)
-    for a, b in long:
-        turn, seconds = float(np.ptp(turned[a : b + 1])), float(stream.time[b] - stream.time[a])
-        if turn > max(TURNED, TURN_DRIFT * seconds):
-            why = f"the gyro turns by {np.rad2deg(turn):.0f} deg"
-            yield FrozenStretch(sensor, "held", stream.time[a : b + 1], why)
-
-
-def _held_fix(log: Log, config: Config) -> Iterator[FrozenStretch]:
-    """Fixes that repeat one exactly while the DVL moves; the first of them is right."""
-    if not {"dvl", "fix"} <= log.sensors or len(log["fix"]) < HELD_FIX:
-        return
-    fix, pings = log["fix"], _valid(log["dvl"])
-    runs = equal_runs(fix.data[:, :2])
-    counts = runs[:, 1] - runs[:, 0] + 1
-    usual = float(np.median(counts)) if len(counts) > 3 else 1.0
-    for a, b in runs[counts >= max(HELD_FIX, 3.0 * usual)]:
-        first, last = float(fix.time[a]), float(fix.time[b])
-        during = (pings.time >= first) & (pings.time <= last)
-        speed = float(np.median(np.linalg.norm(pings.data[during, :3], axis=1))) if during.any() else 0.0
-        way = speed * (last - first)
-        if last - first >= HELD_FIX_SECONDS and way > max(FIX_DISTANCE, SURE * config.fix.sd_m):
-            yield FrozenStretch("fix", "held", fix.time[a + 1 : b + 1], f"the DVL moves by {way:.0f} m")
-
-
-def _alive(log: Log, first: float, last: float) -> bool:
-    """Whether the IMU's signals change between two times, as those of a real one always do."""
-    samples = _between(log, "imu", first, last)
-    return len(samples) > 2 and bool(np.ptp(samples, axis=0).max() > ALIVE)
+def _alive(log: Log, run: Run) -> str:
+    """That the IMU's signals change, as those of a real one always do, beside values that are not zero."""
+    samples = _between(log, "imu", run.first, run.last)
+    alive = len(samples) > 2 and np.ptp(samples, axis=0).max() > ALIVE
+    return "the IMU shows motion" if alive and run.values.any() and np.isfinite(run.values).all() else ""
 
 
 def _meanwhile(log: Log, first: float, last: float) -> str:
@@ -561,7 +627,13 @@ def _meanwhile(log: Log, first: float, last: float) -> str:
 
 
 def _between(log: Log, sensor: str, first: float, last: float) -> Array:
-    if sensor not in log:
-        return np.empty((0, 6))
-    stream = log[sensor]
-    return stream.data[np.searchsorted(stream.time, first) : np.searchsorted(stream.time, last, side="right")]
+    return _during(log[sensor], first, last) if sensor in log else np.empty((0, 6))
+
+
+def _during(stream: Stream, first: float, last: float) -> Array:
+    return stream.data[_slice(stream, first, last)]
+
+
+def _slice(stream: Stream, first: float, last: float) -> slice:
+    """Places of the measurements from one time to another, both included."""
+    return slice(int(np.searchsorted(stream.time, first)), int(np.searchsorted(stream.time, last, side="right")))

@@ -19,6 +19,7 @@ from rovgraph.log.streams import (
     LABEL,
     LAT_LON,
     RECEIVED,
+    SPACING_S,
     STREAMS,
     THRUSTER,
     Stream,
@@ -424,11 +425,15 @@ def _interpolated(at: Array, time: Array, values: Array) -> tuple[Array, Bools]:
 
 
 def _distinct_times(stream: Stream, source: str) -> Stream:
-    """A stream with one measurement at a time, the first."""
+    """A stream with one measurement at a time, the first; those within `SPACING_S` are of one time."""
     require_moving(stream.time, f"{source}: {stream.sensor}")
-    again = np.concatenate([[False], np.diff(stream.time) == 0.0])
-    if not again.any():
+    close = np.flatnonzero(np.diff(stream.time) < SPACING_S) + 1
+    if not len(close):
         return stream
+    again, kept = np.zeros(len(stream), bool), -np.inf
+    for k in close.tolist():
+        kept = kept if again[k - 1] else stream.time[k - 1]
+        again[k] = stream.time[k] - kept < SPACING_S
     first = np.flatnonzero(~again)[np.cumsum(~again) - 1]
     same = again & ((stream.data == stream.data[first]) | (np.isnan(stream.data) & np.isnan(stream.data[first]))).all(1)
     for which, what in ((same, "repeated exactly, left out"), (again & ~same, "at the time of another, first kept")):

@@ -34,6 +34,7 @@ LABEL = "place_id"  # a column of names, not of quantities
 LAT_LON = ("fix_lat", "fix_lon")
 RECEIVED = "received"  # time of arrival [s]; a log that has this column holds its rows in the order of arrival
 DATE = "date"  # day, or GPS week, of the times beside it
+SPACING_S = 1e-4  # closer measurements of a sensor are of one time, and the first is taken: no sensor is that fast
 THRUSTER = re.compile(r"thruster_[1-9]\d*")
 
 
@@ -97,7 +98,7 @@ class Stream:
     time : ndarray, shape (n,) [s], increasing
     data : ndarray, shape (n, k); optional columns that are missing are NaN (dvl_valid: 1)
     row : ndarray of int, shape (n,), lines of the file, 1 = header
-    same_time : others that were left out, as they have the stamp of one that is kept
+    same_time : others that were left out, as they are of the time of one that is kept
     """
 
     sensor: str
