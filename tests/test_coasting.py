@@ -1,15 +1,17 @@
 """A silence of the IMU: the same motion for graph and filters, and tracks that do not leave in it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from dives import batch, falcon, incremental, interrupted, position_errors, renewed, simulated, started
+from motions import predict, problem_of, residual, transition, weights
 
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.engine.preintegration import preintegrate, preintegration_params
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.scale import SCALES
-from rovgraph.engine.transition import predict, residual, transitions, whitening
 from rovgraph.engine.unknowns import Unknowns
-from rovgraph.geometry import matrix_from_rpy, rpy_from_matrix
+from rovgraph.geometry import Array, matrix_from_rpy, rpy_from_matrix
 from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.graph.values import state_values
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR, RIGHTING_S, TILT_SD
@@ -19,21 +21,27 @@ SECONDS = 0.9
 
 
 @pytest.fixture(scope="module")
-def interval() -> KeyframeInterval:
-    """Of which nothing is known but that the vehicle turned at 0.3 rad/s before and after."""
+def dive() -> Problem:
+    """Of whose motion nothing is known but that the vehicle turned at 0.3 rad/s before and after."""
     return silent(SECONDS + 0.2)
 
 
-def silent(gap_s: float) -> KeyframeInterval:
-    params = preintegration_params(falcon(), BRIDGE_ACC, BRIDGE_GYR)
+@pytest.fixture(scope="module")
+def motion(dive) -> Array:
+    return dive.motions[0]
+
+
+def silent(gap_s: float) -> Problem:
+    params = preintegration_params(falcon())
+    params = replace(params, densities=(BRIDGE_ACC, BRIDGE_GYR, *params.densities[2:]))
     samples = np.array([[t, 0.3, 0.1, -9.8, 0.02, -0.05, 0.3] for t in (-0.1, SECONDS + 0.1)])
     motion, _ = preintegrate(params, np.zeros(6), samples, 0.0, np.empty(0), SECONDS, gap_s)
-    return KeyframeInterval(1, SECONDS, 0, np.zeros(3), 0.0, motion, [])
+    return problem_of(np.array([0.0, SECONDS]), motion[None])
 
 
-def covariance(interval: KeyframeInterval) -> np.ndarray:
+def covariance(motion: Array) -> Array:
     """Of the residual."""
-    W = whitening(interval)
+    [W] = weights(motion[None])
     return np.linalg.inv(W.T @ W)
 
 
@@ -45,24 +53,24 @@ def state(rpy: list[float], p_n: list[float], v_n: list[float]) -> State:
 BEFORE, AFTER = state([0.1, -0.2, 2.0], [3, -2, 5], [0.4, -0.2, 0.1]), state([0.3, 0.1, 2.4], [4, -2, 5], [0.1, 0.2, 0])
 
 
-def test_an_interval_is_blind_where_the_imu_was_silent_for_more_than_three_quarters_of_a_second(interval):
-    assert interval.motion.coasted
-    assert not silent(0.7).motion.coasted
+def test_an_interval_is_blind_where_the_imu_was_silent_for_more_than_three_quarters_of_a_second(dive):
+    assert dive.coasted[1]
+    assert not silent(0.7).coasted[1]
 
 
-def test_it_goes_on_as_it_went_turns_as_it_turned_and_rights_itself(interval):
-    after = predict(interval, BEFORE)
+def test_it_goes_on_as_it_went_turns_as_it_turned_and_rights_itself(motion):
+    after = predict(motion, BEFORE)
     np.testing.assert_allclose(after.v_n, BEFORE.v_n)
     np.testing.assert_allclose(after.p_n, BEFORE.p_n + SECONDS * BEFORE.v_n)
     left = np.exp(-SECONDS / RIGHTING_S)
     np.testing.assert_allclose(
         rpy_from_matrix(after.R_nb[0]), [0.1 * left, -0.2 * left, 2.0 + 0.3 * SECONDS], atol=0.01
     )
-    np.testing.assert_allclose(residual(interval, BEFORE, after)[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(residual(motion, BEFORE, after)[0], 0.0, atol=1e-12)
 
 
-def test_its_derivatives_are_those_of_the_residual(interval):
-    _, A_i, A_j = residual(interval, BEFORE, AFTER)
+def test_its_derivatives_are_those_of_the_residual(motion):
+    _, A_i, A_j = residual(motion, BEFORE, AFTER)
     columns = [(POSE, k) for k in range(6)] + [(VELOCITY, k) for k in range(3)] + [(BIAS, k) for k in range(6)]
     for column, (variable, k) in enumerate(columns):
         step = np.zeros(3 if variable == VELOCITY else 6)
@@ -72,36 +80,36 @@ def test_its_derivatives_are_those_of_the_residual(interval):
             for sign in (1.0, -1.0):
                 states = [BEFORE, AFTER]
                 states[side] = states[side].retract(variable, sign * step)
-                ends.append(residual(interval, *states)[0])
+                ends.append(residual(motion, *states)[0])
             np.testing.assert_allclose(A[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-7)
 
 
-def test_the_factor_is_the_residual_whitened(interval):
+def test_the_factor_is_the_residual_whitened(dive, motion):
     values = state_values(0, BEFORE)
     values.insert(state_values(1, AFTER))
-    (r, A_i, A_j), S = residual(interval, BEFORE, AFTER), covariance(interval)
+    (r, A_i, A_j), S = residual(motion, BEFORE, AFTER), covariance(motion)
     fixed = {name: np.zeros(3) for name in SCALES}
-    factor = motion_factor(interval, Unknowns(fixed, {}), interval.index)
+    factor = motion_factor(dive, 1, Unknowns(fixed, {}), 1)
     assert 2.0 * factor.error(values) == pytest.approx(r @ np.linalg.solve(S, r))
     A, _ = factor.linearize(values).jacobian()
     both = np.concatenate([A_i[:, :9], A_j[:, :9], A_i[:, 9:], A_j[:, 9:]], axis=1)
     np.testing.assert_allclose(A.T @ A, both.T @ np.linalg.solve(S, both), rtol=1e-6, atol=1e-3)
 
 
-def test_filters_have_it_from_the_same_derivatives(interval):
-    [after], F, Q = transitions([interval], [BEFORE])
-    (_, A_i, A_j), S = residual(interval, BEFORE, after), covariance(interval)
-    np.testing.assert_allclose(A_j @ F[0], -A_i, atol=1e-9)
-    np.testing.assert_allclose(A_j @ Q[0] @ A_j.T, S, atol=1e-12)
+def test_filters_have_it_from_the_same_derivatives(motion):
+    after, F, Q = transition(motion, BEFORE)
+    (_, A_i, A_j), S = residual(motion, BEFORE, after), covariance(motion)
+    np.testing.assert_allclose(A_j @ F, -A_i, atol=1e-9)
+    np.testing.assert_allclose(A_j @ Q @ A_j.T, S, atol=1e-12)
 
 
-def test_a_tilt_that_is_as_vague_as_a_vehicles_stays_so(interval):
+def test_a_tilt_that_is_as_vague_as_a_vehicles_stays_so(motion):
     """However long the silence is: it is what a vehicle that rights itself does."""
     known = state([0.0, 0.0, 1.0], [0, 0, 5], [0, 0, 0])
     P = np.zeros((15, 15))
     for _ in range(10):
-        _, F, Q = transitions([interval], [known])
-        P = F[0] @ P @ F[0].T + Q[0]
+        _, F, Q = transition(motion, known)
+        P = F @ P @ F.T + Q
     np.testing.assert_allclose(np.sqrt(np.diag(P)[:2]), TILT_SD, rtol=1e-3)
     assert np.sqrt(P[2, 2]) == pytest.approx(BRIDGE_GYR * np.sqrt(10 * SECONDS), rel=1e-3)
 

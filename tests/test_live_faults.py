@@ -232,18 +232,6 @@ def test_a_frozen_imu_waits_and_is_taken_back_after_a_second():
     assert known * 0.01 == pytest.approx(HOLDS["imu"].seconds) and verdicts[known].count == known + 1
 
 
-@pytest.mark.parametrize(("turned", "used"), [(0.99, True), (1.01, False)])
-def test_a_heading_may_stand_still_while_the_vehicle_turns_by_its_limit(turned, used):
-    """A turn at a constant rate of the gyro, seen by three headings."""
-    assert np.rad2deg(TURNED) == pytest.approx(17.0)
-    faults, rate = Faults(), turned * TURNED / 2.0
-    for k in range(201):
-        faults.look(Measurement(0.01 * k, "imu", np.array([0.01 * k, 0.0, -9.8, 0.0, 0.0, rate]), 0))
-        if k % 100 == 0:
-            verdict = faults.look(heading(0.01 * k, 1.0))
-    assert verdict.use == used
-
-
 @pytest.mark.parametrize(("period", "longest"), [(0.2, 3.0), (1.0, 10.0)])
 def test_a_sensor_is_silent_after_three_seconds_or_ten_of_its_periods(period, longest):
     faults = Faults()

@@ -5,15 +5,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from dives import fed, simulated
+from dives import batch, simulated
+from motions import problem_of
 from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
 from rovgraph.calibration import TABLE, calibration_size
 from rovgraph.config import Config
-from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_rows, sd_of
-from rovgraph.engine.late_stamp_window import KNOT_S, LateStampWindow
-from rovgraph.engine.measurement_table import MeasurementTable
+from rovgraph.engine.late_stamp_window import KNOT_S
 from rovgraph.engine.measurements import (
     Block,
     loss_and_weight,
@@ -21,60 +20,65 @@ from rovgraph.engine.measurements import (
     make_block,
     whitening,
 )
-from rovgraph.engine.motion import Snapshot
+from rovgraph.engine.problem import sd_of
 from rovgraph.engine.scale import scale_to_bias
 from rovgraph.engine.sensor_rows import KeyframeRows, sensor_table
 from rovgraph.engine.unknowns import Unknowns
-from rovgraph.estimators.initialise import initialise
-from rovgraph.estimators.smoother import BatchSmoother
 from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy
 from rovgraph.graph.keys import key
 from rovgraph.graph.measurement_factors import measurement_factor, measurement_keys, robust_noise
 from rovgraph.graph.rows import Rows
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.instruments import instruments
+from rovgraph.kernels import assembly, motion_row
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.preintegration import SNAPSHOT
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
 
 N, STEP = 4, 1e-6
 SEGMENTS = np.arange(N) // 2
 SIZES = DIMENSION | {PLACE: PLACE_DIM} | {name: variable.dim for name, variable in TABLE.items()}
+LAG = KNOT_S * np.arange(-60, 61)  # of knots around a stamp that may be late [s]
 WALKS = {name: 0.1 if name in {"hard_iron", "field_scale", "dvl_yaw"} else 0.0 for name in TABLE}
 
 
 def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Block, State]:
     """A block with motion to each measurement, and the state of its keyframes."""
     rng, instrument = np.random.default_rng(3), replace(SENSORS[sensor], loss=loss)
-    state = random_state(5, N)
-    attached = []
+    state, dim = random_state(5, N), instrument.model.dim
+    blank = problem_of(np.zeros(N), np.empty((0, motion_row.ROW)))
+    rows, scales, windows = np.zeros((N, at.Z + 2 * max(dim, at.MOST))), np.empty((N, 6, 6)), []
     for k in range(N):
         bias = state.bias[k] + 0.05 * rng.standard_normal(6)
         turn = exp_rotation(0.2 * rng.standard_normal(3))
-        motion = Snapshot(0.1 + 0.05 * k, turn, 0.3 * rng.standard_normal(3), 0.1 * rng.standard_normal(3))
-        motion = motion if moving else Snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
-        rate, z = rng.standard_normal(3), rng.standard_normal(instrument.model.dim)
-        sd = instrument.sd * rng.uniform(0.5, 2.0, instrument.model.dim)
-        track = track_of(motion, bias, rng) if instrument.time_offset else None
-        S = scale_to_bias(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
-        seen = LandmarkObservation(1.0, 7) if sensor == "place" else None
-        snapshot = np.concatenate([[motion.dt], motion.dR.ravel(), motion.dv, motion.dp])
-        row = measurement_rows(0.2 * k, snapshot[None], bias, len(z))[0]
-        row[at.RATE : at.RATE_SD], row[at.RATE_SD] = rate, 0.01
-        row[at.Z : at.Z + len(z)], row[sd_of(len(z)) : sd_of(len(z)) + len(z)] = z, sd
-        attached.append(KeyframeMeasurement(sensor, k, k // 2, 10 + k, len(z), row, track, S, seen))
-    return make_block(MeasurementTable.of(attached), instrument, 9.81, Unknowns(state.calibration, WALKS)), state
+        motion = snapshot(0.1 + 0.05 * k, turn, 0.3 * rng.standard_normal(3), 0.1 * rng.standard_normal(3))
+        motion = motion if moving else snapshot(0.0, np.eye(3), np.zeros(3), np.zeros(3))
+        rate, z = rng.standard_normal(3), rng.standard_normal(dim)
+        sd = instrument.sd * rng.uniform(0.5, 2.0, dim)
+        if instrument.time_offset:
+            windows.append(track_of(motion, rng))
+        scales[k] = scale_to_bias(rng.standard_normal(6), exp_rotation(rng.standard_normal(3)))
+        rows[k, at.TIME], rows[k, at.SNAPSHOT : at.ASSUMED], rows[k, at.ASSUMED : at.Z] = 0.2 * k, motion, bias
+        rows[k, at.RATE : at.RATE_SD], rows[k, at.RATE_SD] = rate, 0.01
+        rows[k, at.Z : at.Z + dim], rows[k, sd_of(dim) : sd_of(dim) + dim] = z, sd
+    of = np.zeros((assembly.OF, N), np.int64)
+    of[[assembly.KEYFRAME_OF, assembly.INTERVAL_OF, assembly.WINDOW_OF]] = np.arange(N)
+    of[assembly.LINE_OF], of[assembly.NUMBER_OF] = 10 + np.arange(N), 7 if sensor == PLACE else -1
+    problem = replace(blank, sensors=(sensor,), dims=(dim,), rows=rows, row_scales=scales, of=of, names=np.ones(N))
+    if windows:
+        problem = replace(problem, windows=np.array(windows), lags={sensor: LAG}, bias=state.bias.mean(axis=0))
+    return make_block(problem, np.arange(N), instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 
 
-def track_of(motion: Snapshot, bias: Array, rng: np.random.Generator) -> LateStampWindow:
-    """A lively motion around a stamp."""
-    lag = KNOT_S * np.arange(-60, 61)
-    turn, dv, dp, rate = (wave(lag, rng) for _ in range(4))
-    still, knots = np.zeros(SNAPSHOT), np.empty((len(lag), SNAPSHOT))
-    still[1:10] = np.eye(3).ravel()
-    knots[:, 0], knots[:, 1:10] = motion.dt - lag, (motion.dR @ exp_rotation(turn)).reshape(-1, 9)
-    knots[:, 10:13], knots[:, 13:16] = motion.dv + dv, motion.dp + dp
-    return LateStampWindow.of(still, knots, lag, rate, bias)
+def snapshot(dt: float, dR: Array, dv: Array, dp: Array) -> Array:
+    """As `rovgraph.kernels.preintegration` lays it out."""
+    return np.concatenate([[dt], dR.ravel(), dv, dp])
+
+
+def track_of(motion: Array, rng: np.random.Generator) -> Array:
+    """A lively motion around a stamp, at knots."""
+    turn, dv, dp, rate = (wave(LAG, rng) for _ in range(4))
+    dR = motion[1:10].reshape(3, 3) @ exp_rotation(turn)
+    return np.column_stack([motion[0] - LAG, dR.reshape(-1, 9), motion[10:13] + dv, motion[13:16] + dp, rate])
 
 
 def wave(time: Array, rng: np.random.Generator) -> Array:
@@ -82,7 +86,7 @@ def wave(time: Array, rng: np.random.Generator) -> Array:
 
 
 def factor_of(block: Block, k: int) -> gtsam.CustomFactor:
-    return measurement_factor(block.at([k]), int(block.segment[k]))
+    return measurement_factor(block.at([k]), int(SEGMENTS[k]))
 
 
 def values_of(state: State, unknowns: Unknowns) -> gtsam.Values:
@@ -132,7 +136,7 @@ def test_custom_factor_is_linearised_by_gtsam_as_its_own_error_moves(sensor):
     linear = factor.linearize(values)
     A, b = linear.jacobian()
     np.testing.assert_allclose(b, -factor.unwhitenedError(values), atol=1e-9)
-    names = dict(zip(measurement_keys(block, block.segment)[k], block.variables, strict=True))
+    names = dict(zip(measurement_keys(block, SEGMENTS)[k], block.variables, strict=True))
     column = 0
     for j in list(linear.keys()):
         dim = SIZES[names[j]]
@@ -242,7 +246,7 @@ def test_some_of_a_block_are_its_own_measurements():
     block, state = block_of("dvl")
     some = block.at(np.array([2, 0]))
     np.testing.assert_allclose(some.normalised(state.at([2, 0])), block.normalised(state)[[2, 0]])
-    assert [row[0] for row in measurement_keys(some, some.segment)] == [key("pose", 2), key("pose", 0)]
+    assert [row[0] for row in measurement_keys(some, SEGMENTS[[2, 0]])] == [key("pose", 2), key("pose", 0)]
 
 
 def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
@@ -251,21 +255,18 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     config = case.config.model_copy(
         update={"heading": case.config.heading.model_copy(update={"sources": ("mag", "dvl", "ahrs")})}
     )
-    smoother: BatchSmoother = fed(BatchSmoother(initialise(case.log, config)), case.log)
-    motion = case.dive.path.motion(np.minimum([i.time for i in smoother.intervals], case.dive.path.duration))
+    smoother = batch(case.log, config)
+    problem = smoother.problem
+    motion = case.dive.path.motion(np.minimum(problem.time, case.dive.path.duration))
     arm = np.array(config.imu.lever_arm_m)
     swing = np.einsum("nij,nj->ni", motion.R_nb, np.cross(motion.w_b, arm))
     p_n, zero = motion.p_n + motion.R_nb @ arm, np.zeros((len(motion), 6))
     truth = State(motion.R_nb, p_n, motion.v_n + swing, zero, case.dive.hidden["calibration"])
-    by_sensor: dict[str, list[KeyframeMeasurement]] = {}
-    for interval in smoother.intervals:
-        for a in interval.measurements:
-            by_sensor.setdefault(a.sensor, []).append(a)
-    assert set(by_sensor) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
-    for sensor, attached in by_sensor.items():
+    assert set(problem.used) == {"dvl", "dvl_heading", "ahrs", "mag", "depth", "fix"}
+    for sensor in problem.used:
         instrument = smoother.initial.instruments[sensor]
         gravity, unknowns = config.environment.gravity_mps2, Unknowns(truth.calibration, {})
-        block = make_block(MeasurementTable.of(attached), instrument, gravity, unknowns)
+        block = make_block(problem, problem.of_sensor(sensor), instrument, gravity, unknowns)
         r = block.normalised(truth.at(block.keyframe))
         # motion from the keyframe is integrated from noisy samples, which adds little
         low, high = chi2.ppf([0.0005, 0.9995], r.size) / r.size

@@ -5,16 +5,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from dives import LIVELY, altered, as_log, batch, changed, falcon, fed, kept, level_log, simulated
+from motions import predict
 
 from rovgraph.config import Config, parse_config
-from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.motion import Motion
-from rovgraph.engine.preintegration import PreintegrationParams, preintegrate, preintegration_params, scatter
-from rovgraph.engine.transition import predict
+from rovgraph.engine.preintegration import preintegrate, preintegration_params, scatter
 from rovgraph.errors import InputError
 from rovgraph.estimators.incremental import IncrementalEstimator
 from rovgraph.estimators.initialise import initialise
-from rovgraph.geometry import earth_rate_n, log_rotation, rpy_from_matrix
+from rovgraph.geometry import Array, earth_rate_n, exp_rotation, log_rotation, rpy_from_matrix
+from rovgraph.kernels import measurement_row, motion_row
 from rovgraph.kernels.coasting import BRIDGE_GYR
 from rovgraph.kernels.imu_samples import typical_scatter
 from rovgraph.simulate import Path, scenario
@@ -30,17 +29,9 @@ def path() -> Path:
     return scenario("falcon", 60.0, 0.5, LIVELY)
 
 
-def params_of(config: Config) -> PreintegrationParams:
-    return preintegration_params(config, config.imu.noise.acc, config.imu.noise.gyr)
-
-
-def moved(motion: Motion) -> np.ndarray:
+def moved(motion: Array) -> Array:
     """Rotation vector, change of position and of velocity, shape (9,)."""
-    return np.concatenate([log_rotation(motion.dR), motion.dp, motion.dv])
-
-
-def after(motion: Motion, state: State) -> State:
-    return predict(KeyframeInterval(1, motion.end, 0, np.zeros(3), 0.0, motion, []), state)
+    return motion[motion_row.TANGENT : motion_row.BIAS]
 
 
 def samples(path: Path, config: Config, rate: float) -> np.ndarray:
@@ -59,8 +50,8 @@ def error(path: Path, config: Config, rate: float) -> np.ndarray:
     """Length of the error in attitude, velocity and position after the motion from START to END."""
     nothing = np.zeros(6)
     imu, stops = samples(path, config, rate), np.array([])
-    motion, _ = preintegrate(params_of(config), nothing, imu, START, stops, END)
-    got = after(motion, at_imu(path, config, START))
+    motion, _ = preintegrate(preintegration_params(config), nothing, imu, START, stops, END)
+    got = predict(motion, at_imu(path, config, START))
     true = at_imu(path, config, END)
     turn = log_rotation(true.R_nb[0].T @ got.R_nb[0])
     parts = (turn, got.v_n - true.v_n, got.p_n - true.p_n)
@@ -79,30 +70,31 @@ def test_motion_is_reproduced_to_second_order(path, arm):
 def test_snapshots_are_what_separate_integrations_give(path):
     config = Config()
     imu, bias = samples(path, config, 100.0), np.array([0.1, -0.1, 0.05, 0.01, -0.02, 0.03])
-    params = params_of(config)
+    params = preintegration_params(config)
     stops = np.array([START, START + 0.333, START + 0.333, START + 0.34, END])
     _, snapshots = preintegrate(params, bias, imu, START, stops, END)
     assert len(snapshots) == len(stops)
-    assert snapshots[0].dt == 0.0
-    for stop, snapshot in zip(stops[1:], snapshots[1:], strict=True):
+    dt, dR, dv, dp = snapshots[:, 0], snapshots[:, 1:10].reshape(-1, 3, 3), snapshots[:, 10:13], snapshots[:, 13:]
+    assert dt[0] == 0.0
+    for k, stop in enumerate(stops[1:], 1):
         alone, _ = preintegrate(params, bias, imu, START, np.array([]), float(stop))
-        assert snapshot.dt == pytest.approx(stop - START)
+        assert dt[k] == pytest.approx(stop - START)
         # the last step of one is cut in the other
-        np.testing.assert_allclose(snapshot.dR, alone.dR, atol=1e-7)
-        np.testing.assert_allclose(snapshot.dv, alone.dv, atol=1e-6)
-        np.testing.assert_allclose(snapshot.dp, alone.dp, atol=1e-6)
+        np.testing.assert_allclose(dR[k], exp_rotation(moved(alone)[:3]), atol=1e-7)
+        np.testing.assert_allclose(dv[k], moved(alone)[6:], atol=1e-6)
+        np.testing.assert_allclose(dp[k], moved(alone)[3:6], atol=1e-6)
 
 
 def test_intervals_that_meet_between_samples_lose_nothing(path):
-    config, params = Config(), params_of(Config())
+    config, params = Config(), preintegration_params(Config())
     imu, none = samples(path, config, 50.0), np.array([])
     whole, _ = preintegrate(params, np.zeros(6), imu, START, none, END)
     state = at_imu(path, config, START)
     cuts = np.array([START, START + 0.0071, START + 1.2345, START + 3.3333, END])
     there = state
     for a, b in pairwise(cuts):
-        there = after(preintegrate(params, np.zeros(6), imu, a, none, b)[0], there)
-    together = after(whole, state)
+        there = predict(preintegrate(params, np.zeros(6), imu, a, none, b)[0], there)
+    together = predict(whole, state)
     # a step that is cut is integrated in two, which is as exact as the samples are dense
     assert np.linalg.norm(there.p_n - together.p_n) < 0.5 * error(path, config, 50.0)[2] + 1e-3
     assert log_rotation(there.R_nb[0].T @ together.R_nb[0]) == pytest.approx(0.0, abs=1e-4)
@@ -112,7 +104,7 @@ def test_a_bias_is_taken_off_the_samples(path):
     config, bias = Config(), np.array([0.1, -0.2, 0.05, 0.01, -0.02, 0.03])
     imu = samples(path, config, 100.0)
     wrong = imu + np.append(0.0, bias)
-    none, params = np.array([]), params_of(config)
+    none, params = np.array([]), preintegration_params(config)
     clean, _ = preintegrate(params, np.zeros(6), imu, START, none, END)
     known, _ = preintegrate(params, bias, wrong, START, none, END)
     np.testing.assert_allclose(moved(known), moved(clean), atol=1e-9)
@@ -123,11 +115,11 @@ def test_mounting_of_the_imu_does_not_matter_once_it_is_known(mount):
     config = parse_config("environment: {dip_deg: 70, field_norm: 1}")
     same = changed(config, imu={"mount_rpy_deg": mount})
     straight, turned = (simulated(c, 40.0, noise=False, seed=2) for c in (config, same))
-    a, b = (batch(s.log, s.config).intervals for s in (straight, turned))
+    a, b = (batch(s.log, s.config).problem for s in (straight, turned))
     assert len(a) == len(b) > 100
-    for one, other in zip(a[1:], b[1:], strict=True):
-        np.testing.assert_allclose(moved(one.motion), moved(other.motion), atol=1e-8)
-        np.testing.assert_allclose(one.rate_b, other.rate_b, atol=1e-9)
+    for one, other in zip(a.motions, b.motions, strict=True):
+        np.testing.assert_allclose(moved(one), moved(other), atol=1e-8)
+    np.testing.assert_allclose(a.rate_b[1:], b.rate_b[1:], atol=1e-9)
 
 
 def test_earths_rate_points_north_and_up_in_the_north():
@@ -147,11 +139,11 @@ def still_heading(on: bool) -> float:
     signal = np.concatenate([[0, 0, -config.environment.gravity_mps2], earth_rate_n(lat)])
     imu = np.column_stack([time, np.tile(signal, (len(time), 1))])
     state = State(np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 6)))
-    params = params_of(config)
+    params = preintegration_params(config)
     for begin in np.arange(0.0, STILL_S, 1.0):
         part = imu[(imu[:, 0] > begin - 0.2) & (imu[:, 0] < begin + 1.2)]
         motion, _ = preintegrate(params, np.zeros(6), part, begin, np.array([]), begin + 1.0)
-        state = after(motion, state)
+        state = predict(motion, state)
     return float(rpy_from_matrix(state.R_nb[0])[2])
 
 
@@ -172,20 +164,19 @@ def silent(seconds: float, **imu: float):
 
 def test_a_gap_in_the_imu_is_bridged_with_an_inflated_covariance():
     case, log = silent(3.0)
-    intervals = batch(log, case.config).intervals
-    bridged = [i for i in intervals if i.bridged]
-    assert bridged
-    assert all(19.9 < i.time < 23.3 for i in bridged)
-    whole = [i for i in intervals[1:] if not i.bridged]
-
-    def rotation_density(interval):
-        return np.sqrt(interval.motion.covariance[0, 0] / interval.motion.duration)
-
-    assert rotation_density(bridged[1]) == pytest.approx(BRIDGE_GYR, rel=0.1)
-    assert rotation_density(bridged[1]) > 50 * np.median([rotation_density(i) for i in whole])
+    problem = batch(log, case.config).problem
+    bridged = np.flatnonzero(problem.bridged)
+    assert len(bridged)
+    assert ((problem.time[bridged] > 19.9) & (problem.time[bridged] < 23.3)).all()
+    motions = problem.motions
+    density = np.sqrt(motions[:, motion_row.COVARIANCE] / motions[:, motion_row.DURATION])  # of the rotation
+    assert density[bridged[1] - 1] == pytest.approx(BRIDGE_GYR, rel=0.1)
+    assert density[bridged[1] - 1] > 50 * np.median(density[~problem.bridged[1:]])
     # and a ping in the gap knows that its rate is a guess
-    inside = [a for i in bridged for a in i.measurements if a.sensor == "dvl" and 20.2 < a.time < 22.9]
-    assert inside and all(a.rate_sd == BRIDGE_GYR for a in inside)
+    pings = problem.rows[problem.of_sensor("dvl")]
+    time = pings[:, measurement_row.TIME]
+    inside = problem.bridged[problem.interval[problem.of_sensor("dvl")]] & (time > 20.2) & (time < 22.9)
+    assert inside.any() and (pings[inside, measurement_row.RATE_SD] == BRIDGE_GYR).all()
 
 
 @pytest.mark.parametrize("rate", [10.0, 30.0, 100.0])
@@ -216,28 +207,29 @@ def test_the_rate_is_that_of_its_own_time(rate):
 
 def test_keyframes_stand_at_the_pings_within_a_gap_of_the_imu():
     case, log = silent(3.0)
-    times = np.array([i.time for i in batch(log, case.config).intervals])
     pings = log["dvl"].time
+    times = batch(log, case.config).problem.time
     assert np.isin(pings[(pings > 20.1) & (pings < 22.9)], times).all()
 
 
 def test_a_keyframe_stands_where_samples_come_again_and_what_follows_is_whole():
     """What is measured after a gap would otherwise be carried through it from the keyframe before."""
     case, log = silent(3.0)
-    intervals = batch(log, case.config).intervals
+    problem = batch(log, case.config).problem
     again = log["imu"].time[log["imu"].time > 20.0][0]
-    [at] = [k for k, i in enumerate(intervals) if i.time == again]
-    assert intervals[at].motion.gap_s == pytest.approx(3.02, abs=0.02)
-    assert intervals[at + 1].motion.gap_s == 0.0
-    carried = [a.motion.dt for a in intervals[at + 1].measurements if a.keyframe == at]
-    assert carried and max(carried) < 0.2
+    [at] = np.flatnonzero(problem.time == again)
+    assert problem.gap_s[at] == pytest.approx(3.02, abs=0.02)
+    assert problem.gap_s[at + 1] == 0.0
+    carried = problem.rows[(problem.interval == at + 1) & (problem.keyframe == at), measurement_row.DT]
+    assert len(carried) and carried.max() < 0.2
 
 
 def test_every_interval_in_a_gap_knows_how_long_it_is():
     case, log = silent(3.0)
-    inside = [i for i in batch(log, case.config).intervals if 20.1 < i.time <= 23.0]
-    assert len(inside) > 5
-    assert [i.motion.gap_s for i in inside] == pytest.approx([3.02] * len(inside), abs=0.02)
+    problem = batch(log, case.config).problem
+    inside = (problem.time > 20.1) & (problem.time <= 23.0)
+    assert inside.sum() > 5
+    np.testing.assert_allclose(problem.gap_s[inside], 3.02, rtol=0.0, atol=0.02)
 
 
 def test_a_gap_longer_than_allowed_is_refused_with_row_and_remedy():
@@ -252,7 +244,7 @@ def test_a_single_lost_sample_is_no_gap():
     case = simulated(falcon(), 40.0, seed=5)
     keep = np.ones(len(case.log["imu"]), bool)
     keep[[1500, 1700, 1701]] = False
-    assert not any(i.bridged for i in batch(kept(case.log, "imu", keep), case.config).intervals)
+    assert not batch(kept(case.log, "imu", keep), case.config).problem.bridged.any()
 
 
 def test_helpers_of_these_tests_make_logs_in_the_logs_contract():

@@ -1,0 +1,69 @@
+"""Motions by themselves, rows of `rovgraph.kernels.motion_row`, and small problems for the tests."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from rovgraph.engine.problem import Problem
+from rovgraph.engine.scale import biased
+from rovgraph.geometry import Array
+from rovgraph.kernels import assembly as at
+from rovgraph.kernels import measurement_row, motion_row
+from rovgraph.kernels.motion import transitions
+from rovgraph.kernels.motion_residual import motion_errors, motion_weights
+from rovgraph.state import State
+
+
+def predict(motion: Array, before: State, scale: Array | None = None) -> State:
+    """The state at the end of a motion, shape (ROW,); ``scale``, shape (6, 6), is that of `rovgraph.engine.scale`."""
+    return transition(motion, before, scale)[0]
+
+
+def transition(motion: Array, before: State, scale: Array | None = None) -> tuple[State, Array, Array]:
+    """The same with the transition F and process noise Q, shape (15, 15)."""
+    R, p, v, F, Q = (np.empty((1, *shape)) for shape in ((3, 3), (3,), (3,), (15, 15), (15, 15)))
+    transitions(motion[None], *_arrays(before, scale), R, p, v, F, Q)
+    return replace(before, R_nb=R, p_n=p, v_n=v), F[0], Q[0]
+
+
+def residual(motion: Array, before: State, after: State) -> tuple[Array, Array, Array]:
+    """How two states disagree with a motion, shape (15,), and the derivatives by both, shape (15, 15)."""
+    r, A_i, A_j = np.empty((1, 15)), np.empty((1, 15, 15)), np.empty((1, 15, 15))
+    motion_errors(motion[None], *_arrays(before), *_arrays(after), r, A_i, A_j)
+    return r[0], A_i[0], A_j[0]
+
+
+def weights(motions: Array) -> Array:
+    """Square-root information of motions, shape (n, 15, 15)."""
+    W = np.empty((len(motions), 15, 15))
+    motion_weights(motions, W)
+    return W
+
+
+def problem_of(time: Array, motions: Array) -> Problem:
+    """Keyframes at n times and the motions between them, shape (n - 1, ROW), without samples and measurements."""
+    keyframes = np.zeros((len(time), at.KEYFRAME))
+    keyframes[:, at.TIME] = time
+    return Problem(
+        sensors=(),
+        dims=(),
+        keyframes=keyframes,
+        motions=motions,
+        weights=weights(motions),
+        scales=np.empty((0, 6, 6)),
+        rows=np.empty((0, measurement_row.ROW)),
+        row_scales=np.empty((0, 6, 6)),
+        of=np.empty((at.OF, 0), np.int64),
+        windows=np.empty((0, 0, at.KNOT)),
+        names=np.empty(0),
+        lags={},
+        bias=motions[0, motion_row.BIAS : motion_row.BIAS + 6] if len(motions) else np.zeros(6),
+        samples=lambda first, last: np.empty((0, 7)),
+    )
+
+
+def _arrays(state: State, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
+    """Attitude, position, velocity, and the bias that is seen, of one epoch, as kernels take them."""
+    seen = state if scale is None else biased(state, scale[None])
+    R, p, v, bias = (np.ascontiguousarray(a, float) for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias))
+    return R, p, v, bias
