@@ -3,8 +3,8 @@
     python benchmarks/batch.py                         500 s, both solvers; 4000 s, ours
     python benchmarks/batch.py --seconds 35 --long 40  a smoke test
 
-The reference solves `Problem.nonlinear()`: the same native factors, and one Python
-`gtsam.CustomFactor` per measurement. Both costs are evaluated by `Problem.cost` with the
+The reference solves `DiveGraph.nonlinear()`: the same native factors, and one Python
+`gtsam.CustomFactor` per measurement. Both costs are evaluated by `DiveGraph.cost` with the
 gates that our solver came to rest with, so gates are left open on both sides.
 Nothing is asserted: it prints a table.
 """
@@ -22,7 +22,7 @@ from rovgraph.config import Config, beliefs, load_config
 from rovgraph.estimators.dead_reckoning import dead_reckon
 from rovgraph.estimators.initialise import initialise
 from rovgraph.estimators.smoother import BatchSmoother
-from rovgraph.graph.batch import Problem, make_problem, make_values, solve
+from rovgraph.graph.batch import DiveGraph, make_graph, make_values, solve
 from rovgraph.log import read_log
 from rovgraph.simulate import Truth, scenario, simulate
 from rovgraph.simulate.files import write_log
@@ -43,47 +43,44 @@ class Run:
     cost: float
 
 
-def make_graph(seconds: float, config: Config) -> tuple[Problem, gtsam.Values]:
+def graph_of(seconds: float, config: Config) -> tuple[DiveGraph, gtsam.Values]:
     """The graph of a simulated dive, and dead reckoning to begin with."""
     truth = Truth(config, imu_rate=IMU_RATE, dvl_rate=DVL_RATE)
     dive = simulate(scenario("falcon", seconds), truth, np.random.default_rng(0))
     with TemporaryDirectory() as folder:
         write_log(dive.log_frame, Path(folder) / "log.csv")
         log = read_log(Path(folder) / "log.csv")
-    smoother = BatchSmoother(initialise(log, config))
-    for measurement in log.measurements():
-        smoother.add(measurement)
-    smoother.finish()
+    smoother = BatchSmoother(initialise(log, config), log)
     b = smoother.initial
     # gates are open: Levenberg-Marquardt has none
     sensors = {name: replace(instrument, gate_sd=None) for name, instrument in b.instruments.items()}
-    problem = make_problem(smoother.intervals, b.prior, b.config, beliefs(b.config), sensors)
-    return problem, make_values(problem, dead_reckon(smoother.intervals, b, problem.unknowns.fixed))
+    graph = make_graph(smoother.problem, b.prior, b.config, beliefs(b.config), sensors)
+    return graph, make_values(graph, dead_reckon(smoother.problem, b, graph.unknowns.fixed))
 
 
-def ours(problem: Problem, values: gtsam.Values, seconds: float, repeats: int = 3) -> Run:
+def ours(graph: DiveGraph, values: gtsam.Values, seconds: float, repeats: int = 3) -> Run:
     """Our solver; the shortest of some runs."""
     times = []
     for _ in range(repeats):
         begin = time.perf_counter()
-        solution = solve(problem, values)
+        solution = solve(graph, values)
         times.append(time.perf_counter() - begin)
-    return _run("rovgraph", problem, seconds, min(times), solution.cost)
+    return _run("rovgraph", graph, seconds, min(times), solution.cost)
 
 
-def reference(problem: Problem, values: gtsam.Values, seconds: float) -> Run:
+def reference(graph: DiveGraph, values: gtsam.Values, seconds: float) -> Run:
     """GTSAM's Levenberg-Marquardt with its default parameters and a tight tolerance."""
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-7)
-    graph = problem.nonlinear()
+    nonlinear = graph.nonlinear()
     begin = time.perf_counter()
-    result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    result = gtsam.LevenbergMarquardtOptimizer(nonlinear, values, params).optimize()
     took = time.perf_counter() - begin
-    return _run("Levenberg-Marquardt", problem, seconds, took, problem.cost(result, problem.initial_gates()))
+    return _run("Levenberg-Marquardt", graph, seconds, took, graph.cost(result, graph.initial_gates()))
 
 
-def _run(solver: str, problem: Problem, seconds: float, took: float, cost: float) -> Run:
-    return Run(solver, seconds, problem.count, sum(len(b) for b in problem.blocks.values()), took, cost)
+def _run(solver: str, graph: DiveGraph, seconds: float, took: float, cost: float) -> Run:
+    return Run(solver, seconds, graph.count, sum(len(b) for b in graph.blocks.values()), took, cost)
 
 
 def table(runs: list[Run]) -> str:
@@ -98,9 +95,9 @@ def table(runs: list[Run]) -> str:
 def main(seconds: float, long: float) -> list[Run]:
     """Run and print; the runs are ours, the reference, ours on the long dive."""
     config = load_config(FALCON)
-    problem, values = make_graph(seconds, config)
-    mine, gtsams = ours(problem, values, seconds), reference(problem, values, seconds)
-    longer = ours(*make_graph(long, config), long, repeats=2)
+    graph, values = graph_of(seconds, config)
+    mine, gtsams = ours(graph, values, seconds), reference(graph, values, seconds)
+    longer = ours(*graph_of(long, config), long, repeats=2)
     runs = [mine, gtsams, longer]
     print(table(runs))
     print()

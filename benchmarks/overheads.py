@@ -191,11 +191,10 @@ def alarms(folder: Path) -> list[Pair]:
     """The verdict on a dive, and its alarms while it goes on."""
     dive, config = simulated("lawnmower", 1, falcon(), Choices(duration=120.0))
     log = Log.from_frame(dive.log_frame)
-    smoother = BatchSmoother(initialise(log, config))
-    smoother.take(log)
+    smoother = BatchSmoother(initialise(log, config), log)
     best = smoother.optimum()
     assert isinstance(best, ChainOptimum)
-    evidence = Evidence(smoother.initial, [smoothed(best, smoother.initial)], best.intervals, best, [], log)
+    evidence = Evidence(smoother.initial, [smoothed(best, smoother.initial)], best.problem, best, [], log)
     messages = [Message("log", m.time, m.time, (Reading(m.sensor, m.values),)) for m in log.measurements()]
     keyframes: list[tuple[Any, ...]] = []
 

@@ -92,7 +92,7 @@ def evidence(
         Estimate("filtered", t, [], {}, nothing if filtered is None else filtered, {"nis": nis or {}}),
     ]
     given: dict[str, Any] = {"initial": None, "optimum": None, "frozen": (), "log": {}, **more}
-    return Evidence(estimates=both, intervals=(), **given)
+    return Evidence(estimates=both, problem=(), **given)
 
 
 def span_of(one: Statistic | Alarm) -> tuple[float, float]:
@@ -369,7 +369,7 @@ def of_motions(residuals_: Array, monkeypatch: pytest.MonkeyPatch) -> Evidence:
     seen = evidence(optimum=SimpleNamespace())
     smoothed = replace(seen.estimates[0], history={"acc_bias": bias, "gyr_bias": bias})
     intervals = [SimpleNamespace(time=float(t), bridged=False) for t in times]
-    return replace(seen, estimates=[smoothed, seen.estimates[1]], intervals=intervals)
+    return replace(seen, estimates=[smoothed, seen.estimates[1]], problem=intervals)
 
 
 @levels

@@ -32,7 +32,7 @@ def filtered(*files: str) -> float:
     log, config = read(*files)
     batch = assemble(log, initialise(log, config))
     began = processor()
-    replay_filter(batch.intervals, batch.initial, REINITIALISE_AT_S, rows=batch.rows).solve()
+    replay_filter(batch.problem, batch.initial, REINITIALISE_AT_S).solve()
     return processor() - began
 
 
