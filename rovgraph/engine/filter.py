@@ -46,21 +46,28 @@ from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import Corrected, GivenRows, correct
+from rovgraph.kernels.correction import GivenRows
 from rovgraph.kernels.filter_state import FilterModel, FilterState
-from rovgraph.kernels.filtering import Filtered, Intervals, filter_intervals
+from rovgraph.kernels.filtering import Filtered, Interval, Intervals, Taken, filter_intervals, take_interval
 from rovgraph.kernels.measurement_row import MeasurementRows
 from rovgraph.kernels.moves import difference, move_estimate
-from rovgraph.kernels.prediction import Predicted, predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 
 ORIGIN = np.zeros(PLACE_DIM)  # where a place is put to begin with
 _EXACT = np.zeros((0, 6, 6))  # of an IMU without scale errors
+_NO_MOTION = np.zeros(0)
+_NO_STATE = FilterState(_NO_MOTION, _NO_MOTION, *[np.zeros((0, 0))] * 3)  # where none is asked for
 
 
 def _state(known: Gaussian) -> FilterState:
     """A copy for kernels, which write to it."""
     return FilterState(known.x.copy(), known.c.copy(), known.P.copy(), known.B.copy(), known.L)
+
+
+def _room(known: Gaussian) -> FilterState:
+    """Arrays for an estimate of the same size."""
+    own = np.empty_like(known.x), np.empty_like(known.c), np.empty_like(known.P), np.empty_like(known.B)
+    return FilterState(*own, known.L)
 
 
 def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> Gaussian:
@@ -126,6 +133,8 @@ class FilterEngine:
         gates : renewed in place
         """
         assert len(before.L) == self.layout.width - self.layout.size  # kernels do not check where they write
+        if (taken := self._take(interval, before, gates)) is not None:
+            return taken
         processed: list[ProcessedMeasurement] = []
         departed = transition = None
         predicted = before
@@ -136,6 +145,51 @@ class FilterEngine:
             predicted = transition.predicted
         filtered = self.correct(predicted, interval.here, gates, processed)
         return FilterStep(departed, transition, filtered, processed)
+
+    def _take(self, interval: KeyframeInterval, before: Gaussian, gates: Gates) -> FilterStep | None:
+        """`step` by one call of a kernel, where kernels know all of it."""
+        if interval.motion is None or before.places or self._changes(interval) or poorly_known(before):
+            return None
+        measurements = [*interval.measurements]  # each is made when it is asked for
+        if any(m.sensor in self._given for m in measurements):
+            return None
+        between = [m for m in measurements if m.keyframe < interval.index]
+        here = [m for m in measurements if m.keyframe == interval.index]
+        departed, predicted = _room(before), _room(before)
+        own = self._interval(between + here, interval, len(between))
+        known, out = self._take_interval(before, own, gates, departed, predicted)
+        after = _estimate(predicted)
+        of = [before] * len(between) + [after] * len(here)
+        met = zip(between + here, of, out.nis.tolist(), out.weight.tolist(), strict=True)
+        processed = [ProcessedMeasurement(m, k.x, k.c, nis, weight) for m, k, nis, weight in met]
+        return FilterStep(_estimate(departed), Transition(out.F, out.Q, after), _estimate(known), processed)
+
+    def _interval(
+        self, measurements: Sequence[KeyframeMeasurement], moved: KeyframeInterval | None = None, between: int = 0
+    ) -> Interval:
+        """Measurements, the first ones of a keyframe before a motion, as kernels take them."""
+        motion, scale = _NO_MOTION, _EXACT[:, 0]
+        if moved is not None and moved.motion is not None:
+            motion, scale = moved.motion.row, scale if moved.scale_to_bias is None else moved.scale_to_bias
+        return Interval(motion, scale, *self._rows(measurements), between, *self._no_rows)
+
+    def _take_interval(
+        self,
+        before: Gaussian,
+        interval: Interval,
+        gates: Gates | None,
+        departed: FilterState = _NO_STATE,
+        predicted: FilterState = _NO_STATE,
+    ) -> tuple[FilterState, Taken]:
+        """The estimate after what a kernel makes of an interval, gates renewed in place."""
+        known, since, m, n = _state(before), self._since(gates or {}), len(interval.which), len(before.P)
+        of_motion = (n, n) if len(interval.motion) else (0, 0)
+        places = np.zeros(n - self.layout.size)
+        out = Taken(departed, predicted, np.empty(of_motion), np.empty(of_motion), np.empty(m), np.empty(m), places)
+        take_interval(known, interval, self._model, since, gates is not None, out)
+        if gates is not None:
+            self._renew(gates, since)
+        return known, out
 
     def _rows(self, measurements: Sequence[KeyframeMeasurement]) -> MeasurementRows:
         """Measurements as kernels take them."""
@@ -162,7 +216,7 @@ class FilterEngine:
         out = Filtered._make(np.empty(shape) for shape in shapes)
         intervals = Intervals(some.motions, some.scales, np.append(0, some.taken), some.first[:k], POORLY_KNOWN)
         measured = MeasurementRows(some.rows, some.which, some.row_scales)
-        taken = filter_intervals(known, intervals, measured, self._model, since, out, correct, predict_filter)
+        taken = filter_intervals(known, intervals, measured, self._model, since, out, take_interval)
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
         interval = np.arange(taken).repeat(np.diff(some.taken[:taken], prepend=0))
@@ -172,14 +226,8 @@ class FilterEngine:
 
     def predict(self, interval: KeyframeInterval, before: Gaussian) -> Transition:
         """The next keyframe, from the IMU alone; calibration walks."""
-        assert interval.motion is not None
-        n = len(before.P)
-        scale = _EXACT[:, 0] if interval.scale_to_bias is None else interval.scale_to_bias
-        P, B = before.P.copy(), before.B.copy()
-        out = Predicted(np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n)))
-        known = FilterState(before.x, before.c, P, B, before.L)
-        predict_filter(known, interval.motion.row, scale, self._model, out)
-        return Transition(out.F, out.Q, Gaussian(out.x, out.c, P, before.places, B, before.L))
+        known, out = self._take_interval(before, self._interval((), interval), None)
+        return Transition(out.F, out.Q, _estimate(known, before.places))
 
     def correct(
         self,
@@ -264,10 +312,14 @@ class FilterEngine:
         """What of the calibration takes another value after one time and up to another [s]."""
         return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
 
+    def _changes(self, interval: KeyframeInterval) -> list[str]:
+        """What of the calibration takes another value in an interval with motion."""
+        assert interval.motion is not None
+        return self.changes_in(interval.time - interval.motion.duration, interval.time)
+
     def _changed(self, known: Gaussian, interval: KeyframeInterval) -> Gaussian:
         """The keyframe before an interval, with the variance of what takes another value in it."""
-        assert interval.motion is not None
-        names = self.changes_in(interval.time - interval.motion.duration, interval.time)
+        names = self._changes(interval)
         if not names:
             return known
         P = known.P.copy()
@@ -292,18 +344,15 @@ class FilterEngine:
         processed: list[ProcessedMeasurement],
     ) -> Gaussian:
         """The estimate corrected by measurements of no places."""
-        given = [self._of_block(before, m) for m in measurements if m.sensor in self._given]
-        others = self._no_rows
+        own, given = (
+            self._interval(measurements),
+            [self._of_block(before, m) for m in measurements if m.sensor in self._given],
+        )
         if given:
-            others = GivenRows(np.concatenate([r for r, _ in given]), np.vstack([H for _, H in given]))
-        known, measured, since = _state(before), self._rows(measurements), self._since(gates or {})
-        m = len(measurements)
-        out = Corrected(np.empty(m), np.empty(m), np.zeros(len(before.P) - self.layout.size))
-        correct(known, measured, others, self._model, since, gates is not None, out)
-        if gates is not None:
-            self._renew(gates, since)
+            own = own._replace(given_r=np.concatenate([r for r, _ in given]), given_H=np.vstack([H for _, H in given]))
+        known, out = self._take_interval(before, own, gates)
         met = zip(measurements, out.nis.tolist(), out.weight.tolist(), strict=True)
-        processed += [ProcessedMeasurement(m, before.x, before.c, own, w) for m, own, w in met]
+        processed += [ProcessedMeasurement(m, before.x, before.c, nis, weight) for m, nis, weight in met]
         return _estimate(known, moved(before.places, out.places) if len(out.places) else before.places)
 
     def _since(self, gates: Gates) -> Array:
@@ -347,8 +396,6 @@ class FilterEngine:
 
     def _correct_by(self, before: Gaussian, m: KeyframeMeasurement, r: Array, H: Array) -> tuple[Gaussian, float]:
         """The estimate corrected by whitened rows that are at hand, and the weight of the measurement."""
-        known, since = _state(before), np.full(len(self._index), np.nan)
-        out = Corrected(np.empty(1), np.empty(1), np.zeros(len(before.P) - self.layout.size))
-        measured = MeasurementRows(np.zeros((1, at.ROW)), np.array([self._index[m.sensor]]), _EXACT)
-        correct(known, measured, GivenRows(r, H), self._model, since, False, out)
+        measured = np.zeros((1, at.ROW)), np.array([self._index[m.sensor]]), _EXACT
+        known, out = self._take_interval(before, Interval(_NO_MOTION, _EXACT[:, 0], *measured, 0, r, H), None)
         return _estimate(known, moved(before.places, out.places)), float(out.weight[0])
