@@ -187,3 +187,83 @@ def test_a_folder_that_an_interrupt_left_empty_is_compiled_again_and_said_to_be(
     assert again.stdout == first.stdout
     assert again.stderr.count("compiling rovgraph's kernels, once") == 1
     assert list(kept.rglob("*.nbi"))
+
+
+RENAMED = {  # what another numba might have changed
+    "a class": "from numba.core import codegen; codegen.Library = codegen.JITCodeLibrary; del codegen.JITCodeLibrary; ",
+    "an argument": "from numba.core.codegen import JITCodeLibrary as L; old = L.serialize_using_object_code; "
+    "L.serialize_using_object_code = lambda self: (*old(self), 'more'); "
+    "new = L._unserialize.__func__; L._unserialize = classmethod(lambda c, g, state: new(c, g, state[:3])); ",
+}
+
+IN_NUMBAS_WAY = """
+import numpy as np
+from collections.abc import Callable
+from typing import NamedTuple
+from rovgraph.kernels.compile import Vector, helper, kernel, view_helper
+
+class Pair(NamedTuple):
+    a: Vector
+    b: Vector
+
+@view_helper
+def dot(a, b):
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+@helper
+def ones(n):
+    return np.ones(n)
+
+@kernel(by_address=True)
+def product(pair: Pair) -> float:
+    return dot(pair.a, pair.b) + dot(ones(2), ones(2))
+
+@kernel()
+def twice(pair: Pair, product: Callable[[Pair], float]) -> float:
+    return 2.0 * product(pair)
+
+print(twice(Pair(np.ones(3), np.full(3, 2.0)), product))
+"""
+
+
+@pytest.mark.parametrize("changed", RENAMED)
+def test_a_numba_that_does_not_take_our_compilers_compiles_in_its_own_way_and_says_so_once(changed, tmp_path):
+    (tmp_path / "own_kernel.py").write_text(IN_NUMBAS_WAY)
+    code = RENAMED[changed] + f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import own_kernel"
+    first, second = (run(code, ROVGRAPH_CACHE_DIR=str(tmp_path / "kept")) for _ in range(2))
+    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
+    assert first.stdout == second.stdout == "16.0\n"
+    assert first.stderr.count("in its own way, more slowly") == 1
+    assert second.stderr == ""
+    assert list((tmp_path / "kept").rglob("*.nbc"))
+
+
+def test_a_numba_that_takes_our_compilers_is_tried_once(tmp_path):
+    (tmp_path / "own_kernel.py").write_text(IN_NUMBAS_WAY)
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import own_kernel"
+    done = run(code, ROVGRAPH_CACHE_DIR=str(tmp_path / "kept"))
+    assert done.stdout == "16.0\n" and "in its own way" not in done.stderr
+    [mark] = (tmp_path / "kept").glob("rovgraph-compilers-*")
+    assert mark.read_text() == "works"
+    untried = "from rovgraph.kernels import compile as c; c._try_out = None; " + code
+    assert run(untried, ROVGRAPH_CACHE_DIR=str(tmp_path / "kept")).stdout == "16.0\n"
+
+
+@pytest.mark.slow
+def test_a_command_runs_with_a_numba_that_does_not_take_our_compilers(tmp_path):
+    code = (
+        RENAMED["a class"] + "import sys; from rovgraph.cli import app; "
+        f"sys.argv = ['rovgraph', 'demo', '--out', {str(tmp_path / 'demo')!r}]; app.main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "ROVGRAPH_CACHE_DIR": str(tmp_path / "kept")},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "trusted" in done.stdout

@@ -43,21 +43,28 @@ from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
-from rovgraph.kernels.correction import Corrected, GivenRows, correct
+from rovgraph.kernels.correction import GivenRows
 from rovgraph.kernels.filter_state import FilterModel, FilterState
-from rovgraph.kernels.filtering import Filtered, Intervals, filter_intervals
+from rovgraph.kernels.filtering import Filtered, Interval, Intervals, Taken, filter_intervals, take_interval
 from rovgraph.kernels.measurement_row import MeasurementRows
 from rovgraph.kernels.moves import difference, move_estimate
-from rovgraph.kernels.prediction import Predicted, predict_filter
 from rovgraph.state import PLACE, PLACE_DIM
 
 ORIGIN = np.zeros(PLACE_DIM)  # where a place is put to begin with
 _EXACT = np.zeros((0, 6, 6))  # of an IMU without scale errors
+_NO_MOTION = np.zeros(0)
+_NO_STATE = FilterState(_NO_MOTION, _NO_MOTION, *[np.zeros((0, 0))] * 3)  # where none is asked for
 
 
 def _state(known: Gaussian) -> FilterState:
     """A copy for kernels, which write to it."""
     return FilterState(known.x.copy(), known.c.copy(), known.P.copy(), known.B.copy(), known.L)
+
+
+def _room(known: Gaussian) -> FilterState:
+    """Arrays for an estimate of the same size."""
+    own = np.empty_like(known.x), np.empty_like(known.c), np.empty_like(known.P), np.empty_like(known.B)
+    return FilterState(*own, known.L)
 
 
 def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> Gaussian:
@@ -124,8 +131,9 @@ class FilterEngine:
         gates : renewed in place
         """
         assert len(before.L) == self.layout.width - self.layout.size  # kernels do not check where they write
-        here = self._first_here(problem, k)
-        met = Met.of(problem, k, len(before.c))
+        here, met = self._first_here(problem, k), Met.of(problem, k, len(before.c))
+        if self._knows_all(problem, k, before):
+            return self._step(problem, k, before, gates, here, met)
         departed = transition = None
         predicted = before
         if k > 0:
@@ -135,6 +143,47 @@ class FilterEngine:
             predicted = transition.predicted
         filtered = self.correct(predicted, problem, slice(here, met.end), gates, met)
         return FilterStep(departed, transition, filtered, met)
+
+    def _knows_all(self, problem: Problem, k: int, before: Gaussian) -> bool:
+        """Whether kernels know all of the interval that ends with keyframe k."""
+        if k == 0 or before.places or poorly_known(before) or self._changes(problem, k):
+            return False
+        return not self._outside[problem.which[slice(*problem.measured_in(k))]].any()
+
+    def _step(self, problem: Problem, k: int, before: Gaussian, gates: Gates, here: int, met: Met) -> FilterStep:
+        """`step` by one call of a kernel."""
+        between, departed, predicted = here - met.begin, _room(before), _room(before)
+        own = self._interval(problem, slice(met.begin, met.end), k, between)
+        known, out = self._take_interval(before, own, gates, departed, predicted)
+        for some, of in ((slice(0, between), before), (slice(between, None), predicted)):
+            met.x[some], met.c[some] = of.x, of.c
+        met.nis[:], met.weight[:] = out.nis, out.weight
+        transition = Transition(out.F, out.Q, _estimate(predicted))
+        return FilterStep(_estimate(departed), transition, _estimate(known), met)
+
+    def _interval(self, problem: Problem, some: slice | Index, k: int = 0, between: int = 0) -> Interval:
+        """Measurements, the first ones before the motion to keyframe k, if there is one, as kernels take them."""
+        motion = problem.motions[k - 1] if k else _NO_MOTION
+        scale = problem.scales[k - 1] if k and len(problem.scales) else _EXACT[:, 0]
+        return Interval(motion, scale, *self._rows(problem, some), between, *self._no_rows)
+
+    def _take_interval(
+        self,
+        before: Gaussian,
+        interval: Interval,
+        gates: Gates | None,
+        departed: FilterState = _NO_STATE,
+        predicted: FilterState = _NO_STATE,
+    ) -> tuple[FilterState, Taken]:
+        """The estimate after what a kernel makes of an interval, gates renewed in place."""
+        known, since, m, n = _state(before), self._since(gates or {}), len(interval.which), len(before.P)
+        of_motion = (n, n) if len(interval.motion) else (0, 0)
+        places = np.zeros(n - self.layout.size)
+        out = Taken(departed, predicted, np.empty(of_motion), np.empty(of_motion), np.empty(m), np.empty(m), places)
+        take_interval(known, interval, self._model, since, gates is not None, out)
+        if gates is not None:
+            self._renew(gates, since)
+        return known, out
 
     def _first_here(self, problem: Problem, k: int) -> int:
         """The first measurement at keyframe k of those of the interval that ends with it."""
@@ -166,7 +215,7 @@ class FilterEngine:
         motions, scales = problem.motions[begin - 1 : end - 1], problem.scales[begin - 1 : end - 1]
         intervals = Intervals(motions, scales, np.append(0, taken), first, POORLY_KNOWN)
         measured = self._rows(problem, own)
-        done = filter_intervals(known, intervals, measured, self._model, since, out, correct, predict_filter)
+        done = filter_intervals(known, intervals, measured, self._model, since, out, take_interval)
         self._renew(gates, since)
         m = int(taken[done - 1]) if done else 0
         found = Filtered._make([*(array[:done] for array in out[:-2]), out.nis[:m], out.weight[:m]])
@@ -175,13 +224,8 @@ class FilterEngine:
 
     def predict(self, problem: Problem, k: int, before: Gaussian) -> Transition:
         """Keyframe k from the one before, by the IMU alone; calibration walks."""
-        n = len(before.P)
-        scale = problem.scales[k - 1] if len(problem.scales) else _EXACT[:, 0]
-        P, B = before.P.copy(), before.B.copy()
-        out = Predicted(np.empty(21), np.empty_like(before.c), np.empty((n, n)), np.empty((n, n)))
-        known = FilterState(before.x, before.c, P, B, before.L)
-        predict_filter(known, problem.motions[k - 1], scale, self._model, out)
-        return Transition(out.F, out.Q, Gaussian(out.x, out.c, P, before.places, B, before.L))
+        known, out = self._take_interval(before, self._interval(problem, slice(0, 0), k), None)
+        return Transition(out.F, out.Q, _estimate(known, before.places))
 
     def correct(
         self, before: Gaussian, problem: Problem, some: slice, gates: Gates | None, met: "Met | None" = None
@@ -264,9 +308,13 @@ class FilterEngine:
         """What of the calibration takes another value after one time and up to another [s]."""
         return [n for n in self.unknowns.estimated for time in self.beliefs[n].changes if begin < time <= end]
 
+    def _changes(self, problem: Problem, k: int) -> list[str]:
+        """What of the calibration takes another value between keyframe k and the one before."""
+        return self.changes_in(float(problem.time[k - 1]), float(problem.time[k]))
+
     def _changed(self, known: Gaussian, problem: Problem, k: int) -> Gaussian:
         """The keyframe before keyframe k, with the variance of what takes another value up to it."""
-        names = self.changes_in(float(problem.time[k - 1]), float(problem.time[k]))
+        names = self._changes(problem, k)
         if not names:
             return known
         P = known.P.copy()
@@ -288,16 +336,12 @@ class FilterEngine:
         self, before: Gaussian, problem: Problem, index: Index, gates: Gates | None, met: "Met | None"
     ) -> Gaussian:
         """The estimate corrected by measurements of no places."""
-        which, m = problem.which[index], len(index)
+        which = problem.which[index]
         given = [self._of_block(before, problem, row) for row in index[self._outside[which]].tolist()]
-        others = self._no_rows
+        own = self._interval(problem, index)
         if given:
-            others = GivenRows(np.concatenate([r for r, _ in given]), np.vstack([H for _, H in given]))
-        known, measured, since = _state(before), self._rows(problem, index), self._since(gates or {})
-        out = Corrected(np.empty(m), np.empty(m), np.zeros(len(before.P) - self.layout.size))
-        correct(known, measured, others, self._model, since, gates is not None, out)
-        if gates is not None:
-            self._renew(gates, since)
+            own = own._replace(given_r=np.concatenate([r for r, _ in given]), given_H=np.vstack([H for _, H in given]))
+        known, out = self._take_interval(before, own, gates)
         if met is not None:
             met.put(index, before, out.nis, out.weight)
         return _estimate(known, moved(before.places, out.places) if len(out.places) else before.places)
@@ -343,8 +387,6 @@ class FilterEngine:
 
     def _correct_by(self, before: Gaussian, r: Array, H: Array) -> tuple[Gaussian, float]:
         """The estimate corrected by whitened rows of a place that are at hand, and the weight of the measurement."""
-        known, since = _state(before), np.full(len(self._index), np.nan)
-        out = Corrected(np.empty(1), np.empty(1), np.zeros(len(before.P) - self.layout.size))
-        measured = MeasurementRows(np.zeros((1, at.ROW)), np.array([self._index[PLACE]]), _EXACT)
-        correct(known, measured, GivenRows(r, H), self._model, since, False, out)
+        measured = np.zeros((1, at.ROW)), np.array([self._index[PLACE]]), _EXACT
+        known, out = self._take_interval(before, Interval(_NO_MOTION, _EXACT[:, 0], *measured, 0, r, H), None)
         return _estimate(known, moved(before.places, out.places)), float(out.weight[0])

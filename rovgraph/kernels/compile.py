@@ -5,6 +5,10 @@ The folder is the first that can be written of ``ROVGRAPH_CACHE_DIR``, ``NUMBA_C
 Below it, one folder stands for each state of a module and of all kernels that it imports, so that a kernel which
 calls a helper of a changed module is compiled again, which numba's own cache does not notice.
 
+How kernels are compiled beyond what numba promises (`rovgraph.kernels.compilers`) is tried out on two small functions,
+once for each version of numba. Where a numba does not take it, kernels are compiled as numba does by itself, which
+takes longer.
+
 Where several modules are missing, as many processes as there are cores compile them, each module after those that it
 imports. A process keeps the helpers that it has compiled for its next modules.
 """
@@ -16,12 +20,13 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import IO, Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import IO, Annotated, Any, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,15 +39,12 @@ try:
     import numba
     from numba import njit, types
     from numba.extending import register_jitable
-
-    from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler, UncalledKernelCompiler
 except ImportError as error:
     raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61'") from None
 
 F = TypeVar("F", bound=Callable[..., Any])
 config: Any = numba.config
 KERNEL: Any = {"error_model": "numpy", "nogil": True}
-HELPER: Any = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # False: as kernels
 HELPS = "ROVGRAPH_HELPS_COMPILE"  # in the environment of a process that compiles for another one
 logger = logging.getLogger("rovgraph")
 
@@ -84,7 +86,7 @@ def signature_of(function: Callable[..., Any]) -> Any:
 
 def helper(function: F) -> F:
     """A function that is compiled into the kernels that call it; from Python it is called as it stands, slowly."""
-    registered: F = register_jitable(**HELPER)(function)
+    registered: F = register_jitable(**_compilation().helper)(function)
     return registered
 
 
@@ -93,7 +95,7 @@ def view_helper(function: F) -> F:
 
     It saves 5 to 10 ns for each array that is given or viewed, which in a helper of branches and loops adds up.
     """
-    registered: F = register_jitable(**HELPER, _nrt=False)(function)
+    registered: F = register_jitable(**_compilation().view_helper)(function)
     return registered
 
 
@@ -116,9 +118,8 @@ def kernel(signature: str | None = None, by_address: bool = False) -> Callable[[
     InputError : numba cannot compile it
     """
 
-    options = {**KERNEL, "pipeline_class": KernelCompiler if by_address else UncalledKernelCompiler}
-
     def decorate(function: F) -> F:
+        options = _compilation().called_kernel if by_address else _compilation().kernel
         folder, own = cache_folder(function.__module__), signature or signature_of(function)
         try:
             with _cache_in(folder):
@@ -133,6 +134,69 @@ def kernel(signature: str | None = None, by_address: bool = False) -> Callable[[
         return cast(F, compiled)
 
     return decorate
+
+
+class _Compilation(NamedTuple):
+    """Options of numba for each kind of function; all the same where numba compiles as it does by itself."""
+
+    helper: dict[str, Any] = KERNEL
+    view_helper: dict[str, Any] = KERNEL
+    kernel: dict[str, Any] = KERNEL
+    called_kernel: dict[str, Any] = KERNEL
+
+
+@cache
+def _compilation() -> _Compilation:
+    """Options by this package's compilers, or numba's own where these were tried and failed."""
+    parent = _writable_parent()
+    if config.DISABLE_JIT:
+        return _Compilation()
+    mark = parent and parent / f"rovgraph-compilers-{_state_of('compilers')}"
+    try:
+        outcome = mark.read_text() if mark else ""
+    except OSError:  # not tried yet
+        outcome = ""
+    if outcome == "failed":
+        return _Compilation()
+    try:
+        special = _special_compilation()
+        if not outcome:
+            _try_out(special)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {_first_line(error)}"
+        _say_once(f"numba {numba.__version__} compiles rovgraph's kernels in its own way, more slowly ({reason})")
+        special, outcome = _Compilation(), "failed"
+    if mark:
+        with contextlib.suppress(OSError):
+            mark.write_text(outcome or "works")
+    return special
+
+
+def _special_compilation() -> _Compilation:
+    from rovgraph.kernels.compilers import HelperCompiler, KernelCompiler, UncalledKernelCompiler
+
+    helping = {**KERNEL, "no_cpython_wrapper": False, "pipeline_class": HelperCompiler}  # False: as kernels
+    kernel, called = ({**KERNEL, "pipeline_class": each} for each in (UncalledKernelCompiler, KernelCompiler))
+    return _Compilation(helping, {**helping, "_nrt": False}, kernel, called)
+
+
+def _double(x: Array) -> float:
+    doubled: float = 2.0 * x[0]
+    return doubled
+
+
+def _double_more(x: Array) -> float:
+    return _double(x) + 1.0
+
+
+def _try_out(options: _Compilation) -> None:
+    """Compile a kernel with a helper, keep it, and load it: an error shows that numba does not take the options."""
+    register_jitable(**options.view_helper)(_double)
+    with tempfile.TemporaryDirectory() as folder, _cache_in(Path(folder)):
+        for each in (options.kernel, options.called_kernel):
+            made, loaded = (njit("f8(f8[::1])", cache=True, **each)(_double_more) for _ in range(2))
+            if not made(np.ones(1)) == loaded(np.ones(1)) == 3.0:
+                raise RuntimeError("another result")
 
 
 def cache_folder(module: str) -> Path | None:
@@ -282,7 +346,8 @@ def _writable(folder: Path) -> bool:
 @cache
 def _state_of(module: str) -> str:
     """A digest of a module, of all kernels that it imports, and of what compiles them."""
-    digest = hashlib.sha256(f"{rovgraph.__version__} {numba.__version__} {sys.version}".encode())
+    own = "" if module == "compilers" or _compilation().helper is not KERNEL else "as numba does"
+    digest = hashlib.sha256(f"{rovgraph.__version__} {numba.__version__} {sys.version}{own}".encode())
     for name in sorted(_imported_kernels(module.rpartition(".")[2])):
         digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
     return digest.hexdigest()[:16]
@@ -311,4 +376,4 @@ def _cache_in(folder: Path | None) -> Iterator[None]:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:200]
+    return (str(error).strip().splitlines() or [""])[0][:200]

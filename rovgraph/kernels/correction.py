@@ -8,7 +8,6 @@
 Which measurements enter, and what a sensor does that was left out for long, is in `rovgraph.kernels.admission`.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from rovgraph.geometry import Array
 from rovgraph.kernels.admission import admit, directions_seen
 from rovgraph.kernels.change_of_basis import change_basis, turn_rows
-from rovgraph.kernels.compile import Matrix, Vector, helper, kernel
+from rovgraph.kernels.compile import helper
 from rovgraph.kernels.error_coordinates import local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
 from rovgraph.kernels.filter_state import FilterModel, FilterState
@@ -145,10 +144,10 @@ def relinearize(
 
 
 class GivenRows(NamedTuple):
-    """Whitened rows of the measurements of kind `GIVEN`, in their order; what is considered comes last."""
+    """Whitened rows of k measurements of kind `GIVEN`, shapes (k,), (k, n); what is considered comes last."""
 
-    r: Vector
-    H: Matrix
+    r: Array
+    H: Array
 
 
 class Corrected(NamedTuple):
@@ -160,32 +159,31 @@ class Corrected(NamedTuple):
     places : correction of the places
     """
 
-    nis: Vector
-    weight: Vector
-    places: Vector
+    nis: Array
+    weight: Array
+    places: Array
 
 
-Correct = Callable[  # type of `correct`
-    [FilterState, MeasurementRows, GivenRows, FilterModel, Vector, bool, Corrected], None
-]
-
-
-@kernel(by_address=True)
+@helper
 def correct(
     known: FilterState,
     measured: MeasurementRows,
     given: GivenRows,
     model: FilterModel,
-    since: Vector,
+    since: Array,
     gated: bool,
     out: Corrected,
-) -> None:
+) -> int:
     """Correct a keyframe by m measurements, in place.
 
     Parameters
     ----------
     since : shape (s,), since when each sensor is left out, nan where it is not [s]
     gated : False lets everything in
+
+    Returns
+    -------
+    How many rows of ``given`` were taken
     """
     x, P, B, L = known.x, known.P, known.B, known.L
     rows, which, sensors, layout = measured.rows, measured.which, model.sensors, model.layout
@@ -224,7 +222,7 @@ def correct(
         else:
             entered = True
     if not entered:
-        return
+        return taken
     delta, behind = np.empty(n), np.zeros(len(layout.columns))
     weights = Weights(loss, bend, np.empty(m), np.empty(first[m]), np.empty_like(S))
     if taken == 0 and widest(S) > WIDE * WIDE:
@@ -238,3 +236,4 @@ def correct(
     move(known, delta, coordinates_of_velocity(x, P, layout))
     for i in range(len(places_out)):
         places_out[i] = delta[n - len(places_out) + i]
+    return taken

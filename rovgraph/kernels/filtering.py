@@ -1,21 +1,22 @@
-"""The filter over many intervals in a row: correct, predict, correct.
+"""The filter over one interval, and over many in a row: correct, predict, correct.
 
-What `rovgraph.engine.filter.FilterEngine.step` does with one, as far as nothing is needed that no kernel knows: it
-stops before an interval with a measurement that is `GIVEN`, and where the attitude is so poorly known that it has to
-be found before it is linearised at (`rovgraph.engine.alignment`).
+`filter_intervals` is what `rovgraph.engine.filter.FilterEngine.step` does, as far as nothing is needed that no kernel
+knows: it stops before an interval with a measurement that is `GIVEN`, and where the attitude is so poorly known that
+it has to be found before it is linearised at (`rovgraph.engine.alignment`).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compile import AnyMatrix, AnyVector, Index, Matrices, Matrix, Vector, helper, kernel, view_helper
-from rovgraph.kernels.correction import Correct, Corrected, GivenRows
+from rovgraph.kernels.correction import Corrected, GivenRows, correct
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import VELOCITY
 from rovgraph.kernels.measurement_row import GIVEN, KIND, MeasurementRows
-from rovgraph.kernels.prediction import Predicted, PredictFilter
+from rovgraph.kernels.prediction import predict_filter
 
 
 @helper
@@ -60,6 +61,88 @@ def _covariance(P: Array, B: Array, first: int, P_out: Array) -> None:
             for k in range(B.shape[1]):
                 total += B[first + i, k] * B[first + j, k]
             P_out[i, j] = total
+
+
+@view_helper
+def _keep(known: FilterState, out: FilterState) -> None:
+    """Copy an estimate, as far as there is room for it."""
+    _copy(known.x, out.x)
+    _copy(known.c, out.c)
+    for i in range(len(out.P)):
+        _copy(known.P[i], out.P[i])
+        _copy(known.B[i], out.B[i])
+
+
+class Interval(NamedTuple):
+    """One interval and its m measurements.
+
+    Attributes
+    ----------
+    motion : row of `rovgraph.kernels.motion_row`, or (0,): there is none, and all is measured at one keyframe
+    scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
+    rows, which, scales : of `MeasurementRows`
+    between : how many of them, the first ones, belong to the keyframe before
+    given_r, given_H : of `GivenRows`
+    """
+
+    motion: Vector
+    scale: Matrix
+    rows: Matrix
+    which: Index
+    scales: Matrices
+    between: int
+    given_r: Vector
+    given_H: Matrix
+
+
+class Taken(NamedTuple):
+    """What `take_interval` writes beside the estimate at the end.
+
+    Attributes
+    ----------
+    departed, predicted : the keyframe before, corrected, and that after it, not yet corrected; or
+        empty arrays where these are not asked for
+    F, Q : shape (n, n), transition from one to the other, and its noise
+    nis, weight : shape (m,), of the measurements; weight 0 = left out
+    places : correction of the places at the last keyframe
+    """
+
+    departed: FilterState
+    predicted: FilterState
+    F: Matrix
+    Q: Matrix
+    nis: Vector
+    weight: Vector
+    places: Vector
+
+
+TakeInterval = Callable[[FilterState, Interval, FilterModel, Vector, bool, Taken], None]  # type of `take_interval`
+
+
+@kernel(by_address=True)
+def take_interval(
+    known: FilterState, interval: Interval, model: FilterModel, since: Vector, gated: bool, out: Taken
+) -> None:
+    """Take one interval.
+
+    Parameters
+    ----------
+    known : the keyframe before it, afterwards that at its end
+    since : shape (s,), since when each sensor is left out, nan where it is not [s]
+    gated : False lets everything in
+    """
+    used, between = 0, interval.between
+    for arrived in range(2):
+        if arrived and len(interval.motion):
+            _keep(known, out.departed)
+            predict_filter(known, interval.motion, interval.scale, model, out.F, out.Q)
+            _keep(known, out.predicted)
+        begin, end = (between, len(interval.which)) if arrived else (0, between)
+        if begin < end:
+            measured = MeasurementRows(interval.rows[begin:end], interval.which[begin:end], interval.scales[begin:end])
+            given = GivenRows(interval.given_r[used:], interval.given_H[used:])
+            corrected = Corrected(out.nis[begin:end], out.weight[begin:end], out.places)
+            used += correct(known, measured, given, model, since, gated, corrected)
 
 
 class Intervals(NamedTuple):
@@ -110,8 +193,7 @@ def filter_intervals(
     model: FilterModel,
     since: Vector,
     out: Filtered,
-    correct: Correct,
-    predict_filter: PredictFilter,
+    take_interval: TakeInterval,
 ) -> int:
     """Take up to k intervals.
 
@@ -119,8 +201,7 @@ def filter_intervals(
     ----------
     known : the keyframe before them, afterwards that at the end of the last one that is taken
     measured : of the intervals
-    since : as `rovgraph.kernels.correction.correct`
-    correct, predict_filter : of `rovgraph.kernels.correction` and `rovgraph.kernels.prediction`
+    since, take_interval : of `take_interval`
 
     Returns
     -------
@@ -129,27 +210,20 @@ def filter_intervals(
     x, c, P, B, L = known
     rows, which, scales = measured
     taken, here = intervals.taken, intervals.here
-    size, nothing = model.walk.shape[1], np.empty(0)
-    given = GivenRows(nothing, np.empty((0, len(L))))
-    exact, there = np.empty((0, 0)), np.empty(21)
-    predicted = Predicted(there, c, np.empty((size, size)), np.empty((size, size)))
+    size, exact, nothing, none = model.walk.shape[1], np.empty((0, 0)), np.empty(0), np.empty((0, len(L)))
+    F, Q, untold = np.empty((size, size)), np.empty((size, size)), FilterState(nothing, nothing, exact, exact, exact)
     for k in range(len(here)):
         tilt, heading = attitude_variances(x, P)
+        begin, end = taken[k], taken[k + 1]
         poorly_known = tilt > intervals.poorly_known[0] or heading > intervals.poorly_known[1]
-        if poorly_known or not knows_all(which[taken[k] : taken[k + 1]], model.sensors):
+        if poorly_known or not knows_all(which[begin:end], model.sensors):
             return k
-        for arrived in range(2):
-            if arrived:
-                scale = intervals.scales[k] if len(intervals.scales) else exact
-                predict_filter(known, intervals.motions[k], scale, model, predicted)
-                _copy(there, x)
-                _copy(x, out.predicted_x[k])
-                _copy(c, out.predicted_c[k])
-            begin, end = (here[k], taken[k + 1]) if arrived else (taken[k], here[k])
-            if begin < end:
-                some = MeasurementRows(rows[begin:end], which[begin:end], scales[begin:end])
-                corrected = Corrected(out.nis[begin:end], out.weight[begin:end], nothing)
-                correct(known, some, given, model, since, True, corrected)
+        scale = intervals.scales[k] if len(intervals.scales) else exact
+        own = rows[begin:end], which[begin:end], scales[begin:end], here[k] - begin
+        interval = Interval(intervals.motions[k], scale, *own, nothing, none)
+        predicted = FilterState(out.predicted_x[k], out.predicted_c[k], exact, exact, exact)
+        some = Taken(untold, predicted, F, Q, out.nis[begin:end], out.weight[begin:end], nothing)
+        take_interval(known, interval, model, since, True, some)
         _copy(x, out.x[k])
         _copy(c, out.c[k])
         _covariance(P, B, 0, out.pose[k])

@@ -10,13 +10,11 @@ is a first-order Gauss-Markov process (Gelb 1974), of which F keeps exp(-dt / T)
 """
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import Matrix, Vector, helper, kernel, view_helper
+from rovgraph.kernels.compile import helper, view_helper
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
 from rovgraph.kernels.motion import predict_with_transition
@@ -72,36 +70,19 @@ def carry_considered(B: Array, F: Array, moved: Array, own: Array) -> None:
             B[i, k] *= F[i, i]
 
 
-class Predicted(NamedTuple):
-    """What `predict_filter` writes.
-
-    Attributes
-    ----------
-    x, c : state and calibration vector after the interval; c may be that before it
-    F, Q : shape (n, n), transition and noise
-    """
-
-    x: Vector
-    c: Vector
-    F: Matrix
-    Q: Matrix
-
-
-PredictFilter = Callable[[FilterState, Vector, Matrix, FilterModel, Predicted], None]  # type of `predict_filter`
-
-
-@kernel(by_address=True)
-def predict_filter(before: FilterState, motion: Vector, scale: Matrix, model: FilterModel, out: Predicted) -> None:
-    """Carry an estimate over an interval.
+@helper
+def predict_filter(
+    known: FilterState, motion: Array, scale: Array, model: FilterModel, F_out: Array, Q_out: Array
+) -> None:
+    """Carry an estimate over an interval, in place.
 
     Parameters
     ----------
-    before : the keyframe before; its P and B become those of the keyframe after
     motion : row of `rovgraph.kernels.motion_row`
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
+    F_out, Q_out : shape (n, n), transition and noise
     """
-    x, c, P, B, L = before
-    x_out, c_out, F_out, Q_out = out
+    x, c, P, B, L = known
     column, walk, estimated = model.column, model.walk, model.walk.shape[1]
     n, moved = len(P), np.zeros((MOVED, len(L)))
     bias, F, Q = x[15:21].copy(), np.zeros((MOTION, MOTION)), np.zeros((MOTION, MOTION))
@@ -109,20 +90,19 @@ def predict_filter(before: FilterState, motion: Vector, scale: Matrix, model: Fi
         for i in range(6):
             for k in range(6):
                 bias[i] += scale[i, k] * c[ACC_SCALE + k]
-    R_out = x_out[0:9].reshape(3, 3)
+    there = np.empty(15)
+    R_out = there[0:9].reshape(3, 3)
     predict_with_transition(
-        motion, x[0:9].reshape(3, 3), x[9:12], x[12:15], bias, R_out, x_out[9:12], x_out[12:15], F, Q
+        motion, x[0:9].reshape(3, 3), x[9:12], x[12:15], bias, R_out, there[9:12], there[12:15], F, Q
     )
-    for i in range(15, 21):
-        x_out[i] = x[i]
+    for i in range(15):
+        x[i] = there[i]
     F_out.fill(0.0)
     Q_out.fill(0.0)
     for i in range(n):
         F_out[i, i] = 1.0
     for i in range(estimated):
         Q_out[i, i] = walk[0, i] * motion[DURATION]
-    for i in range(len(c)):
-        c_out[i] = c[i]
     for i in range(MOTION, len(column)):
         own = column[i]
         if 0 <= own < estimated and walk[1, own] > 0.0:
@@ -130,7 +110,7 @@ def predict_filter(before: FilterState, motion: Vector, scale: Matrix, model: Fi
             keep = math.exp(-rate * motion[DURATION])
             F_out[own, own] = keep
             Q_out[own, own] = walk[0, own] * (1.0 - keep * keep) / (2.0 * rate)
-            c_out[i - MOTION] = walk[2, own] + keep * (c[i - MOTION] - walk[2, own])
+            c[i - MOTION] = walk[2, own] + keep * (c[i - MOTION] - walk[2, own])
     for i in range(MOTION):
         for j in range(MOTION):
             F_out[i, j] = F[i, j]
