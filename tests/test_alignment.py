@@ -10,7 +10,6 @@ import rovgraph.engine.alignment as alignment
 from rovgraph.engine import filter
 from rovgraph.engine.alignment import aligned, poorly_known, with_attitude
 from rovgraph.engine.filter_step import Gaussian
-from rovgraph.engine.keyframes import KeyframeInterval
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, exp_rotation, log_rotation, rpy_from_matrix
@@ -20,13 +19,14 @@ GRAVITY = 9.81
 
 @pytest.fixture(scope="module")
 def met():
-    """A filter in the middle of a dive, the next interval, and the true attitude at its keyframe."""
+    """A filter in the middle of a dive, what `aligned` takes of the next interval, and the true attitude there."""
     case = simulated(falcon(), 45.0, seed=6, dvl_rate=4.0)
     estimator = fed(RecordingFilter(initialise(case.log, case.config)), case.log)
-    index = 80
-    interval = estimator.intervals[index + 1]
-    true = case.truth.R_nb[np.searchsorted(case.truth.time, estimator.intervals[index].time)]
-    return estimator.engine, estimator.filtered[index], interval, true
+    index, problem = 80, estimator.problem
+    true = case.truth.R_nb[np.searchsorted(case.truth.time, problem.time[index])]
+    between = slice(problem.measured_in(index + 1)[0], int(problem.first[index + 1]))
+    assert between.stop > between.start
+    return estimator.engine, estimator.filtered[index], (problem, index + 1, between), true
 
 
 def doubted(known, turn_n: Array, sd: Array):
@@ -38,8 +38,9 @@ def doubted(known, turn_n: Array, sd: Array):
     return Gaussian.of(replace(known.state, R_nb=R_nb[None]), P)
 
 
-def without_measurements(interval: KeyframeInterval) -> KeyframeInterval:
-    return replace(interval, measurements=[])
+def without_measurements(interval):
+    problem, k, between = interval
+    return problem, k, slice(between.start, between.start)
 
 
 def test_an_attitude_is_vague_from_a_tilt_of_four_degrees_or_a_heading_of_ten(met):
@@ -54,7 +55,7 @@ def test_an_attitude_is_vague_from_a_tilt_of_four_degrees_or_a_heading_of_ten(me
 def test_a_heading_that_is_far_off_is_found_from_one_sample_of_the_compasses(met, off):
     engine, known, interval, true = met
     lost = doubted(known, np.deg2rad([0.0, 0.0, off]), np.deg2rad([0.5, 0.5, 70.0]))
-    found = aligned(lost, interval, engine.linearize, GRAVITY)
+    found = aligned(lost, *interval, engine.linearize, GRAVITY)
     error = np.rad2deg(log_rotation(true @ found.state.R_nb[0].T))
     assert abs(error[2]) < 6.0  # a step of those that are tried, and what compasses are off by
 
@@ -62,20 +63,20 @@ def test_a_heading_that_is_far_off_is_found_from_one_sample_of_the_compasses(met
 def test_without_a_compass_nothing_is_turned(met):
     engine, known, interval, _ = met
     lost = doubted(known, np.deg2rad([0.0, 0.0, 90.0]), np.deg2rad([0.5, 0.5, 70.0]))
-    assert aligned(lost, without_measurements(interval), engine.linearize, GRAVITY) is lost
+    assert aligned(lost, *without_measurements(interval), engine.linearize, GRAVITY) is lost
 
 
 def test_a_tilt_that_is_far_off_is_levelled_by_the_specific_force(met):
     engine, known, interval, true = met
     lost = doubted(known, np.deg2rad([9.0, -12.0, 0.0]), np.deg2rad([10.0, 10.0, 1.0]))
-    found = aligned(lost, without_measurements(interval), engine.linearize, GRAVITY)
+    found = aligned(lost, *without_measurements(interval), engine.linearize, GRAVITY)
     assert np.abs(rpy_from_matrix(found.state.R_nb[0]) - rpy_from_matrix(true))[:2].max() < np.deg2rad(2.0)
 
 
 def test_what_cannot_be_gravity_levels_nothing(met):
     engine, known, interval, _ = met
     lost = doubted(known, np.deg2rad([9.0, -12.0, 0.0]), np.deg2rad([10.0, 10.0, 1.0]))
-    same = aligned(lost, without_measurements(interval), engine.linearize, 2.0 * GRAVITY)
+    same = aligned(lost, *without_measurements(interval), engine.linearize, 2.0 * GRAVITY)
     np.testing.assert_array_equal(same.state.R_nb, lost.state.R_nb)
 
 

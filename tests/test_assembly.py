@@ -440,3 +440,12 @@ def test_restored_from_its_state_an_assembly_goes_on_as_if_nothing_had_happened(
     same(before.problem.keyframes[first:, :12], after.problem.keyframes[first:, :12])
     same(before.problem.motions[-40:], after.problem.motions[-40:])
     same(before.problem.rows[-100:], after.problem.rows[-100:])
+
+
+@pytest.mark.parametrize("estimate", [False, True])
+def test_what_is_stamped_late_stands_as_much_earlier(estimate):
+    late = {"depth_time_offset": {"estimate": estimate, "mean": 0.1, "sd": 0.01}}
+    config = Config.model_validate({"calibration": late})
+    problem, _ = assembled(log_of(2.0, [0.5, 0.9], depth=scalar([0.731])), config)
+    [depth] = found(problem, "depth")
+    assert depth.time == pytest.approx(0.631) and depth.dt == pytest.approx(0.131)

@@ -6,17 +6,17 @@ import gtsam
 import numpy as np
 import pytest
 from dives import Simulated, batch, falcon, renewed, simulated, started, true_at
+from motions import predict
 from test_calibration_recovery import PINGS, errors
 
 from rovgraph.config import beliefs
 from rovgraph.engine import gauss_newton
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
-from rovgraph.engine.keyframes import KeyframeInterval
-from rovgraph.engine.transition import predict
+from rovgraph.engine.problem import Problem
 from rovgraph.engine.unknowns import Unknowns, unknowns
 from rovgraph.geometry import log_rotation, rotate, transpose
-from rovgraph.graph.factors import motion
+from rovgraph.graph.motion_factors import motion_factor
 from rovgraph.graph.places import smooth_graph
 from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.simulate import Style, Waves
@@ -49,7 +49,7 @@ def test_the_chain_knows_of_the_scales_what_gtsams_graph_knows(monkeypatch):
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))
     chain = smoother.optimum()
-    graph = smooth_graph(smoother.intervals, smoother.initial, chain.state)
+    graph = smooth_graph(smoother.problem, smoother.initial, chain.state)
     assert chain.solution.cost == pytest.approx(graph.solution.cost, rel=1e-6)
     for name in SCALES:
         np.testing.assert_allclose(chain.covariances(name)[-1], graph.covariances(name)[-1], rtol=1e-3, atol=1e-12)
@@ -63,26 +63,34 @@ def test_scales_that_are_known_are_held_and_fit():
     assert fitted.summary["cost"] < 1e-2 * misfit.summary["cost"]
 
 
-def interval_and_states() -> tuple[KeyframeInterval, Unknowns, State, State]:
-    """A lively interval, with states that do not quite fit it."""
+K = 60  # a lively interval
+
+
+def dive_and_states() -> tuple[Problem, Unknowns, State, State]:
+    """A dive, with states around interval `K` that do not quite fit it."""
     case = scaled(noise=True, seconds=40.0)
     smoother = batch(case.log, started(case))
-    interval = smoother.intervals[60]
+    problem = smoother.problem
     wanted = unknowns(beliefs(smoother.initial.config), smoother.initial.instruments).of(SCALES)
-    at = true_at(case, np.array([smoother.intervals[59].time]))
+    at = true_at(case, problem.time[[K - 1]])
     means = {**wanted.fixed, **{name: np.array(value) for name, value in SCALES.items()}}
     before = State(at.R_nb, at.p_n, at.v_n, 0.01 * np.ones((1, 6)), means)
-    after = predict(interval, before).retract(VELOCITY, np.array([0.01, 0.02, -0.01]))
-    return interval, wanted, before, after
+    after = across(problem, before).retract(VELOCITY, np.array([0.01, 0.02, -0.01]))
+    return problem, wanted, before, after
+
+
+def across(problem: Problem, before: State) -> State:
+    """The state that is predicted after interval `K`."""
+    return predict(problem.motions[K - 1], before, problem.scales[K - 1])
 
 
 def test_factor_of_a_motion_with_scales_is_linearised_as_its_error_moves():
-    interval, wanted, before, after = interval_and_states()
+    problem, wanted, before, after = dive_and_states()
     values = gtsam.Values()
-    insert_state(values, interval.index - 1, before)
-    insert_state(values, interval.index, after)
+    insert_state(values, K - 1, before)
+    insert_state(values, K, after)
     insert_calibration(values, before.calibration, wanted)
-    (factor,) = motion(interval, wanted, interval.index)
+    factor = motion_factor(problem, K, wanted, K)
     linear = factor.linearize(values)
     A, _ = linear.jacobian()
     numeric, step = [], 1e-6
@@ -99,16 +107,16 @@ def test_factor_of_a_motion_with_scales_is_linearised_as_its_error_moves():
 
 
 def test_transition_of_the_filter_holds_the_derivative_by_the_scales():
-    interval, _, before, _ = interval_and_states()
+    problem, _, before, _ = dive_and_states()
     case = scaled(noise=True, seconds=40.0)
     engine = FilterEngine(batch(case.log, started(case)).initial)
     before = replace(before, calibration={**engine.unknowns.fixed, **before.calibration})
-    transition = engine.predict(interval, Gaussian.of(before, engine.start().P))
+    transition = engine.predict(problem, K, Gaussian.of(before, engine.start().P))
     d = 1e-5
     for name in SCALES:
         columns = transition.F[:15, engine.layout.columns[name]]
         for c in range(3):
-            ends = [predict(interval, before.retract(name, s * d * np.eye(3)[c])) for s in (1, -1)]
+            ends = [across(problem, before.retract(name, s * d * np.eye(3)[c])) for s in (1, -1)]
             turn = log_rotation(transpose(ends[1].R_nb) @ ends[0].R_nb)[0]
             shift = rotate(transpose(transition.predicted.state.R_nb), ends[0].p_n - ends[1].p_n)[0]
             change = np.concatenate([turn, shift, (ends[0].v_n - ends[1].v_n)[0], np.zeros(6)])

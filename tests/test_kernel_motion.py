@@ -57,9 +57,7 @@ class Case:
         row[GAP], row[GRAVITY] = gap, 9.81
         row[BIAS : BIAS + 6], row[NOISE : NOISE + 5] = self.bias, self.densities
         row[EARTH_RATE : EARTH_RATE + 3] = self.earth_rate
-        begin, end, count = np.array([self.start]), np.array([self.end]), np.array([0, len(self.imu)])
-        own = np.array([0, len(self.stops)])
-        preintegrate(self.imu, count[:1], count[1:], begin, end, self.stops, own, row[None], snapshots)
+        preintegrate(self.imu, self.start, self.end, self.stops, row, snapshots)
         return row, snapshots
 
     def pim(self, end: float = np.inf) -> gtsam.PreintegratedCombinedMeasurements:

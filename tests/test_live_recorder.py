@@ -324,7 +324,7 @@ def test_no_checkpoint_and_one_of_another_version_are_refused(tmp_path):
         read_checkpoint(tmp_path / "missing")
     write_checkpoint(tmp_path / "a", {})
     (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes().replace(b"checkpoint 6 ", b"checkpoint 3 "))
-    with pytest.raises(InputError, match="of version 3, expected 6"):
+    with pytest.raises(InputError, match="of version 3, expected 7"):
         read_checkpoint(tmp_path / "a")
 
 

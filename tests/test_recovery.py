@@ -8,6 +8,10 @@ from rovgraph.engine.keyframes import KeyframeMeasurement
 from rovgraph.dive import assemble
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import Gaussian
+<<<<<<< HEAD
+=======
+from rovgraph.engine.problem import Problem
+>>>>>>> k.house38d
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter, replay
 from rovgraph.geometry import Array
 from rovgraph.kernels.error_coordinates import ErrorLayout
@@ -68,30 +72,31 @@ def test_fixes_that_are_wrong_for_minutes_do_not_draw_the_filter(wrong):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_correction_of_a_wide_prediction_is_at_the_optimum_of_its_cost(case, seed):
     """Where H' r + P^-1 e = 0, e back to the prediction. Linearised once, it is many sds away."""
-    engine, known, ping = about_to_return(case, np.random.default_rng(seed))
-    after = engine.correct(known, [ping], {}, [])
-    r, H = engine.linearize(known, [ping])
+    engine, known, problem, ping = about_to_return(case, np.random.default_rng(seed))
+    after = engine.correct(known, problem, slice(ping, ping + 1), {})
+    r, H = engine.linearize(known, problem, np.array([ping]))
     delta = known.P @ H.T @ np.linalg.solve(H @ known.P @ H.T + np.eye(3), r)
     x, c, P = known.x.copy(), known.c.copy(), after.P.copy()
     move_estimate(FilterState(x, c, P, np.zeros((len(P), 0)), np.zeros((0, 0))), delta, along_n(engine))
-    assert from_optimum(engine, known, after, ping) < 0.1
-    assert from_optimum(engine, known, Gaussian(x, c, after.P), ping) > 2.0
+    assert from_optimum(engine, known, after, problem, ping) < 0.1
+    assert from_optimum(engine, known, Gaussian(x, c, after.P), problem, ping) > 2.0
 
 
-def about_to_return(case: Simulated, rng: np.random.Generator) -> tuple[FilterEngine, Gaussian, KeyframeMeasurement]:
-    """A prediction after a long silence, off by an error of its covariance, and the first ping."""
+def about_to_return(case: Simulated, rng: np.random.Generator) -> tuple[FilterEngine, Gaussian, Problem, int]:
+    """A prediction after a long silence, off by an error of its covariance, and the first ping of the dive after it."""
     config = falcon(dvl={"loss": "none"})
-    batch = assemble(interrupted(case.log, SILENT_FROM, 160.0, "dvl"), initial_conditions(case.log, config))
-    back = next(k for k, i in enumerate(batch.intervals) if i.time > SILENT_FROM + 159.9)
-    interval = batch.intervals[back]
-    estimator = replay(batch.intervals[:back], batch.initial, REINITIALISE_AT_S)
+    dive = assemble(interrupted(case.log, SILENT_FROM, 160.0, "dvl"), initial_conditions(case.log, config))
+    problem = dive.problem
+    back = int(problem.time.searchsorted(SILENT_FROM + 159.9, side="right"))
+    estimator = replay(problem.upto(back), dive.initial, REINITIALISE_AT_S)
     engine = estimator.engine
-    before = engine.correct(estimator.known, interval.between, {}, [])
-    known = engine.predict(interval, before).predicted
+    (begin, end), here = problem.measured_in(back), int(problem.first[back])
+    before = engine.correct(estimator.known, problem, slice(begin, here), {})
+    known = engine.predict(problem, back, before).predicted
     error = np.linalg.cholesky(known.P) @ rng.standard_normal(len(known.P))
     off = engine.retract(known, error, known.P)
-    [ping] = [m for m in interval.here if m.sensor == "dvl"]
-    return engine, Gaussian(off.x, off.c, known.P), ping
+    [ping] = [row for row in problem.of_sensor("dvl").tolist() if here <= row < end]
+    return engine, Gaussian(off.x, off.c, known.P), problem, ping
 
 
 def along_n(engine: FilterEngine) -> ErrorLayout:
@@ -101,11 +106,11 @@ def along_n(engine: FilterEngine) -> ErrorLayout:
     return ErrorLayout(columns, seen[others], params[others], rows)
 
 
-def from_optimum(engine: FilterEngine, known: Gaussian, there: Gaussian, ping: KeyframeMeasurement) -> float:
+def from_optimum(engine: FilterEngine, known: Gaussian, there: Gaussian, problem: Problem, ping: int) -> float:
     """The largest component of a Newton step from an estimate, in its sds."""
     back, basis = np.empty(engine.layout.size), np.eye(engine.layout.size)
     difference(there.x, there.c, known.x, known.c, along_n(engine), back, basis)
-    r, H = engine.linearize(there, [ping])
+    r, H = engine.linearize(there, problem, np.array([ping]))
     P = basis @ known.P @ basis.T
     step = P @ H.T @ np.linalg.solve(H @ P @ H.T + np.eye(len(r)), r - H @ back) + back
     return float((np.abs(step) / np.sqrt(np.diag(there.P))).max())

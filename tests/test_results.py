@@ -8,6 +8,7 @@ from dives import falcon
 
 from rovgraph.estimators.results import body_trajectory
 from rovgraph.geometry import exp_rotation, skew
+from rovgraph.kernels.assembly import KEYFRAME, RATE_B, SPREAD, TIME
 from rovgraph.state import State
 
 ARM_B = np.array([2.0, -2.0, 1.0])  # 3 m
@@ -24,13 +25,14 @@ def published():
     rate_b, rate_sd = rng.normal(0.0, 0.5, (N, 3)), 0.02
     roots = rng.normal(0.0, 0.02, (N, 6, 6))
     cov_pose, cov_v = roots @ roots.transpose(0, 2, 1), np.tile(np.diag([1e-4, 4e-4, 9e-4]), (N, 1, 1))
-    intervals = [SimpleNamespace(time=float(k), rate_b=rate_b[k], rate_sd=rate_sd) for k in range(N)]
+    keyframes = np.zeros((N, KEYFRAME))
+    keyframes[:, TIME], keyframes[:, RATE_B : RATE_B + 3], keyframes[:, SPREAD] = np.arange(N), rate_b, rate_sd
     config = falcon(imu={"lever_arm_m": ARM_B.tolist()})
     initial = SimpleNamespace(config=config, beliefs={}, streams=())
     states = State(R_nb, p_n, v_n, bias, {})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rovgraph.estimators.results.rests_on_doubtful_compass", lambda initial: False)
-        track = body_trajectory(intervals, states, initial, cov_pose, cov_v)
+        track = body_trajectory(keyframes, states, initial, cov_pose, cov_v)
     return states, rate_b, rate_sd, cov_pose, cov_v, track
 
 

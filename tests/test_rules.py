@@ -5,6 +5,7 @@ from math import hypot, inf, isfinite, nan, sqrt
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pandas as pd
@@ -368,8 +369,8 @@ def of_motions(residuals_: Array, monkeypatch: pytest.MonkeyPatch) -> Evidence:
     bias = History(("x", "y", "z"), "", times, np.zeros((len(times), 3)), np.ones((len(times), 3)))
     seen = evidence(optimum=SimpleNamespace())
     smoothed = replace(seen.estimates[0], history={"acc_bias": bias, "gyr_bias": bias})
-    intervals = [SimpleNamespace(time=float(t), bridged=False) for t in times]
-    return replace(seen, estimates=[smoothed, seen.estimates[1]], problem=intervals)
+    problem = MagicMock(time=times, bridged=np.zeros(len(times), bool), __len__=lambda _: len(times))
+    return replace(seen, estimates=[smoothed, seen.estimates[1]], problem=problem)
 
 
 @levels
