@@ -67,14 +67,9 @@ def custom_factor(problem: Problem, k: int, fixed: Mapping[str, Array], keys: Ma
         scales = {name: values.atVector(keys[name]) if name in keys else fixed[name] for name in SCALES}
         one = State(at_.rotation().matrix()[None], at_.translation()[None], v_n[None], b[None], scales)
         seen = one if S is None else biased(one, S[None])
-<<<<<<< HEAD
-        R, p, v, b = (np.array(a, order="C") for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias))
-        return R, p, v, b
-=======
         # copies: GTSAM's arrays may be read-only, which kernels do not take
         R, p, v, bias_b = (np.array(a, order="C") for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias))
         return R, p, v, bias_b
->>>>>>> k.house38d
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
         r, A_i, A_j = np.empty((1, 15)), np.empty((1, 15, 15)), np.empty((1, 15, 15))
