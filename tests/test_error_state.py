@@ -22,8 +22,7 @@ from dives import (
     started,
     without,
 )
-from rovgraph.engine.keyframes import KeyframeInterval, KeyframeMeasurement
-from rovgraph.engine.transition import predict, transitions
+from motions import predict, transition
 from scipy.optimize import minimize
 from test_consistency import OVERCONFIDENT, band, drawn, nees
 
@@ -31,16 +30,19 @@ from rovgraph.calibration import LAYOUT, TABLE, calibration_size
 from rovgraph.config import Config, beliefs
 from rovgraph.engine import error_layout
 from rovgraph.engine.filter import FilterEngine
-from rovgraph.engine.filter_step import Gaussian, ProcessedMeasurement
+from rovgraph.engine.filter_step import Gaussian, Met
 from rovgraph.engine.initial_conditions import InitialConditions, StatePrior
 from rovgraph.engine.measurements import loss_and_weight, loss_threshold
 from rovgraph.engine.preintegration import INTEGRATION_SD, preintegrate, preintegration_params
+from rovgraph.engine.problem import Index, Problem
 from rovgraph.estimators.eskf.error_state import ErrorStateFilter, replay
 from rovgraph.estimators.initialise import initialise
 from rovgraph.geometry import Array, log_rotation, matrix_from_rpy, transpose
 from rovgraph.instruments import instruments
 from rovgraph.kernels import measurement_row
 from rovgraph.kernels.admission import DISTRUSTED_S, RETURN_SD, admit, directions_seen
+from rovgraph.kernels.error_coordinates import ErrorLayout as Coordinates
+from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.motion_row import DURATION, ROW
 from rovgraph.kernels.prediction import predict_filter
@@ -81,11 +83,21 @@ def estimator(case) -> RecordingFilter:
     return filtered(case.log, case.config)
 
 
-def measuring(m: KeyframeMeasurement, z: Array) -> KeyframeMeasurement:
-    """The same measurement, of other components."""
-    row = m.row.copy()
-    row[measurement_row.Z : measurement_row.Z + m.dim] = z
-    return replace(m, row=row)
+def measuring(dive: Problem, row: int, z: Array) -> Problem:
+    """The same dive, with other components of one measurement."""
+    rows = dive.rows.copy()
+    rows[row, measurement_row.Z : measurement_row.Z + len(z)] = z
+    return replace(dive, rows=rows)
+
+
+def between(dive: Problem, k: int) -> slice:
+    """Measurements from the keyframe before keyframe k to it."""
+    return slice(dive.measured_in(k)[0], int(dive.first[k]))
+
+
+def here(dive: Problem, k: int) -> slice:
+    """Measurements at keyframe k, of the interval that ends with it."""
+    return slice(int(dive.first[k]), dive.measured_in(k)[1])
 
 
 # motion
@@ -101,11 +113,8 @@ def moving(seconds: float, rate: float = 100.0) -> tuple[State, Array]:
     return State(attitude, np.array([[3.0, -2.0, 5.0]]), np.array([[0.4, -0.2, 0.1]]), bias), np.column_stack([t, f, w])
 
 
-def interval_of(samples: Array, seconds: float, bias: Array, config: Config) -> KeyframeInterval:
-    noise = config.imu.noise
-    params = preintegration_params(config, noise.acc, noise.gyr)
-    motion, _ = preintegrate(params, bias, samples, 0.0, np.empty(0), seconds)
-    return KeyframeInterval(1, seconds, 0, np.zeros(3), 0.0, motion, [])
+def motion_of(samples: Array, seconds: float, bias: Array, config: Config) -> Array:
+    return preintegrate(preintegration_params(config), bias, samples, 0.0, np.empty(0), seconds)[0]
 
 
 def difference(state: State, other: State) -> Array:
@@ -118,12 +127,12 @@ def difference(state: State, other: State) -> Array:
 
 def test_transition_is_the_derivative_of_the_prediction():
     state, samples = moving(0.5)
-    interval = interval_of(samples, 0.5, np.zeros(6), falcon())
-    [after], [F], _ = transitions([interval], [state])
+    motion = motion_of(samples, 0.5, np.zeros(6), falcon())
+    after, F, _ = transition(motion, state)
     step, columns = 1e-5, []
     for variable, size in DIMENSION.items():
         for k in range(size):
-            ends = [predict(interval, state.retract(variable, sign * step * np.eye(size)[k])) for sign in (1, -1)]
+            ends = [predict(motion, state.retract(variable, sign * step * np.eye(size)[k])) for sign in (1, -1)]
             columns.append((difference(after, ends[0]) - difference(after, ends[1])) / (2 * step))
     np.testing.assert_allclose(F, np.column_stack(columns), atol=1e-6)
 
@@ -135,8 +144,7 @@ def test_process_noise_is_that_of_noisy_samples():
     noise = config.imu.noise
     state, samples = moving(seconds)
     state = replace(state, bias=np.zeros((1, 6)))
-    interval = interval_of(samples, seconds, np.zeros(6), config)
-    [exact], _, [Q] = transitions([interval], [state])
+    exact, _, Q = transition(motion_of(samples, seconds, np.zeros(6), config), state)
     densities = np.repeat([noise.acc, noise.gyr], 3)
     walks = np.repeat([noise.acc_walk, noise.gyr_walk], 3)
     errors = []
@@ -144,7 +152,7 @@ def test_process_noise_is_that_of_noisy_samples():
         drift = np.cumsum(walks / np.sqrt(rate) * rng.standard_normal((len(samples), 6)), axis=0)
         noisy = samples.copy()
         noisy[:, 1:] += drift + densities * np.sqrt(rate) * rng.standard_normal((len(samples), 6))
-        predicted = predict(interval_of(noisy, seconds, np.zeros(6), config), state)
+        predicted = predict(motion_of(noisy, seconds, np.zeros(6), config), state)
         integration = INTEGRATION_SD * np.sqrt(seconds) * rng.standard_normal((1, 3))
         truth = replace(exact, p_n=exact.p_n + integration, bias=drift[[int(seconds * rate)]])
         errors.append(difference(predicted, truth))
@@ -156,20 +164,21 @@ def test_process_noise_is_that_of_noisy_samples():
 
 def test_all_measurements_of_a_keyframe_together_are_linearised_as_each_alone(estimator):
     """By the filter's kernel as by the models that the smoother uses."""
-    engine, interval = estimator.engine, max(estimator.intervals, key=lambda i: len({m.sensor for m in i.measurements}))
-    known = estimator.filtered[interval.index]
-    assert len(interval.measurements) > 2
-    assert any(m.motion.dt for m in interval.measurements)
-    r, H = engine.linearize(known, interval.measurements)
-    for m, part in zip(interval.measurements, parts_of(interval.measurements), strict=True):
-        alone, jacobians = engine.block([m]).linearize(known.state)
+    engine, dive = estimator.engine, estimator.problem
+    k = max(range(len(dive)), key=lambda k: len(set(dive.which[slice(*dive.measured_in(k))].tolist())))
+    known, index = estimator.filtered[k], np.arange(*dive.measured_in(k))
+    assert len(index) > 2
+    assert dive.rows[index, measurement_row.DT].any()
+    r, H = engine.linearize(known, dive, index)
+    for row, part in zip(index, parts_of(dive, index), strict=True):
+        alone, jacobians = engine.block(dive, np.array([row])).linearize(known.state)
         np.testing.assert_allclose(r[part], alone[0], atol=1e-9)
         np.testing.assert_allclose(H[part], engine.layout.matrix(jacobians)[0], atol=1e-9)
 
 
-def parts_of(measurements: list[KeyframeMeasurement]) -> list[slice]:
+def parts_of(dive: Problem, index: Index) -> list[slice]:
     """The rows of each measurement, of all their rows."""
-    ends = np.cumsum([0, *(len(m.z) for m in measurements)]).tolist()
+    ends = np.cumsum([0, *(dive.dims[sensor] for sensor in dive.which[index])]).tolist()
     return [slice(*pair) for pair in pairwise(ends)]
 
 
@@ -263,11 +272,14 @@ def test_an_error_that_lasts_keeps_its_stationary_variance_and_what_walks_gains_
     P[MOTION:, MOTION:] = np.diag([sd**2, sd**2, 0.5**2])
     walks = np.zeros((3, n))
     walks[0, MOTION:], walks[1, MOTION : MOTION + 2] = [2.0 / 30.0 * sd**2] * 2 + [walk**2], 1.0 / 30.0
-    motion, nothing, out = np.zeros(ROW), np.zeros((0, 0)), (np.empty_like(x), np.empty_like(c), P.copy(), P.copy())
+    motion, nothing = np.zeros(ROW), np.zeros((0, 0))
     motion[DURATION] = seconds
-    predict_filter(x, c, P, np.zeros((n, 0)), nothing, motion, nothing, column, walks, n, *out)
+    known = FilterState(x, c, P, np.zeros((n, 0)), nothing)
+    layout = Coordinates(np.arange(n), np.zeros((0, 3), np.int64), nothing, np.zeros(0, np.int64))
+    model = FilterModel(np.zeros((0, measurement_row.PARAMS)), column, layout, walks, 0.0)
+    predict_filter(known, motion, nothing, model, P.copy(), P.copy())
     np.testing.assert_allclose(np.diag(P)[MOTION:], [sd**2, sd**2, 0.5**2 + walk**2 * seconds])
-    np.testing.assert_allclose(out[1][LAYOUT["fix_error"]], np.exp(-seconds / 30.0))
+    np.testing.assert_allclose(c[LAYOUT["fix_error"]], np.exp(-seconds / 30.0))
 
 
 # admission
@@ -308,6 +320,21 @@ def test_a_knock_at_any_time_since_has_the_moments_of_a_uniform_time():
     np.testing.assert_allclose(second[3:6, 3:6], T**2 / 3.0 * np.eye(3), atol=1e-12)
 
 
+def test_an_update_carries_what_is_considered_as_its_estimate_would_move():
+    """Schmidt's: of an error B y the correction leaves (B - K (H B + H_y)) y."""
+    rng = np.random.default_rng(4)
+    P, r, H = problem(rng)
+    J, innovation_, B, H_y = np.vstack(H), np.concatenate(r), rng.standard_normal((5, 2)), rng.standard_normal((6, 2))
+    K = P @ J.T @ np.linalg.inv(J @ P @ J.T + np.eye(6))
+    expected = B - K @ (J @ B + H_y)
+    found, delta = Innovations(np.array([0, 6]), innovation_, J, H_y, np.empty((6, 5)), np.empty((6, 6))), np.empty(5)
+    innovation_covariance(P, found)
+    weights = Weights(np.zeros(1, np.int64), np.zeros(1), np.ones(1), np.ones(6), np.linalg.inv(found.S + np.eye(6)))
+    joseph(P, B, found, weights, delta)
+    np.testing.assert_allclose(B, expected, atol=1e-12)
+    np.testing.assert_allclose(delta, K @ innovation_, atol=1e-12)
+
+
 # update
 
 
@@ -342,20 +369,6 @@ def test_an_update_without_losses_is_kalmans():
     np.testing.assert_allclose(posterior, np.linalg.inv(information), atol=1e-9)
     np.testing.assert_allclose(delta, np.linalg.solve(information, J.T @ np.concatenate(r)), atol=1e-9)
     np.testing.assert_array_equal(weights, 1.0)
-
-
-def test_an_update_carries_what_is_considered_as_its_estimate_would_move():
-    """Schmidt's: of an error B y the correction leaves (B - K (H B + H_y)) y."""
-    rng = np.random.default_rng(4)
-    P, r, H = problem(rng)
-    J, innovation_, B, H_y = np.vstack(H), np.concatenate(r), rng.standard_normal((5, 2)), rng.standard_normal((6, 2))
-    K = P @ J.T @ np.linalg.inv(J @ P @ J.T + np.eye(6))
-    expected = B - K @ (J @ B + H_y)
-    HP, S, delta = np.empty((6, 5)), np.empty((6, 6)), np.empty(5)
-    innovation_covariance(P, J, HP, S)
-    joseph(P, B, innovation_, J, H_y, HP, np.ones(6), np.linalg.inv(S + np.eye(6)), delta)
-    np.testing.assert_allclose(B, expected, atol=1e-12)
-    np.testing.assert_allclose(delta, K @ innovation_, atol=1e-12)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
@@ -393,9 +406,10 @@ def test_intervals_in_a_row_come_out_as_one_by_one(case):
     data[20::17, 0] += 1.0  # some that the gate leaves out
     dive = batch(altered(case.log, "dvl", data), case.config)
     alone = ErrorStateFilter(dive.initial, (10.0,))
-    for interval in dive.intervals:
-        alone.step(interval)
-    together = replay(dive.intervals, dive.initial, (10.0,))
+    alone.problem = dive.problem
+    for _ in range(len(dive.problem)):
+        alone.step()
+    together = replay(dive.problem, dive.initial, (10.0,))
     np.testing.assert_array_equal(together.known.P, alone.known.P)
     np.testing.assert_array_equal(together.states().p_n, alone.states().p_n)
     assert together.gates == alone.gates
@@ -405,42 +419,45 @@ def test_intervals_in_a_row_come_out_as_one_by_one(case):
     np.testing.assert_array_equal(a.trajectory.p_sd, b.trajectory.p_sd)
 
 
-@pytest.mark.parametrize("where", ["between", "here"])
+@pytest.mark.parametrize("where", [between, here])
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_correction_is_a_textbooks_kalman_update_moved_along_the_coordinates(estimator, where, loss):
     initial = estimator.initial
     lossy = {sensor: replace(instrument, loss=loss) for sensor, instrument in initial.instruments.items()}
     engine = FilterEngine(replace(initial, instruments=lossy))
-    interval = max(estimator.intervals[60:], key=lambda i: len(getattr(i, where)))
-    known = estimator.filtered[interval.index - 1]
-    if where == "here":
-        known = engine.predict(interval, known).predicted
-    measurements: list[KeyframeMeasurement] = getattr(interval, where)
-    measurements = [measuring(m, m.z + 10.0 * m.sd) if m is measurements[-1] else m for m in measurements]
-    processed: list[ProcessedMeasurement] = []
-    after = engine.correct(known, measurements, None, processed)
-    (r, H), parts = engine.linearize(known, measurements), parts_of(measurements)
-    losses = [engine.initial.instruments[m.sensor].loss for m in measurements]
+    dive = estimator.problem
+    k = max(range(60, len(dive)), key=lambda k: where(dive, k).stop - where(dive, k).start)
+    known, some = estimator.filtered[k - 1], where(dive, k)
+    if where is here:
+        known = engine.predict(dive, k, known).predicted
+    index, sensors = np.arange(some.start, some.stop), [dive.sensors[sensor] for sensor in dive.which[some]]
+    last, dim = index[-1:], dive.dims[dive.which[index[-1]]]
+    dive = measuring(dive, index[-1], (dive.z(last, dim) + 10.0 * dive.sd(last, dim))[0])
+    met = Met.of(dive, k, len(known.c))
+    after = engine.correct(known, dive, some, None, met)
+    (r, H), parts = engine.linearize(known, dive, index), parts_of(dive, index)
+    losses = [engine.initial.instruments[sensor].loss for sensor in sensors]
     delta, P, weights = kalman(known.P, r, H, parts, losses)
     expected = engine.retract(known, delta, P)
     np.testing.assert_allclose(after.x, expected.x, atol=1e-9)
     np.testing.assert_allclose(after.c, expected.c, atol=1e-9)
     np.testing.assert_allclose(after.P, expected.P, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose([one.weight for one in processed], weights, atol=1e-9)
+    np.testing.assert_allclose(met.weight[index - met.begin], weights, atol=1e-9)
     assert (min(weights) < 1.0) == (loss != "none")
-    for one, part in zip(processed, parts, strict=True):
+    for nis, part in zip(met.nis[index - met.begin], parts, strict=True):
         S = H[part] @ known.P @ H[part].T + np.eye(len(r[part]))
-        assert one.nis == pytest.approx(r[part] @ np.linalg.solve(S, r[part]))
+        assert nis == pytest.approx(r[part] @ np.linalg.solve(S, r[part]))
 
 
 def test_a_step_is_a_correction_a_prediction_and_a_correction(estimator):
     engine = estimator.engine
-    interval = next(i for i in estimator.intervals[40:] if i.between and i.here)
-    before = estimator.filtered[interval.index - 1]
-    step = engine.step(interval, before, {})
-    departed = engine.correct(before, interval.between, {}, [])
-    transition = engine.predict(interval, departed)
-    filtered = engine.correct(transition.predicted, interval.here, {}, [])
+    dive = estimator.problem
+    k = next(k for k in range(40, len(dive)) if dive.measured_in(k)[0] < dive.first[k] < dive.measured_in(k)[1])
+    before = estimator.filtered[k - 1]
+    step = engine.step(dive, k, before, {})
+    departed = engine.correct(before, dive, between(dive, k), {})
+    transition = engine.predict(dive, k, departed)
+    filtered = engine.correct(transition.predicted, dive, here(dive, k), {})
     for one, other in (
         (step.departed, departed),
         (step.transition.predicted, transition.predicted),
@@ -452,8 +469,11 @@ def test_a_step_is_a_correction_a_prediction_and_a_correction(estimator):
     F, Q = transition.F, transition.Q
     np.testing.assert_allclose(transition.predicted.P, F @ departed.P @ F.T + Q, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(step.transition.F, F)
-    assert [one.measurement for one in step.processed] == [*interval.between, *interval.here]
-    np.testing.assert_array_equal(before.x, estimator.filtered[interval.index - 1].x)
+    np.testing.assert_array_equal(step.met.index, np.arange(between(dive, k).start, here(dive, k).stop))
+    at_keyframe = dive.keyframe[step.met.index] == k
+    np.testing.assert_array_equal(step.met.x, np.where(at_keyframe[:, None], transition.predicted.x, before.x))
+    assert step.met.nis.all()
+    np.testing.assert_array_equal(before.x, estimator.filtered[k - 1].x)
 
 
 # dives
@@ -549,7 +569,7 @@ def test_calibration_that_walks_keeps_an_uncertainty(case):
 
 
 def test_feeding_measurements_and_replaying_intervals_are_the_same(case, estimator):
-    again = replay(batch(case.log, case.config).intervals, initialise(case.log, case.config))
+    again = replay(batch(case.log, case.config).problem, initialise(case.log, case.config))
     np.testing.assert_allclose(again.solve().trajectory.p_n, estimator.solve().trajectory.p_n, atol=1e-12)
     np.testing.assert_array_equal(again.latest().p_n, again.known.state.p_n)
 
@@ -616,20 +636,22 @@ def left_out(estimator: RecordingFilter, off: float, since: float) -> tuple[Gaus
 
     Also whether the ping was let in, and the gates after it.
     """
-    engine, index = estimator.engine, 100
-    known = engine.predict(estimator.intervals[index], estimator.departed[index - 1]).predicted
-    [ping] = [m for m in estimator.intervals[index].here if m.sensor == "dvl"]
-    r, H = engine.linearize(known, [ping])
+    engine, dive, k = estimator.engine, estimator.problem, 100
+    known = engine.predict(dive, k, estimator.departed[k - 1]).predicted
+    [ping] = np.intersect1d(dive.of_sensor("dvl"), np.arange(len(dive.rows))[here(dive, k)])
+    own = np.array([ping])
+    _, H = engine.linearize(known, dive, own)
     along = np.linalg.cholesky(H @ known.P @ H.T + np.eye(3))[:, 0]
-    aside = measuring(ping, ping.z - engine.block([ping]).innovations(known.state)[0])
-    r, H = engine.linearize(known, [aside])
+    aside = measuring(dive, ping, dive.z(own, 3)[0] - engine.block(dive, own).innovations(known.state)[0])
+    r, _ = engine.linearize(known, aside, own)
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
-    shift = np.linalg.solve(engine.block([ping]).W[0], along * off)
-    processed: list[ProcessedMeasurement] = []
-    gates = {} if since == 0.0 else {"dvl": ping.time - since}
-    after = engine.correct(known, [measuring(aside, aside.z + shift)], gates, processed)
-    assert np.sqrt(processed[0].nis) == pytest.approx(off)
-    return known, after, processed[0].weight > 0.0, gates
+    shift = np.linalg.solve(engine.block(dive, own).W[0], along * off)
+    shifted = measuring(aside, ping, aside.z(own, 3)[0] + shift)
+    met = Met.of(shifted, k, len(known.c))
+    gates = {} if since == 0.0 else {"dvl": float(dive.rows[ping, measurement_row.TIME]) - since}
+    after = engine.correct(known, shifted, slice(ping, ping + 1), gates, met)
+    assert np.sqrt(met.nis[ping - met.begin]) == pytest.approx(off)
+    return known, after, bool(met.weight[ping - met.begin] > 0.0), gates
 
 
 def test_a_measurement_beyond_its_gate_changes_nothing_and_is_remembered(estimator):

@@ -25,8 +25,7 @@ from scipy.stats import chi2
 
 from rovgraph.check import examine
 from rovgraph.config import Config
-from rovgraph.engine.assembly import Assembler
-from rovgraph.engine.keyframes import KeyframeMeasurement, LandmarkObservation, measurement_rows, sd_of
+from rovgraph.engine.assembly import assembly_of
 from rovgraph.engine.optimum import OTHERS
 from rovgraph.errors import DataWarning, InputError
 from rovgraph.estimators.eskf.error_state import REINITIALISE_AT_S, ErrorStateFilter
@@ -38,6 +37,7 @@ from rovgraph.graph.keys import calibration_key, key, key_name
 from rovgraph.graph.marginals import covariances, marginals
 from rovgraph.graph.optimum import GraphOptimum
 from rovgraph.graph.places import matched
+from rovgraph.kernels.measurement_row import TIME
 from rovgraph.live.checkpoint import read_checkpoint, write_checkpoint
 from rovgraph.live.message import Reading
 from rovgraph.live.recorder import Recorder
@@ -247,15 +247,9 @@ def test_a_false_first_sighting_spoils_none_of_those_that_follow(lost):
 def walked(offsets: Array, sd: Array, names: Array) -> list[int]:
     """Numbers of landmarks on a random walk whose steps have a standard deviation of 1 m."""
     m = len(offsets)
-    still = np.concatenate([[0.0], np.eye(3).ravel(), np.zeros(6)])[None]
-    seen = []
-    for k, name in enumerate(names):
-        row = measurement_rows(float(k), still, np.zeros(6), 2)[0]
-        row[sd_of(2) : sd_of(2) + 2] = sd
-        seen.append(KeyframeMeasurement("place", k, 0, k, 2, row, landmark=LandmarkObservation(name, k)))
     steps = np.minimum.outer(np.arange(m), np.arange(m)) + 1.0
     covariance = np.kron(steps, np.eye(2)) + np.diag(np.tile(sd**2, m))
-    return matched(seen, offsets, covariance, 4.0)
+    return matched(names, np.arange(m), offsets, covariance, 4.0)
 
 
 def test_sightings_are_told_apart_by_where_the_vehicle_can_be():
@@ -279,10 +273,11 @@ def test_what_was_recognised_narrows_the_next_comparison():
 
 
 def test_a_filter_forgets_what_it_has_not_seen_for_longest(lost):
-    intervals = batch(lost.log, lost.config).intervals
+    problem = batch(lost.log, lost.config).problem
     most = ErrorStateFilter(initialise(lost.log, changed(lost.config, place={"remembered": 1})))
     both = ErrorStateFilter(initialise(lost.log, lost.config))
-    few, all_of = ([f.step(interval).filtered for interval in intervals] for f in (most, both))
+    most.problem = both.problem = problem
+    few, all_of = ([f.step().filtered for _ in range(len(problem))] for f in (most, both))
     size = both.engine.layout.size
     assert {len(k.places) for k in few} == {0, 1} and {len(k.places) for k in all_of} == {0, 1, 2}
     assert all(k.P.shape == (size + 2 * len(k.places),) * 2 for k in all_of)
@@ -292,9 +287,9 @@ def test_a_filter_forgets_what_it_has_not_seen_for_longest(lost):
 
 def test_a_renewed_filter_knows_the_places_as_the_graph_does(lost):
     best = graph_of(lost)
-    numbers = sorted(set(best.problem.blocks["place"].place.tolist()))
+    numbers = sorted(set(best.graph.blocks["place"].place.tolist()))
     P = best.newest_covariance(numbers)
-    known = covariances(marginals(best.problem, best.solution.point, best.solution.gates))
+    known = covariances(marginals(best.graph, best.solution.point, best.solution.gates))
     for k, number in enumerate(numbers[::-1]):
         own = P[len(P) - 2 * (k + 1) :, len(P) - 2 * (k + 1) :][:2, :2]
         np.testing.assert_allclose(own, known[key("place", number)], rtol=1e-5)
@@ -317,22 +312,22 @@ def test_late_and_restored_it_remembers_the_same_places(lost, tmp_path):
     after.restore(read_checkpoint(tmp_path / "state"))
     for m in late[len(late) // 2 :]:
         after.add(m)
-    marks = []
-    after.passed = marks.append
+    snapshots = []
+    after.passed = snapshots.append
     after.finish()
-    known = marks[-1].known
+    known = snapshots[-1].known
     assert [p.number for p in known.places] == [p.number for p in reference.places] and len(known.places) == 2
     np.testing.assert_allclose(known.P, reference.P, rtol=1e-5, atol=1e-9)
 
 
 def test_information_about_the_calibration_is_the_graphs_with_places_in_it(lost):
     best = graph_of(lost)
-    end = best.problem.count - 1
+    end = best.graph.count - 1
     seen = best.knowledge([end // 3, 2 * end // 3, end])
     names, column = best.unknowns.estimated, OTHERS
-    known = covariances(marginals(best.problem, best.solution.point, best.solution.gates))
+    known = covariances(marginals(best.graph, best.solution.point, best.solution.gates))
     for name in names:
-        P = known[calibration_key(best.unknowns, name, int(best.problem.index[-1]))]
+        P = known[calibration_key(best.unknowns, name, int(best.graph.index[-1]))]
         own = slice(column, column + len(P))
         np.testing.assert_allclose(seen.covariance[-1][own, own], P, rtol=1e-4)
         column += len(P)
@@ -346,12 +341,15 @@ def test_a_place_that_stays_in_view_counts_once(lost):
     data = np.column_stack([np.ones(len(time)), np.full(len(time), 0.3)])
     stream = replace(often, time=time, data=data, row=np.arange(len(time)))
     log = Log("dive.csv", {**lost.log.streams, "place": stream})
-    assembler = Assembler(initial.config, initial.instruments, initial.prior.state.bias[0])
-    intervals = [i for m in log.measurements() for i in assembler.add(m)]
-    seen = [a for i in intervals for a in i.measurements if a.sensor == "place"]
-    assert [a.time for a in seen] == [50.0, 55.0] and [a.landmark.number for a in seen] == [1, 2]
-    assert all((a.sd == 0.3).all() for a in seen)
-    assert assembler.left_out["place", "still in view"] == len(time) - 2
+    assembly = assembly_of(initial)
+    for m in log.measurements():
+        assembly.insert(m)
+        assembly.extend()
+    problem = assembly.problem
+    seen = problem.of_sensor("place")
+    assert problem.rows[seen, TIME].tolist() == [50.0, 55.0] and problem.number[seen].tolist() == [1, 2]
+    assert (problem.sd(seen, 2) == 0.3).all()
+    assert assembly.left_out["place", "still in view"] == len(time) - 2
     assert key_name(key("place", 2)) == "place 2"
 
 
