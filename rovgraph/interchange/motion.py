@@ -13,11 +13,11 @@ import numpy as np
 from rovgraph.check.findings import integral, valid_pings
 from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.config import Config
+from rovgraph.engine.samples import GAP_PERIODS
 from rovgraph.geometry import Array
 from rovgraph.log import Log
 
 Kind = Literal["turning", "depth", "speed", "velocity", "way"]
-GAP_PERIODS = 5.0  # between samples that are still interpolated
 WINDOW = 1.0  # shortest over which changes are compared [s]
 WINDOW_PERIODS = 3.0
 FIX_WINDOW = 20.0  # over which fixes show a speed [s]
