@@ -13,6 +13,7 @@ from rovgraph.log import STREAMS, Log, Stream
 from rovgraph.log.frozen import (
     BRAKING,
     CLEAR_SPEED,
+    HOLDS,
     STOPPING,
     are_in,
     companies,
@@ -51,6 +52,18 @@ def test_a_value_held_for_a_minute_is_frozen_and_no_other_is(case, sensor):
     assert found.first == pytest.approx(FROM, abs=0.5)
     assert found.last == pytest.approx(TO, abs=0.5)
     assert frozen_stretches(case.log, case.config) == []
+
+
+@pytest.mark.parametrize("sensor", ["dvl", "mag"])
+@pytest.mark.parametrize("beyond", [False, True])
+def test_values_are_held_from_the_limit_of_seconds_on(case, sensor, beyond):
+    time, data = case.log[sensor].time, case.log[sensor].data.copy()
+    first, half = int(np.searchsorted(time, FROM)), 0.5 * float(np.median(np.diff(time)))
+    limit = time[first] + HOLDS[sensor].seconds
+    last = np.searchsorted(time, limit + half) if beyond else np.searchsorted(time, limit - half) - 1
+    data[first : last + 1, :3] = data[first, :3]
+    found = [f for f in frozen_stretches(altered(case.log, sensor, data), case.config) if f.kind == "held"]
+    assert [len(f.time) for f in found] == [last + 1 - first] * beyond
 
 
 def left_out_live(log: Log, config: Config) -> dict[str, list[float]]:

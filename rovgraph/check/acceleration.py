@@ -10,15 +10,16 @@ every tau. `refine` then fits tau together with what else may be a little wrong:
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.correlation import Correlator
-from rovgraph.check.findings import without_spikes
+from rovgraph.check.findings import CLIPPED, without_spikes
 from rovgraph.check.inertial import LEVEL_SECONDS, InertialMotion, in_gap, point_acceleration, smoothed
+from rovgraph.check.lags import ORIENTATIONS, correlate, normal_equations, spread
 from rovgraph.config import Config, mount_matrix
-from rovgraph.geometry import Array, cross, exp_rotation, rotate, signed_permutations
+from rovgraph.geometry import Array, cross, exp_rotation, rotate
 from rovgraph.log import Stream
 
 FOLLOWS = 0.65  # agreement of accelerations that are of one motion
@@ -30,8 +31,6 @@ LONGEST_PING_GAP = 2.5  # periods that are interpolated
 ENOUGH = 150  # even times
 ENOUGH_PINGS = 30
 BURST = 5  # pings that a serial buffer may hold back
-CLIPPED = 4.0  # times the median difference, which counts no more
-PARTS = 10  # of the dive, each left out once to see how much a fit depends on it
 ITERATIONS = 4
 SETTLED = 2e-3  # step that ends it [s, rad]
 LARGEST_STEP = 1.0  # that a fit leads away from where it began [s]
@@ -40,9 +39,6 @@ TURNING_SECONDS = 1200.0  # of a dive, the liveliest, that show whether the axes
 LARGEST_DRIFT = np.deg2rad(3.0)  # of the gyro about the vertical [rad/s]
 # priors of what `refine` fits: lag [s], rotation [rad], scale, lever arm [m], the accelerometer's bias [m/s^2]
 PRIOR_SD = np.array([10.0, 0.3, 0.3, 0.3, 0.05, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
-
-
-ORIENTATIONS = signed_permutations()
 
 
 @dataclass(frozen=True)
@@ -160,17 +156,17 @@ class Comparison:
         dy, mean, seen = self._changes(y, seen)
         a, w = (np.where(known[:, None], rotate(self.R_bs.T, v), 0.0) for v in (self.acceleration_b, self.rate_b))
         dy, mean = (np.where(seen[:, None], v, 0.0) for v in (dy, mean))
-        correlate = Correlator(len(time), reach)
+        sums = partial(correlate, first=-reach, last=reach)
         inertial, pinged = (flags[:, None].astype(float) for flags in (known, seen))
         pairs = np.triu_indices(3)
-        count = np.maximum(correlate(inertial, pinged)[0, 0], 1.0)
-        own = correlate(_square(a)[:, None], pinged)[0, 0]
-        speed = correlate(_square(w)[:, None], _square(mean)[:, None])[0, 0]
-        speed += correlate(inertial, _square(dy)[:, None])[0, 0]
-        swing = correlate(w, cross(mean, dy))
-        both = correlate(a, dy) + correlate(cross(a, w), mean)
+        count = np.maximum(sums(inertial, pinged)[0, 0], 1.0)
+        own = sums(_square(a)[:, None], pinged)[0, 0]
+        speed = sums(_square(w)[:, None], _square(mean)[:, None])[0, 0]
+        speed += sums(inertial, _square(dy)[:, None])[0, 0]
+        swing = sums(w, cross(mean, dy))
+        both = sums(a, dy) + sums(cross(a, w), mean)
         twice = np.where(pairs[0] == pairs[1], 1.0, 2.0)
-        outer = correlate(w[:, pairs[0]] * w[:, pairs[1]], mean[:, pairs[0]] * mean[:, pairs[1]])
+        outer = sums(w[:, pairs[0]] * w[:, pairs[1]], mean[:, pairs[0]] * mean[:, pairs[1]])
         moment = ORIENTATIONS[:, pairs[0]][:, :, pairs[0]] * ORIENTATIONS[:, pairs[1]][:, :, pairs[1]]
         moment = 0.5 * (moment + ORIENTATIONS[:, pairs[0]][:, :, pairs[1]] * ORIENTATIONS[:, pairs[1]][:, :, pairs[0]])
         moment = moment * twice[:, None] * twice
@@ -314,16 +310,13 @@ class Comparison:
     def _solved(self, J: Array, left: Array, guess: "_Guess", prior_sd: Array) -> tuple[Array, Array]:
         """Step and standard deviations (11,), these by leaving out one part after the other."""
         variance = float(np.mean(left**2)) * self.apart  # differences overlap
-        parts = np.array_split(np.arange(len(left)), PARTS)
-        H = np.array([np.einsum("nik,nil->kl", J[p], J[p], optimize=True) for p in parts]) / variance
-        g = np.array([np.einsum("nik,ni->k", J[p], left[p]) for p in parts]) / variance
+        H, g = normal_equations(J, left, variance)
         so_far = np.concatenate([np.zeros(5), guess.arm_b, guess.bias_b])
         towards = -so_far / prior_sd**2
         information = H.sum(axis=0) + np.diag(1.0 / prior_sd**2)
         step = np.linalg.solve(information, g.sum(axis=0) + towards)
         without = np.linalg.solve(information - H, (g.sum(axis=0) - g + towards)[..., None])[..., 0]
-        spread = np.sqrt((PARTS - 1) * np.var(without, axis=0))
-        return step, np.maximum(spread, np.sqrt(np.diag(np.linalg.inv(information))))
+        return step, np.maximum(spread(without), np.sqrt(np.diag(np.linalg.inv(information))))
 
     def _inertial(self, when: Array) -> tuple[Array, Array, Array]:
         """Attitude, rate and the integral of the acceleration along the gyro's axes, at some times."""

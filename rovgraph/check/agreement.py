@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from rovgraph.check.compasses import field_axes, magnetic_heading
-from rovgraph.check.findings import Finding, integral, valid_pings, without_spikes
+from rovgraph.check.findings import BELIEVED_SDS, Finding, integral, valid_pings, without_spikes
 from rovgraph.check.fixes import turned_by
 from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.check.signals import FOLLOWS, LAG_WARNING, MIN_WINDOWS, Fit, Lag, Signal, coarse_lag, fit, lag
@@ -24,7 +24,6 @@ from rovgraph.log.units import turn_angles
 ENOUGH_TURNING = 0.05  # sd of the turn within a window [rad]
 ENOUGH_DIVING = 0.05  # sd of the change of depth within a window [m]
 CLOSELY = 0.95  # correlation beyond which a slope is that of the scales
-BELIEVED_SDS = 3.0  # of a time offset that is estimated, within which it explains a lag
 LEAST_STEP = 0.3  # of a depth whose zero is set anew [m]
 STEPS = 10.0  # times its usual change against the DVL's way
 MOST_STEPS = 3

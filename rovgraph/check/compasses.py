@@ -16,12 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.findings import Finding
+from rovgraph.check.findings import CLIPPED, Finding
 from rovgraph.check.inertial import BIAS_SD, GAP, InertialMotion, in_gap, inertial_motion, means, smoothed
+from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.check.signals import FOLLOWS, MIN_WINDOWS, Signal, fit
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config, beliefs, mount_matrix
-from rovgraph.geometry import Array, cross, rotate, signed_permutations, skew
+from rovgraph.geometry import Array, cross, rotate, skew
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
 
@@ -40,13 +41,11 @@ EXPLAINED = 0.5  # of the changes' square, that a rotation may leave at most
 BETTER = 3.0  # times smaller a square than as configured, which neither noise nor iron makes
 SIMILAR = 1.3  # times the least square, that tells two rotations apart no more
 EVIDENCE = 60.0  # in chi-square
-CLIPPED = 4.0  # times the median residual, which counts no more
 LEVEL = 0.1  # of the field along the vertical, whose sense shows nothing
 UPSIDE_DOWN = 0.5  # of the field along the vertical in the wrong sense, which no iron makes
 TROPIC_DEG = 20.0  # of latitude, beyond which the dip has its sign
 SAME_HEADING = np.deg2rad(40.0)  # of two compasses, which no offset and no iron exceeds
 
-ORIENTATIONS = signed_permutations()
 AS_NAMED = ORIENTATIONS[0]
 HANDED = np.linalg.det(ORIENTATIONS) > 0.0
 

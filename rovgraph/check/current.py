@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.check.compasses import body_heading
-from rovgraph.check.findings import Finding, since, valid_pings
+from rovgraph.check.findings import BELIEVED_SDS, SURE, Finding, since, valid_pings
 from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.gauss_markov import walked
@@ -22,9 +22,7 @@ FIX_BLOCK_S = 30.0  # of fixes, whose differences are noisier
 LONGEST_GAP = 2.0  # between pings [s]
 ENOUGH = 3  # blocks of either level
 LEAST_MPS = 0.1  # between two levels, which errors of scale and heading stay below
-SURE = 5.0  # standard deviations
 HALF = 0.5  # of the square about one level, that two may leave
-BELIEVED_SDS = 3.0
 ENOUGH_FIXES = 5  # in a block
 Heading = tuple[Array, Array]  # times [s], of the body [rad]
 Complexes = NDArray[np.complex128]

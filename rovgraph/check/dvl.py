@@ -7,10 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.acceleration import BETTER, FOLLOWS, ORIENTATIONS, Comparison, Fit, Search
+from rovgraph.check.acceleration import BETTER, FOLLOWS, Comparison, Fit, Search
 from rovgraph.check.agreement import dives_with_depth
-from rovgraph.check.findings import Finding
+from rovgraph.check.findings import BELIEVED_SDS, SURE, Finding
 from rovgraph.check.jumps import Examined, compare, find_jump
+from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, log_rotation
 from rovgraph.log import Log
@@ -20,7 +21,6 @@ SIMILAR = 1.1  # times the least error, that tells two orientations apart no mor
 SIMPLER = 1.3  # times larger an error that a simpler explanation may leave
 LAG_WARNING = 0.05  # [s]
 APART = 0.15  # that search and fit may be apart [s]
-SURE = 5.0  # standard deviations of a lag
 EVIDENCE = 30.0  # in chi-square that a lag explains
 TURNED = np.deg2rad(30.0)  # a mounting that is no small error; steady circles confuse smaller ones with a lag
 
@@ -130,7 +130,7 @@ def _clock(config: Config, compared: Comparison, H: Array, fit: Fit, coarse: flo
     late = fit.lag - mean
     sense = "late" if late >= 0.0 else "early"
     text = f"its stamps are {abs(late):.3f} s {sense} relative to the IMU's (sd {fit.lag_sd:.3f} s)"
-    allowed = max(LAG_WARNING, SURE * fit.lag_sd, 3.0 * offset.sd if offset.estimate else 0.0)
+    allowed = max(LAG_WARNING, SURE * fit.lag_sd, BELIEVED_SDS * offset.sd if offset.estimate else 0.0)
     if abs(late) < allowed:
         return Finding("dvl", "ok", text)
     if abs(fit.lag - coarse) > max(APART, SURE * fit.lag_sd) or abs(coarse - mean) < 0.5 * abs(late):

@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from rovgraph.check.acceleration import FOLLOWS, ORIENTATIONS
+from rovgraph.check.acceleration import FOLLOWS
 from rovgraph.check.agreement import heading_lag
 from rovgraph.check.jumps import compare
+from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config
 from rovgraph.log import Log
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.check.compasses import OFFSETS, body_heading
-from rovgraph.check.findings import Finding, valid_pings
+from rovgraph.check.findings import BELIEVED_SDS, CLIPPED, SURE, Finding, valid_pings
 from rovgraph.check.inertial import in_gap
 from rovgraph.config import Config, beliefs, mount_matrix
 from rovgraph.geometry import Array, rotate
@@ -26,15 +26,13 @@ MIN_FIXES = 15
 STRETCH = 300.0  # over which the DVL's track drifts less than fixes scatter [s]
 LONGEST_GAP = 5.0  # between pings, in which the track is lost [s]
 ENOUGH_DISTANCE = 10.0  # spread of the fixes [m]
-MISALIGNED, BELIEVED_SDS = np.deg2rad(15.0), 3.0
+MISALIGNED = np.deg2rad(15.0)
 FARTHER = 5.0  # times the spread of fixes, that a DVL's track spreads over if they are no measurement of it
 RADIANS = 40.0, 80.0  # times too small, that radians are if they are taken for degrees
 LARGEST_LAG = 60.0  # [s]
 LAG_STEP = 0.25  # [s]
 LAG_WARNING = 0.5  # [s]
-SURE = 5.0  # standard deviations
 EVIDENCE = 40.0  # in chi-square
-CLIPPED = 4.0  # times the median residual, which counts no more
 STRETCHED = 0.1  # logarithm of a scale that no turn leaves
 MIRRORED = 3.0  # times less error, that a mirrored axis leaves
 LIKE = 0.9  # agreement, below which fixes and track go different ways where noise is not the reason

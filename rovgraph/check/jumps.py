@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rovgraph.check.acceleration import BETTER, FOLLOWS, ORIENTATIONS, Comparison, Search
+from rovgraph.check.acceleration import BETTER, FOLLOWS, Comparison, Search
 from rovgraph.check.findings import Finding, since, valid_pings
 from rovgraph.check.inertial import inertial_motion
+from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.check.values import GRAVITY_ANGLE, tilt
 from rovgraph.config import Config
 from rovgraph.errors import warn

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.check.correlation import Correlator
+from rovgraph.check.inertial import in_gap
+from rovgraph.check.lags import PARTS, correlate, peak, spread
 from rovgraph.geometry import Array
 
 MIN_WINDOWS = 15
@@ -18,7 +19,6 @@ LARGEST_LAG = 3.0  # that is searched for [s]
 FARTHEST_LAG = 300.0  # that is searched for coarsely [s]
 FAR_BETTER = 4.0  # times smaller a part that two signals do not share
 SURE = 3.0  # standard deviations of a lag that is no chance
-PARTS = 10  # of the log, each left out once to see how much a lag depends on it
 OVERLAP = 5  # windows that begin within one
 
 
@@ -37,10 +37,7 @@ class Signal:
 
     def at(self, times: Array, longest: float) -> Array:
         """Values at times of any order, NaN in a gap; shape (len(times),)."""
-        k = np.searchsorted(self.time, times).clip(1, len(self.time) - 1)
-        in_gap = self.time[k] - self.time[k - 1] > longest
-        inside = (times >= self.time[0]) & (times <= self.time[-1]) & ~in_gap
-        return np.where(inside, np.interp(times, self.time, self.value), np.nan)
+        return np.where(in_gap(times, self.time, longest), np.nan, np.interp(times, self.time, self.value))
 
     def changes(self, edges: Array, longest: float) -> Array:
         """Change from each edge to the next, NaN next to a gap; shape (len(edges) - 1,)."""
@@ -117,9 +114,8 @@ def coarse_lag(a: Signal, b: Signal, window: float) -> float:
     known = [np.isfinite(change) for change in changes]
     x, y = (np.where(k, change - np.nanmean(change), 0.0) for k, change in zip(known, changes, strict=True))
     reach = int(min(FARTHEST_LAG / step, 0.4 * len(x)))
-    correlate = Correlator(len(x), reach)
     left, right = (np.column_stack([k * 1.0, v, v * v]) for k, v in zip(known, (x, y), strict=True))
-    both = correlate(left, right)
+    both = correlate(left, right, -reach, reach)
     sums = np.array([both[0, 0], both[1, 0], both[0, 1], both[2, 0], both[0, 2], both[1, 1]]).T
     lags = step * np.arange(-reach, reach + 1)
     correlation = np.where(sums[:, 0] > 0.5 * len(x), _correlation(sums), 0.0)
@@ -159,7 +155,7 @@ def lag(a: Signal, b: Signal, window: float, coarse: float | None = None) -> Lag
     without = np.array([_peak(lags, _correlation(every - sums[..., k])) for k in range(PARTS)])
     unshifted = correlation[len(lags) // 2] if centre == 0.0 else 0.0
     better = np.log((1.0 - unshifted**2) / max(1.0 - float(correlation.max()) ** 2, 1e-9))
-    return Lag(centre + seconds, float(np.sqrt((PARTS - 1) * np.var(without))), float(better * count / OVERLAP))
+    return Lag(centre + seconds, float(spread(without)), float(better * count / OVERLAP))
 
 
 def _moments(x: Array, y: Array, part: NDArray[np.int64]) -> Array:
@@ -178,9 +174,4 @@ def _correlation(sums: Array) -> Array:
 
 def _peak(lags: Array, correlation: Array) -> float:
     """Lag at which a correlation is largest [s]; NaN if the signals do not follow each other there."""
-    k = int(np.argmax(correlation))
-    if not 0 < k < len(lags) - 1 or correlation[k] < FOLLOWS:
-        return np.nan
-    before, peak, after = correlation[k - 1 : k + 2]
-    bend = before - 2.0 * peak + after
-    return float(lags[k] + (0.5 * (lags[1] - lags[0]) * (before - after) / bend if bend < 0 else 0.0))
+    return peak(lags, correlation) if correlation.max() >= FOLLOWS else np.nan

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rovgraph.check.findings import Finding, valid_pings
+from rovgraph.check.findings import SURE, Finding, valid_pings
 from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.log import Log
@@ -16,7 +16,6 @@ from rovgraph.log import Log
 FIRST = 5  # fixes, of which the median counts
 ENOUGH = 3  # fixes
 SOON = 30.0  # after the log's begin [s]
-SURE = 5.0  # standard deviations
 
 
 def start(log: Log, config: Config) -> Iterator[Finding]:

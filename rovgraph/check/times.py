@@ -11,10 +11,10 @@ from rovgraph.engine.constant_velocity import motion_model
 from rovgraph.instruments import heading_sources
 from rovgraph.log import Log, Stream
 from rovgraph.log.frozen import FrozenStretch, Runs, repeats, without
+from rovgraph.log.streams import GAP_PERIODS
 from rovgraph.sensors import SENSORS
 from rovgraph.stamps import few_digits
 
-GAP_PERIODS = 5.0  # longer than this many periods is a gap
 BURST = 0.3  # of the mean period, below which most periods lie within bursts
 BURST_SECONDS = 3.0  # between bursts of a buffer that is read again and again; what is longer is silence
 WITHIN = 0.1  # of the time, that bursts last at most of sensors other than the IMU, which may measure now and then only

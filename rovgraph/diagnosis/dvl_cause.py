@@ -16,12 +16,13 @@ from dataclasses import replace
 import numpy as np
 
 from rovgraph.check.dvl import dvl_and_imu
+from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config, mount_matrix
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
 from rovgraph.engine.measurements import Block
 from rovgraph.engine.optimum import Optimum
-from rovgraph.geometry import Array, cross, rotate, signed_permutations, transpose
+from rovgraph.geometry import Array, cross, rotate, transpose
 from rovgraph.kernels import motion_row
 from rovgraph.log import Log
 from rovgraph.sensors.dvl import DvlVelocity, axes_remedy
@@ -44,12 +45,11 @@ def dvl_cause(evidence: Evidence) -> Iterator[Statistic]:
         return
     R_bs = mount_matrix(config.dvl.mount_rpy_deg)
     as_configured = compared.error(np.eye(3), R_bs, 0.0)
-    orientations = signed_permutations()
-    turned = [compared.error(H, R_bs, 0.0) for H in orientations]
+    turned = [compared.error(H, R_bs, 0.0) for H in ORIENTATIONS]
     shifted = {float(s): compared.error(np.eye(3), R_bs, float(s)) for s in SHIFTS_S}
     shift = min(shifted, key=lambda s: shifted[s])
     if min(turned) < shifted[shift]:
-        cause, remedy = axes_remedy(orientations[int(np.argmin(turned))], R_bs)
+        cause, remedy = axes_remedy(ORIENTATIONS[int(np.argmin(turned))], R_bs)
         figure, kind = as_configured / min(turned), "axes"
     else:
         late = "late" if shift > 0 else "early"

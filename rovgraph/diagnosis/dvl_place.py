@@ -16,8 +16,6 @@ from rovgraph.engine.rate_noise import ARM
 from rovgraph.engine.released import release
 from rovgraph.geometry import Array
 
-PLACED = 5.0  # sds from which a DVL is elsewhere
-
 
 @dataclass(frozen=True)
 class DvlPlace:
@@ -53,7 +51,7 @@ def other_place(best: ChainOptimum) -> DvlPlace | None:
         return None
     belief, released = best.beliefs[ARM], release(best, RELEASED)
     spread = {r.label: float(np.hypot(r.sd, FEIGNED.get(r.name, 0.0))) for r in released}
-    arm = [r for r in released if r.name == ARM and abs(r.step) > PLACED * spread[r.label]]
+    arm = [r for r in released if r.name == ARM and abs(r.step) > RULES["held"].doubtful * spread[r.label]]
     # a place that is off makes stamps seem late: the arm is compared without what errors in variables allow for
     others = [abs(r.step) / spread[r.label] for r in released if r.name != ARM]
     if not arm or max(r.significance for r in arm) < max(others, default=0.0):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Literal
 
+from rovgraph.check.findings import SURE
 from rovgraph.log.frozen import HOLD
 
 Severity = Literal["advice", "doubtful", "wrong"]
@@ -79,7 +80,7 @@ _ROWS = (
         rate=1e-3,
     ),
     Rule(
-        "held", "error of a constant that is not estimated, in its sds", 5.0, 30.0, live="of the smoothed dive so far"
+        "held", "error of a constant that is not estimated, in its sds", SURE, 30.0, live="of the smoothed dive so far"
     ),
     Rule(
         "moved", "shift of an estimated variable or a first bias, in sds of that shift", 4.0, 10.0, 1.6e-3, live="now"

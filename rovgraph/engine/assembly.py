@@ -39,12 +39,11 @@ from rovgraph.kernels.layout import MOTION
 from rovgraph.kernels.measurement_row import MOST, Z
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.packing import pack, unpack
-from rovgraph.log.streams import arrivals, in_precedence, precedence
+from rovgraph.log.streams import GAP_PERIODS, arrivals, in_precedence, precedence
 from rovgraph.sensors import SENSORS, ModelAiding
 from rovgraph.sensors.sensor import none_refused, of_instrument
 from rovgraph.state import PLACE
 
-GAP_PERIODS = 5.0  # an IMU silence of more sample periods than this is a gap
 KEPT = 256  # keyframes that are never forgotten, for the noise that they have shown
 BUFFER = 64  # rows of an array to begin with
 _FATES = {

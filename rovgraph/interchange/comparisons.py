@@ -20,7 +20,8 @@ from typing import Protocol
 
 import numpy as np
 
-from rovgraph.geometry import Array, exp_rotation, signed_permutations, skew
+from rovgraph.check.lags import ORIENTATIONS, correlate
+from rovgraph.geometry import Array, exp_rotation, skew
 from rovgraph.interchange.motion import Acceleration, Motion, Signal
 
 MOST_SAMPLES = 20_000  # of a recording that are searched; longer ones are sampled more coarsely
@@ -262,8 +263,7 @@ def _by_arm(rate: Array, spin: Array) -> Array:
 
 def _rotations() -> Array:
     """Rotations from a DVL's axes to an IMU's: right angles, and any turn about the DVL's z axis; shape (k, 3, 3)."""
-    right = signed_permutations()
-    right = right[np.linalg.det(right) > 0.0]
+    right = ORIENTATIONS[np.linalg.det(ORIENTATIONS) > 0.0]
     about_z = exp_rotation(np.column_stack([np.zeros((len(TURNS), 2)), TURNS]))
     return np.asarray((right[:, None] @ about_z).reshape(-1, 3, 3))
 
@@ -287,8 +287,5 @@ def _products(a: Array, b: Array) -> Array:
 
 def _correlate(a: Array, b: Array) -> Array:
     """Sums over t of a_i(t) b_j(t + lag) for (n, ...) and (m, ...), lags from 1 - n to m - 1; shape (lags, i * j)."""
-    from scipy.signal import fftconvolve  # type: ignore[attr-defined]  # takes 0.4 s to load, for every command
-
-    a, b = a.reshape(len(a), -1), b.reshape(len(b), -1)
-    sums = fftconvolve(a[::-1, :, None], b[:, None], axes=0)
-    return np.asarray(sums.reshape(len(sums), -1))
+    sums = correlate(a.reshape(len(a), -1), b.reshape(len(b), -1), 1 - len(a), len(b) - 1)
+    return np.ascontiguousarray(sums.reshape(-1, sums.shape[-1]).T)

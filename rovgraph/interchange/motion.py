@@ -15,9 +15,9 @@ from rovgraph.check.inertial import InertialMotion, inertial_motion
 from rovgraph.config import Config
 from rovgraph.geometry import Array
 from rovgraph.log import Log
+from rovgraph.log.streams import GAP_PERIODS
 
 Kind = Literal["turning", "depth", "speed", "velocity", "way"]
-GAP_PERIODS = 5.0  # between samples that are still interpolated
 WINDOW = 1.0  # shortest over which changes are compared [s]
 WINDOW_PERIODS = 3.0
 FIX_WINDOW = 20.0  # over which fixes show a speed [s]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rovgraph.check.lags import PARTS, normal_equations, spread
 from rovgraph.geometry import Array
 from rovgraph.interchange.comparisons import Comparison, coarse_step, comparisons
 from rovgraph.interchange.motion import Motion
@@ -20,7 +21,6 @@ OVERLAP = 0.3  # of the shorter recording
 FOLLOWS = 0.3  # part of the motion's square that has to be explained
 EVIDENCE = 40.0  # in chi-square, that the best lag is better than any other
 DRIFT_SD = 1e-4  # of crystals, their prior
-PARTS = 10  # of the overlap, each left out once
 SURE_S = 0.5  # sd of an offset that is believed [s]
 ITERATIONS = 20
 HELD = 3  # of them with the lag held, until mountings fit
@@ -58,11 +58,6 @@ class Offset:
     overlap: float
     explained: float
     how: str
-
-    def to_a(self, times: Array) -> Array:
-        """Times of clock A at times of clock B."""
-        since = np.asarray(times) - self.seconds - self.at
-        return np.asarray(self.at + since / (1.0 + self.drift))
 
     def reversed(self) -> "Offset":
         """How much later clock A is than B."""
@@ -222,14 +217,12 @@ def _step(
     usable = size <= CLIPPED**2 * max(float(np.median(size)), 1e-12)
     J, left, seen = J[usable], left[usable], y[known][usable]
     variance = max(float(np.mean(left**2)), 1e-18)
-    parts = np.array_split(np.arange(len(left)), PARTS)
-    H = np.array([np.einsum("nik,nil->kl", J[p], J[p], optimize=True) for p in parts]) / variance
-    g = np.array([np.einsum("nik,ni->k", J[p], left[p]) for p in parts]) / variance
+    H, g = normal_equations(J, left, variance)
     prior = TINY + np.concatenate([[0.0, 0.0], comparison.information])
     information = H.sum(axis=0) + np.diag(prior)
     without = np.linalg.solve(information - H, (g.sum(axis=0) - g)[..., None])[:, 0, 0]
-    spread = np.hypot(np.sqrt((PARTS - 1) * np.var(without)), comparison.floor_s)
-    wider = max(1.0, float(spread) / float(np.sqrt(np.linalg.inv(information)[0, 0]))) ** 2
+    sd = np.hypot(spread(without), comparison.floor_s)
+    wider = max(1.0, float(sd) / float(np.sqrt(np.linalg.inv(information)[0, 0]))) ** 2
     prior[1] += DRIFT_SD**-2
     prior[:2] += HOLD if held else 0.0
     information = H.sum(axis=0) / wider + np.diag(prior)

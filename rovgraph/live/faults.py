@@ -215,7 +215,7 @@ class Faults:
     def _waits(self, m: Measurement, watch: Watch) -> bool:
         """Whether it waits until it is known whether its values are held."""
         if not watch.waits and watch.equal == WAIT.get(m.sensor) and watch.state == "ok":
-            usual = np.median([run[1] for run in watch.runs]) if watch.runs else 1.0
+            usual = float(np.median([run[1] for run in watch.runs])) if watch.runs else 1.0
             watch.waits = usual <= 1.0 and (m.sensor == "imu" or bool(m.values[:3].any()))
         return watch.waits and watch.asked == -np.inf
 

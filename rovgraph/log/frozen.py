@@ -100,6 +100,9 @@ class Run(NamedTuple):
     last: float
 
 
+Shown = Callable[[Run], str]  # what shows that the vehicle moved meanwhile; "" = nothing does
+
+
 @dataclass(frozen=True)
 class Runs:
     """m runs of equal measurements of a sensor, single ones too, in the order of time.
@@ -490,9 +493,6 @@ def held(sensor: str, runs: Runs, log: Log, config: Config, turning: float | Non
     for k in np.flatnonzero(long).tolist() if shown is not None else ():
         if why := shown(Run(runs.values[k], float(runs.first[k]), float(runs.last[k]))):
             yield k, why
-
-
-Shown = Callable[[Run], str]
 
 
 def _motion_shown(
