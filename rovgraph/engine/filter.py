@@ -49,7 +49,7 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.correction import GivenRows
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.filtering import Filtered, Interval, Intervals, Taken, filter_intervals, take_interval
-from rovgraph.kernels.measurement_row import MeasurementRows
+from rovgraph.kernels.measurement_row import MeasuredRows
 from rovgraph.kernels.moves import difference, move_estimate
 from rovgraph.state import PLACE, PLACE_DIM
 
@@ -191,14 +191,14 @@ class FilterEngine:
             self._renew(gates, since)
         return known, out
 
-    def _rows(self, measurements: Sequence[KeyframeMeasurement]) -> MeasurementRows:
+    def _rows(self, measurements: Sequence[KeyframeMeasurement]) -> MeasuredRows:
         """Measurements as kernels take them."""
         if not measurements:
-            return MeasurementRows(np.empty((0, at.ROW)), np.empty(0, np.int64), _EXACT)
+            return MeasuredRows(np.empty((0, at.ROW)), np.empty(0, np.int64), _EXACT)
         scaled = measurements[0].scale_to_bias is not None
         scale = np.array([m.scale_to_bias for m in measurements]) if scaled else _EXACT
         rows = np.array([m.row[: at.ROW] for m in measurements])
-        return MeasurementRows(rows, np.array([self._index[m.sensor] for m in measurements]), scale)
+        return MeasuredRows(rows, np.array([self._index[m.sensor] for m in measurements]), scale)
 
     def run(self, rows: DiveRows, begin: int, end: int, before: Gaussian, gates: Gates) -> FilterRun:
         """Take intervals of a dive as `step` does, as far as kernels know how.
@@ -215,7 +215,7 @@ class FilterEngine:
         shapes = (k, 21), (k, C), (k, 21), (k, C), (k, 6, 6), (k, 3, 3), (k, size), (m,), (m,)
         out = Filtered._make(np.empty(shape) for shape in shapes)
         intervals = Intervals(some.motions, some.scales, np.append(0, some.taken), some.first[:k], POORLY_KNOWN)
-        measured = MeasurementRows(some.rows, some.which, some.row_scales)
+        measured = MeasuredRows(some.rows, some.which, some.row_scales)
         taken = filter_intervals(known, intervals, measured, self._model, since, out, take_interval)
         self._renew(gates, since)
         m = int(some.taken[taken - 1]) if taken else 0
