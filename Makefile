@@ -1,5 +1,6 @@
 # make demo   rovgraph demo: a dive, its track, and how far it is from the truth
 # make test   linters, types and tests
+# make matrix tests with the oldest and the newest numba, numpy, gtsam and pandas
 # make docs   this documentation as pages, in build/site
 # make mutants   faults are planted in a copy, and those that the fast tests miss are named
 # Each makes the environment that it needs in .venv.
@@ -13,7 +14,7 @@ DEMO   ?= results/demo
 # Tests start many programs, which load faster from bytecode that is kept.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help venv demo test lint docs bench mutants clean
+.PHONY: help venv demo test lint docs bench matrix mutants clean
 .DELETE_ON_ERROR:
 
 help:
@@ -53,6 +54,9 @@ test: lint
 
 docs: $(VENV)/docs.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+matrix:
+	$(PYTHON) benchmarks/matrix.py
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python benchmarks/batch.py

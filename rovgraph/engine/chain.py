@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -35,7 +34,8 @@ from rovgraph.engine.sensor_rows import compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
-from rovgraph.kernels.dive import eliminate_dive, robust_costs, squared_lengths
+from rovgraph.kernels.chain import Elimination, PlacedRows, Walks
+from rovgraph.kernels.dive import DiveFactors, Point, eliminate_dive, robust_costs, squared_lengths
 from rovgraph.kernels.measurement_row import GATE, TIME
 from rovgraph.state import State
 
@@ -195,11 +195,15 @@ class Chain:
 
     def _squared_lengths(self, point: State) -> Array:
         """Of the whitened innovations of what kernels know, shape (m,)."""
-        r, out = self.problem, np.empty(len(self.problem.rows))
-        gravity = self.initial.gravity
-        dive = r.compiled_rows, r.which, r.first, r.row_scales, self._sensors
-        squared_lengths(*dive, *self._arrays(point), gravity, out)
+        out = np.empty(len(self.problem.rows))
+        squared_lengths(self._factors, self._arrays(point), out)
         return out
+
+    @property
+    def _factors(self) -> DiveFactors:
+        r = self.problem
+        of_motions, measured = (r.motions, r.weights, r.scales), (r.compiled_rows, r.which, r.first, r.row_scales)
+        return DiveFactors(*of_motions, *measured, self._sensors, self.initial.gravity)
 
     def _entered(self, gates: Gates) -> NDArray[np.bool_]:
         """Gates of what kernels know, shape (m,)."""
@@ -208,14 +212,14 @@ class Chain:
             out[places] = gates[sensor]
         return out
 
-    def _arrays(self, point: State) -> tuple[Array, Array, Array, Array, Array]:
+    def _arrays(self, point: State) -> Point:
         """A point as `rovgraph.kernels.dive` takes it."""
         walked = any(value.ndim > 1 for value in point.calibration.values())  # also of what is held where it has walked
         c = np.empty((len(self.problem) if walked else 1, calibration_size()))
         for name, part in LAYOUT.items():
             c[:, part] = point.calibration[name]
         R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
-        return R, p, v, b, c
+        return Point(R, p, v, b, c)
 
     def step(self, point: State, gates: Gates) -> ChainStep:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
@@ -306,22 +310,14 @@ class Chain:
         self._put_priors(given, point, clones)
         for place, (sensor, block) in enumerate(self.given.items(), PRIORS):
             self._put_block(given, place, block, point, gates[sensor])
-        r, n, d, c = self.problem, len(self.problem), self.layout.d, self.layout.c + clones
-        dive = r.motions, r.weights, r.scales, r.compiled_rows, r.which, r.first, r.row_scales, self._sensors
-        gravity = self.initial.gravity
-        walks = *self.walk, -self.walk_residuals(point)
-        point_and_layout: Any = *self._arrays(point), self.layout.column, gravity, *walks
-        rest: Any = (
-            given.values,
-            given.targets,
-            given.first,
-            self._border_rows(point, clones),
-            np.array(stops, np.int64),
-        )
+        n, d, c = len(self.problem), self.layout.d, self.layout.c + clones
+        entered, at, walks = self._entered(gates), self._arrays(point), Walks(*self.walk, -self.walk_residuals(point))
+        others, border_rows = PlacedRows(given.values, given.targets, given.first), self._border_rows(point, clones)
+        kept_at, column = np.array(stops, np.int64), self.layout.column
 
         def fill(conditionals: Array, border: Array, filtered: Array, left: Array) -> int:
-            out: Any = conditionals, border, filtered, left
-            return eliminate_dive(*dive, self._entered(gates), *point_and_layout, *rest, *out)
+            out = Elimination(kept_at, conditionals, border, filtered, left)
+            return eliminate_dive(self._factors, entered, at, column, walks, others, border_rows, out)
 
         try:
             return square_root(n, d, c, len(stops), fill, kept, diagonal)

@@ -46,7 +46,7 @@ from rovgraph.kernels import measurement_row as at
 from rovgraph.kernels.correction import GivenRows
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.filtering import Filtered, Interval, Intervals, Taken, filter_intervals, take_interval
-from rovgraph.kernels.measurement_row import MeasurementRows
+from rovgraph.kernels.measurement_row import MeasuredRows
 from rovgraph.kernels.moves import difference, move_estimate
 from rovgraph.state import PLACE, PLACE_DIM
 
@@ -190,11 +190,11 @@ class FilterEngine:
         begin, end = problem.measured_in(k)
         return end - int(np.count_nonzero(problem.keyframe[begin:end] == k))
 
-    def _rows(self, problem: Problem, some: "slice | Index") -> MeasurementRows:
+    def _rows(self, problem: Problem, some: "slice | Index") -> MeasuredRows:
         """Measurements as kernels take them."""
         scales = problem.row_scales[some] if len(problem.row_scales) else problem.row_scales
         rows = np.ascontiguousarray(problem.rows[some, : at.ROW])
-        return MeasurementRows(rows, np.ascontiguousarray(problem.which[some]), scales)
+        return MeasuredRows(rows, np.ascontiguousarray(problem.which[some]), scales)
 
     def run(self, problem: Problem, begin: int, end: int, before: Gaussian, gates: Gates) -> FilterRun:
         """Take intervals of a dive as `step` does, as far as kernels know how.

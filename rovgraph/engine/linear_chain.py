@@ -7,7 +7,8 @@ import numpy as np
 
 from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, square_root
 from rovgraph.geometry import Array
-from rovgraph.kernels.chain import Index
+from rovgraph.kernels.chain import Elimination, Index, PlacedRows, Walks
+from rovgraph.kernels.linear_chain import LinearMotions
 from rovgraph.kernels.linear_chain import eliminate as eliminate_rows
 
 
@@ -61,9 +62,11 @@ def eliminate(
     UndeterminedError : the rows do not determine some component
     """
     m, n, c = motions, len(measurements.first) - 1, border_rows.shape[1] - 1
-    rows = measurements.values, measurements.targets, measurements.first, border_rows, np.array(stops, dtype=np.int64)
+    rows = PlacedRows(measurements.values, measurements.targets, measurements.first)
+    kept_at = np.array(stops, dtype=np.int64)
 
-    def fill(*out: Array) -> int:
-        return eliminate_rows(m.A, m.C, m.targets, m.walk, m.kept, m.walk_r, *rows, *out)
+    def fill(conditionals: Array, border: Array, filtered: Array, left: Array) -> int:
+        own, walks = LinearMotions(m.A, m.C, m.targets), Walks(m.walk, m.kept, m.walk_r)
+        return eliminate_rows(own, walks, rows, border_rows, Elimination(kept_at, conditionals, border, filtered, left))
 
     return square_root(n, m.A.shape[1] + m.walk.shape[1], c, len(stops), fill)

@@ -25,16 +25,55 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import helper, kernel, view_helper
+from rovgraph.kernels.compile import Index, IndexMatrix, Matrices, Matrix, Vector, helper, kernel, view_helper
 from rovgraph.kernels.householder import padded, triangularise
-
-Index = NDArray[np.int64]
 
 UNDETERMINED = 1e-10  # a pivot below this part of its column is rounding
 PENDING = 48  # rows that are folded into the border at a time
+
+
+class Walks(NamedTuple):
+    """What walks from keyframe to keyframe: ``weight (x_{k+1} - kept x_k) = r`` is white; shape (n - 1, walking)."""
+
+    weight: Matrix
+    kept: Matrix
+    r: Matrix
+
+
+class PlacedRows(NamedTuple):
+    """Whitened rows of measurements in the order of keyframes.
+
+    Attributes
+    ----------
+    rows : shape (m, s + q + 1): the first s components of the keyframe, q others, right-hand side
+    targets : shape (m, q), of the q others
+    first : shape (n + 1,), a keyframe's first row
+    """
+
+    rows: Matrix
+    targets: IndexMatrix
+    first: Index
+
+
+class Elimination(NamedTuple):
+    """What an elimination writes.
+
+    Attributes
+    ----------
+    stops : shape (f,), increasing, keyframes at which to keep what the rows up to there say
+    conditionals : shape (n, d, 2 d + c + 1), columns R_k, S_k, T_k, z_k
+    border : shape (c, c + 1), columns R_y, z_y
+    filtered : shape (f, d + c, d + c + 1), triangular: rows of that keyframe and of the border, of data up to it
+    left : shape (1,), sum of squares at the minimum
+    """
+
+    stops: Index
+    conditionals: Matrices
+    border: Matrix
+    filtered: Matrices
+    left: Vector
 
 
 class Room(NamedTuple):
@@ -91,8 +130,9 @@ def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
 
 
 @view_helper
-def load_measurements(rows: Array, targets: Index, begin: int, end: int, s: int, d: int, room: Room) -> int:
+def load_measurements(k: int, measured: PlacedRows, s: int, d: int, room: Room) -> int:
     """Rows of a keyframe's measurements into V, below the d rows that are known of it; returns the row after them."""
+    rows, targets, begin, end = measured.rows, measured.targets, measured.first[k], measured.first[k + 1]
     last, V_out, scale_out = rows.shape[1] - 1, room.V, room.scale
     for i in range(end - begin):
         row = begin + i
@@ -183,40 +223,30 @@ def undetermined(triangle: Array, scale: Array, begin: int, end: int, shift: int
 
 
 @view_helper
-def absorb(
-    k: int,
-    n: int,
-    end: int,
-    last: int,
-    stops: Index,
-    stop: int,
-    room: Room,
-    filtered_out: Array,
-    left_out: Array,
-) -> tuple[int, int, int]:
+def absorb(k: int, n: int, end: int, last: int, stop: int, room: Room, out: Elimination) -> tuple[int, int, int]:
     """Make a triangle of keyframe k's rows in V, up to ``end``, and put it where its motion is added.
 
     Parameters
     ----------
     last : of Y, the row after those that are in use
-    stops, stop, filtered_out, left_out : as `rovgraph.kernels.linear_chain.eliminate`, and the next of the stops
+    stop : the next of the stops
 
     Returns
     -------
     last, stop : afterwards
     failing : the first component that is not determined at a stop, or -1
     """
-    V, W, Y, d = room.V, room.W, room.Y, room.W.shape[0] // 2
+    V, W, Y, d, stops = room.V, room.W, room.Y, room.W.shape[0] // 2, out.stops
     c, failing = room.scale.shape[0] - d, -1
     triangularise(V, d, 0, end, end, room.v, room.w)
     last = append_rows(V, d, end, d, c + 1, last, Y)
     stops_here = stop < stops.shape[0] and stops[stop] == k
     if last > c + PENDING or stops_here or k == n - 1:
-        left_out[0] += fold_border(Y, c, last, room.v, room.w)
+        out.left[0] += fold_border(Y, c, last, room.v, room.w)
         last = c
     if stops_here:
         failing = max(undetermined(V, room.scale, 0, d, k * d), undetermined(Y, room.scale, d, d + c, (n - 1) * d))
-        join(V, Y, d, c, stop, filtered_out)
+        join(V, Y, d, c, stop, out.filtered)
         stop += 1
     for i in range(d):
         for j in range(d):

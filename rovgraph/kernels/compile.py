@@ -40,7 +40,7 @@ try:
     from numba import njit, types
     from numba.extending import register_jitable
 except ImportError as error:
-    raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61'") from None
+    raise InputError(f"numba is missing or broken ({error}): pip install 'numba>=0.61,<0.69'") from None
 
 F = TypeVar("F", bound=Callable[..., Any])
 config: Any = numba.config
@@ -53,6 +53,7 @@ Vector = Annotated[Array, types.float64[::1]]
 Matrix = Annotated[Array, types.float64[:, ::1]]
 Matrices = Annotated[Array, types.float64[:, :, ::1]]  # one for each of n
 Index = Annotated[NDArray[np.int64], types.int64[::1]]
+Flags = Annotated[NDArray[np.bool_], types.boolean[::1]]
 IndexMatrix = Annotated[NDArray[np.int64], types.int64[:, ::1]]
 # arrays with any strides, which may be read-only; in no NamedTuple, whose fields numba does not convert
 AnyVector = Annotated[Array, types.Array(types.float64, 1, "A", readonly=True)]

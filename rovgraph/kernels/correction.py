@@ -20,7 +20,7 @@ from rovgraph.kernels.error_coordinates import local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
-from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME, MeasurementRows
+from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME, MeasuredRows
 from rovgraph.kernels.moves import move
 from rovgraph.kernels.robust_update import (
     Innovations,
@@ -54,7 +54,7 @@ def split(row: Array, L: Array, H_out: Array, H_y_out: Array) -> None:
 
 @helper
 def linearize_keyframe(
-    known: FilterState, measured: MeasurementRows, model: FilterModel, scratch: Scratch, found: Innovations
+    known: FilterState, measured: MeasuredRows, model: FilterModel, scratch: Scratch, found: Innovations
 ) -> None:
     """Whitened innovations and Jacobians of the measurements of a keyframe but those that are `GIVEN`.
 
@@ -87,7 +87,7 @@ def widest(S: Array) -> float:
 @helper
 def relinearize(
     known: FilterState,
-    measured: MeasurementRows,
+    measured: MeasuredRows,
     model: FilterModel,
     entered: Array,
     found: Innovations,
@@ -167,7 +167,7 @@ class Corrected(NamedTuple):
 @helper
 def correct(
     known: FilterState,
-    measured: MeasurementRows,
+    measured: MeasuredRows,
     given: GivenRows,
     model: FilterModel,
     since: Array,

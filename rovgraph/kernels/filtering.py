@@ -15,7 +15,7 @@ from rovgraph.kernels.compile import AnyMatrix, AnyVector, Index, Matrices, Matr
 from rovgraph.kernels.correction import Corrected, GivenRows, correct
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import VELOCITY
-from rovgraph.kernels.measurement_row import GIVEN, KIND, MeasurementRows
+from rovgraph.kernels.measurement_row import GIVEN, KIND, MeasuredRows
 from rovgraph.kernels.prediction import predict_filter
 
 
@@ -80,7 +80,7 @@ class Interval(NamedTuple):
     ----------
     motion : row of `rovgraph.kernels.motion_row`, or (0,): there is none, and all is measured at one keyframe
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
-    rows, which, scales : of `MeasurementRows`
+    rows, which, scales : of `MeasuredRows`
     between : how many of them, the first ones, belong to the keyframe before
     given_r, given_H : of `GivenRows`
     """
@@ -139,7 +139,7 @@ def take_interval(
             _keep(known, out.predicted)
         begin, end = (between, len(interval.which)) if arrived else (0, between)
         if begin < end:
-            measured = MeasurementRows(interval.rows[begin:end], interval.which[begin:end], interval.scales[begin:end])
+            measured = MeasuredRows(interval.rows[begin:end], interval.which[begin:end], interval.scales[begin:end])
             given = GivenRows(interval.given_r[used:], interval.given_H[used:])
             corrected = Corrected(out.nis[begin:end], out.weight[begin:end], out.places)
             used += correct(known, measured, given, model, since, gated, corrected)
@@ -189,7 +189,7 @@ class Filtered(NamedTuple):
 def filter_intervals(
     known: FilterState,
     intervals: Intervals,
-    measured: MeasurementRows,
+    measured: MeasuredRows,
     model: FilterModel,
     since: Vector,
     out: Filtered,

@@ -41,7 +41,7 @@ GIVEN = -1.0
 SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2
 
 
-class MeasurementRows(NamedTuple):
+class MeasuredRows(NamedTuple):
     """m measurements.
 
     Attributes
