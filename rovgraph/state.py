@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.geometry import Array, exp_rotation, rotate
-from rovgraph.kernels.propagation import propagate_many
 
 POSE, VELOCITY, BIAS = "pose", "velocity", "bias"
 DIMENSION = {POSE: 6, VELOCITY: 3, BIAS: 6}
@@ -90,61 +89,3 @@ def _stacked(values: list[Array]) -> Array:
     if all(value is values[0] for value in values):
         return np.broadcast_to(values[0], (len(values), *values[0].shape))
     return np.array(values)
-
-
-@dataclass(frozen=True)
-class Delta:
-    """Preintegrated motion from a keyframe to a measurement's own time, n of them.
-
-    Attributes
-    ----------
-    dt : ndarray, shape (n,) [s]
-    dR : ndarray, shape (n, 3, 3)
-    dv, dp : ndarray, shape (n, 3) [m/s, m]
-    bias : ndarray, shape (n, 6), the bias the preintegration assumed
-    """
-
-    dt: Array
-    dR: Array
-    dv: Array
-    dp: Array
-    bias: Array
-
-    @staticmethod
-    def none(n: int) -> "Delta":
-        """No motion: the measurement is at its keyframe."""
-        zero = np.zeros((n, 3))
-        return Delta(np.zeros(n), np.broadcast_to(np.eye(3), (n, 3, 3)), zero, zero, np.zeros((n, 6)))
-
-
-def propagate(state: State, delta: Delta, gravity: float) -> State:
-    """The state at the measurements' times (equations in `rovgraph.kernels.propagation`)."""
-    return _propagate(state, delta, gravity, np.empty((0, 15, 15)))
-
-
-def propagate_with_jacobian(state: State, delta: Delta, gravity: float) -> tuple[State, Array]:
-    """The state at the measurements' times, and its derivative by the keyframes' state.
-
-    Parameters
-    ----------
-    state : State of the keyframes, n epochs
-    delta : Delta, n
-    gravity : [m/s^2]
-
-    Returns
-    -------
-    state : State, n epochs
-    F : ndarray, shape (n, 15, 15), pose, velocity, bias by pose, velocity, bias
-    """
-    F = np.zeros((len(state), 15, 15))
-    return _propagate(state, delta, gravity, F), F
-
-
-def _propagate(state: State, delta: Delta, gravity: float, F: Array) -> State:
-    n = len(state)
-    given = (state.R_nb, state.p_n, state.v_n, state.bias, delta.dt, delta.dR, delta.dv, delta.dp, delta.bias)
-    if any(len(values) != n for values in given):
-        raise ValueError(f"cannot propagate {n} epochs with arrays of {[len(v) for v in given]}")
-    R_nb, p_n, v_n = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
-    propagate_many(*given, gravity, R_nb, p_n, v_n, F)
-    return State(R_nb, p_n, v_n, state.bias, state.calibration)

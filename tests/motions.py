@@ -1,14 +1,18 @@
 """Motions by themselves, rows of `rovgraph.kernels.motion_row`, and small problems for the tests."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from rovgraph.calibration import TABLE
+from rovgraph.engine.measurements import kernel_states
 from rovgraph.engine.problem import Problem
 from rovgraph.engine.scale import biased
 from rovgraph.geometry import Array
 from rovgraph.kernels import assembly as at
 from rovgraph.kernels import measurement_row, motion_row
+from rovgraph.kernels.linearization import States, place_measurements
 from rovgraph.kernels.motion import transitions
 from rovgraph.kernels.motion_residual import motion_errors, motion_weights
 from rovgraph.state import State
@@ -54,7 +58,7 @@ def problem_of(time: Array, motions: Array) -> Problem:
         rows=np.empty((0, measurement_row.ROW)),
         row_scales=np.empty((0, 6, 6)),
         of=np.empty((at.OF, 0), np.int64),
-        windows=np.empty((0, 0, at.KNOT)),
+        windows=np.empty((0, 0, measurement_row.KNOT)),
         names=np.empty(0),
         lags={},
         bias=motions[0, motion_row.BIAS : motion_row.BIAS + 6] if len(motions) else np.zeros(6),
@@ -67,3 +71,34 @@ def _arrays(state: State, scale: Array | None = None) -> tuple[Array, Array, Arr
     seen = state if scale is None else biased(state, scale[None])
     R, p, v, bias = (np.ascontiguousarray(a, float) for a in (seen.R_nb, seen.p_n, seen.v_n, seen.bias))
     return R, p, v, bias
+
+
+class Delta(NamedTuple):
+    """Motion from n keyframes to measurements: see `rovgraph.kernels.propagation`."""
+
+    dt: Array
+    dR: Array
+    dv: Array
+    dp: Array
+    bias: Array
+
+    @staticmethod
+    def none(n: int) -> "Delta":
+        zero = np.zeros((n, 3))
+        return Delta(np.zeros(n), np.tile(np.eye(3), (n, 1, 1)), zero, zero, np.zeros((n, 6)))
+
+
+def propagate(state: State, delta: Delta, gravity: float) -> tuple[State, Array]:
+    """The states at the measurements' own times, and their derivatives by those of the keyframes, (n, 15, 15)."""
+    n, row = len(state), measurement_row
+    rows = np.zeros((n, row.ROW))
+    rows[:, row.DT], rows[:, row.DR : row.DV] = delta.dt, delta.dR.reshape(n, 9)
+    rows[:, row.DV : row.DP], rows[:, row.DP : row.ASSUMED], rows[:, row.ASSUMED : row.Z] = delta[2:]
+    none = np.zeros((0, 6, 6)), np.full(n, -1), np.zeros((0, 0, row.KNOT))
+    measured = row.MeasuredRows(rows, np.zeros(n, np.int64), *none)
+    calibration = {name: np.zeros(variable.dim) for name, variable in TABLE.items()}
+    known = replace(state, calibration={**calibration, **state.calibration})
+    out = States(*(np.empty((n, *shape)) for shape in ((3, 3), (3,), (3,), (6,), (12,))))
+    F = np.zeros((n, 15, 15))
+    place_measurements(kernel_states(known), measured, np.zeros((1, row.PARAMS)), gravity, out, np.empty((n, 3)), F)
+    return State(out.R, out.p, out.v, out.b, state.calibration), F

@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from motions import Delta
+from motions import propagate as propagate_all
 
 from rovgraph.calibration import LAYOUT, SIZE, TABLE, Variable, calibration_size, register
 from rovgraph.geometry import exp_rotation, matrix_from_rpy, wrap_angle
 from rovgraph.kernels import layout
 from rovgraph.kernels import measurements as kernels
-from rovgraph.kernels.propagation import WORK, chain, propagate, propagate_many, propagation_jacobian
+from rovgraph.kernels.propagation import WORK, chain, propagate, propagation_jacobian
 from rovgraph.kernels.weighting import LOSSES, loss_weight, robust_cost, weight_many, whiten_many
 from rovgraph.sensors import CompassHeading, Position
-from rovgraph.state import PLACE_DIM, Delta, State
-from rovgraph.state import propagate as propagate_state
+from rovgraph.state import PLACE_DIM, State
 
 N, STEP = 5, 1e-6
 RNG = np.random.default_rng(0)
@@ -188,8 +189,6 @@ def test_arrays_of_different_numbers_of_epochs_are_refused():
         model.predict(State(R, p, v[1:], b, calibration), rate)
     with pytest.raises(ValueError, match=f"depth: cannot predict {N} epochs"):
         model.predict(State(R, p, v, b, {"depth_offset": np.zeros((N + 1, 1))}), rate)
-    with pytest.raises(ValueError, match=f"cannot propagate {N} epochs"):
-        propagate_state(State(R, p, v, b), Delta.none(N - 1), 9.81)
 
 
 def motions() -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -202,9 +201,8 @@ def motions() -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 def test_one_epoch_is_propagated_as_many():
     state, motion = motions()
-    out = [np.empty((N, 3, 3)), np.empty((N, 3)), np.empty((N, 3))]
-    F = np.zeros((N, 15, 15))
-    propagate_many(*state, *motion, 9.81, *out, F)
+    there, F = propagate_all(State(*state), Delta(*motion), 9.81)
+    out = there.R_nb, there.p_n, there.v_n
     work, one, one_F = np.empty((WORK, 3, 3)), [np.empty((3, 3)), np.empty(3), np.empty(3)], np.zeros((15, 15))
     for k in range(N):
         propagate(*(values[k] for values in (*state, *motion)), 9.81, *one, work)
@@ -216,8 +214,7 @@ def test_one_epoch_is_propagated_as_many():
 @pytest.mark.parametrize("name", CASES)
 def test_chained_jacobian_is_the_product_with_that_of_the_propagation(name):
     state, motion = motions()
-    F = np.zeros((N, 15, 15))
-    propagate_many(*state, *motion, 9.81, np.empty((N, 3, 3)), np.empty((N, 3)), np.empty((N, 3)), F)
+    _, F = propagate_all(State(*state), Delta(*motion), 9.81)
     for H in (predict(name, epochs(name))[1], RNG.standard_normal((N, 3, 20))):
         for k in range(N):
             expected = np.hstack([H[k, :, :15] @ F[k], H[k, :, 15:]])

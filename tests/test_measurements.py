@@ -6,23 +6,22 @@ import gtsam
 import numpy as np
 import pytest
 from dives import batch, simulated
-from motions import problem_of
+from motions import Delta, problem_of, propagate
 from scipy.stats import chi2
 from test_sensors import CONFIG, SENSORS, random_state
 
 from rovgraph.calibration import TABLE, calibration_size
 from rovgraph.config import Config
-from rovgraph.engine.late_stamp_window import KNOT_S
 from rovgraph.engine.measurements import (
-    Block,
+    KeyframeRows,
+    Measurements,
     loss_and_weight,
     loss_threshold,
-    make_block,
+    sensor_table,
     whitening,
 )
 from rovgraph.engine.problem import sd_of
 from rovgraph.engine.scale import scale_to_bias
-from rovgraph.engine.sensor_rows import KeyframeRows, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, exp_rotation, matrix_from_rpy
 from rovgraph.graph.keys import key
@@ -32,16 +31,16 @@ from rovgraph.graph.values import insert_calibration, insert_state
 from rovgraph.instruments import instruments
 from rovgraph.kernels import assembly, motion_row
 from rovgraph.kernels import measurement_row as at
-from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State, propagate
+from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, State
 
 N, STEP = 4, 1e-6
 SEGMENTS = np.arange(N) // 2
 SIZES = DIMENSION | {PLACE: PLACE_DIM} | {name: variable.dim for name, variable in TABLE.items()}
-LAG = KNOT_S * np.arange(-60, 61)  # of knots around a stamp that may be late [s]
+LAG = at.KNOT_S * np.arange(-60, 61)  # of knots around a stamp that may be late [s]
 WALKS = {name: 0.1 if name in {"hard_iron", "field_scale", "dvl_yaw"} else 0.0 for name in TABLE}
 
 
-def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Block, State]:
+def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Measurements, State]:
     """A block with motion to each measurement, and the state of its keyframes."""
     rng, instrument = np.random.default_rng(3), replace(SENSORS[sensor], loss=loss)
     state, dim = random_state(5, N), instrument.model.dim
@@ -61,12 +60,13 @@ def block_of(sensor: str, moving: bool = True, loss: str = "none") -> tuple[Bloc
         rows[k, at.RATE : at.RATE_SD], rows[k, at.RATE_SD] = rate, 0.01
         rows[k, at.Z : at.Z + dim], rows[k, sd_of(dim) : sd_of(dim) + dim] = z, sd
     of = np.zeros((assembly.OF, N), np.int64)
-    of[[assembly.KEYFRAME_OF, assembly.INTERVAL_OF, assembly.WINDOW_OF]] = np.arange(N)
+    of[[assembly.KEYFRAME_OF, assembly.INTERVAL_OF]] = np.arange(N)
+    of[assembly.WINDOW_OF] = np.arange(N) if instrument.time_offset else -1
     of[assembly.LINE_OF], of[assembly.NUMBER_OF] = 10 + np.arange(N), 7 if sensor == PLACE else -1
     problem = replace(blank, sensors=(sensor,), dims=(dim,), rows=rows, row_scales=scales, of=of, names=np.ones(N))
     if windows:
         problem = replace(problem, windows=np.array(windows), lags={sensor: LAG}, bias=state.bias.mean(axis=0))
-    return make_block(problem, np.arange(N), instrument, 9.81, Unknowns(state.calibration, WALKS)), state
+    return Measurements(problem, np.arange(N), instrument, 9.81, Unknowns(state.calibration, WALKS)), state
 
 
 def snapshot(dt: float, dR: Array, dv: Array, dp: Array) -> Array:
@@ -78,14 +78,14 @@ def track_of(motion: Array, rng: np.random.Generator) -> Array:
     """A lively motion around a stamp, at knots."""
     turn, dv, dp, rate = (wave(LAG, rng) for _ in range(4))
     dR = motion[1:10].reshape(3, 3) @ exp_rotation(turn)
-    return np.column_stack([motion[0] - LAG, dR.reshape(-1, 9), motion[10:13] + dv, motion[13:16] + dp, rate])
+    return np.column_stack([motion[0] - LAG, dR.reshape(-1, 9), motion[10:13] + dv, motion[13:16] + dp, rate, LAG])
 
 
 def wave(time: Array, rng: np.random.Generator) -> Array:
     return np.sin(2.0 * time[:, None] + rng.uniform(0, 6, 3)) * rng.standard_normal(3)
 
 
-def factor_of(block: Block, k: int) -> gtsam.CustomFactor:
+def factor_of(block: Measurements, k: int) -> gtsam.CustomFactor:
     return measurement_factor(block.at([k]), int(SEGMENTS[k]))
 
 
@@ -123,7 +123,9 @@ def test_a_heading_across_the_wrap_has_a_small_innovation():
     x[:9] = matrix_from_rpy(np.array([0.0, 0.0, np.pi - degree])).ravel()
     row[at.DR : at.DV], row[at.Z], row[at.SD] = np.eye(3).ravel(), -np.pi + degree, 1.0
     column, table = np.full(15 + calibration_size(), -1), sensor_table({"ahrs": instrument}, [])
-    rows = KeyframeRows(row[None], np.zeros(1, np.int64), table, column, 1, np.zeros((0, 6, 6)), 9.81)
+    which, window, exact = np.zeros(1, np.int64), np.full(1, -1), np.zeros((0, 6, 6))
+    measured = at.MeasuredRows(row[None], which, exact, window, np.zeros((0, 0, at.KNOT)))
+    rows = KeyframeRows(measured, table, column, 1, 9.81)
     r, _ = rows.linearize(x, np.zeros(calibration_size()))
     np.testing.assert_allclose(r, [2.0 * degree])
 
@@ -233,13 +235,16 @@ def test_whitening_takes_in_the_noise_of_the_rate_at_the_lever_arm():
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_block_predicts_at_the_measurements_own_time(sensor):
     block, state = block_of(sensor)
-    block = replace(block, window=None, scale_to_bias=None)
-    there = propagate(state, block.motion, block.gravity)
+    of = block.problem.of.copy()
+    of[assembly.WINDOW_OF] = -1
+    block = replace(block, problem=replace(block.problem, row_scales=np.zeros((0, 6, 6)), of=of, lags={}))
+    rows = block.rows
+    dR, dv, dp = rows[:, at.DR : at.DV].reshape(-1, 3, 3), rows[:, at.DV : at.DP], rows[:, at.DP : at.ASSUMED]
+    there, _ = propagate(state, Delta(rows[:, at.DT], dR, dv, dp, rows[:, at.ASSUMED : at.Z]), block.gravity)
     expected = block.instrument.model.predict(there, block.rate_b)[0]
     np.testing.assert_allclose(block.predicted(state), expected, atol=1e-12)
     np.testing.assert_allclose(block.predict(state)[0], expected, atol=1e-12)
-    resting = replace(block, motion=replace(block.motion, dt=0 * block.motion.dt))
-    assert resting.at_keyframes and not block.at_keyframes
+    np.testing.assert_allclose(block.z - block.innovations(state), expected, atol=1e-12)
 
 
 def test_some_of_a_block_are_its_own_measurements():
@@ -266,7 +271,7 @@ def test_measurements_of_a_true_dive_have_unit_innovations_at_the_truth():
     for sensor in problem.used:
         instrument = smoother.initial.instruments[sensor]
         gravity, unknowns = config.environment.gravity_mps2, Unknowns(truth.calibration, {})
-        block = make_block(problem, problem.of_sensor(sensor), instrument, gravity, unknowns)
+        block = Measurements(problem, problem.of_sensor(sensor), instrument, gravity, unknowns)
         r = block.normalised(truth.at(block.keyframe))
         # motion from the keyframe is integrated from noisy samples, which adds little
         low, high = chi2.ppf([0.0005, 0.9995], r.size) / r.size

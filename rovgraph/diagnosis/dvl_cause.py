@@ -20,7 +20,7 @@ from rovgraph.check.lags import ORIENTATIONS
 from rovgraph.config import Config, mount_matrix
 from rovgraph.diagnosis.alarm import Statistic
 from rovgraph.diagnosis.evidence import Evidence
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.optimum import Optimum
 from rovgraph.geometry import Array, cross, rotate, transpose
 from rovgraph.kernels import motion_row
@@ -88,7 +88,7 @@ class _Compared:
         self.before, self.now = pairs
 
     @staticmethod
-    def of(best: Optimum, block: Block) -> "_Compared | None":
+    def of(best: Optimum, block: Measurements) -> "_Compared | None":
         problem, state = best.problem, best.state
         model = block.instrument.model
         if not isinstance(model, DvlVelocity) or len(block) < ENOUGH or len(problem) < 3:

@@ -36,7 +36,7 @@ from rovgraph.kernels import assembly as at
 from rovgraph.kernels import motion_row
 from rovgraph.kernels.imu_samples import HALF_WINDOW_S
 from rovgraph.kernels.layout import MOTION
-from rovgraph.kernels.measurement_row import MOST, Z
+from rovgraph.kernels.measurement_row import KNOT, MOST, Z
 from rovgraph.log import Log, Measurement, Stream
 from rovgraph.log.packing import pack, unpack
 from rovgraph.log.streams import GAP_PERIODS, arrivals, in_precedence, precedence
@@ -508,7 +508,7 @@ class Assembly:
             np.zeros((rows, Z + 2 * self._most)),
             np.zeros((rows * scaled, 6, 6)),
             np.zeros((at.OF, rows), np.int64),
-            np.zeros((windows, knots, at.KNOT)),
+            np.zeros((windows, knots, KNOT)),
             np.zeros(rows),
             np.zeros(7, np.int64),
         )

@@ -14,28 +14,30 @@ from weakref import ReferenceType, ref
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.calibration import LAYOUT, TABLE, Belief, calibration_size
+from rovgraph.calibration import TABLE, Belief
 from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, UndeterminedError, square_root
 from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING, ChainLayout
 from rovgraph.engine.gauss_newton import Gates, Measured
 from rovgraph.engine.initial_conditions import InitialConditions
 from rovgraph.engine.measurements import (
-    Block,
+    Measurements,
     Seen,
-    blocks_of,
+    compiled,
     cost_at_gate,
     gates_of,
+    kernel_states,
     loss_and_weight,
     measurement_cost,
+    measurements_of,
+    sensor_table,
 )
 from rovgraph.engine.pieces import pieces
 from rovgraph.engine.problem import Problem
-from rovgraph.engine.sensor_rows import compiled, sensor_table
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.errors import InputError
 from rovgraph.geometry import Array, exp_rotation, log_rotation, right_jacobian, rotate
 from rovgraph.kernels.chain import Elimination, PlacedRows, Walks
-from rovgraph.kernels.dive import DiveFactors, Point, eliminate_dive, robust_costs, squared_lengths
+from rovgraph.kernels.dive import DiveFactors, eliminate_dive, robust_costs, squared_lengths
 from rovgraph.kernels.measurement_row import GATE, TIME
 from rovgraph.state import State
 
@@ -116,24 +118,22 @@ class Chain:
         return np.asarray(weight * (away[1:] - kept * away[:-1]))
 
     @cached_property
-    def blocks(self) -> dict[str, Block]:
+    def blocks(self) -> dict[str, Measurements]:
         """Sensor -> its measurements."""
         return self._blocks({*self.initial.instruments})
 
     @cached_property
-    def given(self) -> dict[str, Block]:
+    def given(self) -> dict[str, Measurements]:
         """The same of sensors whose equation no kernel knows."""
         return self._blocks(self._unknown_to_kernels) if self._unknown_to_kernels else {}
 
-    def _blocks(self, sensors: set[str]) -> dict[str, Block]:
+    def _blocks(self, sensors: set[str]) -> dict[str, Measurements]:
         gravity = self.initial.gravity
-        return blocks_of(self.problem, sensors, self.initial.instruments, gravity, self.unknowns)
+        return measurements_of(self.problem, sensors, self.initial.instruments, gravity, self.unknowns)
 
     @cached_property
     def _unknown_to_kernels(self) -> set[str]:
-        # of a time offset that is held here, too: its measurements have been assembled for any
-        late = {name for name, belief in self.beliefs.items() if belief.estimate}
-        return {s for s, i in self.initial.instruments.items() if not compiled(i, i.time_offset in late)}
+        return {s for s, i in self.initial.instruments.items() if not compiled(i)}
 
     @cached_property
     def _sensors(self) -> Array:
@@ -148,7 +148,7 @@ class Chain:
 
     # what `rovgraph.engine.gauss_newton` asks
 
-    def seen(self, state: State, blocks: Mapping[str, Block]) -> Seen:
+    def seen(self, state: State, blocks: Mapping[str, Measurements]) -> Seen:
         """Sensors' blocks, with the state of each measurement's keyframe."""
         return ((sensor, block, state.at(block.keyframe)) for sensor, block in blocks.items())
 
@@ -196,14 +196,13 @@ class Chain:
     def _squared_lengths(self, point: State) -> Array:
         """Of the whitened innovations of what kernels know, shape (m,)."""
         out = np.empty(len(self.problem.rows))
-        squared_lengths(self._factors, self._arrays(point), out)
+        squared_lengths(self._factors, kernel_states(point), out)
         return out
 
     @property
     def _factors(self) -> DiveFactors:
         r = self.problem
-        of_motions, measured = (r.motions, r.weights, r.scales), (r.compiled_rows, r.which, r.first, r.row_scales)
-        return DiveFactors(*of_motions, *measured, self._sensors, self.initial.gravity)
+        return DiveFactors(r.motions, r.weights, r.scales, r.measured(), r.first, self._sensors, self.initial.gravity)
 
     def _entered(self, gates: Gates) -> NDArray[np.bool_]:
         """Gates of what kernels know, shape (m,)."""
@@ -211,15 +210,6 @@ class Chain:
         for sensor, places in self._places.items():
             out[places] = gates[sensor]
         return out
-
-    def _arrays(self, point: State) -> Point:
-        """A point as `rovgraph.kernels.dive` takes it."""
-        walked = any(value.ndim > 1 for value in point.calibration.values())  # also of what is held where it has walked
-        c = np.empty((len(self.problem) if walked else 1, calibration_size()))
-        for name, part in LAYOUT.items():
-            c[:, part] = point.calibration[name]
-        R, p, v, b = (np.ascontiguousarray(a) for a in (point.R_nb, point.p_n, point.v_n, point.bias))
-        return Point(R, p, v, b, c)
 
     def step(self, point: State, gates: Gates) -> ChainStep:
         """As `rovgraph.engine.gauss_newton.Linearizable`."""
@@ -311,7 +301,7 @@ class Chain:
         for place, (sensor, block) in enumerate(self.given.items(), PRIORS):
             self._put_block(given, place, block, point, gates[sensor])
         n, d, c = len(self.problem), self.layout.d, self.layout.c + clones
-        entered, at, walks = self._entered(gates), self._arrays(point), Walks(*self.walk, -self.walk_residuals(point))
+        entered, at, walks = self._entered(gates), kernel_states(point), Walks(*self.walk, -self.walk_residuals(point))
         others, border_rows = PlacedRows(given.values, given.targets, given.first), self._border_rows(point, clones)
         kept_at, column = np.array(stops, np.int64), self.layout.column
 
@@ -357,7 +347,7 @@ class Chain:
         rows.put(2, np.zeros((1, clones)), tie, -STIFF * np.eye(clones)[None], clone, _ONE)
 
     def _put_block(
-        self, rows: MeasurementRows, place: int, block: Block, point: State, gate: NDArray[np.bool_]
+        self, rows: MeasurementRows, place: int, block: Measurements, point: State, gate: NDArray[np.bool_]
     ) -> None:
         """The measurements of one sensor, weighted."""
         names = self._columns_of(block)
@@ -373,7 +363,7 @@ class Chain:
             C = np.concatenate([np.empty((*r.shape, 0)), *(H[n] for n in names)], axis=2)
             rows.put(place, r, J, C, targets, weight, part)
 
-    def _columns_of(self, block: Block) -> list[str]:
+    def _columns_of(self, block: Measurements) -> list[str]:
         """Calibration that a sensor's measurements depend on, of what is estimated."""
         return [name for name in block.unknowns.estimated if name in self.layout.places]
 

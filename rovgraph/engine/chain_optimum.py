@@ -14,7 +14,7 @@ from rovgraph.engine.chain_layout import COLUMNS, MOTION, NOTHING
 from rovgraph.engine.chain_window import window
 from rovgraph.engine.gauss_newton import Solution, left_after, whole_share
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.measurements import Block, weights_of
+from rovgraph.engine.measurements import Measurements, weights_of
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.problem import Problem
 from rovgraph.engine.stretches import Searches, at_rest, resume, solve
@@ -57,7 +57,7 @@ class ChainOptimum:
         return self.chain.unknowns
 
     @property
-    def blocks(self) -> Mapping[str, Block]:
+    def blocks(self) -> Mapping[str, Measurements]:
         return self.chain.blocks
 
     @property

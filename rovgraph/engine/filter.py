@@ -26,7 +26,7 @@ from rovgraph.engine.filter_step import (
     state_vector,
 )
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.measurements import Block, make_block
+from rovgraph.engine.measurements import KeyframeRows, Measurements, compiled, sensor_table
 from rovgraph.engine.problem import Index, Problem
 from rovgraph.engine.remembered_places import (
     RememberedPlace,
@@ -39,7 +39,6 @@ from rovgraph.engine.remembered_places import (
     with_another,
     without_oldest,
 )
-from rovgraph.engine.sensor_rows import KeyframeRows, compiled, sensor_table
 from rovgraph.engine.unknowns import unknowns
 from rovgraph.geometry import Array
 from rovgraph.kernels import measurement_row as at
@@ -63,7 +62,7 @@ def _state(known: Gaussian) -> FilterState:
 
 def _room(known: Gaussian) -> FilterState:
     """Arrays for an estimate of the same size."""
-    own = np.empty_like(known.x), np.empty_like(known.c), np.empty_like(known.P), np.empty_like(known.B)
+    own = (np.empty(array.shape) for array in (known.x, known.c, known.P, known.B))
     return FilterState(*own, known.L)
 
 
@@ -102,7 +101,7 @@ class FilterEngine:
             walk[2, self.layout.columns[name]] = self.unknowns.fixed[name]
         instruments = initial.instruments
         self._given = {  # linearised outside the kernels
-            s for s, i in instruments.items() if not compiled(i, i.time_offset in self.unknowns.walks) or s == PLACE
+            s for s, i in instruments.items() if not compiled(i) or s == PLACE
         }
         sensors = sensor_table(instruments, sorted(self._given))
         self._model = FilterModel(sensors, self.layout.column, self.layout.coordinates, walk, initial.gravity)
@@ -165,7 +164,7 @@ class FilterEngine:
         """Measurements, the first ones before the motion to keyframe k, if there is one, as kernels take them."""
         motion = problem.motions[k - 1] if k else _NO_MOTION
         scale = problem.scales[k - 1] if k and len(problem.scales) else _EXACT[:, 0]
-        return Interval(motion, scale, *self._rows(problem, some), between, *self._no_rows)
+        return Interval(motion, scale, problem.measured(some), between, *self._no_rows)
 
     def _take_interval(
         self,
@@ -176,7 +175,7 @@ class FilterEngine:
         predicted: FilterState = _NO_STATE,
     ) -> tuple[FilterState, Taken]:
         """The estimate after what a kernel makes of an interval, gates renewed in place."""
-        known, since, m, n = _state(before), self._since(gates or {}), len(interval.which), len(before.P)
+        known, since, m, n = _state(before), self._since(gates or {}), len(interval.measured.which), len(before.P)
         of_motion = (n, n) if len(interval.motion) else (0, 0)
         places = np.zeros(n - self.layout.size)
         out = Taken(departed, predicted, np.empty(of_motion), np.empty(of_motion), np.empty(m), np.empty(m), places)
@@ -189,12 +188,6 @@ class FilterEngine:
         """The first measurement at keyframe k of those of the interval that ends with it."""
         begin, end = problem.measured_in(k)
         return end - int(np.count_nonzero(problem.keyframe[begin:end] == k))
-
-    def _rows(self, problem: Problem, some: "slice | Index") -> MeasuredRows:
-        """Measurements as kernels take them."""
-        scales = problem.row_scales[some] if len(problem.row_scales) else problem.row_scales
-        rows = np.ascontiguousarray(problem.rows[some, : at.ROW])
-        return MeasuredRows(rows, np.ascontiguousarray(problem.which[some]), scales)
 
     def run(self, problem: Problem, begin: int, end: int, before: Gaussian, gates: Gates) -> FilterRun:
         """Take intervals of a dive as `step` does, as far as kernels know how.
@@ -214,7 +207,7 @@ class FilterEngine:
         out = Filtered._make(np.empty(shape) for shape in shapes)
         motions, scales = problem.motions[begin - 1 : end - 1], problem.scales[begin - 1 : end - 1]
         intervals = Intervals(motions, scales, np.append(0, taken), first, POORLY_KNOWN)
-        measured = self._rows(problem, own)
+        measured = problem.measured(own)
         done = filter_intervals(known, intervals, measured, self._model, since, out, take_interval)
         self._renew(gates, since)
         m = int(taken[done - 1]) if done else 0
@@ -246,7 +239,7 @@ class FilterEngine:
         r, H = [np.empty(0)], [np.empty((0, self.layout.width))]
         for row in index.tolist():
             if problem.sensors[problem.which[row]] in self._given:
-                own_r, own_H = self._of_block(known, problem, row)
+                own_r, own_H = self._of_model(known, problem, row)
             else:
                 own_r, own_H = self.rows(problem, np.array([row])).linearize(known.x, known.c)
             r.append(own_r)
@@ -272,13 +265,13 @@ class FilterEngine:
 
     def rows(self, problem: Problem, index: Index) -> KeyframeRows:
         """Measurements of one keyframe that the kernels know."""
-        layout, (rows, which, scale) = self.layout, self._rows(problem, index)
-        return KeyframeRows(rows, which, self._model.sensors, layout.column, layout.width, scale, self._gravity)
+        layout, measured = self.layout, problem.measured(index)
+        return KeyframeRows(measured, self._model.sensors, layout.column, layout.width, self._gravity)
 
-    def block(self, problem: Problem, index: Index) -> Block:
+    def measurements(self, problem: Problem, index: Index) -> Measurements:
         """Measurements of one sensor, with the filter's unknowns."""
         instrument = self.initial.instruments[problem.sensors[problem.which[index[0]]]]
-        return make_block(problem, index, instrument, self._gravity, self._wide)
+        return Measurements(problem, index, instrument, self._gravity, self._wide)
 
     def retract(self, known: Gaussian, delta: Array, P: Array, B: Array | None = None) -> Gaussian:
         """The estimate that lies ``delta``, shape (d,), away; P, and B (None = its own), are about the old one."""
@@ -337,7 +330,7 @@ class FilterEngine:
     ) -> Gaussian:
         """The estimate corrected by measurements of no places."""
         which = problem.which[index]
-        given = [self._of_block(before, problem, row) for row in index[self._outside[which]].tolist()]
+        given = [self._of_model(before, problem, row) for row in index[self._outside[which]].tolist()]
         own = self._interval(problem, index)
         if given:
             own = own._replace(given_r=np.concatenate([r for r, _ in given]), given_H=np.vstack([H for _, H in given]))
@@ -354,10 +347,10 @@ class FilterEngine:
         gates.clear()
         gates.update((s, t) for s, t in zip(self._index, since.tolist(), strict=True) if t == t)
 
-    def _of_block(self, known: Gaussian, problem: Problem, row: int) -> tuple[Array, Array]:
+    def _of_model(self, known: Gaussian, problem: Problem, row: int) -> tuple[Array, Array]:
         """The same of a sensor whose equation the kernels do not know."""
         state = known.state if problem.number[row] < 0 else known.state.seeing(ORIGIN)
-        r, jacobians = self.block(problem, np.array([row])).linearize(state)
+        r, jacobians = self.measurements(problem, np.array([row])).linearize(state)
         return r[0], self.layout.matrix(jacobians)[0]
 
     def _see(self, before: Gaussian, problem: Problem, row: int, met: "Met | None") -> Gaussian:
@@ -365,7 +358,7 @@ class FilterEngine:
         instrument, size = self.initial.instruments[PLACE], self.layout.size
         name, number = float(problem.names[row]), int(problem.number[row])
         time, sd = float(problem.rows[row, at.TIME]), problem.sd(np.array([row]), PLACE_DIM)[0]
-        r, H = self._of_block(before, problem, row)
+        r, H = self._of_model(before, problem, row)
         H, H_y = H[:, :size], H[:, size:]
         match = nearest(before.P, r, H, sd, size, before.places, name)
         gate = instrument.gate_sd or np.inf
@@ -387,6 +380,7 @@ class FilterEngine:
 
     def _correct_by(self, before: Gaussian, r: Array, H: Array) -> tuple[Gaussian, float]:
         """The estimate corrected by whitened rows of a place that are at hand, and the weight of the measurement."""
-        measured = np.zeros((1, at.ROW)), np.array([self._index[PLACE]]), _EXACT
-        known, out = self._take_interval(before, Interval(_NO_MOTION, _EXACT[:, 0], *measured, 0, r, H), None)
+        which, window = np.array([self._index[PLACE]]), np.full(1, -1)
+        own = MeasuredRows(np.zeros((1, at.ROW)), which, _EXACT, window, np.zeros((0, 0, at.KNOT)))
+        known, out = self._take_interval(before, Interval(_NO_MOTION, _EXACT[:, 0], own, 0, r, H), None)
         return _estimate(known, moved(before.places, out.places)), float(out.weight[0])

@@ -38,7 +38,7 @@ from rovgraph.engine.chain import Chain
 from rovgraph.engine.chain_optimum import ChainOptimum
 from rovgraph.engine.gauss_newton import Gates, Solution
 from rovgraph.engine.linear_constants import LinearConstants
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.rate_noise import ARM, noise_moves_arm
 from rovgraph.engine.stretches import resume
 from rovgraph.engine.widened_chain import begin_at, with_lasting
@@ -239,7 +239,7 @@ def _steps(now: _Baseline, passed: Collection[str], beside: str = "") -> list[La
     return out
 
 
-def _jumps(block: Block, state: State, H: Array) -> tuple[tuple[float, Array], ...]:
+def _jumps(block: Measurements, state: State, H: Array) -> tuple[tuple[float, Array], ...]:
     """When the residuals of a sensor jump, and by how much as an error; in the order of time.
 
     Each measurement by itself says how large the error is. Medians of some seconds are compared with those after the
@@ -274,7 +274,7 @@ def _jumps(block: Block, state: State, H: Array) -> tuple[tuple[float, Array], .
     return tuple(sorted(found, key=lambda one: one[0]))
 
 
-def _single(block: Block, state: State, H: Array) -> Array:
+def _single(block: Measurements, state: State, H: Array) -> Array:
     """How large the error is by each measurement alone, shape (n, k)."""
     r, information = block.normalised(state), np.einsum("nij,nik->njk", H, H)
     tiny = 1e-12 * np.trace(information, axis1=1, axis2=2).max() * np.eye(H.shape[2])
@@ -361,7 +361,7 @@ def _probes(now: _Baseline, passed: Collection[str]) -> list[LastingError]:
     return out
 
 
-def unity(block: Block, state: State, H: Array, gate: NDArray[np.bool_]) -> float:
+def unity(block: Measurements, state: State, H: Array, gate: NDArray[np.bool_]) -> float:
     """How far a sensor's residuals go together for seconds: variance of sums over a time, 1 for independent noise.
 
     Parameters

@@ -1,146 +1,229 @@
-"""The measurements of one sensor as arrays, linearised for all of them at once.
+"""What sensors have measured of a dive, linearised about states of its keyframes.
+
+The equations are compiled (`rovgraph.kernels.linearization`): the state at a measurement's own time, the prediction
+there, whitening. A model that no kernel knows is given the states at its measurements' times, all at once, and gives
+predictions and Jacobians there.
 
 Robust losses are applied by reweighting: the weight of a measurement is
 rho'(d) / d at its normalised length d (Huber 1964; Zhang 1997), times zero where it is
 gated. The thresholds are where a good measurement of that dimension lies with 95 %.
 """
 
-from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from rovgraph.calibration import LAYOUT, TABLE, calibration_size
 from rovgraph.engine.gauss_newton import Gates
-from rovgraph.engine.late_stamp_window import LateStampWindow
-from rovgraph.engine.problem import Problem, sd_of
-from rovgraph.engine.scale import COLUMNS, SCALES, biased
+from rovgraph.engine.problem import Index, Problem
+from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array, rotate
 from rovgraph.instruments import Instrument
 from rovgraph.kernels import measurement_row as at
+from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.linearization import States, linearize, place_measurements
+from rovgraph.kernels.measurement_row import MeasuredRows
 from rovgraph.kernels.weighting import LOSSES, weight_many, whiten_many
-from rovgraph.sensors import innovation
-from rovgraph.state import (
-    BIAS,
-    DIMENSION,
-    PLACE,
-    POSE,
-    VELOCITY,
-    Delta,
-    Jacobians,
-    State,
-    propagate,
-    propagate_with_jacobian,
-)
+from rovgraph.sensors import SENSORS, innovation
+from rovgraph.state import BIAS, DIMENSION, PLACE, POSE, VELOCITY, Jacobians, State
 
 _COLUMNS = {POSE: slice(0, 6), VELOCITY: slice(6, 9), BIAS: slice(9, 15)}
+_STATE = slice(9, 12), slice(12, 15), slice(15, 21)  # position, velocity and bias in a state vector
+_FRAME = {"velocity": at.SEES_VELOCITY, "heading": at.SEES_HEADING, "position": at.SEES_POSITION}
+
+
+def compiled(instrument: Instrument) -> bool:
+    """Whether kernels know an instrument's equation."""
+    return hasattr(instrument.model, "kind")
+
+
+def sensor_table(instruments: Mapping[str, Instrument], given: Sequence[str]) -> Array:
+    """A row for each sensor, shape (s, PARAMS + k); ``given`` are linearised outside the kernels."""
+    packed = {
+        s: np.zeros(0) if s in given else i.model.packed[0]  # type: ignore[attr-defined]
+        for s, i in instruments.items()
+    }
+    out = np.zeros((len(instruments), at.PARAMS + max((len(p) for p in packed.values()), default=0)))
+    for row, (sensor, instrument) in zip(out, instruments.items(), strict=True):
+        model, dim, offset = instrument.model, instrument.model.dim, instrument.time_offset
+        row[at.KIND] = at.GIVEN if sensor in given else model.kind  # type: ignore[attr-defined]
+        row[at.DIM] = dim
+        row[at.LOSS], row[at.BEND] = LOSSES.index(instrument.loss), loss_threshold(instrument.loss, dim)
+        row[at.GATE] = np.inf if instrument.gate_sd is None else instrument.gate_sd
+        row[at.READMIT] = instrument.readmit_s
+        observed = SENSORS[sensor].observes
+        row[at.SEEN_FRAME], row[at.SEES : at.SEES + 3] = _FRAME[observed.frame], np.isin(np.arange(3), observed.axes)
+        gain = np.zeros((3, 3))
+        if dim <= 3:
+            gain[:dim, :dim] = instrument.rate_gain @ instrument.rate_gain.T
+        row[at.GAIN : at.GAIN + 9] = gain.ravel()
+        row[at.OFFSET] = -1.0 if offset is None else LAYOUT[offset].start
+        row[at.PARAMS : at.PARAMS + len(packed[sensor])] = packed[sensor]
+    return out
+
+
+def kernel_states(state: State) -> States:
+    """A state of n epochs as kernels take it."""
+    walked = any(value.ndim > 1 for name, value in state.calibration.items() if name != PLACE)
+    c = np.empty((len(state) if walked else 1, calibration_size()))
+    for name, part in LAYOUT.items():
+        c[:, part] = state.calibration[name]
+    R, p, v, b = (np.require(a, float, ("C", "W")) for a in (state.R_nb, state.p_n, state.v_n, state.bias))
+    return States(R, p, v, b, c)
 
 
 @dataclass(frozen=True)
-class Block:
+class KeyframeRows:
+    """Measurements of one keyframe that the kernels know.
+
+    Attributes
+    ----------
+    measured : they
+    sensors : ndarray, of `sensor_table`
+    column : ndarray of int, shape (15 + C,), place of each component in the error, -1 where it is not estimated
+    size : of the error
+    gravity : [m/s^2]
+    """
+
+    measured: MeasuredRows
+    sensors: Array
+    column: Index
+    size: int
+    gravity: float
+
+    def linearize(self, x: Array, c: Array, weighted: bool = False) -> tuple[Array, Array]:
+        """Whitened innovations, shape (k,), and Jacobians, shape (k, size), on request weighted by the losses.
+
+        Parameters
+        ----------
+        x, c : ndarray, shapes (21,), (C,), as of `rovgraph.engine.filter_step.Gaussian`
+        """
+        r = np.zeros(int(self.sensors[self.measured.which, at.DIM].sum()))
+        H, row = np.zeros((len(r), self.size)), x[None]
+        states = States(
+            x[:9].reshape(1, 3, 3), *(row[:, a:b].copy() for a, b in ((9, 12), (12, 15), (15, 21))), c[None]
+        )
+        linearize(states, self.measured, self.sensors, self.column, self.gravity, weighted, r, H)
+        return r, H
+
+
+@dataclass(frozen=True)
+class Measurements:
     """n measurements of one sensor.
 
     Attributes
     ----------
+    problem, index : the dive, and ndarray of int, shape (n,), which of its measurements
     instrument : model, noise and loss
-    keyframe : ndarray of int, shape (n,)
-    time, line : ndarray, shape (n,), and in the log
-    z : ndarray, shape (n, dim)
-    W : ndarray, shape (n, dim, dim), square-root information, lower triangular
-    rate_b : ndarray, shape (n, 3), measured rate, bias still in it [rad/s]
-    rate_sd : ndarray, shape (n,), its noise [rad/s]
-    motion : Delta, n, from the keyframe to the measurement
     gravity : [m/s^2]
-    unknowns : the calibration variables that are estimated, of those that the instrument has
-    window : along which the motion goes on to where a stamp that may be late belongs, or None
-    scale_to_bias : ndarray, shape (n, 6, 6), of `rovgraph.engine.scale`, or None where the IMU's scale is exact
-    place, believed : ndarray of int and of bool, shape (n,), number of the place that is seen, -1 where none is, and
-        False where the vehicle cannot have been there: it is not let in unless the optimum says otherwise
+    of_graph : the calibration variables of the whole graph
     """
 
+    problem: Problem
+    index: Index
     instrument: Instrument
-    keyframe: NDArray[np.int64]
-    time: Array
-    line: NDArray[np.int64]
-    z: Array
-    W: Array
-    rate_b: Array
-    rate_sd: Array
-    motion: Delta
     gravity: float
-    unknowns: Unknowns
-    place: NDArray[np.int64]
-    believed: NDArray[np.bool_]
-    window: LateStampWindow | None = None
-    scale_to_bias: Array | None = None
+    of_graph: Unknowns
 
     def __len__(self) -> int:
-        return len(self.z)
+        return len(self.index)
+
+    @cached_property
+    def rows(self) -> Array:
+        """Shape (n, ROW) or wider, of `rovgraph.kernels.measurement_row`."""
+        return self.problem.rows[self.index]
+
+    @property
+    def keyframe(self) -> Index:
+        """That each belongs to, shape (n,)."""
+        return self.problem.keyframe[self.index]
+
+    @property
+    def line(self) -> Index:
+        """Of each in the log, shape (n,)."""
+        return self.problem.line[self.index]
+
+    @property
+    def place(self) -> Index:
+        """Number of the place that is seen, -1 where none is, shape (n,)."""
+        return self.problem.number[self.index]
+
+    @property
+    def believed(self) -> NDArray[np.bool_]:
+        """False where the vehicle cannot have been: not let in unless the optimum says otherwise, shape (n,)."""
+        return self.problem.believed[self.index]
+
+    @property
+    def time(self) -> Array:
+        """Shape (n,) [s]."""
+        return self.rows[:, at.TIME]
+
+    @property
+    def z(self) -> Array:
+        """Components, shape (n, dim)."""
+        return self.rows[:, at.Z : at.Z + self.instrument.model.dim]
+
+    @property
+    def rate_b(self) -> Array:
+        """Measured rate, bias still in it, shape (n, 3) [rad/s]."""
+        return self.rows[:, at.RATE : at.RATE + 3]
+
+    @property
+    def rate_sd(self) -> Array:
+        """Its noise, shape (n,) [rad/s]."""
+        return self.rows[:, at.RATE_SD]
+
+    @property
+    def dt(self) -> Array:
+        """Since the keyframe, shape (n,) [s]."""
+        return self.rows[:, at.DT]
+
+    @cached_property
+    def W(self) -> Array:
+        """Square-root information, shape (n, dim, dim), lower triangular."""
+        return whitening(self.instrument, self.problem.sd(self.index, self.instrument.model.dim), self.rate_sd)
+
+    @property
+    def may_be_late(self) -> bool:
+        """Whether how late their stamps are is a variable, for which they have windows."""
+        return self.problem.sensors[self.problem.which[self.index[0]]] in self.problem.lags if len(self) else False
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """The calibration variables that are estimated, of those that they depend on."""
+        scales = SCALES if len(self.problem.row_scales) else ()
+        return self.of_graph.of((*self.instrument.calibration, *scales))
 
     @property
     def variables(self) -> tuple[str, ...]:
         """Variables that the factors touch, in the order of their keys."""
         return (*self.instrument.model.state, *self.unknowns.estimated)
 
-    @cached_property
-    def at_keyframes(self) -> bool:
-        """All measurements are at their keyframes: there is no motion to reckon with."""
-        return self.window is None and not self.motion.dt.any()
+    def at(self, index: slice | Index) -> "Measurements":
+        """Some of the measurements."""
+        return replace(self, index=self.index[index])
 
-    def predict(self, state: State) -> tuple[Array, Jacobians]:
-        """Predicted measurements, shape (n, dim), and Jacobians by the keyframes' variables."""
-        if self.scale_to_bias is not None:
-            predicted, H = self._predict(biased(state, self.scale_to_bias))
-            by_bias = H[BIAS] @ self.scale_to_bias if BIAS in H else np.zeros((*predicted.shape, 6))
-            return predicted, H | {name: by_bias[..., COLUMNS[name]] for name in SCALES}
-        return self._predict(state)
-
-    def _predict(self, state: State) -> tuple[Array, Jacobians]:
-        """The same, for an IMU without scale errors."""
-        model = self.instrument.model
-        if self.at_keyframes:
-            return model.predict(state, self.rate_b)
-        motion, rate_b = self._placed(state)
-        there, F = propagate_with_jacobian(state, motion, self.gravity)
-        predicted, H = model.predict(there, rate_b)
-        if self.window is not None and self.instrument.time_offset is not None:
-            by = self.window.by_time_offset(self._late(state), state, there, H, self.gravity)
-            H = H | {self.instrument.time_offset: by}
-        stacked = np.zeros((len(self), predicted.shape[1], 15))
-        for variable, columns in _COLUMNS.items():
-            if variable in H:
-                stacked[..., columns] = H[variable]
-        stacked = stacked @ F
-        return predicted, H | {variable: stacked[..., columns] for variable, columns in _COLUMNS.items()}
+    # predictions
 
     def predicted(self, state: State) -> Array:
-        """Predicted measurements alone, shape (n, dim)."""
-        if self.scale_to_bias is not None:
-            state = biased(state, self.scale_to_bias)
-        motion, rate_b = self._placed(state)
-        there = state if self.at_keyframes else propagate(state, motion, self.gravity)
+        """Predicted measurements, shape (n, dim); ``state`` is at each one's keyframe."""
+        there, rate_b, _ = self._placed(state, False)
         return self.instrument.model.predict(there, rate_b)[0]
 
     def innovations(self, state: State) -> Array:
-        """Measured minus predicted, shape (n, dim); ``state`` is at each one's keyframe."""
+        """Measured minus predicted, shape (n, dim)."""
         return innovation(self.instrument.model, self.z, self.predicted(state))
 
-    def by_calibration(self, state: State, name: str) -> Array:
-        """Whitened Jacobian by a calibration variable, estimated or not, shape (n, dim, dim of the variable)."""
-        there = state if self.at_keyframes else propagate(state, self._placed(state)[0], self.gravity)
-        return np.asarray(self.W @ self.instrument.model.predict(there, self.rate_b)[1][name])
-
-    def _placed(self, state: State) -> tuple[Delta, Array]:
-        """The motion to where each measurement was valid, and the rate there."""
-        return (self.motion, self.rate_b) if self.window is None else self.window.placed(self._late(state))
-
-    def _late(self, state: State) -> Array:
-        """How late each stamp is, shape (n,) [s]."""
-        assert self.instrument.time_offset is not None
-        return np.broadcast_to(state.calibration[self.instrument.time_offset][..., 0], len(self))
+    def normalised(self, state: State) -> Array:
+        """Whitened innovations, shape (n, dim)."""
+        if not self._compiled:
+            return rotate(self.W, self.innovations(state))
+        return self._by_kernel(state, {})[0]
 
     def linearize(self, state: State) -> tuple[Array, Jacobians]:
         """Whitened innovations and Jacobians at ``state`` (that of each keyframe).
@@ -150,16 +233,12 @@ class Block:
         r : ndarray, shape (n, dim)
         H : variable -> ndarray, shape (n, dim, dim of variable)
         """
+        if self._compiled:
+            return self._by_kernel(state, self.variables)
         predicted, H = self.predict(state)
         r = rotate(self.W, innovation(self.instrument.model, self.z, predicted))
-        return r, {v: self.W @ H[v] if v in H else self._zeros(v) for v in self.variables}
-
-    def _zeros(self, variable: str) -> Array:
-        return np.zeros((*self.z.shape, DIMENSION[variable]))
-
-    def normalised(self, state: State) -> Array:
-        """Whitened innovations alone, shape (n, dim)."""
-        return rotate(self.W, self.innovations(state))
+        zeros = (*predicted.shape, 0)
+        return r, {v: self.W @ H[v] if v in H else np.zeros((*zeros[:2], DIMENSION[v])) for v in self.variables}
 
     def weighted(self, state: State, gate: NDArray[np.bool_]) -> tuple[Array, Jacobians]:
         """As `linearize`, weighted by the loss; zero beyond the gate."""
@@ -167,59 +246,71 @@ class Block:
         root = np.sqrt(loss_and_weight(r, self.instrument.loss)[1] * gate)[:, None]
         return r * root, {v: h * root[..., None] for v, h in H.items()}
 
+    def by_calibration(self, state: State, name: str) -> Array:
+        """Whitened Jacobian by a calibration variable, estimated or not, shape (n, dim, dim of the variable)."""
+        if self._compiled:
+            return self._by_kernel(state, (name,))[1][name]
+        return np.asarray(self.W @ self.predict(state)[1][name])
+
+    def predict(self, state: State) -> tuple[Array, Jacobians]:
+        """Predictions of a model that no kernel knows, shape (n, dim), and Jacobians by the keyframes' variables."""
+        there, rate_b, F = self._placed(state, True)
+        predicted, H = self.instrument.model.predict(there, rate_b)
+        n, stacked = len(self), np.zeros((len(self), predicted.shape[1], MOTION))
+        for variable, columns in _COLUMNS.items():
+            if variable in H:
+                stacked[..., columns] = H[variable]
+        if self.may_be_late and self.instrument.time_offset is not None:
+            slope, rate_slope = np.split(F[1].reshape(n, 12), [9], axis=1)  # type: ignore[index]
+            by = rotate(stacked[..., :9], slope) - rotate(stacked[..., 12:], rate_slope)
+            H = H | {self.instrument.time_offset: by[..., None]}
+        stacked = stacked @ F[0]
+        H = H | {variable: stacked[..., columns] for variable, columns in _COLUMNS.items()}
+        if len(self.problem.row_scales):
+            by_bias = H[BIAS] @ self.problem.row_scales[self.index]
+            H |= {name: by_bias[..., COLUMNS[name]] for name in SCALES}
+        return predicted, H
+
     def with_places(self, state: State, places: Mapping[int, Array]) -> State:
         """The state of each measurement's keyframe together with the place that is seen, where one is."""
         if PLACE not in self.instrument.model.state:
             return state
         return state.seeing(np.array([places[number] for number in self.place.tolist()]))
 
-    def at(self, index: slice | Array) -> "Block":
-        """Some of the measurements."""
-        arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name in _PER_MEASUREMENT}
-        motion = Delta(*(getattr(self.motion, f.name)[index] for f in fields(Delta)))
-        window, scale_to_bias = (
-            self.window and self.window.at(index),
-            None if self.scale_to_bias is None else self.scale_to_bias[index],
-        )
-        return replace(self, **arrays, motion=motion, window=window, scale_to_bias=scale_to_bias)
+    @property
+    def _compiled(self) -> bool:
+        return compiled(self.instrument) and PLACE not in self.instrument.model.state
 
+    @cached_property
+    def _for_kernels(self) -> tuple[MeasuredRows, Array]:
+        """The measurements, and their sensor alone."""
+        measured = self.problem.measured(self.index)._replace(which=np.zeros(len(self), np.int64))
+        sensor = self.problem.sensors[self.problem.which[self.index[0]]] if len(self) else next(iter(SENSORS))
+        return measured, sensor_table({sensor: self.instrument}, [] if self._compiled else [sensor])
 
-_PER_MEASUREMENT = ("keyframe", "time", "line", "z", "W", "rate_b", "rate_sd", "place", "believed")
+    def _by_kernel(self, state: State, variables: Iterable[str]) -> tuple[Array, Jacobians]:
+        """Whitened innovations and Jacobians by some variables."""
+        n, dim = len(self), self.instrument.model.dim
+        sizes = {v: DIMENSION[v] if v in DIMENSION else TABLE[v].dim for v in variables}
+        ends = np.cumsum([*sizes.values()], dtype=np.int64).tolist()
+        parts = {v: slice(end - sizes[v], end) for v, end in zip(sizes, ends, strict=True)}
+        column = np.full(MOTION + calibration_size(), -1)
+        for v, part in parts.items():
+            own = _COLUMNS[v] if v in _COLUMNS else slice(MOTION + LAYOUT[v].start, MOTION + LAYOUT[v].stop)
+            column[own] = np.arange(part.start, part.stop)
+        width = ends[-1] if ends else 0
+        r, H = np.zeros(n * dim), np.zeros((n * dim if width else 0, width))
+        states = kernel_states(state)
+        linearize(states, *self._for_kernels, column, self.gravity, False, r, H)
+        return r.reshape(n, dim), {v: H[:, part].reshape(n, dim, -1) for v, part in parts.items()}
 
-
-def make_block(
-    problem: Problem, index: NDArray[np.int64], instrument: Instrument, gravity: float, unknowns: Unknowns
-) -> Block:
-    """Some measurements of one sensor; ``unknowns`` are those of the whole graph."""
-    dim, rows, sensor = instrument.model.dim, problem.rows[index], problem.sensors[problem.which[index[0]]]
-    sd, rate_sd = rows[:, sd_of(dim) : sd_of(dim) + dim], rows[:, at.RATE_SD]
-    window, scales = None, problem.row_scales[index] if len(problem.row_scales) else None
-    if sensor in problem.lags:
-        knots = problem.windows[problem.window[index]]
-        window = LateStampWindow.of(problem.lags[sensor], knots, problem.bias)
-    return Block(
-        instrument,
-        problem.keyframe[index],
-        rows[:, at.TIME],
-        problem.line[index],
-        rows[:, at.Z : at.Z + dim],
-        whitening(instrument, sd, rate_sd),
-        rows[:, at.RATE : at.RATE + 3],
-        rate_sd,
-        motions_of(rows),
-        gravity,
-        unknowns.of((*instrument.calibration, *(() if scales is None else SCALES))),
-        problem.number[index],
-        problem.believed[index],
-        window,
-        scales,
-    )
-
-
-def motions_of(rows: Array) -> Delta:
-    """From their keyframes to n measurements, of rows of `rovgraph.kernels.measurement_row`, shape (n, ROW)."""
-    dR, dv, dp = rows[:, at.DR : at.DV].reshape(-1, 3, 3), rows[:, at.DV : at.DP], rows[:, at.DP : at.ASSUMED]
-    return Delta(rows[:, at.DT], dR, dv, dp, rows[:, at.ASSUMED : at.ASSUMED + 6])
+    def _placed(self, state: State, derive: bool) -> tuple[State, Array, tuple[Array, Array]]:
+        """States at the measurements' own times, the rate there, and derivatives as of `place_measurements`."""
+        n, states = len(self), kernel_states(state)
+        shapes = (n, 3, 3), (n, 3), (n, 3), (n, 6), (n, 12)
+        out, rate_b, F = States(*map(np.empty, shapes)), np.empty((n, 3)), np.zeros((n * derive, MOTION, MOTION))
+        place_measurements(states, *self._for_kernels, self.gravity, out, rate_b, F)
+        return State(out.R, out.p, out.v, out.b, state.calibration), rate_b, (F, out.c)
 
 
 def whitening(instrument: Instrument, sd: Array, rate_sd: Array) -> Array:
@@ -272,15 +363,15 @@ def _cost_and_weight(d2: Array, loss: str, dim: int) -> tuple[Array, Array]:
     return rho, weight
 
 
-Seen = Iterable[tuple[str, Block, State]]  # every sensor's block, with the state of each measurement's keyframe
+Seen = Iterable[tuple[str, Measurements, State]]  # every sensor's, with the state of each measurement's keyframe
 
 
 def gates_of(seen: Seen) -> Gates:
     """Which measurements lie within their gate."""
     out = {}
-    for sensor, block, state in seen:
-        gate = block.instrument.gate_sd or np.inf
-        out[sensor] = np.linalg.norm(block.normalised(state), axis=1) <= gate
+    for sensor, measured, state in seen:
+        gate = measured.instrument.gate_sd or np.inf
+        out[sensor] = np.linalg.norm(measured.normalised(state), axis=1) <= gate
     return out
 
 
@@ -294,29 +385,29 @@ def cost_at_gate(instrument: Instrument) -> float:
 def weights_of(seen: Seen, gates: Gates) -> dict[str, Array]:
     """Weight of every measurement, shape (n,) for each sensor."""
     return {
-        sensor: loss_and_weight(block.normalised(state), block.instrument.loss)[1] * gates[sensor]
-        for sensor, block, state in seen
+        sensor: loss_and_weight(measured.normalised(state), measured.instrument.loss)[1] * gates[sensor]
+        for sensor, measured, state in seen
     }
 
 
 def measurement_cost(seen: Seen, gates: Gates) -> float:
     """Robust cost of the measurements that are let in."""
     return sum(
-        float(loss_and_weight(block.normalised(state), block.instrument.loss)[0] @ gates[sensor])
-        for sensor, block, state in seen
+        float(loss_and_weight(measured.normalised(state), measured.instrument.loss)[0] @ gates[sensor])
+        for sensor, measured, state in seen
     )
 
 
-def blocks_of(
+def measurements_of(
     problem: Problem,
     sensors: Container[str],
     instruments: Mapping[str, Instrument],
     gravity: float,
     unknowns: Unknowns,
-) -> dict[str, Block]:
+) -> dict[str, Measurements]:
     """The measurements of a dive, by sensor, of some sensors."""
     return {
-        sensor: make_block(problem, problem.of_sensor(sensor), instruments[sensor], gravity, unknowns)
+        sensor: Measurements(problem, problem.of_sensor(sensor), instruments[sensor], gravity, unknowns)
         for sensor in problem.used
         if sensor in sensors
     }

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rovgraph.calibration import Belief
 from rovgraph.engine.gauss_newton import Solution
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.problem import Problem
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.geometry import Array
@@ -61,7 +61,7 @@ class Optimum(Protocol):
     @property
     def unknowns(self) -> Unknowns: ...
     @property
-    def blocks(self) -> Mapping[str, Block]: ...
+    def blocks(self) -> Mapping[str, Measurements]: ...
     @property
     def state(self) -> State: ...
     @property
@@ -120,7 +120,7 @@ class Optimum(Protocol):
         ...
 
 
-def residual_state(optimum: Optimum, block: Block) -> State:
+def residual_state(optimum: Optimum, block: Measurements) -> State:
     """State of each measurement's keyframe, with the place that it sees, where it sees one."""
     return block.with_places(optimum.state.at(block.keyframe), optimum.places)
 

@@ -16,6 +16,7 @@ from rovgraph.kernels import assembly as at
 from rovgraph.kernels import measurement_row as measured
 from rovgraph.kernels import motion_row
 from rovgraph.kernels.layout import MOTION
+from rovgraph.kernels.measurement_row import MeasuredRows
 from rovgraph.kernels.motion import LONGEST_BRIDGED_S
 from rovgraph.kernels.motion_residual import motion_residuals
 from rovgraph.kernels.preintegration import integrated_steps
@@ -171,10 +172,12 @@ class Problem:
         """The first measurement of each keyframe, shape (n + 1,)."""
         return np.asarray(self.keyframe.searchsorted(np.arange(len(self) + 1)))
 
-    @cached_property
-    def compiled_rows(self) -> Array:
-        """The rows as kernels take them, shape (m, ROW)."""
-        return np.ascontiguousarray(self.rows[:, : measured.ROW])
+    def measured(self, some: "slice | Index" = slice(None)) -> MeasuredRows:
+        """Measurements as kernels take them."""
+        rows, which, window = self.rows[some, : measured.ROW], self.which[some], self.window[some]
+        scales = self.row_scales[some] if len(self.row_scales) else self.row_scales
+        contiguous = np.ascontiguousarray
+        return MeasuredRows(contiguous(rows), contiguous(which), scales, contiguous(window), self.windows)
 
     @property
     def used(self) -> list[str]:

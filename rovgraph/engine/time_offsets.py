@@ -1,9 +1,9 @@
 """How late stamps may be, and where on the time line a measurement is put for that.
 
-A measurement stands at its stamp less the time_offset that is assumed; what remains until the
-time_offset that is estimated is bridged by a `LateStampWindow`. So the assumption need not be right, but the
-nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. The
-assumption may be renewed while measurements come.
+A measurement stands at its stamp less the time offset that is assumed. What remains until the one that is estimated is
+bridged by a window, the motion at knots around the stamp (`rovgraph.kernels.linearization`). So the assumption need not
+be right, but the nearer it is, the less of the IMU's noise lies between a measurement and its keyframe. The assumption
+may be renewed while measurements come.
 """
 
 from collections.abc import Mapping
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rovgraph.calibration import LAYOUT, Belief
-from rovgraph.engine.late_stamp_window import KNOT_S
 from rovgraph.geometry import Array
 from rovgraph.instruments import Instrument
+from rovgraph.kernels.measurement_row import KNOT_S
 
 REACH_SD = 4.0  # of the prior, that a time_offset may be off
 
@@ -27,7 +27,7 @@ class TimeOffsets:
     ----------
     variable : sensor -> name of the calibration variable
     lags : variable that is estimated -> ndarray, shape (K,), time_offset that is reckoned with, ascending by
-        `rovgraph.engine.late_stamp_window.KNOT_S` [s]
+        `rovgraph.kernels.measurement_row.KNOT_S` [s]
     assumed : variable -> time_offset by which measurements are put earlier [s]
     """
 

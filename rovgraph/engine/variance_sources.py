@@ -19,7 +19,7 @@ from rovgraph.engine.chain import Chain, ChainStep
 from rovgraph.engine.chain_information import SquareRoot
 from rovgraph.engine.chain_layout import COLUMNS, MOTION
 from rovgraph.engine.chain_optimum import ChainOptimum
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.pieces import pieces
 from rovgraph.geometry import Array, transpose
 from rovgraph.kernels import chain_posterior
@@ -128,7 +128,7 @@ def _of_measurements(chain: Chain, best: ChainOptimum, step: ChainStep) -> list[
     return out
 
 
-def _along(chain: Chain, block: Block, H: dict[str, Array], step: ChainStep) -> Array:
+def _along(chain: Chain, block: Measurements, H: dict[str, Array], step: ChainStep) -> Array:
     """Derivative of whitened measurements along a step, shape (n, dim)."""
     own, total = step.x[block.keyframe], np.zeros(block.z.shape)
     for name, by in H.items():

@@ -6,7 +6,7 @@ predictions by time for stamps.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,8 +14,9 @@ import numpy as np
 from rovgraph.calibration import STEADY, TABLE, Belief
 from rovgraph.config import mount_matrix
 from rovgraph.engine.chain import Chain
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.pieces import pieces
+from rovgraph.engine.problem import Index
 from rovgraph.engine.scale import COLUMNS, SCALES
 from rovgraph.engine.unknowns import Unknowns
 from rovgraph.gauss_markov import stationary_walk
@@ -40,7 +41,7 @@ def widened(chain: Chain, state: State, names: tuple[str, ...], beliefs: Mapping
     wide, timed, rows = chain.unknowns.estimating(names), {}, chain.problem
     offsets = {i.time_offset for i in chain.initial.instruments.values()}
     for sensor, block in chain.blocks.items() if offsets & set(names) else ():
-        if block.instrument.time_offset in names and block.window is None:
+        if block.instrument.time_offset in names and not block.may_be_late:
             timed[sensor] = _timed(block, wide, chain, state)
     if {*SCALES} & set(names) and not len(rows.scales):
         rows = replace(rows, scales=_mean_signal_to_bias(chain, state))
@@ -75,10 +76,10 @@ def lasting_belief(before: Belief, sd: float, time_constant: float, changes: tup
 class _WidenedChain(Chain):
     """A chain with the measurements of sensors whose stamps may be late, which no kernel knows."""
 
-    timed: Mapping[str, Block]
+    timed: Mapping[str, Measurements]
 
     @cached_property
-    def given(self) -> dict[str, Block]:
+    def given(self) -> dict[str, Measurements]:
         given = self._unknown_to_kernels
         if given <= self.timed.keys():  # in the order in which they measure first, as of all blocks
             return {sensor: block for sensor, block in self.timed.items() if sensor in given}
@@ -86,36 +87,32 @@ class _WidenedChain(Chain):
 
 
 @dataclass(frozen=True)
-class _TimedBlock(Block):
-    """A block whose stamps may be late: ``slope``, shape (n, dim), is how a prediction changes with time."""
+class _TimedMeasurements(Measurements):
+    """Measurements whose stamps may be late: ``slope``, shape (n, dim), is how a prediction changes with time."""
 
-    slope: Array | None = None
+    slope: Array
 
-    def at(self, index: slice | Array) -> "_TimedBlock":
-        some, slope = super().at(index), self.slope
-        assert isinstance(some, _TimedBlock) and slope is not None
-        return replace(some, slope=slope[index])
+    def at(self, index: slice | Index) -> "_TimedMeasurements":
+        return replace(self, index=self.index[index], slope=self.slope[index])
 
-    def predict(self, state: State) -> tuple[Array, Jacobians]:
-        predicted, H = super().predict(state)
-        assert self.slope is not None and self.instrument.time_offset is not None
-        return predicted, H | {self.instrument.time_offset: -self.slope[..., None]}
+    def linearize(self, state: State) -> tuple[Array, Jacobians]:
+        r, H = super().linearize(state)
+        assert self.instrument.time_offset is not None
+        return r, H | {self.instrument.time_offset: self.W @ -self.slope[..., None]}
 
 
-def _timed(block: Block, wide: Unknowns, chain: Chain, state: State) -> _TimedBlock:
-    """A block that knows how its predictions change with time [unit/s], from the keyframes around each."""
-    scales = SCALES if block.scale_to_bias is not None else ()
-    wider = replace(block, unknowns=wide.of([*block.instrument.calibration, *scales]))
-    model, time, rate_b = block.instrument.model, chain.problem.time, chain.problem.rate_b
-    before = np.maximum(block.keyframe - (block.motion.dt < SHORT_S), 0)
-    after, slope = np.minimum(block.keyframe + 1, len(time) - 1), np.empty(block.z.shape)
-    for part in pieces(0, len(block)):
+def _timed(one: Measurements, wide: Unknowns, chain: Chain, state: State) -> _TimedMeasurements:
+    """Measurements that know how their predictions change with time [unit/s], from the keyframes around each."""
+    model, time, rate_b = one.instrument.model, chain.problem.time, chain.problem.rate_b
+    before = np.maximum(one.keyframe - (one.dt < SHORT_S), 0)
+    after, slope = np.minimum(one.keyframe + 1, len(time) - 1), np.empty(one.z.shape)
+    for part in pieces(0, len(one)):
         k, j = before[part], after[part]
         here, there = state.at(k), state.at(j)
         there = replace(there, calibration=here.calibration)  # errors that come and go are no motion
         begin, end = model.predict(here, rate_b[k])[0], model.predict(there, rate_b[j])[0]
         slope[part] = innovation(model, end, begin) / np.maximum(time[j] - time[k], 1e-6)[:, None]
-    return _TimedBlock(**{f.name: getattr(wider, f.name) for f in fields(Block)}, slope=slope)
+    return _TimedMeasurements(one.problem, one.index, one.instrument, one.gravity, wide, slope)
 
 
 def _mean_signal_to_bias(chain: Chain, state: State) -> Array:

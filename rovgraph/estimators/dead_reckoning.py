@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from rovgraph.config import Config, beliefs
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.measurements import motions_of
 from rovgraph.engine.problem import Problem
 from rovgraph.estimators.headings import solve_turn, trusted_first, turn_noise
 from rovgraph.geometry import Array, cross, earth_rate_n, exp_rotation, identity, rotate, transpose
@@ -24,7 +23,7 @@ from rovgraph.instruments import HEADING_STREAMS
 from rovgraph.kernels import motion_row as at
 from rovgraph.kernels.coasting import BRIDGE_ACC, BRIDGE_GYR
 from rovgraph.kernels.dead_reckoning import reckon_attitude
-from rovgraph.kernels.measurement_row import RATE, RATE_SD, TIME
+from rovgraph.kernels.measurement_row import ASSUMED, DP, DR, DT, DV, RATE, RATE_SD, TIME
 from rovgraph.sensors import dvl_mounting
 from rovgraph.state import State
 
@@ -135,11 +134,12 @@ def _gather(problem: Problem, sensors: Collection[str | None]) -> _Epochs:
     place = np.empty(len(order), np.intp)
     place[order] = np.arange(len(order))
     keyframe, k, of = place[:n], place[n:], np.concatenate([np.arange(n), own])[order]
-    m, motion = len(order), motions_of(rows)
+    m, dR_of = len(order), rows[:, DR:DV].reshape(-1, 3, 3)
     time, dt, dR, dv, assumed = np.empty(m), np.empty(m), np.empty((m, 3, 3)), np.empty((m, 3)), np.empty((m, 6))
     time[keyframe] = problem.time
     dt[keyframe], dR[keyframe], dv[keyframe], assumed[keyframe] = _motions(problem)
-    time[k], dt[k], dR[k], dv[k], assumed[k] = rows[:, TIME], motion.dt, motion.dR, motion.dv, motion.bias
+    time[k], dt[k], dR[k], dv[k] = rows[:, TIME], rows[:, DT], dR_of, rows[:, DV:DP]
+    assumed[k] = rows[:, ASSUMED : ASSUMED + 6]
     begin, begin_R, begin_v = np.roll(dt, 1), np.roll(dR, 1, axis=0), np.roll(dv, 1, axis=0)
     first = (keyframe + 1) % m
     begin[first], begin_R[first], begin_v[first] = 0.0, identity(3), 0.0

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from rovgraph.calibration import CONSIDERED, TABLE, Belief
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.estimators.estimate import RESIDUAL_COLUMNS, CalibrationEstimate, History
 from rovgraph.estimators.observability import verdict
 from rovgraph.estimators.unchecked import rests_on_doubtful_compass
@@ -141,7 +141,7 @@ def calibration_history(name: str, time: Array, value: Array, sd: Array) -> Hist
     return History(TABLE[name].labels, TABLE[name].unit, time, value.copy(), sd.copy())
 
 
-def residual_frame(measured: Iterable[tuple[str, Block, State, Array]] = ()) -> pd.DataFrame:
+def residual_frame(measured: Iterable[tuple[str, Measurements, State, Array]] = ()) -> pd.DataFrame:
     """Innovation, normalised innovation and weight of every measurement, in order of time.
 
     Parameters

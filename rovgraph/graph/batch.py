@@ -1,6 +1,6 @@
 """A dive as GTSAM's graph, solved by Gauss-Newton: where loops are closed, and to hold the chain against.
 
-Each iteration linearises GTSAM's own factors there, and all measurements at once as `Block`s; GTSAM eliminates the
+Each iteration linearises GTSAM's own factors there, and all measurements of a sensor at once; GTSAM eliminates the
 sum. Calibration that walks has a value at each keyframe, as in the chain.
 """
 
@@ -20,7 +20,15 @@ from rovgraph.config import Config
 from rovgraph.engine.constant_velocity import gravity
 from rovgraph.engine.gauss_newton import Gates, Measured, Solution
 from rovgraph.engine.initial_conditions import StatePrior
-from rovgraph.engine.measurements import Block, Seen, blocks_of, cost_at_gate, gates_of, measurement_cost, weights_of
+from rovgraph.engine.measurements import (
+    Measurements,
+    Seen,
+    cost_at_gate,
+    gates_of,
+    measurement_cost,
+    measurements_of,
+    weights_of,
+)
 from rovgraph.engine.problem import Problem
 from rovgraph.engine.stretches import resume
 from rovgraph.engine.stretches import solve as solve_problem
@@ -54,14 +62,14 @@ class DiveGraph:
     Attributes
     ----------
     native : priors and IMU factors
-    blocks : sensor -> Block
+    blocks : sensor -> Measurements
     unknowns : the calibration variables
     index : ndarray of int, shape (n,), of the value that calibration which walks has at each keyframe, from 0
         and by steps of 0 or 1
     """
 
     native: gtsam.NonlinearFactorGraph
-    blocks: dict[str, Block]
+    blocks: dict[str, Measurements]
     unknowns: Unknowns
     index: NDArray[np.int64]
 
@@ -166,7 +174,7 @@ def make_graph(
     index = np.arange(len(problem))
     wanted = wanted or unknowns(beliefs, problem.used)
     factors = _others(problem, prior, beliefs, wanted, index)
-    blocks = blocks_of(problem, instruments, instruments, gravity(config), wanted)
+    blocks = measurements_of(problem, instruments, instruments, gravity(config), wanted)
     if "place" in blocks:
         factors += [landmark_prior(number) for number in np.unique(blocks["place"].place).tolist()]
     native = gtsam.NonlinearFactorGraph()

@@ -275,7 +275,7 @@ class Incremental:
         for row in term.landmarks:
             number, keyframe = int(self._numbers[row]), int(term.problem.keyframe[row])
             segment = int(term.problem.keyframes[keyframe, SEGMENT])
-            block, here = self._filter.block(term.problem, np.array([row])), keyframe == term.k
+            block, here = self._filter.measurements(term.problem, np.array([row])), keyframe == term.k
             state = Gaussian(x[int(here)], c, np.empty((0, 0))).state
             name = key(PLACE, number)
             if number not in self._places:

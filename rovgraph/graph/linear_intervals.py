@@ -50,7 +50,7 @@ class KeyframeTerms:
     def __init__(self, filter: FilterEngine, problem: Problem, index: Index) -> None:
         known = np.array([filter.knows(problem.sensors[k]) for k in problem.which[index].tolist()])
         self._rows = filter.rows(problem, index[known]) if known.any() else None
-        self._blocks = [filter.block(problem, np.array([row])) for row in index[~known].tolist()]
+        self._blocks = [filter.measurements(problem, np.array([row])) for row in index[~known].tolist()]
         self._matrix = filter.layout.matrix
 
     def linearize(self, x: Array, c: Array) -> tuple[Array, Array]:

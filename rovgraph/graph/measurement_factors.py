@@ -1,4 +1,4 @@
-"""Measurements as GTSAM's nonlinear factors, whose callbacks linearise the same `Block` as the chain does."""
+"""Measurements as GTSAM's nonlinear factors, whose callbacks linearise the same `Measurements` as the chain does."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from rovgraph.engine.measurements import Block, loss_threshold
+from rovgraph.engine.measurements import Measurements, loss_threshold
 from rovgraph.geometry import Array
 from rovgraph.graph.keys import key
 from rovgraph.graph.values import state_at
@@ -14,7 +14,7 @@ from rovgraph.instruments import Instrument
 from rovgraph.state import PLACE, State
 
 
-def measurement_keys(block: Block, segment: NDArray[np.int64]) -> list[list[int]]:
+def measurement_keys(block: Measurements, segment: NDArray[np.int64]) -> list[list[int]]:
     """Keys of every measurement, in the order of ``block.variables``.
 
     Parameters
@@ -28,7 +28,7 @@ def measurement_keys(block: Block, segment: NDArray[np.int64]) -> list[list[int]
     return rows
 
 
-def measurement_factor(block: Block, segment: int) -> gtsam.CustomFactor:
+def measurement_factor(block: Measurements, segment: int) -> gtsam.CustomFactor:
     """A block of one measurement as a factor that calls back; ``segment`` as `measurement_keys` takes it."""
     index = int(block.keyframe[0])
 
@@ -42,7 +42,7 @@ def measurement_factor(block: Block, segment: int) -> gtsam.CustomFactor:
     return gtsam.CustomFactor(robust_noise(block.instrument), measurement_keys(block, np.array([segment]))[0], error)
 
 
-def with_places(block: Block, state: State, values: gtsam.Values) -> State:
+def with_places(block: Measurements, state: State, values: gtsam.Values) -> State:
     """The state of each measurement's keyframe together with the place that is seen, where one is."""
     return block.with_places(state, {n: values.atVector(key(PLACE, n)) for n in set(block.place.tolist()) if n >= 0})
 

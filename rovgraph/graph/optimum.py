@@ -10,7 +10,7 @@ import numpy as np
 from rovgraph.calibration import TABLE, Belief
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.optimum import Knowledge
 from rovgraph.engine.problem import Problem
 from rovgraph.engine.unknowns import Unknowns
@@ -37,7 +37,7 @@ class GraphOptimum:
         return self.graph.unknowns
 
     @property
-    def blocks(self) -> Mapping[str, Block]:
+    def blocks(self) -> Mapping[str, Measurements]:
         return self.graph.blocks
 
     @cached_property

@@ -27,7 +27,7 @@ from rovgraph.engine.constant_velocity import gravity
 from rovgraph.engine.filter import ORIGIN
 from rovgraph.engine.gauss_newton import Solution
 from rovgraph.engine.initial_conditions import InitialConditions
-from rovgraph.engine.measurements import Block, make_block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.problem import Problem
 from rovgraph.geometry import Array
 from rovgraph.graph.batch import DiveGraph, make_graph, make_values, solve
@@ -105,7 +105,7 @@ def recognised(
     _, place, often = np.unique(names, return_inverse=True, return_counts=True)
     again = often[place] > 1
     if again.any():
-        block = make_block(problem, seen[again], instrument, gravity, graph.unknowns)
+        block = Measurements(problem, seen[again], instrument, gravity, graph.unknowns)
         where, covariance = _where(block, graph, solution)
         numbers[again] = matched(names[again], numbers[again], where, covariance, instrument.gate_sd)
     return numbers
@@ -127,7 +127,7 @@ def resolved(problem: Problem, numbers: NDArray[np.int64]) -> Problem:
     return problem.sighting(np.array(found), seen[alone])
 
 
-def insert_places(values: gtsam.Values, block: Block, states: State) -> None:
+def insert_places(values: gtsam.Values, block: Measurements, states: State) -> None:
     """Insert the places of landmarks that have none yet, each where the first landmark that is believed has it.
 
     Parameters
@@ -180,7 +180,7 @@ def matched(names: Array, own: NDArray[np.int64], where: Array, covariance: Arra
     return numbers
 
 
-def _where(block: Block, graph: DiveGraph, solution: Solution[gtsam.Values]) -> tuple[Array, Array]:
+def _where(block: Measurements, graph: DiveGraph, solution: Solution[gtsam.Values]) -> tuple[Array, Array]:
     """Place of each landmark if it is believed alone, shape (m, 2), and their joint covariance, shape (2 m, 2 m).
 
     The motion from a keyframe to its landmark is short, and taken as exact.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rovgraph.calibration import TABLE
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.geometry import Array
 from rovgraph.graph.keys import key
 from rovgraph.state import DIMENSION, PLACE, PLACE_DIM, Jacobians
@@ -26,11 +26,11 @@ class Rows:
 
     Parameters
     ----------
-    blocks : sensor -> Block, at least one; either of places or of none
+    blocks : sensor -> Measurements, at least one; either of places or of none
     value : index of the value that calibration which walks has at each keyframe
     """
 
-    def __init__(self, blocks: Mapping[str, Block], value: NDArray[np.int64]) -> None:
+    def __init__(self, blocks: Mapping[str, Measurements], value: NDArray[np.int64]) -> None:
         every, self._sensors = list(blocks.values()), list(blocks)
         walks = {name: walk for block in every for name, walk in block.unknowns.walks.items()}
         touched = {variable for block in every for variable in block.variables}
@@ -58,7 +58,7 @@ class Rows:
         Parameters
         ----------
         graph : to add to
-        linear : sensor -> innovations and Jacobians of its block, as `Block.weighted` returns them
+        linear : sensor -> innovations and Jacobians of its block, as `Measurements.weighted` returns them
         """
         b = np.zeros(self._count)
         A = {v: np.zeros((self._count, size)) for v, size in self._sizes.items()}

@@ -56,7 +56,7 @@ from rovgraph.kernels.imu_samples import (
     survey,
     typical_scatter,
 )
-from rovgraph.kernels.measurement_row import ASSUMED, MOST, RATE, RATE_SD, SNAPSHOT, Z
+from rovgraph.kernels.measurement_row import ASSUMED, KNOT_LAG, KNOT_RATE, MOST, RATE, RATE_SD, SNAPSHOT, Z
 from rovgraph.kernels.measurement_row import TIME as AT
 from rovgraph.kernels.motion_residual import motion_weight
 from rovgraph.kernels.preintegration import SNAPSHOT as NUMBERS
@@ -69,7 +69,6 @@ IN, EARLY, LATE, UNFINISHED, BEYOND, IN_VIEW, REFUSED = 0, 1, 2, 3, 4, 5, 6  # f
 CLOSES, ONCE, TURNED, DIM, SIGHTS, LAG, ABOUT = 0, 1, 2, 3, 4, 5, 6  # of a sensor; LAG is its place in ``lags`` or -1
 SAMPLES, READ, ORDERED, KEYFRAMES, ROWS, WINDOWS, FORGOTTEN = 0, 1, 2, 3, 4, 5, 6  # counts
 WHICH, KEYFRAME_OF, INTERVAL_OF, LINE_OF, WINDOW_OF, NUMBER_OF, OF = 0, 1, 2, 3, 4, 5, 6  # what a row is of
-KNOT = NUMBERS + 3  # numbers of a window's knot: a snapshot from the keyframe, and the rate
 
 SHORTEST_S = 1e-3  # an interval
 KNOT_WINDOW_S = 0.1  # either side of a knot, over which the rate is taken; the less noise is in its slope the better
@@ -384,8 +383,9 @@ def _window(
     noise averages.
     """
     count = 0
-    while count < len(lag) and not math.isnan(lag[count]):
-        count += 1
+    for k in range(len(lag)):
+        window_out[k, KNOT_LAG] = lag[k]
+        count += not math.isnan(lag[k])
     begin, end = min(start, stamp - lag[count - 1]), max(start, stamp - lag[0])
     if not (imu[0, 0] <= begin and begin < end and end <= imu[len(imu) - 1, 0]):
         return False
@@ -419,7 +419,7 @@ def _window(
         _mean_rate(imu, angle, stamp - lag[k], KNOT_WINDOW_S, wide)
         _mean_rate(imu, angle, stamp - lag[k], 0.5 * KNOT_WINDOW_S, narrow)
         for i in range(3):
-            out[NUMBERS + i] = (4.0 * narrow[i] - wide[i]) / 3.0
+            out[KNOT_RATE + i] = (4.0 * narrow[i] - wide[i]) / 3.0
     return True
 
 

@@ -19,7 +19,7 @@ from rovgraph.kernels.compile import helper
 from rovgraph.kernels.error_coordinates import local, retract
 from rovgraph.kernels.error_coordinates import make_scratch as make_coordinates_scratch
 from rovgraph.kernels.filter_state import FilterModel, FilterState
-from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch
+from rovgraph.kernels.linearization import Keyframe, Scratch, linearize_measurement, make_scratch, pick
 from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, READMIT, TIME, MeasuredRows
 from rovgraph.kernels.moves import move
 from rovgraph.kernels.robust_update import (
@@ -60,16 +60,16 @@ def linearize_keyframe(
 
     Columns of what is considered, behind those of what is estimated, are multiplied by L.
     """
-    rows, which, scale = measured
+    which = measured.which
     x, c, L, sensors, estimated = known.x, known.c, known.L, model.sensors, len(model.layout.columns)
     first, r_out, H_out, H_y_out = found.first, found.r, found.H, found.H_y
     wide = np.zeros((len(r_out), estimated + len(L))) if len(L) else H_out
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
+    state = Keyframe(x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21], c)
     for j in range(len(which)):
-        sensor, begin, end = sensors[which[j]], first[j], first[j + 1]
-        if sensor[KIND] != GIVEN:
-            own, own_r, own_H = scale[j] if len(scale) else scratch.exact, r_out[begin:end], wide[begin:end]
-            linearize_measurement(R, p, v, b, c, rows[j], sensor, own, model.gravity, scratch, own_r, own_H)
+        begin, end = first[j], first[j + 1]
+        if sensors[which[j], KIND] != GIVEN:
+            one = pick(measured, j, sensors, scratch)
+            linearize_measurement(state, one, model.gravity, scratch, r_out[begin:end], wide[begin:end])
             if len(L):
                 for a in range(begin, end):
                     split(wide[a], L, H_out[a, :estimated], H_y_out[a])

@@ -25,8 +25,16 @@ from rovgraph.kernels.chain import (
 )
 from rovgraph.kernels.compile import Flags, Index, Matrices, Matrix, Vector, kernel, view_helper
 from rovgraph.kernels.layout import ACC_SCALE, MOTION
-from rovgraph.kernels.linearization import Scratch, linearize_measurement, make_scratch, squared_length
-from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, MOST
+from rovgraph.kernels.linearization import (
+    Scratch,
+    States,
+    keyframe,
+    linearize_measurement,
+    make_scratch,
+    pick,
+    squared_length,
+)
+from rovgraph.kernels.measurement_row import BEND, DIM, GIVEN, KIND, LOSS, MOST, MeasuredRows
 from rovgraph.kernels.motion_residual import make_residual_scratch, motion_error, whiten_motion
 from rovgraph.kernels.motion_row import AFTER, RESIDUAL, WIDTH
 from rovgraph.kernels.weighting import loss_weight, robust_cost
@@ -39,9 +47,8 @@ class DiveFactors(NamedTuple):
     ----------
     motions, W : shapes (n - 1, ROW), (n - 1, 15, 15), of `rovgraph.kernels.motion_row`, square-root information
     scales : shape (n - 1, 6, 6), bias by the IMU's scales in each interval, or (0, 6, 6) where these are exact
-    rows, which : shapes (m, ROW), (m,), measurements in the order of keyframes, and the sensor that each is of
+    measured : m measurements in the order of keyframes
     first : shape (n + 1,), a keyframe's first measurement
-    row_scales : shape (m, 6, 6) or (0, 6, 6), as scales, from the keyframe to each measurement
     sensors : a row for each sensor, of `rovgraph.kernels.measurement_row`; those that are `GIVEN` are left out
     gravity : [m/s^2]
     """
@@ -49,37 +56,18 @@ class DiveFactors(NamedTuple):
     motions: Matrix
     W: Matrices
     scales: Matrices
-    rows: Matrix
-    which: Index
+    measured: MeasuredRows
     first: Index
-    row_scales: Matrices
     sensors: Matrix
     gravity: float
 
 
-class Point(NamedTuple):
-    """States of n keyframes.
-
-    Attributes
-    ----------
-    R, p, v, b : shapes (n, 3, 3), (n, 3), (n, 3), (n, 6)
-    c : calibration vectors, shape (n, C), or (1, C) where nothing walks
-    """
-
-    R: Matrices
-    p: Matrix
-    v: Matrix
-    b: Matrix
-    c: Matrix
-
-
 @view_helper
 def load_linearized(
-    k: int, row: int, point: Point, dive: DiveFactors, entered: Array, room: Room, scratch: Scratch, r: Array
+    k: int, row: int, point: States, dive: DiveFactors, entered: Array, room: Room, scratch: Scratch, r: Array
 ) -> int:
     """Weighted rows of the measurements of keyframe k into V from ``row`` on; returns the row after them."""
-    R, p, v, b, c = point.R[k], point.p[k], point.v[k], point.b[k], point.c[k if len(point.c) > 1 else 0]
-    rows, which, row_scales, sensors = dive.rows, dive.which, dive.row_scales, dive.sensors
+    state, which, sensors = keyframe(point, k), dive.measured.which, dive.sensors
     V, sums, last = room.V, room.scale, len(room.scale)
     for m in range(dive.first[k], dive.first[k + 1]):
         sensor = sensors[which[m]]
@@ -90,9 +78,8 @@ def load_linearized(
             r[a] = 0.0
             for j in range(V.shape[1]):
                 V[row + a, j] = 0.0
-        scale = row_scales[m] if len(row_scales) else scratch.exact
-        H = V[row : row + dim]
-        square = linearize_measurement(R, p, v, b, c, rows[m], sensor, scale, dive.gravity, scratch, r, H)
+        one = pick(dive.measured, m, sensors, scratch)
+        square = linearize_measurement(state, one, dive.gravity, scratch, r, V[row : row + dim])
         root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
         for a in range(dim):
             for j in range(last):
@@ -107,7 +94,7 @@ def load_linearized(
 def eliminate_dive(
     dive: DiveFactors,
     entered: Flags,
-    point: Point,
+    point: States,
     column: Index,
     walks: Walks,
     given: PlacedRows,
@@ -164,18 +151,16 @@ def eliminate_dive(
 
 
 @kernel()
-def squared_lengths(dive: DiveFactors, point: Point, square_out: Vector) -> None:
+def squared_lengths(dive: DiveFactors, point: States, square_out: Vector) -> None:
     """Squared lengths of the whitened innovations of a dive's measurements, shape (m,); 0 of those that are `GIVEN`."""
-    R, p, v, b, c = point
-    rows, which, first, row_scales, sensors = dive.rows, dive.which, dive.first, dive.row_scales, dive.sensors
-    scratch, of_c = make_scratch(c.shape[1], np.empty(0, np.int64)), len(c) > 1
+    first, sensors, which = dive.first, dive.sensors, dive.measured.which
+    scratch = make_scratch(point.c.shape[1], np.empty(0, np.int64))
     for k in range(len(first) - 1):
+        state = keyframe(point, k)
         for m in range(first[k], first[k + 1]):
-            sensor, square_out[m] = sensors[which[m]], 0.0
-            if sensor[KIND] != GIVEN:
-                scale = row_scales[m] if len(row_scales) else scratch.exact
-                state = R[k], p[k], v[k], b[k], c[k * of_c]
-                square_out[m] = squared_length(*state, rows[m], sensor, scale, dive.gravity, scratch)
+            square_out[m] = 0.0
+            if sensors[which[m], KIND] != GIVEN:
+                square_out[m] = squared_length(state, pick(dive.measured, m, sensors, scratch), dive.gravity, scratch)
 
 
 @kernel()

@@ -15,7 +15,7 @@ from rovgraph.kernels.compile import AnyMatrix, AnyVector, Index, Matrices, Matr
 from rovgraph.kernels.correction import Corrected, GivenRows, correct
 from rovgraph.kernels.filter_state import FilterModel, FilterState
 from rovgraph.kernels.layout import VELOCITY
-from rovgraph.kernels.measurement_row import GIVEN, KIND, MeasuredRows
+from rovgraph.kernels.measurement_row import GIVEN, KIND, MeasuredRows, some_of
 from rovgraph.kernels.prediction import predict_filter
 
 
@@ -80,16 +80,14 @@ class Interval(NamedTuple):
     ----------
     motion : row of `rovgraph.kernels.motion_row`, or (0,): there is none, and all is measured at one keyframe
     scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
-    rows, which, scales : of `MeasuredRows`
+    measured : its measurements
     between : how many of them, the first ones, belong to the keyframe before
     given_r, given_H : of `GivenRows`
     """
 
     motion: Vector
     scale: Matrix
-    rows: Matrix
-    which: Index
-    scales: Matrices
+    measured: MeasuredRows
     between: int
     given_r: Vector
     given_H: Matrix
@@ -137,9 +135,9 @@ def take_interval(
             _keep(known, out.departed)
             predict_filter(known, interval.motion, interval.scale, model, out.F, out.Q)
             _keep(known, out.predicted)
-        begin, end = (between, len(interval.which)) if arrived else (0, between)
+        begin, end = (between, len(interval.measured.which)) if arrived else (0, between)
         if begin < end:
-            measured = MeasuredRows(interval.rows[begin:end], interval.which[begin:end], interval.scales[begin:end])
+            measured = some_of(interval.measured, begin, end)
             given = GivenRows(interval.given_r[used:], interval.given_H[used:])
             corrected = Corrected(out.nis[begin:end], out.weight[begin:end], out.places)
             used += correct(known, measured, given, model, since, gated, corrected)
@@ -208,7 +206,6 @@ def filter_intervals(
     How many intervals are taken
     """
     x, c, P, B, L = known
-    rows, which, scales = measured
     taken, here = intervals.taken, intervals.here
     size, exact, nothing, none = model.walk.shape[1], np.empty((0, 0)), np.empty(0), np.empty((0, len(L)))
     F, Q, untold = np.empty((size, size)), np.empty((size, size)), FilterState(nothing, nothing, exact, exact, exact)
@@ -216,14 +213,14 @@ def filter_intervals(
         tilt, heading = attitude_variances(x, P)
         begin, end = taken[k], taken[k + 1]
         poorly_known = tilt > intervals.poorly_known[0] or heading > intervals.poorly_known[1]
-        if poorly_known or not knows_all(which[begin:end], model.sensors):
+        if poorly_known or not knows_all(measured.which[begin:end], model.sensors):
             return k
         scale = intervals.scales[k] if len(intervals.scales) else exact
-        own = rows[begin:end], which[begin:end], scales[begin:end], here[k] - begin
-        interval = Interval(intervals.motions[k], scale, *own, nothing, none)
+        some = some_of(measured, begin, end)
+        interval = Interval(intervals.motions[k], scale, some, here[k] - begin, nothing, none)
         predicted = FilterState(out.predicted_x[k], out.predicted_c[k], exact, exact, exact)
-        some = Taken(untold, predicted, F, Q, out.nis[begin:end], out.weight[begin:end], nothing)
-        take_interval(known, interval, model, since, True, some)
+        taken_out = Taken(untold, predicted, F, Q, out.nis[begin:end], out.weight[begin:end], nothing)
+        take_interval(known, interval, model, since, True, taken_out)
         _copy(x, out.x[k])
         _copy(c, out.c[k])
         _covariance(P, B, 0, out.pose[k])

@@ -3,18 +3,27 @@
     r = W (z - h(x(t), c)),  H = W dh/d(x, c)      x(t): the keyframe's state, propagated to the measurement's time
 
 with the bias b + S k where the IMU's scale may be off by k (`rovgraph.engine.scale`).
+
+An instrument whose stamps are late by tau measured at stamp - tau. A derivative by time would do for an offset that is
+small against the motion; half a second is not. So the motion from the keyframe is kept at knots around the stamp, as
+far as the prior of tau reaches, and interpolated: rotation along its geodesic, velocity and position linearly, and the
+rate on cubic arcs (Catmull and Rom 1974). Linear pieces would not do for the rate: noise of a knot and of the slope
+beside it go together, which through the lever arm feigns an offset. The slope of these arcs is as symmetric about a
+knot as the knot is. Predictions are exact for any tau, and
+
+    dh/dtau = H (d rotation, d position, d velocity)/dtau - H_bias d rate/dtau
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rovgraph.geometry import Array
 from rovgraph.kernels.compass import wrap
-from rovgraph.kernels.compile import helper, kernel, view_helper
-from rovgraph.kernels.layout import ACC_SCALE, MOTION
+from rovgraph.kernels.compile import Index, Matrices, Matrix, Vector, helper, kernel, view_helper
+from rovgraph.kernels.layout import ACC_SCALE, GYR_BIAS, MOTION
+from rovgraph.kernels.layout import VELOCITY as VELOCITY_AT
 from rovgraph.kernels.measurement_row import (
     ASSUMED,
     BEND,
@@ -25,21 +34,53 @@ from rovgraph.kernels.measurement_row import (
     DV,
     GAIN,
     KIND,
+    KNOT,
+    KNOT_DT,
+    KNOT_LAG,
+    KNOT_RATE,
+    KNOT_S,
     LOSS,
     MOST,
+    OFFSET,
     PARAMS,
     RATE,
     RATE_SD,
     SD,
+    MeasuredRows,
     Z,
 )
 from rovgraph.kernels.measurements import WORK as PREDICT_WORK
 from rovgraph.kernels.measurements import is_angular, predict
 from rovgraph.kernels.propagation import WORK as PROPAGATE_WORK
 from rovgraph.kernels.propagation import chain, propagate, propagation_jacobian
+from rovgraph.kernels.rotations import exp_rotation, log_rotation, multiply, multiply_transposed, rotate, rotate_back
 from rovgraph.kernels.weighting import loss_weight, whiten
 
-Index = NDArray[np.int64]
+
+class Keyframe(NamedTuple):
+    """A keyframe's state, as `rovgraph.kernels.measurements.predict` takes it, and calibration vector."""
+
+    R: Array
+    p: Array
+    v: Array
+    b: Array
+    c: Array
+
+
+class Measured(NamedTuple):
+    """A measurement.
+
+    Attributes
+    ----------
+    row, sensor : of `rovgraph.kernels.measurement_row`
+    scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
+    window : shape (K, KNOT), motion around a stamp that may be late, or (0, 0)
+    """
+
+    row: Array
+    sensor: Array
+    scale: Array
+    window: Array
 
 
 class Scratch(NamedTuple):
@@ -51,7 +92,9 @@ class Scratch(NamedTuple):
     z, H : shapes (3,), (3, 15 + C), predicted measurement, then the innovation; its derivative
     W : shape (3, 3), square-root information, lower triangular
     R, there : shapes (3, 3), (2, 3), attitude, position and velocity at the measurement's time
+    rate, by_offset : shapes (3,), (4, 3), rate there; how rotation, position, velocity and rate go with a late stamp
     F : shape (15, 15), zero at first
+    knot, placing : shapes (KNOT,), (4, 3, 3), to place a late stamp with
     predicting, moving : shapes (WORK, 3, 3)
     used, column : shapes (u,), components of state and calibration that are estimated, and the column of each
     exact : shape (0, 0), bias by the IMU's scales where these are exact
@@ -63,7 +106,11 @@ class Scratch(NamedTuple):
     W: Array
     R: Array
     there: Array
+    rate: Array
+    by_offset: Array
     F: Array
+    knot: Array
+    placing: Array
     predicting: Array
     moving: Array
     used: Index
@@ -84,58 +131,145 @@ def make_scratch(calibration_size: int, column: Index) -> Scratch:
             used[count], columns[count] = j, column[j]
             count += 1
     H, F = np.zeros((MOST, MOTION + calibration_size)), np.zeros((MOTION, MOTION))
-    state = np.empty((3, 3)), np.empty((2, 3))
+    state = np.empty((3, 3)), np.empty((2, 3)), np.empty(3), np.empty((4, 3)), F, np.empty(KNOT), np.empty((4, 3, 3))
     work = np.empty((PREDICT_WORK, 3, 3)), np.empty((PROPAGATE_WORK, 3, 3))
     estimated = used[:count].copy(), columns[:count].copy()
-    return Scratch(
-        np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST)), *state, F, *work, *estimated, np.empty((0, 0))
-    )
+    return Scratch(np.empty(6), np.empty(MOST), H, np.empty((MOST, MOST)), *state, *work, *estimated, np.empty((0, 0)))
+
+
+@helper
+def pick(measured: MeasuredRows, m: int, sensors: Array, scratch: Scratch) -> Measured:
+    """One of some measurements."""
+    scale = measured.scales[m] if len(measured.scales) else scratch.exact
+    window = measured.windows[measured.window[m]] if measured.window[m] >= 0 else scratch.exact
+    return Measured(measured.rows[m], sensors[measured.which[m]], scale, window)
 
 
 @view_helper
-def _innovate(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    row: Array,
-    sensor: Array,
-    scale: Array,
-    gravity: float,
-    derive: bool,
-    scratch: Scratch,
-) -> None:
-    """Innovation and square-root information, and on request the derivative of the prediction, in ``scratch``."""
-    kind, dim, dt = int(sensor[KIND]), int(sensor[DIM]), row[DT]
-    bias, z, H, W = scratch.bias, scratch.z[:dim], scratch.H[:dim], scratch.W[:dim, :dim]
+def _interpolate(window: Array, late: float, motion_out: Array, slope_out: Array, work: Array) -> None:
+    """The motion at a time between two knots, as numbers of a knot, and its slope by the time offset.
+
+    Shapes (KNOT,) and (4, 3): rotation, position, velocity, rate.
+    """
+    last = 3
+    while last + 1 < len(window) and not math.isnan(window[last + 1, KNOT_LAG]):
+        last += 1
+    x = (late - window[0, KNOT_LAG]) / KNOT_S
+    k = min(max(math.floor(x), 1), last - 2)
+    x -= k
+    before, here, after, beyond = window[k - 1], window[k], window[k + 1], window[k + 2]
+    turned, turn = work[0], work[1, 0]
+    dR_here, dR_after = here[KNOT_DT + 1 : KNOT_DT + 10].reshape(3, 3), after[KNOT_DT + 1 : KNOT_DT + 10].reshape(3, 3)
+    multiply_transposed(dR_here, dR_after, turned)
+    log_rotation(turned, turn)
+    for i in range(3):
+        slope_out[0, i] = turn[i] / KNOT_S
+        turn[i] *= x
+    exp_rotation(turn, turned)
+    multiply(dR_here, turned, motion_out[KNOT_DT + 1 : KNOT_DT + 10].reshape(3, 3))
+    motion_out[KNOT_DT] = (1.0 - x) * here[KNOT_DT] + x * after[KNOT_DT]
+    for i in range(3):
+        for j in (KNOT_DT + 10 + i, KNOT_DT + 13 + i):  # velocity, position
+            motion_out[j] = (1.0 - x) * here[j] + x * after[j]
+        slope_out[1, i] = (after[KNOT_DT + 13 + i] - here[KNOT_DT + 13 + i]) / KNOT_S
+        slope_out[2, i] = (after[KNOT_DT + 10 + i] - here[KNOT_DT + 10 + i]) / KNOT_S
+        j = KNOT_RATE + i
+        first, second = 0.5 * (after[j] - before[j]), before[j] - 2.5 * here[j] + 2.0 * after[j] - 0.5 * beyond[j]
+        third = 1.5 * (here[j] - after[j]) + 0.5 * (beyond[j] - before[j])
+        motion_out[j] = here[j] + x * (first + x * (second + x * third))
+        slope_out[3, i] = (first + x * (2.0 * second + 3.0 * x * third)) / KNOT_S
+
+
+@view_helper
+def place(state: Keyframe, one: Measured, gravity: float, derive: bool, scratch: Scratch) -> bool:
+    """The state at a measurement's own time, and the rate there, in ``scratch``; False = it is the keyframe's.
+
+    On request with their derivatives by the keyframe's state, and by how late the stamp is.
+    """
+    row, bias, late = one.row, scratch.bias, len(one.window) > 0
     for i in range(6):
-        bias[i] = b[i]
-        for k in range(len(scale)):
-            bias[i] += scale[i, k] * c[ACC_SCALE + k]
+        bias[i] = state.b[i]
+        for k in range(len(one.scale)):
+            bias[i] += one.scale[i, k] * state.c[ACC_SCALE + k]
+    for i in range(3):
+        scratch.rate[i] = row[RATE + i]
+    if not late and row[DT] == 0.0:
+        return False
+    dt, dR, dv, dp = row[DT], row[DR:DV].reshape(3, 3), row[DV:DP], row[DP:ASSUMED]
+    if late:
+        own = scratch.knot
+        _interpolate(one.window, state.c[int(one.sensor[OFFSET])], own, scratch.by_offset, scratch.placing)
+        dt, dR = own[KNOT_DT], own[KNOT_DT + 1 : KNOT_DT + 10].reshape(3, 3)
+        dv, dp = own[KNOT_DT + 10 : KNOT_DT + 13], own[KNOT_DT + 13 : KNOT_DT + 16]
+        for i in range(3):
+            scratch.rate[i] = own[KNOT_RATE + i]
+    p, v, motion, assumed = scratch.there[0], scratch.there[1], scratch.moving, row[ASSUMED : ASSUMED + 6]
+    propagate(state.R, state.p, state.v, bias, dt, dR, dv, dp, assumed, gravity, scratch.R, p, v, motion)
+    if derive:
+        propagation_jacobian(state.R, dt, scratch.F, motion)
+        if late:
+            _by_offset(state, dt, assumed, gravity, scratch)
+    return True
+
+
+@view_helper
+def _by_offset(state: Keyframe, dt: float, assumed: Array, gravity: float, scratch: Scratch) -> None:
+    """From slopes of the motion to those of the state, as `Scratch.by_offset` has them, in place."""
+    slope, turn, back = scratch.by_offset, scratch.placing[0, 0], scratch.placing[1]
+    moved, seen = scratch.placing[2], scratch.placing[3, 0]
+    bias, by_turn, by_p, by_v = scratch.bias, moved[0], moved[1], moved[2]
+    for i in range(3):
+        turn[i] = dt * (bias[3 + i] - assumed[3 + i])  # back over the turn that the bias adds
+    exp_rotation(turn, back)
+    rotate(back, slope[0], by_turn)
+    for i in range(3):
+        slope[1, i] += dt * (bias[i] - assumed[i])
+        slope[2, i] += bias[i] - assumed[i]
+    rotate(state.R, slope[1], by_p)
+    rotate(state.R, slope[2], by_v)
+    for i in range(3):
+        by_p[i] -= state.v[i]
+        slope[0, i] = by_turn[i] + bias[3 + i] - assumed[3 + i]
+        slope[2, i] = by_v[i]
+    by_p[2] -= gravity * dt
+    slope[2, 2] -= gravity
+    rotate_back(scratch.R, by_p, seen)
+    for i in range(3):
+        slope[1, i] = seen[i]
+
+
+@view_helper
+def innovate(state: Keyframe, one: Measured, gravity: float, derive: bool, scratch: Scratch) -> None:
+    """Innovation and square-root information, and on request the derivative of the prediction, in ``scratch``."""
+    row, sensor = one.row, one.sensor
+    kind, dim = int(sensor[KIND]), int(sensor[DIM])
+    z, H, W = scratch.z[:dim], scratch.H[:dim], scratch.W[:dim, :dim]
     for a in range(dim):  # columns that are not estimated nobody reads
         for j in range(MOTION):
             H[a, j] = 0.0
         for j in scratch.used:
             H[a, j] = 0.0
-    rate, params, work = row[RATE : RATE + 3], sensor[PARAMS:], scratch.predicting
-    if dt != 0.0:
-        dR, dv, dp = row[DR:DV].reshape(3, 3), row[DV:DP], row[DP:ASSUMED]
-        there_R, there_p, there_v, motion = scratch.R, scratch.there[0], scratch.there[1], scratch.moving
-        assumed = row[ASSUMED : ASSUMED + 6]
-        propagate(R, p, v, bias, dt, dR, dv, dp, assumed, gravity, there_R, there_p, there_v, motion)
-        predict(kind, there_R, there_p, there_v, bias, c, rate, params, z, H, work)
+    params, work, c = sensor[PARAMS:], scratch.predicting, state.c
+    if place(state, one, gravity, derive, scratch):
+        predict(kind, scratch.R, scratch.there[0], scratch.there[1], scratch.bias, c, scratch.rate, params, z, H, work)
         if derive:
-            propagation_jacobian(R, dt, scratch.F, motion)
+            if len(one.window):
+                offset = MOTION + int(sensor[OFFSET])
+                for a in range(dim):
+                    H[a, offset] = 0.0
+                    for i in range(3):
+                        by = scratch.by_offset
+                        H[a, offset] += H[a, i] * by[0, i] + H[a, 3 + i] * by[1, i] + H[a, VELOCITY_AT + i] * by[2, i]
+                        H[a, offset] -= H[a, GYR_BIAS + i] * by[3, i]  # the rate enters less its bias
             chain(H, scratch.F)
     else:
-        predict(kind, R, p, v, bias, c, rate, params, z, H, work)
+        predict(kind, state.R, state.p, state.v, scratch.bias, c, scratch.rate, params, z, H, work)
     if derive:
         for a in range(dim):
-            for k in range(len(scale)):
+            for k in range(len(one.scale)):
                 by_bias = 0.0
                 for i in range(6):
-                    by_bias += H[a, 9 + i] * scale[i, k]
+                    by_bias += H[a, 9 + i] * one.scale[i, k]
                 H[a, MOTION + ACC_SCALE + k] = by_bias
     whiten(row[SD : SD + dim], sensor[GAIN : GAIN + 9].reshape(3, 3)[:dim, :dim], row[RATE_SD], W)
     for a in range(dim):
@@ -144,22 +278,11 @@ def _innovate(
 
 
 @view_helper
-def squared_length(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    row: Array,
-    sensor: Array,
-    scale: Array,
-    gravity: float,
-    scratch: Scratch,
-) -> float:
-    """Squared length of the whitened innovation; parameters as `linearize_measurement`."""
-    _innovate(R, p, v, b, c, row, sensor, scale, gravity, False, scratch)
+def squared_length(state: Keyframe, one: Measured, gravity: float, scratch: Scratch) -> float:
+    """Squared length of the whitened innovation."""
+    innovate(state, one, gravity, False, scratch)
     square = 0.0
-    for a in range(int(sensor[DIM])):
+    for a in range(int(one.sensor[DIM])):
         whitened = 0.0
         for k in range(a + 1):
             whitened += scratch.W[a, k] * scratch.z[k]
@@ -169,74 +292,125 @@ def squared_length(
 
 @view_helper
 def linearize_measurement(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    c: Array,
-    row: Array,
-    sensor: Array,
-    scale: Array,
-    gravity: float,
-    scratch: Scratch,
-    r_out: Array,
-    H_out: Array,
+    state: Keyframe, one: Measured, gravity: float, scratch: Scratch, r_out: Array, H_out: Array
 ) -> float:
     """Whitened innovation of one measurement, its derivative, and its squared length.
 
-    Parameters
-    ----------
-    R, p, v, b : the keyframe's state, as `rovgraph.kernels.measurements.predict` takes it
-    c : calibration vector
-    row, sensor : of `rovgraph.kernels.measurement_row`
-    scale : shape (6, 6), bias by the IMU's scales, or (0, 0) where these are exact
-    gravity : [m/s^2]
-    scratch : of `make_scratch`
-    r_out, H_out : shapes (dim,), (dim, n), zero before
+    ``r_out`` and ``H_out``, shapes (dim,), (dim, n), are zero before; its columns are those of ``scratch``.
     """
-    _innovate(R, p, v, b, c, row, sensor, scale, gravity, True, scratch)
+    innovate(state, one, gravity, True, scratch)
     z, H, W, square = scratch.z, scratch.H, scratch.W, 0.0
-    for a in range(int(sensor[DIM])):
+    for a in range(int(one.sensor[DIM])):
         for k in range(a + 1):
             r_out[a] += W[a, k] * z[k]
         square += r_out[a] * r_out[a]
     for u in range(len(scratch.used)):
         j, own = scratch.used[u], scratch.column[u]
-        for a in range(int(sensor[DIM])):
+        for a in range(int(one.sensor[DIM])):
             for k in range(a + 1):
                 H_out[a, own] += W[a, k] * H[k, j]
     return square
 
 
-@kernel("void(f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8, b1, f8[::1], f8[:, ::1])")
+class States(NamedTuple):
+    """States of n keyframes.
+
+    Attributes
+    ----------
+    R, p, v, b : shapes (n, 3, 3), (n, 3), (n, 3), (n, 6)
+    c : calibration vectors, shape (n, C), or (1, C) where nothing walks
+    """
+
+    R: Matrices
+    p: Matrix
+    v: Matrix
+    b: Matrix
+    c: Matrix
+
+
+@helper
+def keyframe(states: States, k: int) -> Keyframe:
+    """One of some states."""
+    return Keyframe(states.R[k], states.p[k], states.v[k], states.b[k], states.c[k if len(states.c) > 1 else 0])
+
+
+@kernel()
 def linearize(
-    x: Array,
-    c: Array,
-    rows: Array,
-    which: Index,
-    sensors: Array,
+    states: States,
+    measured: MeasuredRows,
+    sensors: Matrix,
     column: Index,
-    scale: Array,
     gravity: float,
     weighted: bool,
-    r_out: Array,
-    H_out: Array,
+    r_out: Vector,
+    H_out: Matrix,
 ) -> None:
-    """Whitened innovations and Jacobians of m measurements of a keyframe, none of them `GIVEN`; as a filter takes.
+    """Whitened innovations and Jacobians of m measurements, one after the other, none of them `GIVEN`.
 
-    ``weighted`` ones are multiplied by the root of the weight of their loss.
+    Parameters
+    ----------
+    states : of each measurement's keyframe, or one of all
+    column : shape (15 + C,), column of each component, -1 where it has none
+    weighted : multiply them by the root of the weight of their loss
+    r_out, H_out : shapes (k,), (k, n), zero before; of shape (0, n) the Jacobians are left out
     """
-    begin, scratch = 0, make_scratch(len(c), column)
-    R, p, v, b = x[0:9].reshape(3, 3), x[9:12], x[12:15], x[15:21]
-    for j in range(len(which)):
-        sensor = sensors[which[j]]
-        end = begin + int(sensor[DIM])
-        own, r, H = scale[j] if len(scale) else scratch.exact, r_out[begin:end], H_out[begin:end]
-        square = linearize_measurement(R, p, v, b, c, rows[j], sensor, own, gravity, scratch, r, H)
+    begin, scratch, derive = 0, make_scratch(states.c.shape[1], column), len(H_out) > 0
+    for j in range(len(measured.which)):
+        one, state = pick(measured, j, sensors, scratch), keyframe(states, j if len(states.R) > 1 else 0)
+        dim = int(one.sensor[DIM])
+        r = r_out[begin : begin + dim]
+        if derive:
+            square = linearize_measurement(state, one, gravity, scratch, r, H_out[begin : begin + dim])
+        else:
+            innovate(state, one, gravity, False, scratch)
+            square = 0.0
+            for a in range(dim):
+                for k in range(a + 1):
+                    r[a] += scratch.W[a, k] * scratch.z[k]
+                square += r[a] * r[a]
         if weighted:
-            root = math.sqrt(loss_weight(square, int(sensor[LOSS]), sensor[BEND]))
-            for a in range(begin, end):
+            root = math.sqrt(loss_weight(square, int(one.sensor[LOSS]), one.sensor[BEND]))
+            for a in range(begin, begin + dim):
                 r_out[a] *= root
                 for i in range(H_out.shape[1]):
                     H_out[a, i] *= root
-        begin = end
+        begin += dim
+
+
+@kernel()
+def place_measurements(
+    states: States,
+    measured: MeasuredRows,
+    sensors: Matrix,
+    gravity: float,
+    out: States,
+    rate_out: Matrix,
+    F_out: Matrices,
+) -> None:
+    """States at the own times of m measurements, for models that no kernel knows; with derivatives.
+
+    Parameters
+    ----------
+    states : of each measurement's keyframe
+    out : R, p, v, and the bias with what the IMU's scales make of it; c holds (m, 12): how rotation, position and
+        velocity go with a late stamp, and how the rate does
+    rate_out, F_out : shapes (m, 3), (m, 15, 15) by the keyframe's state; of shape (0, 15, 15) these are left out
+    """
+    scratch, derive = make_scratch(states.c.shape[1], np.empty(0, np.int64)), len(F_out) > 0
+    for m in range(len(measured.which)):
+        one, state = pick(measured, m, sensors, scratch), keyframe(states, m)
+        moved = place(state, one, gravity, derive, scratch)
+        for i in range(3):
+            out.p[m, i] = scratch.there[0, i] if moved else state.p[i]
+            out.v[m, i] = scratch.there[1, i] if moved else state.v[i]
+            rate_out[m, i] = scratch.rate[i]
+            for j in range(3):
+                out.R[m, i, j] = scratch.R[i, j] if moved else state.R[i, j]
+            for j in range(4):
+                out.c[m, 3 * j + i] = scratch.by_offset[j, i]
+        for i in range(6):
+            out.b[m, i] = scratch.bias[i]
+        if derive:
+            for i in range(MOTION):
+                for j in range(MOTION):
+                    F_out[m, i, j] = scratch.F[i, j] if moved else 1.0 * (i == j)

@@ -22,13 +22,14 @@ sensor
 `SEES`             3  1 where an error of the `SEEN_FRAME` shows in it
 `SEEN_FRAME`       1  `SEES_VELOCITY`, `SEES_HEADING` or `SEES_POSITION`
 `GAIN`             9  covariance of the measurement where that of the rate is the unit matrix, by rows
+`OFFSET`           1  place in the calibration vector of how late its stamps are; -1 = they have none
 `PARAMS`           *  the model's own
 =============  =====  ==========================================================================================
 """
 
 from typing import NamedTuple
 
-from rovgraph.kernels.compile import Index, Matrices, Matrix
+from rovgraph.kernels.compile import Index, Matrices, Matrix, helper
 
 TIME, RATE, RATE_SD, SNAPSHOT, ASSUMED, Z = 0, 1, 4, 5, 21, 27
 MOST = 3  # components of a measurement that a kernel takes
@@ -36,7 +37,10 @@ SD = Z + MOST
 ROW = SD + MOST
 DT, DR, DV, DP = SNAPSHOT, SNAPSHOT + 1, SNAPSHOT + 10, SNAPSHOT + 13
 
-KIND, DIM, LOSS, BEND, GATE, READMIT, SEES, SEEN_FRAME, GAIN, PARAMS = 0, 1, 2, 3, 4, 5, 6, 9, 10, 19
+KIND, DIM, LOSS, BEND, GATE, READMIT, SEES, SEEN_FRAME, GAIN, OFFSET, PARAMS = 0, 1, 2, 3, 4, 5, 6, 9, 10, 19, 20
+# a knot of a window: a snapshot from the keyframe, the rate [rad/s], how long before the stamp, nan behind the last [s]
+KNOT_DT, KNOT_RATE, KNOT_LAG, KNOT = 0, 16, 19, 20
+KNOT_S = 0.02  # at 3 m/s3, the jerk of gravity in a turning body, velocity is interpolated within 0.2 mm/s
 GIVEN = -1.0
 SEES_VELOCITY, SEES_HEADING, SEES_POSITION = 0, 1, 2
 
@@ -48,8 +52,19 @@ class MeasuredRows(NamedTuple):
     ----------
     rows, which : shapes (m, ROW), (m,), and the sensor that each is of
     scales : shape (m, 6, 6), bias by the IMU's scales, or (0, 6, 6) where these are exact
+    window : shape (m,), of each whose stamp may be late, else -1
+    windows : shape (w, K, KNOT), motion around such stamps
     """
 
     rows: Matrix
     which: Index
     scales: Matrices
+    window: Index
+    windows: Matrices
+
+
+@helper
+def some_of(measured: MeasuredRows, begin: int, end: int) -> MeasuredRows:
+    """Measurements ``begin`` to before ``end``."""
+    rows, which, scales = measured.rows[begin:end], measured.which[begin:end], measured.scales[begin:end]
+    return MeasuredRows(rows, which, scales, measured.window[begin:end], measured.windows)

@@ -16,10 +16,8 @@ order of `rovgraph.kernels.layout`, the derivative F of the state at t by that a
 and the biases stay.
 """
 
-import numpy as np
-
 from rovgraph.geometry import Array
-from rovgraph.kernels.compile import given, kernel, view_helper
+from rovgraph.kernels.compile import view_helper
 from rovgraph.kernels.layout import ACC_BIAS, GYR_BIAS, MOTION, TRANSLATION, VELOCITY
 from rovgraph.kernels.rotations import cross, exp_rotation, multiply, right_jacobian, rotate
 
@@ -102,69 +100,3 @@ def chain(H: Array, F: Array) -> None:
             h[9 + k] += t0 * F[3, 9 + k] + t1 * F[4, 9 + k] + t2 * F[5, 9 + k]
             h[9 + k] += v0 * F[6, 9 + k] + v1 * F[7, 9 + k] + v2 * F[8, 9 + k]
             h[12 + k] += a0 * F[0, 12 + k] + a1 * F[1, 12 + k] + a2 * F[2, 12 + k]
-
-
-@view_helper
-def _propagate_rows(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    dt: Array,
-    dR: Array,
-    dv: Array,
-    dp: Array,
-    assumed: Array,
-    gravity: float,
-    R_out: Array,
-    p_out: Array,
-    v_out: Array,
-    F_out: Array,
-    turns: Array,
-    own: Array,
-    work: Array,
-) -> None:
-    """The loop of `propagate_many`, with its own copies, shapes (2, 3, 3) and (6, 6), of what may be strided."""
-    own_p, own_v, own_dv, own_dp, own_b, own_assumed = own[0], own[1], own[2], own[3], own[4], own[5]
-    own_R, own_dR = turns[0], turns[1]
-    for k in range(len(dt)):
-        for i in range(3):
-            own_p[i], own_v[i], own_dv[i], own_dp[i] = p[k, i], v[k, i], dv[k, i], dp[k, i]
-            own_b[i], own_b[3 + i] = b[k, i], b[k, 3 + i]
-            own_assumed[i], own_assumed[3 + i] = assumed[k, i], assumed[k, 3 + i]
-            for j in range(3):
-                own_R[i, j], own_dR[i, j] = R[k, i, j], dR[k, i, j]
-        start = own_R, own_p, own_v, own_b
-        motion = dt[k], own_dR, own_dv, own_dp, own_assumed
-        propagate(*start, *motion, gravity, R_out[k], p_out[k], v_out[k], work)
-        if len(F_out):
-            propagation_jacobian(own_R, dt[k], F_out[k], work)
-
-
-@kernel(
-    f"void({given(3)}, {given(2)}, {given(2)}, {given(2)}, {given(1)}, {given(3)}, {given(2)}, {given(2)}, {given(2)}, "
-    "f8, f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1])"
-)
-def propagate_many(
-    R: Array,
-    p: Array,
-    v: Array,
-    b: Array,
-    dt: Array,
-    dR: Array,
-    dv: Array,
-    dp: Array,
-    assumed: Array,
-    gravity: float,
-    R_out: Array,
-    p_out: Array,
-    v_out: Array,
-    F_out: Array,
-) -> None:
-    """`propagate` and `propagation_jacobian` of n epochs, all with the epochs in front.
-
-    ``F_out``, shape (n, 15, 15), must be zero; of shape (0, 15, 15) it is left out.
-    """
-    state, motion, out = (R, p, v, b), (dt, dR, dv, dp, assumed), (R_out, p_out, v_out, F_out)
-    turns, own, work = np.empty((2, 3, 3)), np.empty((6, 6)), np.empty((WORK, 3, 3))
-    _propagate_rows(*state, *motion, gravity, *out, turns, own, work)

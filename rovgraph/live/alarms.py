@@ -264,7 +264,7 @@ class LiveAlarms:
 def _innovations(engine: FilterEngine, sensor: str, samples: list[tuple[Met, int, Array]]) -> SensorResiduals:
     """Innovations in units of their sd: along those in units of the noise, and as long as the NIS says."""
     problem = gathered([(met.problem, met.begin + k) for met, k, _ in samples])
-    block = engine.block(problem, np.arange(len(samples)))
+    block = engine.measurements(problem, np.arange(len(samples)))
     x, c, nis, weight = (
         np.array([getattr(met, name)[k] for met, k, _ in samples]) for name in ("x", "c", "nis", "weight")
     )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rovgraph.engine.filter import FilterEngine
 from rovgraph.engine.filter_step import FilterRun, Gaussian, Met, stack_states, states_of
-from rovgraph.engine.measurements import Block
+from rovgraph.engine.measurements import Measurements
 from rovgraph.engine.problem import Problem
 from rovgraph.estimators.estimate import Estimate
 from rovgraph.estimators.results import (
@@ -120,14 +120,14 @@ class FilterHistory:
         residuals = residual_frame(self._measured(problem, smoothed))
         return Estimate(kind, trajectory, calibration, history, residuals, self._summary(problem))
 
-    def _measured(self, problem: Problem, smoothed: State | None) -> Iterator[tuple[str, Block, State, Array]]:
+    def _measured(self, problem: Problem, smoothed: State | None) -> Iterator[tuple[str, Measurements, State, Array]]:
         """Each sensor's measurements, the states they are compared with, and their weights."""
         weight = np.concatenate([np.empty(0), *(part.weight for part in self._met)])
         if problem.used and PLACE in problem.used:
             place = [part.place if len(part.place) else np.full((len(part.nis), 2), np.nan) for part in self._met]
         for sensor in problem.used:
             own = problem.of_sensor(sensor)
-            block = self._engine.block(problem, own)
+            block = self._engine.measurements(problem, own)
             here = smoothed.at(block.keyframe) if smoothed is not None else states_of(*self._states(own))
             if sensor == PLACE:
                 here = here.seeing(np.concatenate(place)[own])
