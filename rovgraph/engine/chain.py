@@ -205,8 +205,17 @@ class Chain:
     @property
     def _factors(self) -> DiveFactors:
         r = self.rows
-        of_motions, measured = (r.motions, r.weights, r.scales), (r.rows, r.which, r.first, r.row_scales)
-        return DiveFactors(*of_motions, *measured, self._sensors, self.initial.gravity)
+        return DiveFactors(
+            motions=r.motions,
+            W=r.weights,
+            scales=r.scales,
+            rows=r.rows,
+            which=r.which,
+            first=r.first,
+            row_scales=r.row_scales,
+            sensors=self._sensors,
+            gravity=self.initial.gravity,
+        )
 
     def _entered(self, gates: Gates) -> NDArray[np.bool_]:
         """Gates of what kernels know, shape (m,)."""

@@ -75,7 +75,7 @@ class Point(NamedTuple):
 
 @view_helper
 def load_linearized(
-    k: int, row: int, point: Point, dive: DiveFactors, entered: Array, room: Room, scratch: Scratch, r: Array
+    k: int, row: int, point: Point, dive: DiveFactors, entered: Flags, room: Room, scratch: Scratch, r: Array
 ) -> int:
     """Weighted rows of the measurements of keyframe k into V from ``row`` on; returns the row after them."""
     R, p, v, b, c = point.R[k], point.p[k], point.v[k], point.b[k], point.c[k if len(point.c) > 1 else 0]
