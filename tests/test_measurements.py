@@ -244,7 +244,6 @@ def test_block_predicts_at_the_measurements_own_time(sensor):
     expected = block.instrument.model.predict(there, block.rate_b)[0]
     np.testing.assert_allclose(block.predicted(state), expected, atol=1e-12)
     np.testing.assert_allclose(block.predict(state)[0], expected, atol=1e-12)
-    np.testing.assert_allclose(block.z - block.innovations(state), expected, atol=1e-12)
 
 
 def test_some_of_a_block_are_its_own_measurements():

@@ -202,7 +202,15 @@ class Chain:
     @property
     def _factors(self) -> DiveFactors:
         r = self.problem
-        return DiveFactors(r.motions, r.weights, r.scales, r.measured(), r.first, self._sensors, self.initial.gravity)
+        return DiveFactors(
+            motions=r.motions,
+            W=r.weights,
+            scales=r.scales,
+            measured=r.measured(),
+            first=r.first,
+            sensors=self._sensors,
+            gravity=self.initial.gravity,
+        )
 
     def _entered(self, gates: Gates) -> NDArray[np.bool_]:
         """Gates of what kernels know, shape (m,)."""

@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 
 from rovgraph.geometry import Array, transpose
 from rovgraph.kernels import chain, chain_posterior
-from rovgraph.kernels.chain import Index
+from rovgraph.kernels.compile import Index
 
 EVERY = slice(None)
 

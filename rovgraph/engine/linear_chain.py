@@ -7,7 +7,8 @@ import numpy as np
 
 from rovgraph.engine.chain_information import MeasurementRows, SquareRoot, square_root
 from rovgraph.geometry import Array
-from rovgraph.kernels.chain import Elimination, Index, PlacedRows, Walks
+from rovgraph.kernels.chain import Elimination, PlacedRows, Walks
+from rovgraph.kernels.compile import Index
 from rovgraph.kernels.linear_chain import LinearMotions
 from rovgraph.kernels.linear_chain import eliminate as eliminate_rows
 

@@ -132,9 +132,10 @@ def fold_border(Y: Array, c: int, end: int, v: Array, w: Array) -> float:
 @view_helper
 def load_measurements(k: int, measured: PlacedRows, s: int, d: int, room: Room) -> int:
     """Rows of a keyframe's measurements into V, below the d rows that are known of it; returns the row after them."""
-    rows, targets, begin, end = measured.rows, measured.targets, measured.first[k], measured.first[k + 1]
+    rows, targets, begin = measured.rows, measured.targets, measured.first[k]
+    count: int = measured.first[k + 1] - begin
     last, V_out, scale_out = rows.shape[1] - 1, room.V, room.scale
-    for i in range(end - begin):
+    for i in range(count):
         row = begin + i
         for j in range(V_out.shape[1]):
             V_out[d + i, j] = 0.0
@@ -146,7 +147,7 @@ def load_measurements(k: int, measured: PlacedRows, s: int, d: int, room: Room) 
         for j in range(scale_out.shape[0]):
             scale_out[j] += V_out[d + i, j] * V_out[d + i, j]
         V_out[d + i, scale_out.shape[0]] = rows[row, last]
-    return d + end - begin
+    return d + count
 
 
 @view_helper

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rovgraph.geometry import Array
 from rovgraph.kernels.chain import (
     Elimination,
     PlacedRows,
@@ -64,7 +63,7 @@ class DiveFactors(NamedTuple):
 
 @view_helper
 def load_linearized(
-    k: int, row: int, point: States, dive: DiveFactors, entered: Array, room: Room, scratch: Scratch, r: Array
+    k: int, row: int, point: States, dive: DiveFactors, entered: Flags, room: Room, scratch: Scratch, r: Vector
 ) -> int:
     """Weighted rows of the measurements of keyframe k into V from ``row`` on; returns the row after them."""
     state, which, sensors = keyframe(point, k), dive.measured.which, dive.sensors
