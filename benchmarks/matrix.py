@@ -18,7 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 LIBRARIES = ("numba", "numpy", "gtsam", "pandas")
 # what tests import beside the package
-TOOLS = ("pytest>=8", "pytest-timeout>=2.3", "hypothesis>=6.100")
+TOOLS = ("pytest>=8", "pytest-timeout>=2.3", "hypothesis>=6.100", "pint>=0.24")
 TESTS = (
     "tests/test_golden.py",
     "tests/test_kernel_chain.py",
@@ -65,7 +65,7 @@ def passes(column: str, python: str, tests: list[str]) -> bool:
         said = (done.stdout.strip().splitlines() or [done.stderr.strip()])[-1]
         print(f"{column}, {python}: {versions}: {said}", flush=True)
         for line in done.stdout.splitlines():
-            if line.startswith(("FAILED", "ERROR")):
+            if line.startswith(("FAILED", "ERROR ", "E  ")):
                 print(f"  {line}", flush=True)
         return done.returncode == 0
 
