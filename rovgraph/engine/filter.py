@@ -63,8 +63,7 @@ def _state(known: Gaussian) -> FilterState:
 
 def _room(known: Gaussian) -> FilterState:
     """Arrays for an estimate of the same size."""
-    own = np.empty_like(known.x), np.empty_like(known.c), np.empty_like(known.P), np.empty_like(known.B)
-    return FilterState(*own, known.L)
+    return FilterState(*[np.empty(a.shape) for a in (known.x, known.c, known.P, known.B)], known.L)  # contiguous
 
 
 def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> Gaussian:
