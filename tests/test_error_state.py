@@ -171,7 +171,7 @@ def test_all_measurements_of_a_keyframe_together_are_linearised_as_each_alone(es
     assert dive.rows[index, measurement_row.DT].any()
     r, H = engine.linearize(known, dive, index)
     for row, part in zip(index, parts_of(dive, index), strict=True):
-        alone, jacobians = engine.block(dive, np.array([row])).linearize(known.state)
+        alone, jacobians = engine.measurements(dive, np.array([row])).linearize(known.state)
         np.testing.assert_allclose(r[part], alone[0], atol=1e-9)
         np.testing.assert_allclose(H[part], engine.layout.matrix(jacobians)[0], atol=1e-9)
 
@@ -642,10 +642,10 @@ def left_out(estimator: RecordingFilter, off: float, since: float) -> tuple[Gaus
     own = np.array([ping])
     _, H = engine.linearize(known, dive, own)
     along = np.linalg.cholesky(H @ known.P @ H.T + np.eye(3))[:, 0]
-    aside = measuring(dive, ping, dive.z(own, 3)[0] - engine.block(dive, own).innovations(known.state)[0])
+    aside = measuring(dive, ping, dive.z(own, 3)[0] - engine.measurements(dive, own).innovations(known.state)[0])
     r, _ = engine.linearize(known, aside, own)
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
-    shift = np.linalg.solve(engine.block(dive, own).W[0], along * off)
+    shift = np.linalg.solve(engine.measurements(dive, own).W[0], along * off)
     shifted = measuring(aside, ping, aside.z(own, 3)[0] + shift)
     met = Met.of(shifted, k, len(known.c))
     gates = {} if since == 0.0 else {"dvl": float(dive.rows[ping, measurement_row.TIME]) - since}

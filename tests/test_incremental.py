@@ -255,14 +255,14 @@ def test_the_rows_of_an_interval_are_gtsams_factors_of_it(whole):
         insert_state(values, j - 1 + k, states_of(x[k : k + 1], c))
     insert_calibration(values, states_of(x[:1], c).calibration, unknowns)
     graph.add(motion_factor(problem, j, unknowns, 0))
-    blocks = [engine.block(problem, np.array([row])) for row in own]
-    for block in blocks:
-        graph.add(measurement_factor(block, 0))
+    seen = [engine.measurements(problem, np.array([row])) for row in own]
+    for measured in seen:
+        graph.add(measurement_factor(measured, 0))
     order = gtsam.Ordering()
     for k in (j - 1, j):
         for variable in (POSE, VELOCITY, BIAS):
             order.push_back(key(variable, k))
-    touched = {name for block in blocks for name in block.unknowns.estimated}
+    touched = {name for measured in seen for name in measured.unknowns.estimated}
     names = [name for name in unknowns.estimated if name in touched]
     for name in names:
         order.push_back(key(name))

@@ -196,13 +196,14 @@ def test_the_rate_is_that_of_its_own_time(rate):
 
     own = {"dvl": {"lever_arm_m": [0.3, 0.0, 0.1]}, "graph": {"min_gap_s": 0.1}, "start": {"heading_deg": 0.0}}
     config = changed(Config(), **own)
-    intervals = batch(log, config).intervals
-    seen = [m for i in intervals for m in i.measurements if m.sensor == "dvl"]
-    assert sorted(m.time for m in seen) == pings.tolist() and {m.motion.dt > 0.0 for m in seen} == {True, False}
-    for m in seen:
-        np.testing.assert_allclose(m.rate_b, true(m.time), atol=1e-9)
-    for i in intervals[1:-1]:
-        np.testing.assert_allclose(i.rate_b, true(i.time), atol=1e-9)
+    problem = batch(log, config).problem
+    seen = problem.rows[problem.of_sensor("dvl")]
+    times, after = seen[:, measurement_row.TIME], seen[:, measurement_row.DT] > 0.0
+    assert sorted(times) == pings.tolist() and set(after) == {True, False}
+    for row, t in zip(seen, times, strict=True):
+        np.testing.assert_allclose(row[measurement_row.RATE : measurement_row.RATE + 3], true(t), atol=1e-9)
+    for rate_b, t in zip(problem.rate_b[1:-1], problem.time[1:-1], strict=True):
+        np.testing.assert_allclose(rate_b, true(t), atol=1e-9)
 
 
 def test_keyframes_stand_at_the_pings_within_a_gap_of_the_imu():

@@ -62,8 +62,8 @@ def _state(known: Gaussian) -> FilterState:
 
 def _room(known: Gaussian) -> FilterState:
     """Arrays for an estimate of the same size."""
-    own = (np.empty(array.shape) for array in (known.x, known.c, known.P, known.B))
-    return FilterState(*own, known.L)
+    x, c, P, B = (np.empty(array.shape) for array in (known.x, known.c, known.P, known.B))
+    return FilterState(x, c, P, B, known.L)
 
 
 def _estimate(known: FilterState, places: tuple[RememberedPlace, ...] = ()) -> Gaussian:

@@ -104,10 +104,9 @@ class KeyframeRows:
         x, c : ndarray, shapes (21,), (C,), as of `rovgraph.engine.filter_step.Gaussian`
         """
         r = np.zeros(int(self.sensors[self.measured.which, at.DIM].sum()))
-        H, row = np.zeros((len(r), self.size)), x[None]
-        states = States(
-            x[:9].reshape(1, 3, 3), *(row[:, a:b].copy() for a, b in ((9, 12), (12, 15), (15, 21))), c[None]
-        )
+        H = np.zeros((len(r), self.size))
+        p, v, b = (x[None, part].copy() for part in _STATE)
+        states = States(x[:9].reshape(1, 3, 3), p, v, b, c[None])
         linearize(states, self.measured, self.sensors, self.column, self.gravity, weighted, r, H)
         return r, H
 
@@ -261,7 +260,7 @@ class Measurements:
             if variable in H:
                 stacked[..., columns] = H[variable]
         if self.may_be_late and self.instrument.time_offset is not None:
-            slope, rate_slope = np.split(F[1].reshape(n, 12), [9], axis=1)  # type: ignore[index]
+            slope, rate_slope = np.split(F[1].reshape(n, 12), [9], axis=1)
             by = rotate(stacked[..., :9], slope) - rotate(stacked[..., 12:], rate_slope)
             H = H | {self.instrument.time_offset: by[..., None]}
         stacked = stacked @ F[0]
